@@ -1,0 +1,1 @@
+"""bcppl: finding where a part is by looking at it and touching it."""

@@ -1,0 +1,1 @@
+"""Pose priors, and likelihoods of depth images and contacts."""

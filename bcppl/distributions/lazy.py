@@ -1,0 +1,52 @@
+"""Distributions that cost nothing until their log-probability or a sample is asked for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from pyro.distributions import TorchDistribution
+from torch import Tensor
+from torch.distributions import constraints
+
+from bcppl.errors import InputError
+
+
+class LazyDistribution(TorchDistribution):
+    """A distribution over one observation for each of N particles, evaluated only on demand.
+
+    Subclasses run their simulator in `log_prob` and `sample`, never in `__init__`, so that a program
+    can be traced for the price of its Python.
+
+    Attributes:
+        inputs: the tensors, particle axis first, that the distribution hangs on. While they stay the same,
+            a log-probability that is known already is not computed again.
+    """
+
+    arg_constraints: dict[str, Any] = {}
+    support = constraints.real
+
+    def __init__(self, particles: int, event_shape: tuple[int, ...], inputs: tuple[Tensor, ...]) -> None:
+        self.inputs = inputs
+        super().__init__(torch.Size([particles]), torch.Size(event_shape), validate_args=False)
+
+    def expand(self, batch_shape: Any, _instance: Any = None) -> LazyDistribution:
+        """Itself: Pyro's plates call this on every site, also when its shape fits already.
+
+        Raises:
+            InputError: the particle axis does not fit.
+        """
+        if torch.Size(batch_shape) == self.batch_shape:
+            return self
+        raise InputError(
+            f"{type(self).__name__} was made for {self.batch_shape[0]} particles and cannot be spread over a plate "
+            f"of shape {tuple(batch_shape)}; build it from values sampled in the same program."
+        )
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-probability (N,) of one observation, or of one for each particle."""
+        raise NotImplementedError
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """One observation for each particle, (N, *event_shape); only the empty sample_shape is known."""
+        raise NotImplementedError

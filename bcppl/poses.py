@@ -1,0 +1,204 @@
+"""SE(3): batched poses, their tangent space and their base measure.
+
+A pose is `[x, y, z, qw, qx, qy, qz]`, metres and a unit quaternion, in the last dimension of a float64
+tensor; q and -q are the same pose. A pose is named after the frames it takes from and to:
+`world_from_part` maps points given in the part's frame to the world's.
+
+The tangent space at a pose is R^3 x so(3), translation and rotation apart: a tangent `[v, w]` moves the
+translation by v (in the frame the pose maps to, metres) and turns the rotation by the rotation vector w
+(in the frame the pose maps from, radians): (t, R) -> (t + v, R Exp(w)).
+
+Every pose density in bcppl is with respect to Lebesgue measure on the free translations times the
+normalised Haar measure on the free rotations, and every one takes its Jacobian from here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import roma
+import torch
+from torch import Tensor
+
+from bcppl.errors import InputError
+
+LOG_8_PI_SQUARED = math.log(8.0 * math.pi**2)
+
+
+def identity(*batch: int) -> Tensor:
+    """The identity pose, shape (*batch, 7)."""
+    pose = torch.zeros(*batch, 7, dtype=torch.float64)
+    pose[..., 3] = 1.0
+    return pose
+
+
+def as_pose(values: object, name: str = "pose") -> Tensor:
+    """A float64 pose tensor from seven numbers (or a batch of them), its quaternion normalised.
+
+    Raises:
+        InputError: the last dimension is not 7, a number is not finite, or a quaternion is far from unit length.
+    """
+    pose = torch.as_tensor(values, dtype=torch.float64)
+    if pose.ndim == 0 or pose.shape[-1] != 7:
+        raise InputError(
+            f"{name} has shape {tuple(pose.shape)}; a pose is seven numbers x y z (m) qw qx qy qz in the last dimension."
+        )
+    if not bool(torch.isfinite(pose).all()):
+        raise InputError(f"{name} holds a number that is not finite; give x y z in metres and a unit quaternion.")
+    norm = pose[..., 3:].norm(dim=-1)
+    if bool(((norm - 1.0).abs() > 1e-3).any()):
+        raise InputError(
+            f"{name} has a quaternion of length {float(norm.flatten()[0]):.4g}; give qw qx qy qz of unit length."
+        )
+    return torch.cat([pose[..., :3], pose[..., 3:] / norm[..., None]], dim=-1)
+
+
+def translation(pose: Tensor) -> Tensor:
+    """The translation of poses (..., 7), in metres, shape (..., 3)."""
+    return pose[..., :3]
+
+
+def quaternion_xyzw(pose: Tensor) -> Tensor:
+    """The rotations of poses (..., 7) as unit quaternions in roma's and scipy's order, shape (..., 4)."""
+    return pose[..., [4, 5, 6, 3]]
+
+
+def from_translation_quaternion_xyzw(translation: Tensor, quaternion: Tensor) -> Tensor:
+    """Poses (..., 7) from translations (..., 3) and quaternions in order x y z w (..., 4)."""
+    translation, quaternion = torch.broadcast_tensors(
+        torch.nn.functional.pad(translation, (0, 1)), quaternion
+    )
+    return torch.cat([translation[..., :3], quaternion[..., [3, 0, 1, 2]]], dim=-1)
+
+
+def from_rotation_matrix(translation: Tensor, rotation: Tensor) -> Tensor:
+    """Poses (..., 7) from translations (..., 3) in metres and rotation matrices (..., 3, 3)."""
+    return from_translation_quaternion_xyzw(translation, roma.rotmat_to_unitquat(rotation))
+
+
+def rotation_matrix(pose: Tensor) -> Tensor:
+    """The rotations of poses (..., 7) as matrices (..., 3, 3)."""
+    return roma.unitquat_to_rotmat(quaternion_xyzw(pose))
+
+
+def compose(a_from_b: Tensor, b_from_c: Tensor) -> Tensor:
+    """`a_from_c` of two batches of poses (..., 7) that broadcast against each other."""
+    turned = (rotation_matrix(a_from_b) @ b_from_c[..., :3, None])[..., 0]
+    first, second = torch.broadcast_tensors(quaternion_xyzw(a_from_b), quaternion_xyzw(b_from_c))
+    product = roma.quat_product(first, second)
+    product = product / product.norm(dim=-1, keepdim=True)
+    return from_translation_quaternion_xyzw(a_from_b[..., :3] + turned, product)
+
+
+def inverse(a_from_b: Tensor) -> Tensor:
+    """`b_from_a` of poses (..., 7)."""
+    rotation = rotation_matrix(a_from_b)
+    translation = -(rotation.transpose(-1, -2) @ a_from_b[..., :3, None])[..., 0]
+    return from_translation_quaternion_xyzw(translation, roma.quat_conjugation(quaternion_xyzw(a_from_b)))
+
+
+def transform(a_from_b: Tensor, points: Tensor) -> Tensor:
+    """Points given in frame b, in frame a: poses (..., 7) and points (M, 3) give (..., M, 3), metres."""
+    return points @ rotation_matrix(a_from_b).transpose(-1, -2) + a_from_b[..., None, :3]
+
+
+def retract(pose: Tensor, tangent: Tensor) -> Tensor:
+    """The pose (..., 7) reached from a pose (..., 7) by a tangent (..., 6): metres, then radians."""
+    turn = roma.rotvec_to_unitquat(tangent[..., 3:])
+    first, second = torch.broadcast_tensors(quaternion_xyzw(pose), turn)
+    product = roma.quat_product(first, second)
+    product = product / product.norm(dim=-1, keepdim=True)
+    return from_translation_quaternion_xyzw(pose[..., :3] + tangent[..., :3], product)
+
+
+def local(pose: Tensor, other: Tensor) -> Tensor:
+    """The tangent (..., 6) that takes `pose` to `other`: the inverse of `retract`, rotation angle at most pi."""
+    first, second = torch.broadcast_tensors(
+        roma.quat_conjugation(quaternion_xyzw(pose)), quaternion_xyzw(other)
+    )
+    turn = roma.quat_product(first, second)
+    return torch.cat([other[..., :3] - pose[..., :3], roma.unitquat_to_rotvec(turn)], dim=-1)
+
+
+def log_haar_density_of_rotation_vector(angle: Tensor) -> Tensor:
+    """log of d(normalised Haar measure on SO(3)) / d(Lebesgue measure of the rotation vector), at an angle.
+
+    The density is (1 - cos a) / (4 pi^2 a^2): Chirikjian, Stochastic Models, Information Theory, and Lie
+    Groups, vol. 2, 10.6. Angles may exceed pi (further windings); at 2 pi k, k > 0, it is -inf.
+    """
+    half = 0.5 * angle
+    return 2.0 * torch.log(torch.sinc(half / math.pi).abs()) - LOG_8_PI_SQUARED
+
+
+_AXES = {"x": 0, "y": 1, "z": 2}
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """Which axes of a pose are free, and so the base measure of its densities.
+
+    Attributes:
+        translation: the free translations among "xyz", in the frame the pose maps to.
+        rotation: "all", "none", or the one axis ("x", "y" or "z", of the frame the pose maps from)
+            about which the pose may turn. Other combinations have no Haar measure and are refused.
+
+    The measure is Lebesgue on the free translations (metres) times the normalised Haar measure on the free
+    rotations: of SO(3) for "all", of the circle for one axis, a unit mass for "none".
+    """
+
+    translation: str = "xyz"
+    rotation: str = "all"
+
+    def __post_init__(self) -> None:
+        if "".join(a for a in "xyz" if a in self.translation) != self.translation:
+            raise InputError(
+                f"free translations {self.translation!r} are not a part of 'xyz' in that order; write for example 'xy'."
+            )
+        if self.rotation not in ("all", "none", "x", "y", "z"):
+            raise InputError(
+                f"free rotation {self.rotation!r} is refused: only 'all', 'none' or one axis 'x', 'y', 'z' has a Haar measure."
+            )
+        if not self.translation and self.rotation == "none":
+            raise InputError("a pose with no free axis needs no belief: leave at least one translation or rotation free.")
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """Indices into the tangent (6,) of the free coordinates."""
+        turns = {"all": (3, 4, 5), "none": ()}.get(self.rotation)
+        if turns is None:
+            turns = (3 + _AXES[self.rotation],)
+        return (*(_AXES[a] for a in self.translation), *turns)
+
+    @property
+    def dimension(self) -> int:
+        """The number of free axes."""
+        return len(self.axes)
+
+    def embed(self, coordinates: Tensor) -> Tensor:
+        """The tangent (..., 6) of free coordinates (..., dimension)."""
+        tangent = coordinates.new_zeros(*coordinates.shape[:-1], 6)
+        tangent[..., list(self.axes)] = coordinates
+        return tangent
+
+    def coordinates(self, tangent: Tensor) -> Tensor:
+        """The free coordinates (..., dimension) of a tangent (..., 6)."""
+        return tangent[..., list(self.axes)]
+
+    def off_axis(self, tangent: Tensor) -> Tensor:
+        """The largest component of tangents (..., 6) along the held axes, shape (...,): zero on the support."""
+        held = [k for k in range(6) if k not in self.axes]
+        if not held:
+            return tangent.new_zeros(tangent.shape[:-1])
+        return tangent[..., held].abs().amax(dim=-1)
+
+    def log_base_density(self, angle: Tensor) -> Tensor:
+        """log d(base measure) / d(Lebesgue measure of the free coordinates), at a signed rotation angle (...,)."""
+        if self.rotation == "all":
+            return log_haar_density_of_rotation_vector(angle)
+        if self.rotation == "none":
+            return torch.zeros_like(angle)
+        return torch.full_like(angle, -math.log(2.0 * math.pi))
+
+
+FREE = Freedom()

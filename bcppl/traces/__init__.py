@@ -1,0 +1,1 @@
+"""Traces: runs of a program for N particles at once, and the verbs on them."""

@@ -1,0 +1,1 @@
+"""Inference programs and the pieces they are made of."""

@@ -1,0 +1,1 @@
+"""Generative programs: each a short file to copy and edit."""
