@@ -70,7 +70,7 @@ class Part:
         return float(pdist(hull).max())
 
     def surface_points(self, count: int = 1000, seed: int = 0) -> Array:
-        """Points (count, 3) spread evenly over the surface by area, in the part's frame: what ADD is taken over."""
+        """Points (count, 3) spread evenly over the surface by area, in the part's frame; ADD is over them."""
         points, _ = trimesh.sample.sample_surface(self.mesh, count, seed=seed)
         return np.ascontiguousarray(points, dtype=np.float64)
 
@@ -85,7 +85,9 @@ class Part:
         if not np.isfinite(self.vertices).all():
             raise InputError(f"part {self.name!r} has a vertex that is not finite; export its mesh again.")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
-            raise InputError(f"part {self.name!r} has a face that points at no vertex; export its mesh again.")
+            raise InputError(
+                f"part {self.name!r} has a face that points at no vertex; export its mesh again."
+            )
         if self.extent.max() > LARGEST_EXTENT:
             raise InputError(
                 f"part {self.name!r} is {self.extent.max():.0f} m long: its mesh is probably in millimetres; "

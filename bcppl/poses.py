@@ -37,19 +37,23 @@ def as_pose(values: object, name: str = "pose") -> Tensor:
     """A float64 pose tensor from seven numbers (or a batch of them), its quaternion normalised.
 
     Raises:
-        InputError: the last dimension is not 7, a number is not finite, or a quaternion is far from unit length.
+        InputError: the last dimension is not 7, a number is not finite, or a quaternion is not a unit one.
     """
     pose = torch.as_tensor(values, dtype=torch.float64)
     if pose.ndim == 0 or pose.shape[-1] != 7:
         raise InputError(
-            f"{name} has shape {tuple(pose.shape)}; a pose is seven numbers x y z (m) qw qx qy qz in the last dimension."
+            f"{name} has shape {tuple(pose.shape)}; a pose is seven numbers x y z (m) qw qx qy qz "
+            "in the last dimension."
         )
     if not bool(torch.isfinite(pose).all()):
-        raise InputError(f"{name} holds a number that is not finite; give x y z in metres and a unit quaternion.")
+        raise InputError(
+            f"{name} holds a number that is not finite; give x y z in metres and a unit quaternion."
+        )
     norm = pose[..., 3:].norm(dim=-1)
     if bool(((norm - 1.0).abs() > 1e-3).any()):
         raise InputError(
-            f"{name} has a quaternion of length {float(norm.flatten()[0]):.4g}; give qw qx qy qz of unit length."
+            f"{name} has a quaternion of length {float(norm.flatten()[0]):.4g}; "
+            "give qw qx qy qz of unit length."
         )
     return torch.cat([pose[..., :3], pose[..., 3:] / norm[..., None]], dim=-1)
 
@@ -113,7 +117,7 @@ def retract(pose: Tensor, tangent: Tensor) -> Tensor:
 
 
 def local(pose: Tensor, other: Tensor) -> Tensor:
-    """The tangent (..., 6) that takes `pose` to `other`: the inverse of `retract`, rotation angle at most pi."""
+    """The tangent (..., 6) from `pose` to `other`: the inverse of `retract`, rotation angle at most pi."""
     first, second = torch.broadcast_tensors(
         roma.quat_conjugation(quaternion_xyzw(pose)), quaternion_xyzw(other)
     )
@@ -122,7 +126,7 @@ def local(pose: Tensor, other: Tensor) -> Tensor:
 
 
 def log_haar_density_of_rotation_vector(angle: Tensor) -> Tensor:
-    """log of d(normalised Haar measure on SO(3)) / d(Lebesgue measure of the rotation vector), at an angle.
+    """Log of d(normalised Haar measure on SO(3)) / d(Lebesgue measure of the rotation vector), at an angle.
 
     The density is (1 - cos a) / (4 pi^2 a^2): Chirikjian, Stochastic Models, Information Theory, and Lie
     Groups, vol. 2, 10.6. Angles may exceed pi (further windings); at 2 pi k, k > 0, it is -inf.
@@ -153,14 +157,18 @@ class Freedom:
     def __post_init__(self) -> None:
         if "".join(a for a in "xyz" if a in self.translation) != self.translation:
             raise InputError(
-                f"free translations {self.translation!r} are not a part of 'xyz' in that order; write for example 'xy'."
+                f"free translations {self.translation!r} are not a part of 'xyz' in that order; "
+                "write for example 'xy'."
             )
         if self.rotation not in ("all", "none", "x", "y", "z"):
             raise InputError(
-                f"free rotation {self.rotation!r} is refused: only 'all', 'none' or one axis 'x', 'y', 'z' has a Haar measure."
+                f"free rotation {self.rotation!r} is refused: "
+                "only 'all', 'none' or one axis 'x', 'y', 'z' has a Haar measure."
             )
         if not self.translation and self.rotation == "none":
-            raise InputError("a pose with no free axis needs no belief: leave at least one translation or rotation free.")
+            raise InputError(
+                "a pose with no free axis needs no belief: leave at least one translation or rotation free."
+            )
 
     @property
     def axes(self) -> tuple[int, ...]:
@@ -186,14 +194,14 @@ class Freedom:
         return tangent[..., list(self.axes)]
 
     def off_axis(self, tangent: Tensor) -> Tensor:
-        """The largest component of tangents (..., 6) along the held axes, shape (...,): zero on the support."""
+        """The largest part of tangents (..., 6) along the held axes, shape (...,): zero on the support."""
         held = [k for k in range(6) if k not in self.axes]
         if not held:
             return tangent.new_zeros(tangent.shape[:-1])
         return tangent[..., held].abs().amax(dim=-1)
 
     def log_base_density(self, angle: Tensor) -> Tensor:
-        """log d(base measure) / d(Lebesgue measure of the free coordinates), at a signed rotation angle (...,)."""
+        """Log of d(base measure) / d(Lebesgue measure of the free coordinates), at signed angles (...,)."""
         if self.rotation == "all":
             return log_haar_density_of_rotation_vector(angle)
         if self.rotation == "none":

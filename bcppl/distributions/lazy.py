@@ -39,8 +39,8 @@ class LazyDistribution(TorchDistribution):
         if torch.Size(batch_shape) == self.batch_shape:
             return self
         raise InputError(
-            f"{type(self).__name__} was made for {self.batch_shape[0]} particles and cannot be spread over a plate "
-            f"of shape {tuple(batch_shape)}; build it from values sampled in the same program."
+            f"{type(self).__name__} was made for {self.batch_shape[0]} particles and cannot be spread over "
+            f"a plate of shape {tuple(batch_shape)}; build it from values sampled in the same program."
         )
 
     def log_prob(self, value: Tensor) -> Tensor:

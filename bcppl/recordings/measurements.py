@@ -71,7 +71,7 @@ class Push:
 
 @dataclass(frozen=True, eq=False)
 class DepthImage:
-    """Observation: depth along the optical axis, (H, W) metres, NaN where missing; colour (H, W, 3) if kept."""
+    """Observation: depth along the optical axis, (H, W) metres, NaN where missing; colour (H, W, 3)."""
 
     depth: Array
     rgb: npt.NDArray[np.uint8] | None = None
@@ -102,7 +102,7 @@ class Measurement:
 
     @property
     def kind(self) -> str:
-        """"view", "window" or "push"."""
+        """One of "view", "window" and "push"."""
         return {View: "view", ProbeWindow: "window", Push: "push"}[type(self.action)]
 
 

@@ -35,7 +35,7 @@ class Camera:
     far: float = 10.0
 
     def rays(self) -> Array:
-        """Directions (height * width, 3) of the pixels in the optical frame, z = 1 (a ray's length is its depth)."""
+        """Directions (height * width, 3) of the pixels in the optical frame, z = 1 (lengths are depths)."""
         u, v = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
         x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
         return np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)

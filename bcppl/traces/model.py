@@ -16,10 +16,11 @@ class Model:
     """What a model file defines under the name `model`.
 
     Attributes:
-        program: a Pyro program `program(scene, actions)`. Its arguments are what the robot did, never what it saw.
-        prepare: `prepare(recording) -> scene`, everything that stays the same over a run: the prior, simulators.
+        program: a Pyro program `program(scene, actions)`. Its arguments are what the robot did, never what
+            it saw.
+        prepare: `prepare(recording) -> scene`, what stays the same over a run: the prior, simulators.
         observe: `observe(scene, measurements) -> {address: value}`, the constraints that the measurements put
-            on `program(scene, [m.action for m in measurements])`: all of them, also those of earlier measurements.
+            on `program(scene, [m.action for m in measurements])`: all, also those of earlier measurements.
         pose: address of the sought pose (`world_from_part`).
         invent: `invent(seed, **options) -> Recording`, a recording made up by the model; None if it has none.
     """
