@@ -1,5 +1,8 @@
-"""Measurements on disk: what a recording holds, its native file, and the importers."""
+"""Measurements on disk: what a recording holds, its native file, its checks, and the importers."""
 
+from bcppl.recordings.check import notes, problems, validate
+from bcppl.recordings.describe import describe
+from bcppl.recordings.file import load, save
 from bcppl.recordings.measurements import (
     DepthImage,
     Guess,
@@ -12,4 +15,20 @@ from bcppl.recordings.measurements import (
     View,
 )
 
-__all__ = ["DepthImage", "Guess", "Measurement", "Probe", "ProbeWindow", "Push", "Recording", "Touch", "View"]
+__all__ = [
+    "DepthImage",
+    "Guess",
+    "Measurement",
+    "Probe",
+    "ProbeWindow",
+    "Push",
+    "Recording",
+    "Touch",
+    "View",
+    "describe",
+    "load",
+    "notes",
+    "problems",
+    "save",
+    "validate",
+]
