@@ -6,3 +6,10 @@ class InputError(ValueError):
 
     The command line prints the sentence alone and exits with code 2.
     """
+
+
+class InferenceError(RuntimeError):
+    """Inference cannot go on: a log-probability is not a number, or no particle has any weight left.
+
+    The message names the site and the particles, and says what to try.
+    """

@@ -1,0 +1,250 @@
+"""One run of a program for N particles at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+import pyro
+import pyro.poutine as poutine
+import torch
+from torch import Tensor
+
+from bcppl.errors import InferenceError, InputError
+from bcppl.traces.carried import Entry, carrying, same_inputs
+
+Program = Callable[..., Any]
+Index = Tensor | Sequence[int] | slice
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What one pass through a program left: distributions and values by address, and the states it carries."""
+
+    distributions: dict[str, Any]
+    values: dict[str, Tensor]
+    fixed: frozenset[str]
+    carried: dict[str, Entry]
+    result: Any
+
+
+def run(
+    program: Program,
+    args: tuple[Any, ...],
+    particles: int,
+    given: Mapping[str, Tensor],
+    carried: Mapping[str, Entry],
+) -> Run:
+    """Run a program under the plate `particles`, its sites set to `given` and the others sampled.
+
+    Raises:
+        InputError: a duplicate address, an enumerated site, a site outside the particle axis, or a value of
+            the wrong shape; the sentence names the address.
+    """
+
+    def plated() -> Any:
+        with pyro.plate("particles", particles, dim=-1):
+            return program(*args)
+
+    try:
+        with carrying(carried) as used, torch.no_grad(), pyro.validation_enabled(False):
+            tracer = poutine.trace(poutine.condition(plated, data=dict(given)))
+            recorded = tracer.get_trace()
+    except RuntimeError as error:
+        if "Multiple" in str(error) and "sites named" in str(error):
+            raise InputError(f"the program visits an address twice: {error}; give each site its own.") from error
+        raise
+    distributions: dict[str, Any] = {}
+    values: dict[str, Tensor] = {}
+    fixed = set()
+    for address, site in recorded.nodes.items():
+        if site["type"] != "sample" or type(site["fn"]).__name__ == "_Subsample":
+            continue
+        if site["infer"].get("_deterministic"):
+            continue
+        if site["infer"].get("enumerate"):
+            raise InputError(f"site {address!r} is enumerated, which particles cannot be; remove `enumerate`.")
+        distribution, value = site["fn"], site["value"]
+        shape = tuple(distribution.batch_shape)
+        if shape != (particles,):
+            raise InputError(
+                f"site {address!r} has batch shape {shape} and not ({particles},), one entry for each particle; "
+                "put further dimensions into the event with `.to_event()`."
+            )
+        event = tuple(distribution.event_shape)
+        own = tuple(value.shape) == (particles, *event)
+        if not own and not (site["is_observed"] and tuple(value.shape) == event):
+            raise InputError(
+                f"the value of site {address!r} has shape {tuple(value.shape)}; "
+                f"its event has shape {event}, for {particles} particles ({particles}, *{event})."
+            )
+        distributions[address] = distribution
+        values[address] = value
+        if site["is_observed"] and address not in given:
+            fixed.add(address)
+    return Run(distributions, values, frozenset(fixed), dict(used), recorded.nodes["_RETURN"]["value"])
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """Values by address for N particles, and the log-probability of every site, evaluated when asked for.
+
+    `trace["hole"]` is a value; `trace[ancestors]`, `trace[mask]` and `trace[:50]` are traces of those particles.
+    Treat it as immutable: the verbs of `bcppl.traces` make new ones.
+
+    Attributes:
+        program, args: what was run.
+        particles: N.
+        choices: the latent values, particle axis first.
+        observations: the constrained values, the same for all particles.
+        carried: simulator states by name, particle axis first (see `bcppl.traces.carried`).
+    """
+
+    program: Program
+    args: tuple[Any, ...]
+    particles: int
+    choices: Mapping[str, Tensor]
+    observations: Mapping[str, Tensor]
+    carried: Mapping[str, Entry] = field(default_factory=dict)
+    known: dict[str, Tensor] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def _run(self) -> Run:
+        """The program run again at these values: distributions are cheap, what they compute is kept in `known`."""
+        given = {**self.choices, **self.observations}
+        again = run(self.program, self.args, self.particles, given, self.carried)
+        self.carried_states().update(again.carried)
+        return again
+
+    def carried_states(self) -> dict[str, Entry]:
+        """The carried states, as a dictionary that states started later are added to."""
+        assert isinstance(self.carried, dict)
+        return self.carried
+
+    @property
+    def distributions(self) -> Mapping[str, Any]:
+        """The distribution of every site at these values, by address in the program's order."""
+        return MappingProxyType(self._run.distributions)
+
+    @property
+    def addresses(self) -> list[str]:
+        """All addresses in the order of the program."""
+        return list(self._run.distributions)
+
+    @property
+    def result(self) -> Any:
+        """What the program returned."""
+        return self._run.result
+
+    def log_prob(self, *addresses: str) -> Tensor:
+        """Log-probability (N,) of the sites at `addresses`, summed; of all sites where none is named.
+
+        Raises:
+            InputError: no site has that address.
+            InferenceError: a log-probability is NaN or +inf; names the site and the particles.
+        """
+        total = torch.zeros(self.particles, dtype=torch.float64)
+        for address in addresses or self.addresses:
+            total = total + self._site(address)
+        return total
+
+    def _site(self, address: str) -> Tensor:
+        if address not in self.known:
+            if address not in self._run.distributions:
+                raise InputError(
+                    f"the program visits no address {address!r}; it visits {', '.join(self.addresses) or 'none'}."
+                )
+            with torch.no_grad():
+                value = self._run.distributions[address].log_prob(self._run.values[address])
+            value = value.to(torch.float64).expand(self.particles)
+            bad = torch.isnan(value) | (value == torch.inf)
+            if bool(bad.any()):
+                which = bad.nonzero().flatten().tolist()
+                raise InferenceError(
+                    f"site {address!r} has a log-probability of {float(value[which[0]])} for "
+                    f"{len(which)} of {self.particles} particles (first: {', '.join(map(str, which[:5]))}); "
+                    "a value or a parameter of its distribution is out of range there."
+                )
+            self.known[address] = value
+        return self.known[address]
+
+    def __getitem__(self, key: str | Index) -> Any:
+        if isinstance(key, str):
+            if key in self.choices:
+                return self.choices[key]
+            if key in self.observations:
+                return self.observations[key]
+            raise KeyError(f"the trace has no value at address {key!r}")
+        index = torch.arange(self.particles)[key]
+        return Trace(
+            self.program,
+            self.args,
+            len(index),
+            {a: v[index] for a, v in self.choices.items()},
+            self.observations,
+            {a: e.take(index) for a, e in self.carried.items()},
+            {a: v[index] for a, v in self.known.items()},
+        )
+
+    def __contains__(self, address: object) -> bool:
+        return address in self.choices or address in self.observations
+
+    def __len__(self) -> int:
+        return self.particles
+
+    def where(self, mask: Tensor, other: Trace) -> Trace:
+        """This trace's particles where `mask` (N,) is true, the other's (same program, same addresses) elsewhere."""
+        shared = set(self.known) & set(other.known)
+        return Trace(
+            self.program,
+            self.args,
+            self.particles,
+            {
+                a: torch.where(mask.reshape(-1, *[1] * (v.ndim - 1)), v, other.choices[a])
+                for a, v in self.choices.items()
+            },
+            self.observations,
+            {a: e.where(mask, other.carried[a]) for a, e in self.carried.items() if a in other.carried},
+            {a: torch.where(mask, self.known[a], other.known[a]) for a in shared},
+        )
+
+    def at(self, values: Mapping[str, Tensor]) -> Trace:
+        """The same run with other values at some latent addresses; log-probabilities that cannot have changed are kept.
+
+        Raises:
+            InputError: an address is not latent, or a value has the wrong shape.
+        """
+        for address, value in values.items():
+            if address not in self.choices:
+                raise InputError(
+                    f"a new value for {address!r} was given, which is no latent address; "
+                    f"latent are {', '.join(self.choices) or 'none'}."
+                )
+            if value.shape != self.choices[address].shape:
+                raise InputError(
+                    f"the new value of {address!r} has shape {tuple(value.shape)}, "
+                    f"the old one {tuple(self.choices[address].shape)}; give one for each particle."
+                )
+        new = Trace(
+            self.program,
+            self.args,
+            self.particles,
+            {**self.choices, **values},
+            self.observations,
+            dict(self.carried),
+        )
+        if set(new.addresses) != set(self.addresses):
+            raise InputError("new values changed which addresses the program visits; mask sites instead.")
+        for address, value in self.known.items():
+            if address in values:
+                continue
+            then, now = self._run.distributions[address], new._run.distributions[address]
+            if hasattr(now, "inputs") and same_inputs(then.inputs, now.inputs):
+                new.known[address] = value
+        # A state that was thrown away must not be merged back in later.
+        for name in [n for n in new.carried_states() if n not in new._run.carried]:
+            del new.carried_states()[name]
+        return new
