@@ -1,0 +1,107 @@
+"""What the figures draw: the right numbers, in millimetres, in the right places."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+import trimesh
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+from bcppl.errors import InputError
+from bcppl.figures import MANY_FACES, add_over_time, belief_in_3d
+from bcppl.parts import Part
+
+HALF = np.sqrt(0.5)
+
+
+def box() -> Part:
+    mesh = trimesh.creation.box((0.10, 0.08, 0.03))
+    return Part("block", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def poses(count: int, spread: float, seed: int = 0) -> np.ndarray:
+    values = np.zeros((count, 7))
+    values[:, :3] = [0.5, 0.1, 0.02] + spread * np.random.default_rng(seed).normal(size=(count, 3))
+    values[:, 3] = 1.0
+    return values
+
+
+def rendered(figure: Figure) -> None:
+    page = io.BytesIO()
+    figure.savefig(page, dpi=40)
+    assert page.tell() > 1000
+
+
+def test_add_over_time_draws_the_weighted_mean_in_millimetres() -> None:
+    adds = np.array([[0.010, 0.030], [0.001, 0.005]])
+    weights = np.array([[1.0, 1.0], [3.0, 1.0]])  # in any scale
+    figure = add_over_time(np.arange(2.0), adds, weights, ["view", "touch"], contact_start=1)
+    (axes,) = figure.axes
+    (mean,) = axes.get_lines()
+    np.testing.assert_allclose(mean.get_ydata(), [20.0, 2.0])
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["view", "touch"]
+    rendered(figure)
+
+
+def test_heavier_particles_are_more_opaque_and_weightless_ones_do_no_harm() -> None:
+    adds = np.full((3, 3), 0.004)
+    weights = np.tile([0.0, 0.2, 0.8], (3, 1))
+    figure = add_over_time(np.arange(3.0), adds, weights, list("abc"))
+    opacity = figure.axes[0].collections[-1].get_facecolor()[:3, 3]
+    assert np.all(np.diff(opacity) > 0.0)
+    rendered(figure)
+
+
+def test_one_particle_and_one_measurement() -> None:
+    rendered(add_over_time(np.zeros(1), np.zeros((1, 1)), np.ones((1, 1)), ["start"], contact_start=0))
+    rendered(belief_in_3d(box(), [("only", poses(1, 0.0), np.zeros(1))]))
+
+
+@pytest.mark.parametrize("weights", [np.zeros((1, 2)), np.array([[np.nan, 1.0]]), np.array([[-1.0, 3.0]])])
+def test_weights_that_are_none_are_refused(weights: np.ndarray) -> None:
+    with pytest.raises(InputError, match="not their logarithms"):
+        add_over_time(np.zeros(1), np.ones((1, 2)), weights, ["start"])
+
+
+def test_belief_with_a_particle_of_no_weight_at_all() -> None:
+    log_weights = np.array([0.0, -np.inf, -1.0, -np.inf])
+    figure = belief_in_3d(box(), [("start", poses(4, 0.01), log_weights)], truth=poses(1, 0.0)[0])
+    rendered(figure)
+    with pytest.raises(InputError, match=r"'start'.*largest is -inf"):
+        belief_in_3d(box(), [("start", poses(2, 0.01), np.full(2, -np.inf))])
+    with pytest.raises(InputError, match=r"'start'.*largest is nan"):
+        belief_in_3d(box(), [("start", poses(2, 0.01), np.array([0.0, np.nan]))])
+
+
+def test_the_title_says_how_far_the_weighted_mean_is_from_the_truth() -> None:
+    two = poses(2, 0.0)
+    two[1, 0] += 0.008
+    figure = belief_in_3d(box(), [("x", two, np.log([0.75, 0.25]))], truth=poses(1, 0.0)[0])
+    assert "mean off by 2 mm, 0°" in figure.axes[0].get_title()
+    assert "spread 3.5 mm" in figure.axes[0].get_title()  # 8 mm sqrt(0.75 * 0.25)
+
+
+def test_arrows_are_the_z_axis_and_ticks_the_x_axis_in_the_world() -> None:
+    truth = np.array([0.1, 0.2, 0.3, HALF, HALF, 0.0, 0.0])  # a quarter turn about x takes z to -y
+    figure = belief_in_3d(box(), [("x", truth[None], np.zeros(1))], truth=truth)
+    drawn = [c for c in figure.axes[0].collections if isinstance(c, Line3DCollection)]
+    cyan = [c for c in drawn if c.get_linewidth()[0] > 4.0]
+    arrow, tick = (np.asarray(c._segments3d[0])[::-1] for c in cyan)  # quiver's shafts run from tip to foot
+    for segment in (arrow, tick):
+        np.testing.assert_allclose(segment[0], [100.0, 200.0, 300.0], atol=1e-9)
+    along = (arrow[1] - arrow[0]) / np.linalg.norm(arrow[1] - arrow[0])
+    np.testing.assert_allclose(along, [0.0, -1.0, 0.0], atol=1e-9)
+    across = (tick[1] - tick[0]) / np.linalg.norm(tick[1] - tick[0])
+    np.testing.assert_allclose(across, [1.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_a_large_mesh_is_drawn_from_few_triangles() -> None:
+    mesh = trimesh.creation.icosphere(5, 0.05)
+    assert len(mesh.faces) > MANY_FACES
+    ball = Part("ball", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    figure = belief_in_3d(ball, [("a", poses(3, 0.01), np.zeros(3)), ("b", poses(3, 0.001), np.zeros(3))])
+    assert figure.axes[0].get_xlim() == figure.axes[1].get_xlim()
+    rendered(figure)
