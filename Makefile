@@ -1,0 +1,64 @@
+# Fresh machine: Python 3.11 or newer and make. Everything else goes into .venv.
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+RECORDINGS := point_probe_10_pushes peg_probe
+# Test processes; each keeps to one thread.
+JOBS ?= 2
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+
+.PHONY: run test lint long check-links clean help
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make run          find the part in the shipped recordings; pictures and beliefs go to runs/"
+	@echo "make test         style, types and tests"
+	@echo "make long         the tests that take minutes"
+	@echo "make check-links  are bcppl/models and bcppl/inference symbolic links?"
+	@echo "make clean        remove what was built, the virtual environment too"
+
+run: $(STAMP)
+	@for name in $(RECORDINGS); do $(BIN)/bcppl run models/recordings/$$name.h5 || exit 1; done
+
+test: lint
+	$(PYTEST) -n $(JOBS) --dist loadfile
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+long: $(STAMP)
+	$(PYTEST) -m long
+
+# torch goes first and alone: pip then takes the build of that version that the machine offers (a local CPU one,
+# say), and the calls after it leave it as it is.
+$(STAMP): pyproject.toml constraints.txt | check-links
+	@if [ ! -x $(BIN)/python ]; then \
+	    for python in python3.11 python3 python3.12 python3.13 python3.14; do \
+	        if $$python -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+	            exec $$python -m venv $(VENV); \
+	        fi; \
+	    done; \
+	    echo "No Python 3.11 or newer with its venv module was found; install it (Debian: apt install python3.11-venv)." >&2; \
+	    exit 1; \
+	fi
+	$(BIN)/python -m pip install --quiet "$$(grep '^torch==' constraints.txt)"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt setuptools
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable ".[dev]"
+	@touch $@
+
+check-links:
+	@for name in models inference; do \
+	    if [ ! -L bcppl/$$name ] || [ ! -d bcppl/$$name ]; then \
+	        echo "bcppl/$$name is not a symbolic link to ../$$name, so this checkout cannot be imported." >&2; \
+	        echo "Mend it with:  git config core.symlinks true && git checkout -- bcppl/$$name" >&2; \
+	        echo "or by hand:    rm -rf bcppl/$$name && ln -s ../$$name bcppl/$$name" >&2; \
+	        echo "(Windows: switch developer mode on first, or work in WSL.)" >&2; \
+	        exit 1; \
+	    fi; \
+	done
+
+clean:
+	rm -rf $(VENV) build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find bcppl models inference tests notebooks benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
