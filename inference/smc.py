@@ -1,6 +1,6 @@
 """Sequential Monte Carlo over measurements, with tempering within a measurement and rejuvenation.
 
-`assimilate` takes one measurement in: extend the traces, let the new likelihood in by steps, resample and
+`tempered` makes the step that takes one measurement in: extend the traces, let the new likelihood in by steps, resample and
 move the particles after each. `smc` is the loop over a recording, an iterator that can be stopped, looked
 into and gone on with. Del Moral, Doucet and Jasra, Sequential Monte Carlo samplers, JRSS B 68, 2006; Chopin
 and Papaspiliopoulos, An Introduction to Sequential Monte Carlo, 2020, chapter 17.
@@ -12,9 +12,8 @@ and fitted proposals it is consistent only. Evidence that contains a surrogate l
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
@@ -56,24 +55,6 @@ class Info(NamedTuple):
     effort: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Settings:
-    """How SMC takes a measurement in.
-
-    Attributes:
-        kernel: moves the particles after each resampling; None leaves them where they are.
-        sweeps: how many moves of every particle after each resampling.
-        resample: when and how particles are resampled.
-        share: tempering keeps the conditional effective sample size above this share of the particles;
-            0 lets a likelihood in at once.
-    """
-
-    kernel: Kernel | None = None
-    sweeps: int = 3
-    resample: Resample = field(default_factory=adaptive)
-    share: float = 0.5
-
-
 class Assimilated(NamedTuple):
     """A population that has taken a measurement in, the acceptance rate and the exponents gone through."""
 
@@ -82,37 +63,52 @@ class Assimilated(NamedTuple):
     exponents: tuple[float, ...]
 
 
-def assimilate(
-    population: Population, args: tuple[Any, ...], observations: Mapping[str, Tensor], settings: Settings
-) -> Assimilated:
-    """Take new observations in: one step `(population, measurement) -> population` of SMC.
+Assimilate = Callable[[Population, tuple[Any, ...], Mapping[str, Tensor]], Assimilated]
+
+
+def tempered(
+    kernel: Kernel | None = None, *, sweeps: int = 3, resample: Resample | None = None, share: float = 0.5
+) -> Assimilate:
+    """How to take a measurement in: let its likelihood in by steps, resample and move the particles after each.
 
     Args:
-        args: the program's arguments up to and including the new measurement.
-        observations: values of the new addresses.
+        kernel: moves the particles after each resampling; None leaves them where they are.
+        sweeps: how many moves of every particle after each resampling.
+        resample: when and how; by default systematic below half the effective sample size.
+        share: tempering keeps the conditional effective sample size above this share of the particles;
+            0 lets a likelihood in at once.
 
-    Raises:
-        InferenceError: no particle is left with any weight.
+    Returns:
+        `assimilate(population, args, observations)`, with the program's arguments up to and including the new
+        measurement, and the values of the new addresses. It raises InferenceError where no particle is left
+        with any weight.
     """
-    longer, log_likelihood = extend(population.trace, args, observations)
-    population = Population(longer, population.log_weights, population.log_evidence)
-    exponent, exponents, acceptances = 0.0, [], []
-    while exponent < 1.0:
-        reached = exponent
-        exponent = 1.0
-        if settings.share > 0.0:
-            exponent = next_exponent(population.log_weights, log_likelihood, reached, settings.share)
-        exponents.append(exponent)
-        step = exponent - reached
-        population = population.reweighed(step * log_likelihood)
-        population, resampled = settings.resample(population)
-        if resampled and settings.kernel is not None:
-            target = POSTERIOR if exponent == 1.0 else Target(dict.fromkeys(observations, exponent))
-            population, acceptance = rejuvenate(population, settings.kernel, target, settings.sweeps)
-            acceptances.append(acceptance)
-        log_likelihood = population.trace.log_prob(*observations)
-    acceptance = sum(acceptances) / len(acceptances) if acceptances else float("nan")
-    return Assimilated(population, acceptance, tuple(exponents))
+    resample = adaptive() if resample is None else resample
+
+    def assimilate(
+        population: Population, args: tuple[Any, ...], observations: Mapping[str, Tensor]
+    ) -> Assimilated:
+        longer, log_likelihood = extend(population.trace, args, observations)
+        population = Population(longer, population.log_weights, population.log_evidence)
+        exponent, exponents, acceptances = 0.0, [], []
+        while exponent < 1.0:
+            reached = exponent
+            exponent = 1.0
+            if share > 0.0:
+                exponent = next_exponent(population.log_weights, log_likelihood, reached, share)
+            exponents.append(exponent)
+            # 0 times -inf is no number, so a particle that cannot be loses its weight here, once.
+            population = population.reweighed((exponent - reached) * log_likelihood)
+            population, resampled = resample(population)
+            if resampled and kernel is not None:
+                target = POSTERIOR if exponent == 1.0 else Target(dict.fromkeys(observations, exponent))
+                population, acceptance = rejuvenate(population, kernel, target, sweeps)
+                acceptances.append(acceptance)
+            log_likelihood = population.trace.log_prob(*observations)
+        acceptance = sum(acceptances) / len(acceptances) if acceptances else float("nan")
+        return Assimilated(population, acceptance, tuple(exponents))
+
+    return assimilate
 
 
 @contextmanager
@@ -137,16 +133,16 @@ class Step(NamedTuple):
 
 
 def smc(
-    model: Model, recording: Any, *, particles: int = 75, seed: int = 0, settings: Settings, scene: Any = None
+    model: Model, recording: Any, *, assimilate: Assimilate, particles: int = 75, seed: int = 0, scene: Any = None
 ) -> Iterator[Step]:
     """Run SMC over a recording: yields the prior's belief first, then one step for each measurement.
 
     Args:
         model: what explains the recording.
         recording: a `bcppl.recordings.Recording`.
+        assimilate: how one measurement is taken in, such as `tempered(...)`.
         particles: N.
         seed: same seed, same beliefs, bit for bit; torch's own generator is left as it was.
-        settings: kernel, resampling and tempering.
         scene: `model.prepare(recording)` unless given.
 
     Raises:
@@ -168,7 +164,7 @@ def smc(
         args = (scene, [m.action for m in measurements])
         try:
             with _random_state(state):
-                population, acceptance, exponents = assimilate(population, args, new, settings)
+                population, acceptance, exponents = assimilate(population, args, new)
         except InferenceError as error:
             raise InferenceError(f"{label}: {error}") from error
         belief = population.belief(model.pose)

@@ -16,7 +16,7 @@ from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import adaptive, systematic
-from bcppl.inference.smc import Settings, assimilate
+from bcppl.inference.smc import tempered
 from bcppl.traces import generate
 
 RUNS, PARTICLES = 20, 2000
@@ -27,10 +27,13 @@ def evidence_errors(program, values, exact, address, sweeps=10):  # type: ignore
     for seed in range(RUNS):
         torch.manual_seed(seed)
         trace, weights = generate(program, (0,), {}, PARTICLES)
-        settings = Settings(
-            metropolis_hastings(drift(address, (0.5, 1.0))), sweeps, resample=adaptive(systematic, 0.75), share=0.7
+        assimilate = tempered(
+            metropolis_hastings(drift(address, (0.5, 1.0))),
+            sweeps=sweeps,
+            resample=adaptive(systematic, 0.75),
+            share=0.7,
         )
-        done = assimilate(Population(trace, weights), (1,), values, settings)
+        done = assimilate(Population(trace, weights), (1,), values)
         errors.append(done.population.log_evidence - exact)
         populations.append(done.population)
     return np.array(errors), populations
@@ -86,7 +89,7 @@ def test_known_correspondence_evidence(diagonal: tuple[float, ...], log_c: float
         if count:
             pyro.sample("seen", SeenPoints(pose, model, noise))
 
-    errors, populations = evidence_errors(program, {"seen": seen}, exact, "pose")
+    errors, populations = evidence_errors(program, {"seen": seen}, exact, "pose", sweeps=3)
     print("known correspondence: mean", errors.mean(), "sd", errors.std(ddof=1))
     assert abs(errors.mean()) < 0.05
     assert errors.std(ddof=1) < 0.1

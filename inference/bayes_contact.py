@@ -1,0 +1,76 @@
+"""BayesContact's own filter, as a baseline: every particle drifts before each measurement and is then weighed.
+
+The paper weighs a drifted particle by w p(o | q) p(q) / pi, which is right for the first measurement only: the
+pose does not move, so the measurements before belong in the weight too. The weight used here is that of the
+SMC sampler with the drift as its forward and its backward kernel (Del Moral, Doucet and Jasra, JRSS B 68,
+2006, eq. 12), p(q') p(o_1..o_t | q') / (p(q) p(o_1..o_{t-1} | q)) times backward over forward. There is no
+tempering and no accept-reject step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bcppl.inference.kernels import Fit, replaced
+from bcppl.inference.population import Population
+from bcppl.inference.proposals import drift
+from bcppl.inference.resampling import Resample, adaptive
+from bcppl.inference.smc import Assimilate, Assimilated, Step, smc
+from bcppl.traces import Model, assess, extend, propose, update
+
+
+def drifted(population: Population, fit: Fit) -> Population:
+    """Every particle moved by a proposal program, and weighed for it; each half learns from the other."""
+    order = torch.randperm(len(population))
+    halves = [order[: len(order) // 2], order[len(order) // 2 :]]
+    factor = torch.zeros(len(population), dtype=torch.float64)
+    for mine, others in (halves, halves[::-1]):
+        if len(mine) == 0 or len(others) == 0:
+            continue
+        program = fit(population[others])
+        trace = population.trace[mine]
+        forward = propose(program, (trace,), len(mine))
+        updated = update(trace, {a: v for a, v in forward.choices.items() if a in trace.choices})
+        back = {**forward.choices, **updated.discarded}
+        backward = assess(program, (updated.trace,), back, len(mine))
+        ratio = updated.log_ratio + backward - forward.log_prob
+        # Impossible before and after is impossible still.
+        factor[mine] = torch.nan_to_num(ratio, nan=0.0, posinf=torch.inf, neginf=-torch.inf)
+        population = replaced(population, mine, updated.trace)
+    return population.reweighed(factor)
+
+
+def drift_and_weigh(fit: Fit, resample: Resample) -> Assimilate:
+    """Take a measurement in by drifting, weighing and, when needed, resampling."""
+
+    def assimilate(
+        population: Population, args: tuple[Any, ...], observations: Mapping[str, Tensor]
+    ) -> Assimilated:
+        population = drifted(population, fit)
+        longer, log_likelihood = extend(population.trace, args, observations)
+        population = Population(longer, population.log_weights, population.log_evidence).reweighed(log_likelihood)
+        population, _ = resample(population)
+        return Assimilated(population, float("nan"), (1.0,))
+
+    return assimilate
+
+
+def infer(
+    model: Model, recording: Any, *, particles: int = 75, seed: int = 0, scale: float = 0.2, scene: Any = None
+) -> Iterator[Step]:
+    """Beliefs over a recording, one step for each measurement, the prior first.
+
+    Args:
+        model: what explains the recording.
+        recording: a `bcppl.recordings.Recording`.
+        particles: how many; the paper uses 75.
+        seed: same seed, same beliefs.
+        scale: the drift, as a share of 2.38 / sqrt(d) times the particles' spread.
+        scene: what `model.prepare(recording)` gives, if it is at hand.
+    """
+    assimilate = drift_and_weigh(drift(model.pose, (scale, scale * 1.0001)), adaptive())
+    return smc(model, recording, assimilate=assimilate, particles=particles, seed=seed, scene=scene)
