@@ -108,7 +108,7 @@ def build_model(part: Part, peg: Part, parameters: ContactParameters) -> mujoco.
     Six actuators pull the peg's origin to the command's, along and about the command's axes, as
     force = control - stiffness * displacement - damping * velocity; `hold` sets the two constants.
     Sensors, in order: the peg's position and quaternion, and the force and torque that the flange exerts on
-    the peg, in the peg's frame about its origin: the opposite of what a wrist sensor feels of the environment.
+    the peg, in the peg's frame about its origin: the opposite of the environment's wrench on the peg.
     Gravity is compensated. No state is carried from step to step but position, velocity and time.
 
     Raises:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import warnings
 from weakref import WeakKeyDictionary
 
@@ -16,8 +17,8 @@ from bcppl.parts import Part
 from bcppl.recordings.measurements import Probe
 from bcppl.simulators.approach import Approach, first_possible_touch, free_approach
 from bcppl.simulators.effort import Effort
-from bcppl.simulators.peg_model import ContactParameters, build_model, check_probe
-from bcppl.simulators.stepping import POSE, SENSED, WRENCH, Clock, Standing
+from bcppl.simulators.peg_model import SENSED, ContactParameters, build_model, check_probe
+from bcppl.simulators.stepping import POSE, WRENCH, Clock, Standing
 
 Array = npt.NDArray[np.float64]
 Selection = Tensor | npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice
@@ -68,7 +69,8 @@ class PegPhysics:
         poses = torch.as_tensor(world_from_part).detach().cpu().numpy().astype(np.float64)
         if poses.ndim != 2 or poses.shape[1] != 7 or not np.isfinite(poses).all():
             raise InputError(
-                f"the part's poses have shape {poses.shape} or are not finite; give (N, 7) numbers x y z qw qx qy qz."
+                f"the part's poses have shape {poses.shape} or are not finite; "
+                "give (N, 7) numbers x y z qw qx qy qz."
             )
         if probe not in self._sessions:
             self._sessions[probe] = Session(self, probe)
@@ -76,7 +78,7 @@ class PegPhysics:
 
 
 class Session:
-    """What all rollouts of one probe share: clocks at the full and the halved time step, the free approach."""
+    """What all rollouts of one probe share: clocks at the full and half the time step, the free approach."""
 
     def __init__(self, physics: PegPhysics, probe: Probe) -> None:
         check_probe(probe)
@@ -132,7 +134,7 @@ class Rollout:
     @property
     def count(self) -> int:
         """The number of stamps that have been simulated."""
-        return self._rows.shape[1]
+        return int(self._rows.shape[1])
 
     @property
     def wrench(self) -> Array:
@@ -147,7 +149,7 @@ class Rollout:
     @property
     def diverged(self) -> npt.NDArray[np.bool_]:
         """(N,) simulations that failed even at half the time step."""
-        return self._level == _DIVERGED
+        return np.asarray(self._level == _DIVERGED)
 
     def __getitem__(self, index: Selection) -> Rollout:
         """Rollouts of some particles, in the order of an index tensor, a mask or a slice."""
@@ -169,8 +171,8 @@ class Rollout:
         """
         if other.session is not self.session or len(other) != len(self):
             raise InputError(
-                f"rollouts of {len(self)} particles of probe {self.session.name!r} cannot be merged with {len(other)} "
-                f"of {other.session.name!r}; both must come from the same physics, probe and population."
+                f"rollouts of {len(self)} particles of probe {self.session.name!r} cannot be merged with "
+                f"{len(other)} of {other.session.name!r}; both must be of one physics, probe and population."
             )
         count = max(self.count, other.count)
         taken = np.flatnonzero(~np.asarray(rows_of(mask), dtype=bool))
@@ -193,7 +195,8 @@ class Rollout:
         """
         if count > len(self.session.stamps):
             raise InputError(
-                f"{count} stamps are asked of probe {self.session.name!r}, which has {len(self.session.stamps)}."
+                f"{count} stamps are asked of probe {self.session.name!r}, which has "
+                f"{len(self.session.stamps)}; ask for no more."
             )
         done = self.count
         if count <= done or len(self) == 0:
@@ -215,7 +218,7 @@ class Rollout:
         return self
 
     def _run(self, level: int, members: npt.NDArray[np.int64], first: int, last: int, fresh: Array) -> None:
-        """Read stamps `first` to `last` for some particles into `fresh`, each from where its free motion ends."""
+        """Read stamps `first` to `last` of some particles into `fresh`, from where their free motion ends."""
         if len(members) == 0:
             return
         clock, free = self.session.clocks[level], self._free[members]
@@ -223,7 +226,7 @@ class Rollout:
             fresh[members] = self.session.approach.rows[first:last]
         cuts = [first, *sorted({int(f) for f in free if first < f < last}), last]
         standing = self._standing
-        for start, stop in zip(cuts[:-1], cuts[1:], strict=True):
+        for start, stop in itertools.pairwise(cuts):
             moving = members[free <= start]
             if len(moving) == 0:
                 continue
@@ -271,8 +274,8 @@ class Rollout:
         self._level[members] = _DIVERGED
         fresh[members] = np.nan
         warnings.warn(
-            f"{len(members)} of {len(self)} rollouts of probe {self.session.name!r} diverged, also at half the "
-            "time step; they count as impossible.",
+            f"{len(members)} of {len(self)} rollouts of probe {self.session.name!r} diverged, also at half "
+            "the time step; they count as impossible.",
             RuntimeWarning,
             stacklevel=3,
         )

@@ -52,13 +52,14 @@ def block_with_square_hole(
     half = 0.5 * hole
     if half <= 0 or abs(offset[0]) + half >= x or abs(offset[1]) + half >= y or depth <= 0:
         raise InputError(
-            f"a hole of {hole:g} m at {offset} does not lie inside a block of {size} m; make it smaller or move it."
+            f"a hole of {hole:g} m at {offset} does not lie inside a block of {size} m; "
+            "make it smaller or move it."
         )
     left, right = offset[0] - half, offset[0] + half
     front, back = offset[1] - half, offset[1] + half
     inner = shapely.box(left, front, right, back)
     outline = shapely.Polygon(shapely.box(-x, -y, x, y).exterior, [inner.exterior])
-    # The walls overlap at the corners, so that no piece has a face inside the solid on which a peg could catch.
+    # The walls overlap at the corners: no piece has a face inside the solid on which a peg could catch.
     pieces = [
         _box((-x, -y, -depth), (left, y, 0.0)),
         _box((right, -y, -depth), (x, y, 0.0)),

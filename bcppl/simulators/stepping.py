@@ -117,7 +117,7 @@ class Clock:
         return low, Standing(state, rows[:, -2:].copy())
 
     def on_time(self, standing: Standing, stamps: int) -> npt.NDArray[np.bool_]:
-        """Which particles (N,) are finite and have come as far as they should: MuJoCo stops one that diverges."""
+        """Which particles (N,) are finite and as far as they should be: MuJoCo stops those that diverge."""
         expected = self.time_step * self.step_after(stamps)
         with np.errstate(invalid="ignore"):
             timely = np.abs(standing.state[:, 0] - expected) < 0.5 * self.time_step

@@ -1,0 +1,105 @@
+"""A probe as its particles feel it: contact physics and sensing, run together and only as far as asked."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from bcppl.recordings.measurements import Probe
+from bcppl.simulators.physics import PegPhysics, Rollout, Selection, rows_of
+from bcppl.simulators.wrench import Sensing, SensingState, in_world
+
+Array = npt.NDArray[np.float64]
+
+
+class ContactTrack:
+    """Contact locations and peg poses along one probe, for N poses of the part; indexing copies.
+
+    Attributes:
+        rollout: the physics.
+        sensing: how contacts are read from the wrench.
+        inputs: the poses (N, 7) of the part, as one tensor: what the track hangs on.
+    """
+
+    def __init__(
+        self,
+        rollout: Rollout,
+        sensing: Sensing,
+        inputs: tuple[Tensor, ...],
+        state: SensingState,
+        contacts: Array,
+    ) -> None:
+        self.rollout, self.sensing, self.inputs = rollout, sensing, inputs
+        self._state, self._contacts = state, contacts
+
+    @classmethod
+    def start(
+        cls, physics: PegPhysics, sensing: Sensing, world_from_part: Tensor, probe: Probe
+    ) -> ContactTrack:
+        """Before the first stamp, for poses (N, 7) of the part.
+
+        Raises:
+            InputError: the poses are not (N, 7) and finite, or the probe cannot be simulated.
+        """
+        rollout = physics.start(world_from_part, probe)
+        particles = len(rollout)
+        return cls(
+            rollout, sensing, (world_from_part,), sensing.start(particles), np.empty((particles, 0, 3))
+        )
+
+    def __len__(self) -> int:
+        return len(self.rollout)
+
+    @property
+    def count(self) -> int:
+        """The number of stamps that are known already."""
+        return int(self._contacts.shape[1])
+
+    @property
+    def diverged(self) -> Tensor:
+        """(N,) particles whose physics failed; their poses are NaN."""
+        return torch.from_numpy(self.rollout.diverged)
+
+    def advance(self, count: int) -> ContactTrack:
+        """Know the first `count` stamps; returns itself."""
+        done = self.count
+        if count > done:
+            self.rollout.advance(count)
+            fresh, self._state = self.sensing.contacts(self.rollout.wrench[:, done:count], self._state)
+            self._contacts = np.concatenate([self._contacts, fresh], axis=1)
+        return self
+
+    def window(self, first: int, last: int) -> tuple[Tensor, Tensor]:
+        """Stamps `first` to `last` (exclusive), simulated only if they are not known yet.
+
+        Returns:
+            Contact locations (N, last-first, 3) in the world, NaN where there is none, and the peg's poses
+            (N, last-first, 7), NaN where the physics diverged.
+        """
+        self.advance(last)
+        pose = torch.from_numpy(self.rollout.world_from_peg[:, first:last].copy())
+        return in_world(torch.from_numpy(self._contacts[:, first:last].copy()), pose), pose
+
+    def __getitem__(self, index: Selection) -> ContactTrack:
+        """The tracks of some particles, in the order of an index tensor, a mask or a slice."""
+        rows = rows_of(index)
+        kept = self.inputs[0][index if isinstance(index, slice) else torch.as_tensor(rows)]
+        return ContactTrack(
+            self.rollout[rows], self.sensing, (kept,), self._state[rows], self._contacts[rows].copy()
+        )
+
+    def where(self, mask: Tensor, other: ContactTrack) -> ContactTrack:
+        """For each particle this track where a mask (N,) is true, else the other; both are run as far."""
+        count = max(self.count, other.count)
+        self.advance(count)
+        other.advance(count)
+        rollout = self.rollout.where(mask, other.rollout)
+        taken = np.flatnonzero(~mask.cpu().numpy())
+        contacts = self._contacts.copy()
+        contacts[taken] = other._contacts[taken]
+        poses = torch.where(mask[:, None], self.inputs[0], other.inputs[0])
+        return ContactTrack(
+            rollout, self.sensing, (poses,), self._state.put(taken, other._state[taken]), contacts
+        )

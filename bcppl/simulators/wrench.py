@@ -1,0 +1,250 @@
+"""From wrenches to contact locations: one code for what was measured and for what was simulated.
+
+A single contact without torque of its own exerts a wrench (f, tau) whose line of action passes through the
+contact: the points r with r x f = tau, that is f x tau / |f|^2 + s f. The contact is where that line enters
+the peg along f, for the environment can only push (Bicchi, Salisbury and Brock 1993, "Contact sensing from
+force measurements", section 3). Several contacts at once give one location, measured and simulated alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from scipy.signal import butter, sosfilt
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.errors import InputError
+from bcppl.parts import Part
+from bcppl.recordings.measurements import Touch
+
+Array = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice
+
+_BATCH = 4096  # lines whose distances to all edges are held at once
+
+
+@dataclass(frozen=True, eq=False)
+class SensingState:
+    """What is carried from one chunk of a wrench signal to the next, for N signals.
+
+    Attributes:
+        tare: (N, n, 6) the first samples, while they are collected and after.
+        filter: (N, sections, 2, 6) the low-pass filter's memory.
+    """
+
+    tare: Array
+    filter: Array
+
+    def __getitem__(self, rows: Rows) -> SensingState:
+        """The same for some of the signals."""
+        return SensingState(self.tare[rows], self.filter[rows])
+
+    def put(self, rows: Rows, other: SensingState) -> SensingState:
+        """The same with some signals' rows replaced; both must have seen equally many samples."""
+        tare, memory = self.tare.copy(), self.filter.copy()
+        tare[rows], memory[rows] = other.tare, other.filter
+        return SensingState(tare, memory)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensing:
+    """How contact locations are read from a wrench signal.
+
+    Attributes:
+        peg: the held peg; wrenches are in its frame, about its origin.
+        rate: samples per second.
+        tare: the number of first samples, free of contact, whose mean is the sensor's zero; no contact is
+            reported during them.
+        cutoff: Hz, of the causal second-order Butterworth low-pass; None for no filter.
+        force: newtons from which on there is a contact.
+        miss_tolerance: metres; where noise lets the line of action pass beside the peg by no more than this,
+            the nearest point of the peg's convex hull is the contact; beyond it there is none.
+    """
+
+    peg: Part
+    rate: float
+    tare: int = 10
+    cutoff: float | None = 20.0
+    force: float = 1.0
+    miss_tolerance: float = 0.002
+
+    def __post_init__(self) -> None:
+        if not self.rate > 0 or self.tare < 0 or not self.force > 0 or self.miss_tolerance < 0:
+            raise InputError(
+                f"sensing has rate {self.rate}, tare {self.tare}, force {self.force}, miss_tolerance "
+                f"{self.miss_tolerance}; rate and force must be positive, the others not negative."
+            )
+        if self.cutoff is not None and not 0 < self.cutoff < 0.5 * self.rate:
+            raise InputError(
+                f"the low-pass cutoff is {self.cutoff} Hz at {self.rate} samples per second; "
+                "give less than half the rate, or None."
+            )
+
+    @cached_property
+    def _sections(self) -> Array:
+        if self.cutoff is None:
+            return np.empty((0, 6))
+        return np.asarray(butter(2, self.cutoff, fs=self.rate, output="sos"), dtype=np.float64)
+
+    @cached_property
+    def _scene(self) -> EmbreeScene:
+        scene = EmbreeScene()
+        TriangleMesh(scene, self.peg.vertices.astype(np.float32), self.peg.faces.astype(np.int32))
+        return scene
+
+    @cached_property
+    def _planes(self) -> tuple[Array, Array]:
+        """A point (F, 3) and the outward normal (F, 3) of each face."""
+        corners = self.peg.vertices[self.peg.faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return corners[:, 0], normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+    @cached_property
+    def _edges(self) -> tuple[Array, Array]:
+        """Start (E, 3) and extent (E, 3) of the convex hull's edges."""
+        hull = self.peg.mesh.convex_hull
+        ends = np.asarray(hull.vertices)[hull.edges_unique]
+        return ends[:, 0], ends[:, 1] - ends[:, 0]
+
+    @cached_property
+    def _ball(self) -> tuple[Array, float]:
+        """Centre (3,) and radius of a ball around the peg."""
+        center = 0.5 * (self.peg.vertices.min(axis=0) + self.peg.vertices.max(axis=0))
+        return center, float(np.linalg.norm(self.peg.vertices - center, axis=1).max())
+
+    def start(self, signals: int) -> SensingState:
+        """The state before the first sample of N signals."""
+        return SensingState(np.empty((signals, 0, 6)), np.zeros((signals, len(self._sections), 2, 6)))
+
+    def clean(self, wrench: Array, state: SensingState) -> tuple[Array, SensingState]:
+        """Tared and filtered wrenches (N, T, 6) of a chunk of raw ones, NaN while taring, and the new state.
+
+        A signal in chunks comes out as the whole signal at once, to the bit.
+        """
+        if wrench.ndim != 3 or wrench.shape[2] != 6:
+            raise InputError(f"wrenches have shape {wrench.shape}; give (signals, samples, 6).")
+        taring = min(max(0, self.tare - state.tare.shape[1]), wrench.shape[1])
+        tare = np.concatenate([state.tare, wrench[:, :taring]], axis=1) if taring else state.tare
+        cleaned = np.full(wrench.shape, np.nan)
+        memory = state.filter
+        if wrench.shape[1] > taring:
+            zero = tare.mean(axis=1, keepdims=True) if self.tare else np.zeros((len(wrench), 1, 6))
+            signal = wrench[:, taring:] - zero
+            if self.cutoff is not None:
+                signal, memory = sosfilt(
+                    self._sections, signal, axis=1, zi=np.ascontiguousarray(np.moveaxis(memory, 0, 1))
+                )
+                memory = np.ascontiguousarray(np.moveaxis(memory, 1, 0))
+            cleaned[:, taring:] = signal
+        return cleaned, SensingState(tare, memory)
+
+    def contacts(self, wrench: Array, state: SensingState) -> tuple[Array, SensingState]:
+        """Contact locations (N, T, 3) in the peg's frame, NaN where none, of a chunk of raw wrenches.
+
+        Args:
+            wrench: (N, T, 6) of the environment on the peg, in the peg's frame about its origin, not tared.
+            state: from `start`, or of the chunk before.
+
+        Returns:
+            The locations, and the state for the next chunk. Chunks give what the whole gives, to the bit.
+
+        Raises:
+            InputError: the wrenches are not (N, T, 6).
+        """
+        cleaned, state = self.clean(wrench, state)
+        locations = np.full((*wrench.shape[:2], 3), np.nan)
+        with np.errstate(invalid="ignore"):
+            touching = np.linalg.norm(cleaned[..., :3], axis=-1) >= self.force
+        locations[touching] = self.locate(cleaned[touching])
+        return locations, state
+
+    def locate(self, wrench: Array) -> Array:
+        """Where the lines of action of wrenches (M, 6) enter the peg: (M, 3) in its frame, NaN if not."""
+        force, torque = wrench[:, :3], wrench[:, 3:]
+        magnitude = np.linalg.norm(force, axis=1, keepdims=True)
+        direction = force / magnitude
+        point = np.cross(direction, torque / magnitude)
+        center, radius = self._ball
+        along = np.sum((center - point) * direction, axis=1, keepdims=True)
+        point = point + along * direction
+        locations = np.full((len(wrench), 3), np.nan)
+        near = np.linalg.norm(point - center, axis=1) <= radius + self.miss_tolerance
+        if not near.any():
+            return locations
+        point, direction = point[near], direction[near]
+        origin = point - 1.1 * radius * direction
+        face = np.asarray(self._scene.run(origin.astype(np.float32), direction.astype(np.float32)))
+        found, hit = np.full((len(point), 3), np.nan), face >= 0
+        # The ray tracer says which face; where exactly is computed in double precision.
+        anchor, normal = self._planes[0][face[hit]], self._planes[1][face[hit]]
+        slope = np.sum(direction[hit] * normal, axis=1)
+        reach = np.sum((anchor - origin[hit]) * normal, axis=1) / slope
+        found[hit] = origin[hit] + reach[:, None] * direction[hit]
+        found[~hit] = self._beside(point[~hit], direction[~hit])
+        locations[near] = found
+        return locations
+
+    def _beside(self, point: Array, direction: Array) -> Array:
+        """The convex hull's nearest points (M, 3) to lines (M, 3) that miss it, NaN beyond the tolerance."""
+        start, extent = self._edges
+        nearest = np.full((len(point), 3), np.nan)
+        for first in range(0, len(point), _BATCH):
+            p, d = point[first : first + _BATCH, None], direction[first : first + _BATCH, None]
+            gap = start - p
+            # In the plane across the line, the line is a point and an edge a shorter edge.
+            gap = gap - np.sum(gap * d, axis=-1, keepdims=True) * d
+            edge = extent - np.sum(extent * d, axis=-1, keepdims=True) * d
+            length = np.sum(edge * edge, axis=-1)
+            share = np.clip(-np.sum(gap * edge, axis=-1) / np.maximum(length, 1e-30), 0.0, 1.0)
+            distance = np.linalg.norm(gap + share[..., None] * edge, axis=-1)
+            best = distance.argmin(axis=1)
+            rows = np.arange(len(best))
+            found = start[best] + share[rows, best][:, None] * extent[best]
+            found[distance[rows, best] > self.miss_tolerance] = np.nan
+            nearest[first : first + _BATCH] = found
+        return nearest
+
+    def measure(self, touches: Sequence[Touch]) -> list[tuple[Tensor, Tensor]]:
+        """Contact locations (T, 3) in the world, and peg poses (T, 7), of consecutive windows of one probe.
+
+        The first window must be the probe's first, for it holds the samples that the sensor's zero is taken
+        from; the filter is carried from window to window.
+
+        Raises:
+            InputError: a window's samples are not `rate` per second within 2 %, or its arrays do not fit.
+        """
+        state, measured = self.start(1), []
+        for k, touch in enumerate(touches):
+            if touch.wrench.shape != (len(touch.times), 6) or touch.world_from_peg.shape != (
+                len(touch.times),
+                7,
+            ):
+                raise InputError(
+                    f"window {k} has {len(touch.times)} times, wrenches {touch.wrench.shape} and peg poses "
+                    f"{touch.world_from_peg.shape}; give (T,), (T, 6) and (T, 7)."
+                )
+            if len(touch.times) > 1:
+                rate = (len(touch.times) - 1) / (touch.times[-1] - touch.times[0])
+                if abs(rate / self.rate - 1.0) > 0.02:
+                    raise InputError(
+                        f"window {k} has {rate:.4g} samples per second, not {self.rate:.4g}; "
+                        "set Sensing's rate to the recording's."
+                    )
+            locations, state = self.contacts(touch.wrench[None].astype(np.float64), state)
+            pose = torch.from_numpy(np.array(touch.world_from_peg, dtype=np.float64))
+            measured.append((in_world(torch.from_numpy(locations[0]), pose), pose))
+        return measured
+
+
+def in_world(locations: Tensor, world_from_peg: Tensor) -> Tensor:
+    """Locations (..., 3) in the peg's frame, each at its own pose (..., 7), in the world."""
+    rotation = poses.rotation_matrix(world_from_peg)
+    return (rotation @ locations[..., None])[..., 0] + world_from_peg[..., :3]
