@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+import typer
+from typer.testing import CliRunner
 
 from bcppl.errors import InputError
 from bcppl.parts import Part
@@ -125,7 +127,9 @@ def test_bad_logs_are_refused_in_a_sentence(tmp_path: Path) -> None:
         ("1 " + push[:-30], "middle of a push"),
         ("1 " + push + push, "more numbers"),
         ("1 " + push.replace(" 12 ", " 2 ", 1), "too few rows|more numbers|middle"),
-        ("1 " + push, "holds 0 with a contact"),
+        ("1 " + push, "holds no push that touches"),
+        ("1 " + push.replace("12 0 0 0", "12 0 0 nan"), "not finite"),
+        ("1 " + push.replace("1 0 0 0", "2 0 0 0", 1), "unit length"),
         ("", "middle of a push"),
     ):
         path.write_text(content)
@@ -134,6 +138,20 @@ def test_bad_logs_are_refused_in_a_sentence(tmp_path: Path) -> None:
         assert "log.txt" in str(failure.value) and "\n" not in str(failure.value)
     with pytest.raises(InputError, match="missing"):
         point_probe.command([tmp_path / "missing.txt"])
+
+
+@pushes_needed
+def test_more_pushes_than_there_are_are_refused() -> None:
+    with pytest.raises(InputError, match=r"51 pushes .* between 1 and 50\.$"):
+        point_probe.command(logs()[:1], pushes=51)
+
+
+@pytest.mark.parametrize("module", importers().values())
+def test_commands_are_understood_by_typer(module: Any) -> None:
+    application = typer.Typer()
+    application.command()(module.command)
+    shown = CliRunner().invoke(application, ["--help"], env={"COLUMNS": "200", "NO_COLOR": "1"})
+    assert shown.exit_code == 0 and "--seed" in shown.output and "--translation" in shown.output
 
 
 @pushes_needed
@@ -225,6 +243,9 @@ def test_an_unknown_object_lists_those_present() -> None:
 
 def test_a_folder_that_is_no_scene_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"scene_gt\.json is missing"):
+        bop.command(tmp_path, 5)
+    (tmp_path / "scene_gt.json").write_text('{"3": [{"cam_t_m2c": [0, 0, 1]}]}')
+    with pytest.raises(InputError, match=r"not laid out as a BOP scene .*obj_id"):
         bop.command(tmp_path, 5)
 
 

@@ -53,6 +53,23 @@ def command(
         raise InputError(
             "the prior's half width cannot be negative; give an angle above 0, at most 180 degrees."
         )
+    try:
+        return _read(
+            scene, object_id, frame, draw(seed, translation, math.radians(angle)), translation, angle
+        )
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise InputError(
+            f"{scene} is not laid out as a BOP scene ({said}); compare its files with the format's description."
+        ) from error
+
+
+def _read(
+    scene: Path, object_id: int, frame: int | None, tangent: Array, translation: float, angle: float
+) -> Recording:
+    """The recording whose truth is its guess moved by `tangent` (6,)."""
     truths = _json(scene / "scene_gt.json")
     number = min(map(int, truths), default=-1) if frame is None else frame
     if str(number) not in truths:
@@ -71,9 +88,7 @@ def command(
     return Recording(
         part=_part(scene / "models_eval" / f"obj_{object_id:06d}.ply", object_id),
         guess=Guess(
-            world_from_part=retract(
-                truth, -torch.from_numpy(draw(seed, translation, math.radians(angle)))
-            ).numpy(),
+            world_from_part=retract(truth, -torch.from_numpy(tangent)).numpy(),
             translation=np.full(3, translation),
             angle=math.radians(angle),
         ),

@@ -92,6 +92,8 @@ def read_log(path: Path) -> list[LoggedPush]:
         raise InputError(
             f"{path} is not a push log of whitespace-separated numbers; give a MLab_EXP log."
         ) from error
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{path} holds a number that is not finite; copy the log again.")
     place = 0
 
     def take(rows: float, columns: int) -> Array:
@@ -113,11 +115,11 @@ def read_log(path: Path) -> list[LoggedPush]:
             raise InputError(f"{path}: push {len(pushes)} holds too few rows to tare; copy the log again.")
         pushes.append(
             LoggedPush(
-                base_from_object=_pose(before),
+                base_from_object=_pose(before, path),
                 force_times=forces[:, 0] - forces[0, 0],
                 force=np.ascontiguousarray(forces[:, 1:]),
                 tip_times=tips[:, 0] - forces[0, 0],
-                base_from_tip=_pose(tips[:, 1:]),
+                base_from_tip=_pose(tips[:, 1:], path),
             )
         )
     if place != len(numbers):
@@ -125,9 +127,12 @@ def read_log(path: Path) -> list[LoggedPush]:
     return pushes
 
 
-def _pose(millimetres: Array) -> Tensor:
+def _pose(millimetres: Array, path: Path) -> Tensor:
     """Poses of rows x y z (mm) qw qx qy qz, whose logged quaternions are rounded."""
-    quaternions = millimetres[..., 3:] / np.linalg.norm(millimetres[..., 3:], axis=-1, keepdims=True)
+    length = np.linalg.norm(millimetres[..., 3:], axis=-1, keepdims=True)
+    if (np.abs(length - 1) > 0.01).any():
+        raise InputError(f"{path} holds a quaternion that is not of unit length, or is no MLab_EXP log.")
+    quaternions = millimetres[..., 3:] / length
     return as_pose(np.concatenate([1e-3 * millimetres[..., :3], quaternions], axis=-1))
 
 
@@ -180,6 +185,10 @@ def command(
         InputError: a log cannot be read, or holds fewer pushes with a contact than asked for.
     """
     touching = [push for log in logs for push in read_log(Path(log)) if push.onset is not None]
+    if not touching:
+        raise InputError(
+            f"{', '.join(str(log) for log in logs)} holds no push that touches; give another log."
+        )
     if not 1 <= pushes <= len(touching):
         names = ", ".join(str(log) for log in logs)
         raise InputError(
