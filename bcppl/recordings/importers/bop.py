@@ -62,7 +62,7 @@ def command(
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         said = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise InputError(
-            f"{scene} is not laid out as a BOP scene ({said}); compare its files with the format's description."
+            f"{scene} is not laid out as a BOP scene ({said}); compare its files with the format."
         ) from error
 
 
