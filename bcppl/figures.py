@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+import torch
 import trimesh
 from matplotlib import rc_context
 from matplotlib.collections import LineCollection
@@ -21,8 +22,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from scipy.spatial.transform import Rotation
-from scipy.special import softmax
 
+from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.parts import Part
 
@@ -157,14 +158,12 @@ def belief_in_3d(
     body, edges = _outline(part)
 
     figure = Figure(figsize=(max(4.6 * len(panels), 6.0), 4.8))
-    means = [_mean(poses, weights) for _, poses, weights in panels]
-    shown = np.concatenate(
-        [_limits_of(part, length, poses, mean) for (_, poses, _), mean in zip(panels, means, strict=True)]
-    )
+    reached = [_limits_of(part, length, poses, mean) for _, poses, _, mean in panels]
     if true is not None:
-        shown = np.concatenate([shown, _limits_of(part, 1.15 * length, true[None], true)])
+        reached.append(_limits_of(part, 1.15 * length, true[None], true))
+    shown = np.concatenate(reached)
     low, high = shown.min(axis=0), shown.max(axis=0)
-    for k, ((title, poses, weights), mean) in enumerate(zip(panels, means, strict=True)):
+    for k, (title, poses, weights, mean) in enumerate(panels):
         with rc_context({"grid.color": "0.88", "grid.linewidth": 0.6}):
             axes: Axes3D = figure.add_subplot(1, len(panels), k + 1, projection="3d", computed_zorder=False)
         faces = _placed(mean, body)
@@ -198,8 +197,8 @@ def belief_in_3d(
     return figure
 
 
-def _checked(title: str, poses: Array, log_weights: Array) -> tuple[Array, Array]:
-    """Poses (N, 7) and normalised weights (N,) of one panel."""
+def _checked(title: str, poses: Array, log_weights: Array) -> tuple[Array, Array, Array]:
+    """Poses (N, 7), normalised weights (N,) and the mean pose (7,) of one panel."""
     poses, log_weights = (np.asarray(values, dtype=np.float64) for values in (poses, log_weights))
     if poses.ndim != 2 or poses.shape[1] != 7 or log_weights.shape != poses.shape[:1] or len(poses) == 0:
         raise InputError(
@@ -209,17 +208,12 @@ def _checked(title: str, poses: Array, log_weights: Array) -> tuple[Array, Array
     largest = log_weights.max()
     if not np.isfinite(largest):
         raise InputError(f"belief {title!r} has log weights whose largest is {largest}; give a finite one.")
-    return poses, np.asarray(softmax(log_weights))
+    belief = Belief(torch.from_numpy(poses), torch.from_numpy(log_weights))
+    return poses, belief.weights.numpy(), belief.mean.numpy()
 
 
 def _rotation(pose: Array) -> Rotation:
     return Rotation.from_quat(pose[..., [4, 5, 6, 3]])
-
-
-def _mean(poses: Array, weights: Array) -> Array:
-    """The weighted mean pose (7,): of translations, and (chordal) of rotations."""
-    quaternion = _rotation(poses).mean(weights).as_quat()
-    return np.concatenate([weights @ poses[:, :3], quaternion[[3, 0, 1, 2]]])
 
 
 def _outline(part: Part) -> tuple[Array, Array]:
