@@ -98,15 +98,19 @@ def box_peg(width: float, length: float, breadth: float | None = None, name: str
 
 
 def round_peg(radius: float, length: float, sides: int = 64, name: str = "round peg") -> Part:
-    """A cylindrical peg; its frame is that of `box_peg`.
+    """A round peg, drawn and touched as a prism; its frame is that of `box_peg`.
+
+    MuJoCo keeps four points of a flat contact: pressed flat on a plane, a round face's centre of pressure is
+    off by up to 1 mm at a radius of 8 mm with 64 sides, and by up to 2 mm with MuJoCo's own cylinder.
 
     Args:
-        radius: of the cylinder that is touched, metres.
+        radius: of the cylinder on which the prism's corners lie, metres.
         length: from the sensor to the tip, metres.
-        sides: of the prism that is drawn; its corners lie on the cylinder.
+        sides: of the prism; the middles of its sides lie radius * (1 - cos(pi / sides)) inside the cylinder.
         name: the part's name.
     """
     angles = 2.0 * math.pi * np.arange(sides) / sides
     outline = shapely.Polygon(radius * np.stack([np.cos(angles), np.sin(angles)], axis=1))
-    piece = Piece("cylinder", np.array([radius, 0.5 * length]), np.array([0.0, 0.0, -0.5 * length]))
-    return _extruded(name, outline, -length, 0.0, [piece])
+    corners = np.asarray(outline.exterior.coords)[:-1]
+    hull = np.concatenate([np.insert(corners, 2, z, axis=1) for z in (-length, 0.0)])
+    return _extruded(name, outline, -length, 0.0, [Piece("hull", hull)])

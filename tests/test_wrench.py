@@ -1,0 +1,174 @@
+"""Wrench to contact location: known contacts are found, in the peg's frame, the same in chunks as at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from bcppl.errors import InputError
+from bcppl.recordings.measurements import Probe, Touch
+from bcppl.simulators.physics import PegPhysics
+from bcppl.simulators.shapes import block, block_with_square_hole, box_peg, round_peg
+from bcppl.simulators.track import ContactTrack
+from bcppl.simulators.wrench import Sensing, in_world
+
+PEG = box_peg(0.016, 0.05)
+PLAIN = Sensing(PEG, rate=100.0, tare=0, cutoff=None)
+STIFFNESS = np.array([1000.0, 1000.0, 1000.0, 50.0, 50.0, 50.0])
+DAMPING = np.array([80.0, 80.0, 80.0, 2.0, 2.0, 2.0])
+
+
+def wrench(point: np.ndarray, force: np.ndarray) -> np.ndarray:
+    return np.concatenate([force, np.cross(point, force)], axis=-1)
+
+
+def random_contacts(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Points (500, 3) on the peg, and forces that push into it, up to 45 degrees off the normal."""
+    rng = np.random.default_rng(seed)
+    points, faces = PEG.mesh.sample(500, return_index=True, seed=seed)
+    inward = -PEG.mesh.face_normals[faces]
+    side = np.cross(inward, rng.normal(size=(500, 3)))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    return np.asarray(points), 7.0 * (inward + rng.uniform(0, 1, (500, 1)) * side)
+
+
+def test_a_contact_is_found_where_the_force_enters_the_peg() -> None:
+    points, force = random_contacts()
+    located = PLAIN.locate(wrench(points, force))
+    np.testing.assert_allclose(located, points, atol=1e-9)
+    # The mutants: a flipped force or torque, and a wrench in the wrong frame, are found elsewhere or nowhere.
+    turn = Rotation.from_euler("zx", [90, 30], degrees=True)
+    turned = np.concatenate([turn.apply(force), turn.apply(np.cross(points, force))], axis=1)
+    flip = wrench(points, force) * [-1, -1, -1, 1, 1, 1]
+    for mutant in (-wrench(points, force), flip, turned):
+        off = np.linalg.norm(np.nan_to_num(PLAIN.locate(mutant), nan=1.0) - points, axis=1)
+        assert np.mean(off > 1e-3) > 0.9
+
+
+def test_a_line_that_misses_by_little_is_taken_to_the_nearest_edge() -> None:
+    points = np.array(
+        [[0.009, 0.002, -0.03], [0.0085, -0.0085, -0.03], [0.0081, 0.0, -0.0501], [0.011, 0, -0.03]]
+    )
+    force = np.array([[0, -5.0, 0], [-1.0, -1.0, 0], [-1.0, 0, -1.0], [0, -5.0, 0]])
+    located = PLAIN.locate(wrench(points, force))
+    np.testing.assert_allclose(located[0, [0, 2]], [0.008, -0.03], atol=1e-9)
+    np.testing.assert_allclose(located[1], [0.008, -0.008, -0.03], atol=1e-9)
+    np.testing.assert_allclose(located[2], [0.008, located[2, 1], -0.05], atol=1e-9)
+    assert np.isnan(located[3]).all()
+
+
+def test_taring_and_filtering_in_chunks_equal_the_whole() -> None:
+    rng = np.random.default_rng(1)
+    points, force = random_contacts()
+    signal = wrench(points, force).reshape(5, 100, 6).cumsum(axis=1) / 10 + rng.normal(size=(5, 1, 6))
+    sensing = Sensing(PEG, rate=100.0, tare=12, cutoff=10.0)
+    whole, state = sensing.contacts(signal, sensing.start(5))
+    assert np.isnan(whole[:, :12]).all() and np.isfinite(whole[:, 12:]).any()
+    chunks, running = [], sensing.start(5)
+    for first, last in ((0, 5), (5, 13), (13, 14), (14, 70), (70, 100)):
+        found, running = sensing.contacts(signal[:, first:last], running)
+        chunks.append(found)
+    np.testing.assert_array_equal(np.concatenate(chunks, axis=1), whole)
+    np.testing.assert_array_equal(running.filter, state.filter)
+    rows = np.array([3, 0, 3])
+    some, _ = sensing.contacts(signal[rows], sensing.start(3))
+    np.testing.assert_array_equal(some, whole[rows])
+    half = sensing.contacts(signal[:, :50], sensing.start(5))[1]
+    some, _ = sensing.contacts(signal[rows, 50:], half[rows])
+    np.testing.assert_array_equal(some, whole[rows, 50:])
+
+
+def test_an_offset_of_the_sensor_changes_nothing() -> None:
+    signal = np.zeros((1, 60, 6))
+    signal[:, 20:] = wrench(np.array([0.003, -0.002, -0.05]), np.array([0.5, 0, 8.0]))
+    sensing = Sensing(PEG, rate=100.0, tare=10, cutoff=20.0)
+    plain, _ = sensing.contacts(signal, sensing.start(1))
+    zero = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.1])
+    offset, _ = sensing.contacts(signal + zero, sensing.start(1))
+    np.testing.assert_allclose(plain[0, 40:], np.tile([0.003, -0.002, -0.05], (20, 1)), atol=1e-9)
+    np.testing.assert_allclose(offset, plain, atol=1e-9)
+
+
+def lean(angle: float, yaw: float = 0.0) -> Probe:
+    """A peg leaning about its y axis, then turned about the world's z, pressed straight down."""
+    turn = Rotation.from_euler("yz", [angle, yaw], degrees=True)
+    command = np.zeros((3, 7))
+    command[:, 2] = [0.06, 0.046, 0.046]
+    command[:, 3:] = turn.as_quat()[[3, 0, 1, 2]]
+    stamps = np.arange(0.0, 1.5, 0.01)
+    stiff = STIFFNESS * [1, 1, 1, 100, 100, 100]
+    return Probe("lean", np.array([0.0, 0.7, 1.5]), command, stiff, 9 * DAMPING, stamps)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 120.0])
+def test_a_leaning_peg_touches_with_its_lowest_edge(yaw: float) -> None:
+    probe = lean(20.0, yaw)
+    sensing = Sensing(PEG, rate=100.0, tare=10, cutoff=20.0)
+    part = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64)
+    track = ContactTrack.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
+    contacts, pose = track.window(130, 150)
+    local, _ = sensing.contacts(track.rollout.wrench, sensing.start(1))
+    # Turned by +20 degrees about y, the edge at x = +8 mm is the lowest.
+    np.testing.assert_allclose(local[0, 130:], np.tile([0.008, 0.0, -0.05], (20, 1)), atol=1e-4)
+    np.testing.assert_allclose(contacts[0, :, 2], 0.0, atol=1e-4)
+    np.testing.assert_array_equal(in_world(torch.from_numpy(local[:, 130:]), pose), contacts)
+
+
+def test_a_peg_pressed_on_the_rim_of_a_hole_feels_the_material_beneath_it() -> None:
+    # Half of the peg stands over the hole: flat contact along x < 0 only, so its middle is at x <= 0.
+    part = block_with_square_hole(size=(0.1, 0.1, 0.02), hole=0.03, offset=(0.015, 0.0))
+    command = np.array([[0, 0, 0.055, 1, 0, 0, 0], [0, 0, 0.047, 1, 0, 0, 0]], dtype=np.float64)
+    stamps = np.arange(0.0, 1.5, 0.01)
+    probe = Probe("rim", np.array([0.0, 0.7]), command, STIFFNESS * 10, DAMPING * 5, stamps)
+    for peg, tolerance in ((PEG, 1e-5), (round_peg(0.008, 0.05), 1e-3)):
+        sensing = Sensing(peg, rate=100.0)
+        pose = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64)
+        contacts, _ = ContactTrack.start(PegPhysics(part, peg), sensing, pose, probe).window(120, 150)
+        assert (contacts[0, :, 0] < 1e-4).all() and (contacts[0, :, 0] > -0.0081).all()
+        np.testing.assert_allclose(contacts[0, :, 1], 0.0, atol=tolerance)
+
+
+def test_a_measured_recording_is_read_by_the_same_code() -> None:
+    probe = lean(10.0, 30.0)
+    sensing = Sensing(PEG, rate=100.0)
+    part = torch.tensor([[0.0, 0, 0.001, 1, 0, 0, 0]], dtype=torch.float64)
+    track = ContactTrack.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
+    whole, pose = track.window(0, 150)
+    touches = [
+        Touch(probe.stamps[a:b], track.rollout.wrench[0, a:b], track.rollout.world_from_peg[0, a:b])
+        for a, b in ((0, 40), (40, 90), (90, 150))
+    ]
+    measured = sensing.measure(touches)
+    np.testing.assert_array_equal(torch.cat([m[0] for m in measured]), whole[0])
+    np.testing.assert_array_equal(torch.cat([m[1] for m in measured]), pose[0])
+    with pytest.raises(InputError, match="samples per second"):
+        Sensing(PEG, rate=500.0).measure(touches)
+    with pytest.raises(InputError, match="cutoff"):
+        Sensing(PEG, rate=30.0)
+
+
+def test_tracks_are_indexed_and_merged_like_the_poses_they_hang_on() -> None:
+    probe = lean(15.0)
+    physics, sensing = PegPhysics(block((0.2, 0.2, 0.02)), PEG), Sensing(PEG, rate=100.0)
+    part = torch.zeros(4, 7, dtype=torch.float64)
+    part[:, 3], part[:, 2] = 1.0, torch.tensor([0.0, 0.002, -0.001, -1.0])
+    whole = ContactTrack.start(physics, sensing, part, probe)
+    expected = whole.window(0, 150)[0]
+    assert torch.isnan(expected[3]).all() and not torch.equal(expected[0], expected[1])
+    track = ContactTrack.start(physics, sensing, part, probe)
+    track.window(0, 60)
+    index = torch.tensor([2, 0, 2])
+    torch.testing.assert_close(
+        track[index].window(0, 150)[0], expected[index], rtol=0, atol=0, equal_nan=True
+    )
+    assert track.count == 60
+    torch.testing.assert_close(track[index].inputs[0], part[index])
+    mask = torch.tensor([True, False, False, True])
+    other = ContactTrack.start(physics, sensing, part.flip(0), probe)
+    other.window(0, 100)
+    merged = track.where(mask, other)
+    wanted = torch.where(mask[:, None, None], expected, expected.flip(0))
+    torch.testing.assert_close(merged.window(0, 150)[0], wanted, rtol=0, atol=0, equal_nan=True)
+    torch.testing.assert_close(merged.inputs[0], torch.where(mask[:, None], part, part.flip(0)))
