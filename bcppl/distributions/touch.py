@@ -1,0 +1,241 @@
+"""What a finger feels when it is moved along a known path: where it first touches, and how it is pushed.
+
+The distributions take the signed distance to the part (`bcppl.simulators.distance.SignedDistance`, or any
+callable that maps points (..., 3) in the part's frame to something with `distance` and `normal`) as an
+argument. Scales are floats, or tensors (N,) where they are latent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.special import log_ndtr
+
+from bcppl import poses
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.path import Path
+
+Distance = Callable[[Tensor], Any]
+Scale = float | Tensor
+
+# Farther than this (m) from the path is off it: paths are thinned and interpolated, to some micrometres.
+OFF_PATH = 1e-3
+# A normal with less than this in the world's xy plane has no direction there.
+UPRIGHT = 1e-6
+
+
+def _latent(scales: tuple[Scale, ...]) -> tuple[Tensor, ...]:
+    return tuple(s for s in scales if isinstance(s, Tensor) and s.ndim > 0)
+
+
+def _at(distance: Distance, pose: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+    """Signed distance (N,) and outward normal (N, 3) in world axes at one place (N, 3) for each pose."""
+    near = distance(poses.transform(poses.inverse(pose), places[:, None])[:, 0])
+    return near.distance, (poses.rotation_matrix(pose) @ near.normal[..., None])[..., 0]
+
+
+def _lowest(distance: Distance, pose: Tensor, path: Path, travelled: Tensor) -> Tensor:
+    """The least signed distance (N,) of the path's points before a distance travelled (N,); inf for none."""
+    seen = path.points[path.travelled < travelled.max()]
+    if len(seen) == 0:
+        return torch.full_like(travelled, torch.inf)
+    all_distances = distance(poses.transform(poses.inverse(pose), seen)).distance
+    before = path.travelled[: len(seen)] < travelled[:, None]
+    return torch.where(before, all_distances, torch.inf).amin(dim=-1)
+
+
+def _travelled(path: Path, place: Tensor, particles: int) -> Tensor:
+    """The distance travelled (N,) until contact was felt at a place (3,) or (N, 3); inf for NaN (never)."""
+    place = place.expand(particles, 3)
+    felt = ~torch.isnan(place).any(dim=-1)
+    return torch.where(
+        felt, path.locate(torch.where(felt[:, None], place, path.points[0])).travelled, torch.inf
+    )
+
+
+class OnsetLocation(LazyDistribution):
+    """Where on its path a finger is when contact is first felt: (3,) in the world, or NaN for never.
+
+    Contact is felt as soon as the signed distance of the tip falls below a threshold -offset + spread * e,
+    e standard normal: a first passage. With probability `outlier` it is felt anywhere on the path, evenly.
+    So the density at distance s along the path, whose signed distance is d(s), is
+
+        (1 - outlier) N(d(s); -offset, spread) |d'(s)| [d(s) is the least so far] + outlier / length.
+
+    The base measure is Lebesgue measure of the distance travelled (metres) on the inner path, plus a unit
+    mass at its start (felt at once) and a unit mass at "never" (NaN); the total is one whatever the path.
+    That the tip moved freely before the onset is part of the density. A location more than 1 mm off the path
+    has probability zero.
+
+    Args:
+        distance: the signed distance to the part.
+        pose: (N, 7) world_from_part.
+        path: the tip's path in the world; also the points where d is evaluated.
+        offset: metres; positive where the tip lies inside the part at onset, on average.
+        spread: standard deviation of the threshold, metres.
+        outlier: probability of an onset that has nothing to do with the part.
+    """
+
+    def __init__(
+        self, distance: Distance, pose: Tensor, path: Path, offset: Scale, spread: Scale, outlier: float
+    ) -> None:
+        self.distance, self.pose, self.path = distance, pose, path
+        self.offset, self.spread, self.outlier = offset, spread, outlier
+        super().__init__(len(pose), (3,), (pose, *_latent((offset, spread))))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (N,) of one location (3,), or of one for each particle (N, 3)."""
+        particles = len(self.pose)
+        value = value.expand(particles, 3)
+        travelled = _travelled(self.path, value, particles)
+        felt = torch.isfinite(travelled)
+        place = torch.where(felt[:, None], value, self.path.points[0])
+        located = self.path.locate(place)
+        here, normal = _at(self.distance, self.pose, place)
+        lowest = _lowest(self.distance, self.pose, self.path, travelled)
+
+        inlier, spread = math.log1p(-self.outlier), torch.as_tensor(self.spread, dtype=torch.float64)
+        approach = -(normal * located.direction).sum(dim=-1)
+        score = (here + self.offset) / spread
+        passage = -0.5 * score**2 - torch.log(spread) - 0.5 * math.log(2.0 * math.pi)
+        passage = passage + torch.log(approach.clamp(min=0.0))
+        passage = inlier + torch.where(here < lowest, passage, -torch.inf)
+        stray = torch.tensor(self.outlier / self.path.length, dtype=torch.float64).log()
+        density = torch.logaddexp(passage, stray.expand(particles))
+        density = torch.where(travelled == 0.0, inlier + log_ndtr(-score), density)
+        density = torch.where(located.off <= OFF_PATH, density, -torch.inf)
+        return torch.where(felt, density, inlier + log_ndtr((lowest + self.offset) / spread))
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """Where contact is first felt, (N, 3): interpolated between the path's points; NaN for never."""
+        particles, path = len(self.pose), self.path
+        threshold = -self.offset + self.spread * torch.randn(particles, dtype=torch.float64)
+        distances = self.distance(poses.transform(poses.inverse(self.pose), path.points)).distance
+        below = distances <= threshold[:, None]
+        first = below.to(torch.uint8).argmax(dim=-1, keepdim=True)
+        after = distances.gather(-1, first)[:, 0]
+        before = distances.gather(-1, (first - 1).clamp(min=0))[:, 0]
+        share = torch.where(first[:, 0] > 0, (before - threshold) / (before - after), 1.0)
+        start = path.travelled[(first[:, 0] - 1).clamp(min=0)]
+        travelled = start + share * (path.travelled[first[:, 0]] - start)
+        place = torch.where(below.any(dim=-1, keepdim=True), path.at(travelled), torch.nan)
+        stray = torch.rand(particles, dtype=torch.float64) < self.outlier
+        anywhere = path.at(path.length * torch.rand(particles, dtype=torch.float64))
+        return torch.where(stray[:, None], anywhere, place)
+
+
+class ForceDirection(LazyDistribution):
+    """The direction, in the world's xy plane, of the force that a moving finger exerts on the part.
+
+    An angle in radians from the world's x axis. Friction turns the force from the inward normal towards the
+    finger's motion, up to the friction cone's half angle a = atan(friction), where the finger slides. With m
+    the angle from the inward normal to the motion, the force stands at a tanh(m / a) from the inward normal:
+    the motion's own direction while the finger sticks, the cone's edge while it slides, and (measured) a
+    smooth passage between them. About that it is normal (wrapped) with `spread`; with probability `outlier`
+    it is uniform. The base measure is Lebesgue on the circle, radians.
+
+    Where the surface faces straight up or down the angle is uniform. Where nothing was felt (tip NaN) the
+    direction is NaN with probability one.
+
+    Args:
+        distance: the signed distance to the part.
+        pose: (N, 7) world_from_part.
+        tip: (3,) or (N, 3) where the finger touches, in the world: the normal is taken there; NaN for never.
+        motion: (3,) or (N, 3) the finger's direction of travel there, in the world.
+        friction: coefficient of friction.
+        spread: radians.
+        outlier: probability of a direction that has nothing to do with the part.
+    """
+
+    def __init__(
+        self,
+        distance: Distance,
+        pose: Tensor,
+        tip: Tensor,
+        motion: Tensor,
+        friction: Scale,
+        spread: Scale,
+        outlier: float,
+    ) -> None:
+        self.distance, self.pose = distance, pose
+        self.tip, self.motion = tip.expand(len(pose), 3), motion.expand(len(pose), 3)
+        self.friction, self.spread, self.outlier = friction, spread, outlier
+        super().__init__(len(pose), (), (pose, self.tip, self.motion, *_latent((friction, spread))))
+
+    def _expected(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The expected angle (N,), where it has a direction (N,), and where anything was felt (N,)."""
+        felt = ~torch.isnan(self.tip).any(dim=-1)
+        _, normal = _at(self.distance, self.pose, torch.where(felt[:, None], self.tip, self.pose[:, :3]))
+        inward = torch.atan2(-normal[:, 1], -normal[:, 0])
+        cone = torch.atan(torch.as_tensor(self.friction, dtype=torch.float64))
+        turn = _wrapped(torch.atan2(self.motion[:, 1], self.motion[:, 0]) - inward)
+        return inward + cone * torch.tanh(turn / cone), normal[:, :2].norm(dim=-1) > UPRIGHT, felt
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (N,) of one angle (), or of one for each particle (N,); radians."""
+        expected, sided, felt = self._expected()
+        value = value.expand(len(self.pose))
+        spread = torch.as_tensor(self.spread, dtype=torch.float64)
+        windings = 2.0 * math.pi * torch.arange(-1, 2, dtype=torch.float64)
+        error = (_wrapped(value - expected)[:, None] + windings) / spread[..., None]
+        near = torch.logsumexp(-0.5 * error**2, dim=-1) - torch.log(spread) - 0.5 * math.log(2.0 * math.pi)
+        even = torch.full_like(expected, -math.log(2.0 * math.pi))
+        stray = torch.tensor(self.outlier, dtype=torch.float64).log()
+        density = torch.logaddexp(math.log1p(-self.outlier) + torch.where(sided, near, even), stray + even)
+        told = ~torch.isnan(value)
+        return torch.where(felt, torch.where(told, density, -torch.inf), torch.where(told, -torch.inf, 0.0))
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """An angle for each particle (N,), radians in (-pi, pi]; NaN where nothing was felt."""
+        expected, sided, felt = self._expected()
+        angle = expected + self.spread * torch.randn(len(self.pose), dtype=torch.float64)
+        even = 2.0 * math.pi * torch.rand(len(self.pose), dtype=torch.float64)
+        stray = torch.rand(len(self.pose), dtype=torch.float64) < self.outlier
+        return torch.where(felt, _wrapped(torch.where(stray | ~sided, even, angle)), torch.nan)
+
+
+class FreePath(LazyDistribution):
+    """Whether nothing was felt on the way to the onset: 1 for nothing, 0 for something.
+
+    The tip moved freely with probability Phi((d + tolerance) / spread), d the least signed distance of
+    the path's points before the onset: an independent second look beside `OnsetLocation`, which already
+    holds that nothing was felt before. The base measure counts {0, 1}.
+
+    Args:
+        distance: the signed distance to the part.
+        pose: (N, 7) world_from_part.
+        path: the tip's path in the world.
+        onset: (3,) or (N, 3) where contact was felt; NaN for never: the whole path was free.
+        tolerance: metres inside the part at which one free path in two is felt.
+        spread: metres.
+    """
+
+    def __init__(
+        self, distance: Distance, pose: Tensor, path: Path, onset: Tensor, tolerance: Scale, spread: Scale
+    ) -> None:
+        self.distance, self.pose, self.path = distance, pose, path
+        self.onset, self.tolerance, self.spread = onset.expand(len(pose), 3), tolerance, spread
+        super().__init__(len(pose), (), (pose, self.onset, *_latent((tolerance, spread))))
+
+    def _score(self) -> Tensor:
+        travelled = _travelled(self.path, self.onset, len(self.pose))
+        return (_lowest(self.distance, self.pose, self.path, travelled) + self.tolerance) / self.spread
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-probability (N,) of 1 (nothing felt) or 0, one () for all particles or one for each (N,)."""
+        score = self._score()
+        return torch.where(value.expand(len(self.pose)) > 0.5, log_ndtr(score), log_ndtr(-score))
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """1 or 0 for each particle, (N,)."""
+        free = torch.rand(len(self.pose), dtype=torch.float64) < torch.special.ndtr(self._score())
+        return free.to(torch.float64)
+
+
+def _wrapped(angle: Tensor) -> Tensor:
+    """Angles in [-pi, pi), radians."""
+    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi
