@@ -1,0 +1,401 @@
+"""What a finger feels: distances in closed form, densities that integrate to one, signs, real pushes."""
+
+import math
+from dataclasses import replace
+from pathlib import Path as File
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.path import Path
+from bcppl.distributions.touch import ForceDirection, FreePath, OnsetLocation
+from bcppl.errors import InputError
+from bcppl.models.point_probe import Settings, felt, learn, model, prepare
+from bcppl.parts import Part
+from bcppl.recordings.importers.point_probe import command
+from bcppl.recordings.measurements import Measurement, Push, Recording, Touch
+from bcppl.simulators.distance import SignedDistance
+from bcppl.traces import assess, generate
+
+LOGS = File(__file__).parents[2] / "shared/data/point_probe_pushes"
+
+
+def t(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def split_box() -> Part:
+    """A box 0.1 x 0.2 x 0.3 m whose triangles share no vertex, as exporters that split by normals do."""
+    corners = trimesh.creation.box((0.1, 0.2, 0.3)).triangles.reshape(-1, 3)
+    return Part("box", np.array(corners), np.arange(len(corners)).reshape(-1, 3))
+
+
+def shifted(*x: float) -> Tensor:
+    """Poses turned by nothing, at x along the world's x axis."""
+    pose = poses.identity(len(x))
+    pose[:, 0] = t(*x)
+    return pose
+
+
+def straight(start: tuple[float, ...], end: tuple[float, ...], count: int = 101) -> Path:
+    return Path(t(*start) + torch.linspace(0, 1, count, dtype=torch.float64)[:, None] * (t(*end) - t(*start)))
+
+
+# ---------------------------------------------------------------- distance
+
+
+def test_distance_to_a_box_is_exact() -> None:
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-0.3, 0.3, (4, 500, 3)))
+    near = SignedDistance(split_box())(points)
+    q = points.abs() - t(0.05, 0.1, 0.15)
+    exact = q.clamp(min=0).norm(dim=-1) + q.amax(dim=-1).clamp(max=0)
+    assert torch.allclose(near.distance, exact, atol=1e-12)
+    assert torch.allclose(points - near.distance[..., None] * near.normal, near.closest, atol=1e-12)
+
+
+def test_normals_are_the_gradient_and_point_outwards() -> None:
+    sphere = trimesh.creation.icosphere(4, 0.05)
+    distance = SignedDistance(Part("sphere", np.asarray(sphere.vertices), np.asarray(sphere.faces)))
+    directions = torch.nn.functional.normalize(
+        torch.from_numpy(np.random.default_rng(1).normal(size=(300, 3))), dim=-1
+    )
+    for radius in (0.03, 0.08):
+        near = distance(radius * directions)
+        # A chord of 5120 triangles lies up to 0.1 % of the radius under the sphere.
+        assert float((near.distance - (radius - 0.05)).abs().max()) < 1e-4
+        assert float((near.normal * directions).sum(-1).min()) > 0.99
+
+
+def test_an_open_mesh_is_refused() -> None:
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    with pytest.raises(InputError, match="open"):
+        SignedDistance(Part("lid off", np.asarray(box.vertices), np.asarray(box.faces)[:-1]))
+
+
+# ---------------------------------------------------------------- onset
+
+
+@pytest.mark.parametrize(
+    ("start", "end"),
+    [
+        (
+            (-0.06, 0.01, 0.02),
+            (-0.04, 0.02, 0.02),
+        ),  # into the face, obliquely, deep enough to be felt for sure
+        ((-0.06, 0.0, 0.0), (-0.0504, 0.0, 0.0)),  # stops where it may not have been felt
+        ((-0.0506, 0.0, 0.0), (-0.04, 0.0, 0.0)),  # starts where it may be felt at once
+        ((-0.07, 0.09, 0.0), (-0.03, 0.115, 0.0)),  # grazes a corner and leaves again
+    ],
+)
+def test_onset_masses_sum_to_one(start: tuple[float, ...], end: tuple[float, ...]) -> None:
+    path, distance, steps = straight(start, end, 201), SignedDistance(split_box()), 1000
+    inner = path.at((torch.arange(steps, dtype=torch.float64) + 0.5) / steps * path.length)
+    atoms = torch.stack([path.points[0], t(math.nan, math.nan, math.nan)])
+    for x, spread in ((0.0, 0.0005), (0.0003, 0.0004), (-0.002, 0.0006)):
+        pose = shifted(*[x] * (steps + 2))
+        onset = OnsetLocation(distance, pose, path, 0.0004, spread, 0.05)
+        mass = onset.log_prob(torch.cat([inner, atoms])).exp()
+        assert float(mass[:steps].mean() * path.length + mass[steps:].sum()) == pytest.approx(1.0, abs=4e-3)
+
+
+def test_onset_masses_sum_to_one_where_the_finger_touches_twice() -> None:
+    boxes = [trimesh.creation.box((0.1, 0.2, 0.3)), trimesh.creation.box((0.1, 0.2, 0.3))]
+    boxes[1].apply_translation((0.0, 0.22, 0.0))
+    both = trimesh.util.concatenate(boxes)
+    distance = SignedDistance(Part("two boxes", np.asarray(both.vertices), np.asarray(both.faces)))
+    path, steps = straight((-0.0497, 0.08, 0.0), (-0.0497, 0.14, 0.0), 401), 4000
+    path = Path(torch.cat([straight((-0.06, 0.08, 0.0), (-0.0497, 0.08, 0.0), 51).points, path.points]))
+    inner = path.at((torch.arange(steps, dtype=torch.float64) + 0.5) / steps * path.length)
+    value = torch.cat([inner, path.points[:1], torch.full((1, 3), math.nan, dtype=torch.float64)])
+    onset = OnsetLocation(distance, shifted(*[0.0] * (steps + 2)), path, 0.0002, 0.0004, 0.05)
+    mass = onset.log_prob(value).exp()
+    assert float(mass[:steps].mean() * path.length + mass[steps:].sum()) == pytest.approx(1.0, abs=5e-3)
+
+
+def test_onset_samples_follow_the_density() -> None:
+    torch.manual_seed(0)
+    path, count = straight((-0.06, 0.01, 0.02), (-0.0495, 0.012, 0.02)), 20000
+    onset = OnsetLocation(SignedDistance(split_box()), shifted(*[0.0] * count), path, 0.0003, 0.0005, 0.1)
+    sample = onset.sample()
+    never = torch.isnan(sample).any(-1)
+    one = OnsetLocation(onset.distance, shifted(0.0), path, 0.0003, 0.0005, 0.1)
+    assert float(never.double().mean()) == pytest.approx(
+        float(one.log_prob(t(*[math.nan] * 3)).exp()), abs=0.01
+    )
+    edges = torch.linspace(0, path.length, 21, dtype=torch.float64)
+    travelled = path.locate(sample[~never]).travelled
+    seen = torch.histogram(travelled, edges).hist / count
+    fine = (torch.arange(2000, dtype=torch.float64) + 0.5) / 2000 * path.length
+    same = OnsetLocation(onset.distance, shifted(*[0.0] * 2000), path, 0.0003, 0.0005, 0.1)
+    density = same.log_prob(path.at(fine)).exp()
+    expected = density.reshape(20, 100).sum(dim=1) * path.length / 2000
+    assert float((seen - expected).abs().max()) < 0.012
+
+
+def test_onset_prefers_a_tip_inside_and_an_approach_from_outside() -> None:
+    distance, inside, outside = SignedDistance(split_box()), t(-0.0495, 0.0, 0.0), t(-0.0505, 0.0, 0.0)
+    inward = straight((-0.06, 0.0, 0.0), (-0.04, 0.0, 0.0), 21)
+    onset = OnsetLocation(distance, shifted(0.0), inward, 0.0005, 0.0002, 0.01)
+    assert float(onset.log_prob(inside)) > float(onset.log_prob(outside)) + 5.0
+    # On its way out the finger was inside before: only the outlier explains that it felt nothing there.
+    outward = OnsetLocation(
+        distance, shifted(0.0), straight((-0.04, 0.0, 0.0), (-0.06, 0.0, 0.0), 21), 0.0005, 0.0002, 0.01
+    )
+    assert float(outward.log_prob(inside)) == pytest.approx(math.log(0.01 / 0.02), abs=1e-9)
+    assert float(onset.log_prob(t(-0.0495, 0.002, 0.0))) == -math.inf  # off the path
+
+
+def test_never_is_likely_only_where_the_path_misses() -> None:
+    path = straight((-0.06, 0.0, 0.0), (-0.04, 0.0, 0.0), 21)
+    never = OnsetLocation(SignedDistance(split_box()), shifted(0.05, 0.0), path, 0.0, 0.0005, 0.01)
+    miss, hit = never.log_prob(t(*[math.nan] * 3))
+    assert float(miss) == pytest.approx(math.log(0.99), abs=1e-9)
+    assert float(hit) < -50.0
+
+
+# ---------------------------------------------------------------- direction
+
+
+def direction(
+    pose: Tensor, motion: Tensor, tip: Tensor | None = None, outlier: float = 0.02
+) -> ForceDirection:
+    tip = t(-0.0502, 0.0, 0.0) if tip is None else tip
+    return ForceDirection(SignedDistance(split_box()), pose, tip, motion, 0.4, 0.1, outlier)
+
+
+def test_direction_integrates_to_one_over_the_circle() -> None:
+    angles = (torch.arange(720, dtype=torch.float64) + 0.5) / 720 * 2 * math.pi - math.pi
+    for motion in (t(1.0, 0.2, 0.0), t(-1.0, 0.1, 0.0), t(0.0, 1.0, 0.0)):
+        density = direction(shifted(*[0.0] * 720), motion).log_prob(angles).exp()
+        assert float(density.mean() * 2 * math.pi) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_direction_is_inward_and_leans_with_the_motion() -> None:
+    cone = math.atan(0.4)
+    # Onto the face at -x, and along it.
+    angles = torch.linspace(-math.pi, math.pi, 721, dtype=torch.float64)
+    best = float(angles[direction(shifted(*[0.0] * 721), t(0.3, 1.0, 0.0)).log_prob(angles).argmax()])
+    assert 0.9 * cone < best <= cone  # the force on the part points to +x (inward) and leans to +y
+    straight_on = direction(shifted(0.0), t(1.0, 0.0, 0.0))
+    assert float(straight_on.log_prob(t(0.0)[0])) > float(straight_on.log_prob(t(math.pi)[0])) + 3.0
+
+
+def test_direction_samples_follow_the_density() -> None:
+    torch.manual_seed(1)
+    many = direction(shifted(*[0.0] * 20000), t(1.0, 0.3, 0.0), outlier=0.2).sample()
+    edges = torch.linspace(-math.pi, math.pi, 33, dtype=torch.float64)
+    middle = torch.linspace(-math.pi, math.pi, 3201, dtype=torch.float64)[:-1] + math.pi / 3200
+    density = direction(shifted(*[0.0] * 3200), t(1.0, 0.3, 0.0), outlier=0.2).log_prob(middle).exp()
+    expected = density.reshape(32, 100).sum(dim=1) * 2 * math.pi / 3200
+    assert float((torch.histogram(many, edges).hist / 20000 - expected).abs().max()) < 0.012
+
+
+def test_nothing_felt_has_no_direction() -> None:
+    tips = torch.stack([t(math.nan, math.nan, math.nan), t(-0.0502, 0.0, 0.0)])
+    none = direction(shifted(0.0, 0.0), t(1.0, 0.0, 0.0), tips)
+    assert none.log_prob(t(math.nan)[0]).tolist() == [0.0, -math.inf]
+    assert none.log_prob(t(0.0)[0])[0] == -math.inf
+    assert torch.isnan(none.sample()).tolist() == [True, False]
+
+
+# ---------------------------------------------------------------- free path
+
+
+def test_free_path_counts_to_one_and_ends_at_the_onset() -> None:
+    path = straight((-0.06, 0.0, 0.0), (-0.04, 0.0, 0.0), 41)
+    pose = shifted(0.01, 0.0, -0.003)
+    free = FreePath(SignedDistance(split_box()), pose, path, t(-0.05, 0.0, 0.0), 0.001, 0.0005)
+    total = free.log_prob(t(1.0)[0]).exp() + free.log_prob(t(0.0)[0]).exp()
+    assert torch.allclose(total, torch.ones(3, dtype=torch.float64))
+    # The last point before the onset is at -50.5 mm: 9.5 mm outside, 0.5 mm outside, 2.5 mm inside.
+    exact = torch.special.log_ndtr((t(0.0095, 0.0005, -0.0025) + 0.001) / 0.0005)
+    assert torch.allclose(free.log_prob(t(1.0)[0]), exact, atol=1e-6)
+    whole = FreePath(free.distance, pose, path, t(math.nan, math.nan, math.nan), 0.001, 0.0005)
+    assert float(whole.log_prob(t(1.0)[0])[1]) < -100.0
+
+
+# ---------------------------------------------------------------- the program
+
+
+def log_likelihood(recording: Recording, pose: Tensor, **settings: object) -> Tensor:
+    """Log-likelihood (N,) of a recording's pushes at poses (N, 7)."""
+    scene = prepare(recording, **settings)
+    observed = model.observe(scene, recording.measurements)
+    actions = [m.action for m in recording.measurements]
+    choices = {**observed, "part": pose}
+    return assess(model.program, (scene, actions), choices, len(pose)) - scene.prior.log_prob(pose)
+
+
+def around(truth: Tensor, step: float) -> Tensor:
+    """The true pose, then poses (7, 7 in all) a step to either side in x and y (m) and yaw (step / 0.1 m)."""
+    tangent = torch.zeros(7, 6, dtype=torch.float64)
+    for k, axis in enumerate((0, 1, 5)):
+        tangent[1 + 2 * k, axis] = step * (10.0 if axis == 5 else 1.0)
+        tangent[2 + 2 * k] = -tangent[1 + 2 * k]
+    return poses.retract(truth, tangent)
+
+
+def moved(recording: Recording, by: Tensor) -> Recording:
+    """The same recording in a world that is moved by a pose (7,): everything that is stated in the world."""
+    turn = poses.rotation_matrix(by).numpy()
+
+    def wrench(touch: Touch) -> Touch:
+        turned = np.concatenate([touch.wrench[:, :3] @ turn.T, touch.wrench[:, 3:] @ turn.T], axis=1)
+        return Touch(touch.times, turned, touch.world_from_peg)
+
+    def there(pose: np.ndarray) -> np.ndarray:
+        return poses.compose(by, torch.from_numpy(pose)).numpy()
+
+    return replace(
+        recording,
+        guess=replace(recording.guess, world_from_part=there(recording.guess.world_from_part)),
+        truth=there(recording.truth),
+        measurements=[
+            Measurement(Push(m.action.times, there(m.action.world_from_tip)), wrench(m.observation))
+            for m in recording.measurements
+        ],
+    )
+
+
+@pytest.mark.parametrize("use_free_path", [False, True])
+def test_the_program_explains_what_it_invents(use_free_path: bool) -> None:
+    recording = model.invent(3, pushes=8, use_free_path=use_free_path)
+    likelihood = log_likelihood(
+        recording, around(torch.from_numpy(recording.truth), 0.002), use_free_path=use_free_path
+    )
+    assert float(likelihood[0]) > float(likelihood[1:].max()) + 5.0
+
+
+def test_what_is_invented_is_read_back() -> None:
+    recording = model.invent(5, pushes=12)
+    scene = prepare(recording)
+    actions = [m.action for m in recording.measurements]
+    torch.manual_seed(5)
+    trace, _ = generate(model.program, (scene, actions), {"part": torch.from_numpy(recording.truth)[None]}, 1)
+    for address, value in model.observe(scene, recording.measurements).items():
+        # One row of force is 0.033 mm of travel; its noise turns the averaged force by a thousandth.
+        tolerance = 1e-4 if address.startswith("onset") else 0.02
+        assert torch.allclose(trace[address][0], value, atol=tolerance, equal_nan=True), address
+
+
+def test_settings_are_learnt_from_pushes_at_a_known_pose() -> None:
+    said = Settings(finger=(0.0010, -0.0005, 0.0), offset=0.0004, spread=0.0002, friction=0.6, outlier=0.0)
+    keys = ("finger", "offset", "spread", "friction", "outlier")
+    recording = model.invent(4, pushes=80, direction_outlier=0.0, **{k: getattr(said, k) for k in keys})
+    touching = [m for m in recording.measurements if np.abs(m.observation.wrench[-1, :2]).max() > 2.0]
+    learnt = learn(replace(recording, measurements=touching))
+    assert learnt.finger == pytest.approx(said.finger, abs=2e-4)
+    assert learnt.offset == pytest.approx(said.offset, abs=1e-4)
+    assert learnt.spread == pytest.approx(said.spread, rel=0.35)
+    assert learnt.friction == pytest.approx(said.friction, abs=0.03)
+    assert learnt.direction_spread == pytest.approx(said.direction_spread, rel=0.3)
+
+
+def test_a_push_that_misses_is_evidence() -> None:
+    recording = model.invent(1, pushes=3)
+    away = np.array(recording.measurements[0].action.world_from_tip)
+    away[:, 2] += 0.2
+    push = recording.measurements[0].action
+    silent = Touch(push.times, np.full((len(push.times), 6), 0.3), np.zeros((0, 7)))
+    missed = replace(recording, measurements=[Measurement(Push(push.times, away), silent)])
+    at = around(torch.from_numpy(recording.truth), 0.001)
+    for use_free_path in (False, True):
+        likelihood = log_likelihood(missed, at, use_free_path=use_free_path)
+        assert torch.allclose(likelihood, torch.full_like(likelihood, math.log(0.99)), atol=1e-9)
+    felt_nothing = replace(recording, measurements=[Measurement(push, silent)])
+    assert float(log_likelihood(felt_nothing, at)[0]) < -4.0
+
+
+@pytest.mark.parametrize("use_free_path", [False, True])
+def test_likelihood_does_not_hang_on_the_world(use_free_path: bool) -> None:
+    recording = model.invent(2, pushes=5)
+    by = t(0.3, -0.2, 0.1, math.cos(0.4), 0.0, 0.0, math.sin(0.4))
+    at = around(torch.from_numpy(recording.truth), 0.0004)
+    here = log_likelihood(recording, at, use_free_path=use_free_path)
+    there = log_likelihood(moved(recording, by), poses.compose(by, at), use_free_path=use_free_path)
+    assert torch.allclose(here, there, atol=1e-6)
+
+
+def test_bad_pushes_are_refused() -> None:
+    recording = model.invent(0, pushes=1)
+    push, touch = recording.measurements[0].action, recording.measurements[0].observation
+    short = Touch(touch.times[:8], touch.wrench[:8], touch.world_from_peg)
+    with pytest.raises(InputError, match="too few to tare"):
+        felt(push, short, Settings())
+    late = Touch(touch.times + 100.0, touch.wrench, touch.world_from_peg)
+    with pytest.raises(InputError, match="outside its path's times"):
+        felt(push, late, Settings())
+    with pytest.raises(InputError, match="no setting 'ofset'"):
+        prepare(recording, ofset=1.0)
+
+
+# ---------------------------------------------------------------- real pushes
+
+
+def log(name: str) -> Recording:
+    files = sorted(LOGS.glob(name + "*"))
+    if not files:
+        pytest.skip(f"the push logs are not at {LOGS}")
+    return command(files, pushes=50, seed=0)
+
+
+def test_defaults_are_learnt_from_one_log() -> None:
+    learnt, settings = learn(log("10_130")), Settings()
+    assert learnt.finger == pytest.approx(settings.finger, abs=1e-5)
+    for name in ("offset", "spread", "tolerance", "free_spread"):
+        assert getattr(learnt, name) == pytest.approx(getattr(settings, name), abs=1e-5)
+    assert learnt.friction == pytest.approx(settings.friction, abs=0.005)
+    assert learnt.direction_spread == pytest.approx(settings.direction_spread, abs=0.002)
+
+
+def test_the_finger_of_one_log_explains_the_other() -> None:
+    recording = log("10_90")
+    truth, distance = torch.from_numpy(recording.truth), SignedDistance(recording.part)
+    depths = {}
+    for finger in ((0.0, 0.0, 0.0), Settings().finger):
+        settings = Settings(finger=finger)
+        tips = torch.stack([felt(m.action, m.observation, settings).onset for m in recording.measurements])
+        depths[finger] = -1e3 * distance(poses.transform(poses.inverse(truth), tips)).distance
+    raw, mended = depths.values()
+    assert float(raw.mean()) == pytest.approx(
+        0.58, abs=0.03
+    )  # mm inside the outline, as the logs' readme has it
+    assert float(raw.std()) > 0.5
+    assert abs(float(mended.mean())) < 0.2
+    assert float(mended.std()) < 0.3
+
+
+def test_forces_lie_in_the_cone_and_point_inwards() -> None:
+    recording = log("10_90")
+    truth, distance, settings = torch.from_numpy(recording.truth), SignedDistance(recording.part), Settings()
+    seen = [felt(m.action, m.observation, settings) for m in recording.measurements]
+    near = distance(poses.transform(poses.inverse(truth), torch.stack([s.onset for s in seen])))
+    inward = -(near.normal @ poses.rotation_matrix(truth).T)
+    lean = torch.stack([s.direction for s in seen]) - torch.atan2(inward[:, 1], inward[:, 0])
+    lean = torch.remainder(lean + math.pi, 2 * math.pi) - math.pi
+    cone = math.atan(settings.friction) + 2 * settings.direction_spread
+    assert float((lean.abs() < cone).double().mean()) >= 0.95
+
+
+def test_the_truth_explains_real_pushes_better_than_its_neighbours() -> None:
+    recording = log("10_90")
+    likelihood = log_likelihood(recording, around(torch.from_numpy(recording.truth), 0.002))
+    assert float(likelihood[0]) > float(likelihood[1:].max()) + 20.0
+    # A world seen in a mirror (forces the other way round) must not do.
+    flipped = replace(
+        recording,
+        measurements=[
+            Measurement(
+                m.action, Touch(m.observation.times, -m.observation.wrench, m.observation.world_from_peg)
+            )
+            for m in recording.measurements
+        ],
+    )
+    assert (
+        float(log_likelihood(flipped, around(torch.from_numpy(recording.truth), 0.002))[0])
+        < float(likelihood[0]) - 100
+    )
