@@ -1,8 +1,6 @@
 """What a finger feels: distances in closed form, densities that integrate to one, signs, real pushes."""
 
 import math
-from dataclasses import replace
-from pathlib import Path as File
 
 import numpy as np
 import pytest
@@ -14,14 +12,8 @@ from bcppl import poses
 from bcppl.distributions.path import Path
 from bcppl.distributions.touch import ForceDirection, FreePath, OnsetLocation
 from bcppl.errors import InputError
-from bcppl.models.point_probe import Settings, felt, learn, model, prepare
 from bcppl.parts import Part
-from bcppl.recordings.importers.point_probe import command
-from bcppl.recordings.measurements import Measurement, Push, Recording, Touch
 from bcppl.simulators.distance import SignedDistance
-from bcppl.traces import assess, generate
-
-LOGS = File(__file__).parents[2] / "shared/data/point_probe_pushes"
 
 
 def t(*values: float) -> Tensor:
@@ -157,6 +149,21 @@ def test_never_is_likely_only_where_the_path_misses() -> None:
     assert float(hit) < -50.0
 
 
+def test_scales_may_differ_between_particles() -> None:
+    distance, path, place = (
+        SignedDistance(split_box()),
+        straight((-0.06, 0.0, 0.0), (-0.04, 0.0, 0.0)),
+        t(-0.0502, 0, 0),
+    )
+    pose, offset, spread = shifted(0.0, 0.0), t(0.0, 0.0005), t(0.0003, 0.0006)
+    both = OnsetLocation(distance, pose, path, offset, spread, 0.01).log_prob(place)
+    each = [
+        OnsetLocation(distance, pose, path, *s, 0.01).log_prob(place)[0]
+        for s in ((0.0, 0.0003), (0.0005, 0.0006))
+    ]
+    assert torch.equal(both, torch.stack(each))
+
+
 # ---------------------------------------------------------------- direction
 
 
@@ -216,186 +223,3 @@ def test_free_path_counts_to_one_and_ends_at_the_onset() -> None:
     assert torch.allclose(free.log_prob(t(1.0)[0]), exact, atol=1e-6)
     whole = FreePath(free.distance, pose, path, t(math.nan, math.nan, math.nan), 0.001, 0.0005)
     assert float(whole.log_prob(t(1.0)[0])[1]) < -100.0
-
-
-# ---------------------------------------------------------------- the program
-
-
-def log_likelihood(recording: Recording, pose: Tensor, **settings: object) -> Tensor:
-    """Log-likelihood (N,) of a recording's pushes at poses (N, 7)."""
-    scene = prepare(recording, **settings)
-    observed = model.observe(scene, recording.measurements)
-    actions = [m.action for m in recording.measurements]
-    choices = {**observed, "part": pose}
-    return assess(model.program, (scene, actions), choices, len(pose)) - scene.prior.log_prob(pose)
-
-
-def around(truth: Tensor, step: float) -> Tensor:
-    """The true pose, then poses (7, 7 in all) a step to either side in x and y (m) and yaw (step / 0.1 m)."""
-    tangent = torch.zeros(7, 6, dtype=torch.float64)
-    for k, axis in enumerate((0, 1, 5)):
-        tangent[1 + 2 * k, axis] = step * (10.0 if axis == 5 else 1.0)
-        tangent[2 + 2 * k] = -tangent[1 + 2 * k]
-    return poses.retract(truth, tangent)
-
-
-def moved(recording: Recording, by: Tensor) -> Recording:
-    """The same recording in a world that is moved by a pose (7,): everything that is stated in the world."""
-    turn = poses.rotation_matrix(by).numpy()
-
-    def wrench(touch: Touch) -> Touch:
-        turned = np.concatenate([touch.wrench[:, :3] @ turn.T, touch.wrench[:, 3:] @ turn.T], axis=1)
-        return Touch(touch.times, turned, touch.world_from_peg)
-
-    def there(pose: np.ndarray) -> np.ndarray:
-        return poses.compose(by, torch.from_numpy(pose)).numpy()
-
-    return replace(
-        recording,
-        guess=replace(recording.guess, world_from_part=there(recording.guess.world_from_part)),
-        truth=there(recording.truth),
-        measurements=[
-            Measurement(Push(m.action.times, there(m.action.world_from_tip)), wrench(m.observation))
-            for m in recording.measurements
-        ],
-    )
-
-
-@pytest.mark.parametrize("use_free_path", [False, True])
-def test_the_program_explains_what_it_invents(use_free_path: bool) -> None:
-    recording = model.invent(3, pushes=8, use_free_path=use_free_path)
-    likelihood = log_likelihood(
-        recording, around(torch.from_numpy(recording.truth), 0.002), use_free_path=use_free_path
-    )
-    assert float(likelihood[0]) > float(likelihood[1:].max()) + 5.0
-
-
-def test_what_is_invented_is_read_back() -> None:
-    recording = model.invent(5, pushes=12)
-    scene = prepare(recording)
-    actions = [m.action for m in recording.measurements]
-    torch.manual_seed(5)
-    trace, _ = generate(model.program, (scene, actions), {"part": torch.from_numpy(recording.truth)[None]}, 1)
-    for address, value in model.observe(scene, recording.measurements).items():
-        # One row of force is 0.033 mm of travel; its noise turns the averaged force by a thousandth.
-        tolerance = 1e-4 if address.startswith("onset") else 0.02
-        assert torch.allclose(trace[address][0], value, atol=tolerance, equal_nan=True), address
-
-
-def test_settings_are_learnt_from_pushes_at_a_known_pose() -> None:
-    said = Settings(finger=(0.0010, -0.0005, 0.0), offset=0.0004, spread=0.0002, friction=0.6, outlier=0.0)
-    keys = ("finger", "offset", "spread", "friction", "outlier")
-    recording = model.invent(4, pushes=80, direction_outlier=0.0, **{k: getattr(said, k) for k in keys})
-    touching = [m for m in recording.measurements if np.abs(m.observation.wrench[-1, :2]).max() > 2.0]
-    learnt = learn(replace(recording, measurements=touching))
-    assert learnt.finger == pytest.approx(said.finger, abs=2e-4)
-    assert learnt.offset == pytest.approx(said.offset, abs=1e-4)
-    assert learnt.spread == pytest.approx(said.spread, rel=0.35)
-    assert learnt.friction == pytest.approx(said.friction, abs=0.03)
-    assert learnt.direction_spread == pytest.approx(said.direction_spread, rel=0.3)
-
-
-def test_a_push_that_misses_is_evidence() -> None:
-    recording = model.invent(1, pushes=3)
-    away = np.array(recording.measurements[0].action.world_from_tip)
-    away[:, 2] += 0.2
-    push = recording.measurements[0].action
-    silent = Touch(push.times, np.full((len(push.times), 6), 0.3), np.zeros((0, 7)))
-    missed = replace(recording, measurements=[Measurement(Push(push.times, away), silent)])
-    at = around(torch.from_numpy(recording.truth), 0.001)
-    for use_free_path in (False, True):
-        likelihood = log_likelihood(missed, at, use_free_path=use_free_path)
-        assert torch.allclose(likelihood, torch.full_like(likelihood, math.log(0.99)), atol=1e-9)
-    felt_nothing = replace(recording, measurements=[Measurement(push, silent)])
-    assert float(log_likelihood(felt_nothing, at)[0]) < -4.0
-
-
-@pytest.mark.parametrize("use_free_path", [False, True])
-def test_likelihood_does_not_hang_on_the_world(use_free_path: bool) -> None:
-    recording = model.invent(2, pushes=5)
-    by = t(0.3, -0.2, 0.1, math.cos(0.4), 0.0, 0.0, math.sin(0.4))
-    at = around(torch.from_numpy(recording.truth), 0.0004)
-    here = log_likelihood(recording, at, use_free_path=use_free_path)
-    there = log_likelihood(moved(recording, by), poses.compose(by, at), use_free_path=use_free_path)
-    assert torch.allclose(here, there, atol=1e-6)
-
-
-def test_bad_pushes_are_refused() -> None:
-    recording = model.invent(0, pushes=1)
-    push, touch = recording.measurements[0].action, recording.measurements[0].observation
-    short = Touch(touch.times[:8], touch.wrench[:8], touch.world_from_peg)
-    with pytest.raises(InputError, match="too few to tare"):
-        felt(push, short, Settings())
-    late = Touch(touch.times + 100.0, touch.wrench, touch.world_from_peg)
-    with pytest.raises(InputError, match="outside its path's times"):
-        felt(push, late, Settings())
-    with pytest.raises(InputError, match="no setting 'ofset'"):
-        prepare(recording, ofset=1.0)
-
-
-# ---------------------------------------------------------------- real pushes
-
-
-def log(name: str) -> Recording:
-    files = sorted(LOGS.glob(name + "*"))
-    if not files:
-        pytest.skip(f"the push logs are not at {LOGS}")
-    return command(files, pushes=50, seed=0)
-
-
-def test_defaults_are_learnt_from_one_log() -> None:
-    learnt, settings = learn(log("10_130")), Settings()
-    assert learnt.finger == pytest.approx(settings.finger, abs=1e-5)
-    for name in ("offset", "spread", "tolerance", "free_spread"):
-        assert getattr(learnt, name) == pytest.approx(getattr(settings, name), abs=1e-5)
-    assert learnt.friction == pytest.approx(settings.friction, abs=0.005)
-    assert learnt.direction_spread == pytest.approx(settings.direction_spread, abs=0.002)
-
-
-def test_the_finger_of_one_log_explains_the_other() -> None:
-    recording = log("10_90")
-    truth, distance = torch.from_numpy(recording.truth), SignedDistance(recording.part)
-    depths = {}
-    for finger in ((0.0, 0.0, 0.0), Settings().finger):
-        settings = Settings(finger=finger)
-        tips = torch.stack([felt(m.action, m.observation, settings).onset for m in recording.measurements])
-        depths[finger] = -1e3 * distance(poses.transform(poses.inverse(truth), tips)).distance
-    raw, mended = depths.values()
-    assert float(raw.mean()) == pytest.approx(
-        0.58, abs=0.03
-    )  # mm inside the outline, as the logs' readme has it
-    assert float(raw.std()) > 0.5
-    assert abs(float(mended.mean())) < 0.2
-    assert float(mended.std()) < 0.3
-
-
-def test_forces_lie_in_the_cone_and_point_inwards() -> None:
-    recording = log("10_90")
-    truth, distance, settings = torch.from_numpy(recording.truth), SignedDistance(recording.part), Settings()
-    seen = [felt(m.action, m.observation, settings) for m in recording.measurements]
-    near = distance(poses.transform(poses.inverse(truth), torch.stack([s.onset for s in seen])))
-    inward = -(near.normal @ poses.rotation_matrix(truth).T)
-    lean = torch.stack([s.direction for s in seen]) - torch.atan2(inward[:, 1], inward[:, 0])
-    lean = torch.remainder(lean + math.pi, 2 * math.pi) - math.pi
-    cone = math.atan(settings.friction) + 2 * settings.direction_spread
-    assert float((lean.abs() < cone).double().mean()) >= 0.95
-
-
-def test_the_truth_explains_real_pushes_better_than_its_neighbours() -> None:
-    recording = log("10_90")
-    likelihood = log_likelihood(recording, around(torch.from_numpy(recording.truth), 0.002))
-    assert float(likelihood[0]) > float(likelihood[1:].max()) + 20.0
-    # A world seen in a mirror (forces the other way round) must not do.
-    flipped = replace(
-        recording,
-        measurements=[
-            Measurement(
-                m.action, Touch(m.observation.times, -m.observation.wrench, m.observation.world_from_peg)
-            )
-            for m in recording.measurements
-        ],
-    )
-    assert (
-        float(log_likelihood(flipped, around(torch.from_numpy(recording.truth), 0.002))[0])
-        < float(likelihood[0]) - 100
-    )
