@@ -1,0 +1,5 @@
+"""`python -m bcppl.cli`."""
+
+from bcppl.cli import main
+
+main()

@@ -1,0 +1,82 @@
+"""`bcppl check`, `bcppl import` and `bcppl simulate`: recordings in and out."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from bcppl.cli import loading
+from bcppl.errors import InputError
+from bcppl.recordings import Recording, describe, load, notes, problems, save, validate
+from bcppl.recordings.importers import importers
+
+OUT = Annotated[Path, typer.Option("--out", "-o", help="The recording to write (.h5).")]
+
+
+def check(
+    file: Annotated[Path, typer.Argument(help="A recording.")],
+) -> None:
+    """Say what a recording holds, and what is wrong with it (exit code 2 if anything is)."""
+    recording = load(file)
+    console = Console()
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for what, value in describe(recording):
+        table.add_row(f"[bold]{what}[/bold]", value)
+    console.print(table)
+    for note in notes(recording):
+        console.print(f"[yellow]note:[/yellow] {note}", highlight=False)
+    found = problems(recording)
+    for problem in found:
+        console.print(f"[red]wrong:[/red] {problem}", highlight=False)
+    if found:
+        raise typer.Exit(2)
+    console.print("[green]nothing wrong was found.[/green]")
+
+
+def simulate(
+    model: Annotated[str, typer.Argument(help="A model's name, or a file.")] = "peg_in_hole",
+    out: OUT = Path("recording.h5"),
+    seed: Annotated[int, typer.Option(help="Same seed, same recording.")] = 0,
+) -> None:
+    """Write a recording that a model's own world makes up: a true pose drawn from the prior, and noisy sensors."""
+    chosen = loading.model(model)
+    if chosen.invent is None:
+        raise InputError(f"model {model!r} invents no recordings; give one that has `invent`, such as peg_in_hole.")
+    _write(chosen.invent(seed), out)
+
+
+import_app = typer.Typer(help="Make a recording from data in another format.", no_args_is_help=True)
+
+
+def _write(recording: Recording, out: Path) -> None:
+    validate(recording)
+    if not out.parent.is_dir():
+        raise InputError(f"there is no folder {out.parent} to write {out.name} into; make it first.")
+    save(recording, out)
+    Console().print(f"wrote {out}: {dict(describe(recording))['measurements']}", highlight=False)
+
+
+def _importing(command: Callable[..., Recording]) -> Callable[..., None]:
+    """The command of an importer with `--out` added, its other options as the importer declares them."""
+
+    @functools.wraps(command)
+    def wrapped(*, out: Path, **options: Any) -> None:
+        _write(command(**options), out)
+
+    signature = inspect.signature(command)
+    added = inspect.Parameter("out", inspect.Parameter.KEYWORD_ONLY, annotation=OUT, default=Path("recording.h5"))
+    parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in signature.parameters.values()]
+    wrapped.__signature__ = signature.replace(parameters=[*parameters, added], return_annotation=None)  # type: ignore[attr-defined]
+    wrapped.__annotations__ = {p.name: p.annotation for p in [*parameters, added]}
+    return wrapped
+
+
+for _name, _module in importers().items():
+    import_app.command(_name, help=_module.HELP)(_importing(_module.command))

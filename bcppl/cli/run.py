@@ -1,0 +1,176 @@
+"""`bcppl run`: the main job, from a recording to beliefs, a table and two figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from bcppl import poses
+from bcppl.beliefs import average_distance, average_nearest_distance
+from bcppl.cli import loading
+from bcppl.errors import InputError
+from bcppl.figures import add_over_time, belief_in_3d
+from bcppl.recordings import Recording
+from bcppl.recordings.beliefs import save_belief
+
+HEADER = ("measurement", "time s", "ESS", "distinct", "log Z", "accepted", "steps", "ADD mm", "truth gap", "wall s")
+WIDTHS = (12, 7, 6, 8, 10, 8, 5, 7, 9, 7)
+
+
+def run(
+    recording: Annotated[str, typer.Argument(help="A recording (.h5), or the name of a shipped one.")],
+    model: Annotated[
+        str | None, typer.Option(help="A model's name or file; by default the one the recording names.")
+    ] = None,
+    inference: Annotated[str, typer.Option(help="An inference program's name or file.")] = "tempered_smc",
+    particles: Annotated[int, typer.Option(help="How many particles.")] = 75,
+    seed: Annotated[int, typer.Option(help="Same seed, same belief, bit for bit.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for beliefs and figures; runs/RECORDING by default.")
+    ] = None,
+) -> None:
+    """Find the part: one row for each measurement, the final pose with its spread, beliefs and figures."""
+    if particles < 2:
+        raise InputError(f"--particles is {particles}; give 2 or more, 75 is a good start.")
+    found = loading.recording(recording)
+    chosen = loading.model(model or found.model)
+    infer = loading.inference(inference)
+    folder = out or Path("runs") / Path(recording).stem
+    scene = chosen.prepare(found)
+    chosen.observe(scene, found.measurements)  # what cannot be read is refused before anything is written
+    console = Console(highlight=False)
+    steps: list[Any] = []
+    try:
+        with _progress(console) as progress:
+            task = progress.add_task("prior", total=len(found.measurements))
+            for step in infer(chosen, found, particles=particles, seed=seed, scene=scene):
+                if not steps:
+                    _start(folder)
+                    progress.console.print(_row(HEADER), style="bold", soft_wrap=True)
+                _keep(folder, len(steps), step)
+                steps.append(step)
+                progress.console.print(_row(_cells(step, found)), soft_wrap=True)
+                progress.update(task, completed=len(steps) - 1, description=step.info.label)
+    finally:
+        # Whatever stopped the run, what was computed is shown and kept.
+        if steps:
+            _report(console, found, steps)
+            _draw(folder, found, steps)
+            console.print(f"beliefs and figures are in {folder}")
+
+
+def _progress(console: Console) -> Progress:
+    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
+
+def _start(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in (*folder.glob("belief_*.h5"), *folder.glob("*.png")):
+        old.unlink()
+
+
+def _keep(folder: Path, number: int, step: Any) -> None:
+    save_belief(
+        step.belief,
+        folder / f"belief_{number:03d}.h5",
+        label=step.info.label,
+        log_evidence=step.info.log_evidence,
+        random_state=step.random_state,
+    )
+
+
+def _row(cells: Sequence[str]) -> str:
+    first, *others = (c.rjust(w) for c, w in zip(cells, WIDTHS, strict=True))
+    return " ".join([first.strip().ljust(WIDTHS[0]), *others])
+
+
+def _number(value: float, digits: int) -> str:
+    return "" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _cells(step: Any, recording: Recording) -> list[str]:
+    info = step.info
+    add = math.nan
+    if recording.truth is not None:
+        add = 1e3 * step.belief.weighted_add(recording.part.surface_points(), recording.truth)
+    return [
+        info.label,
+        _number(info.time, 2),
+        _number(info.effective_sample_size, 1),
+        str(info.distinct),
+        _number(info.log_evidence, 2),
+        _number(info.acceptance, 2),
+        str(len(info.exponents) or ""),
+        _number(add, 2),
+        _number(info.truth_gap, 2),
+        _number(info.seconds, 2),
+    ]
+
+
+def _report(console: Console, recording: Recording, steps: Sequence[Any]) -> None:
+    belief = steps[-1].belief
+    guess = torch.as_tensor(recording.guess.world_from_part, dtype=torch.float64)
+    turned = torch.rad2deg(poses.local(guess, belief.mean)[3:]).tolist()
+    mean, spread = belief.mean.tolist(), belief.spread.tolist()
+    table = Table(title="pose of the part (world_from_part)", title_justify="left", box=None, pad_edge=False)
+    for name in ("axis", "mean", "standard deviation"):
+        table.add_column(name, justify="left" if name == "axis" else "right")
+    for k, axis in enumerate("xyz"):
+        table.add_row(f"{axis}", f"{1e3 * mean[k]:.3f} mm", f"{1e3 * spread[k]:.3f} mm")
+    for k, axis in enumerate("xyz"):
+        table.add_row(
+            f"turn about the part's {axis}, from the guess",
+            f"{turned[k]:.3f}°",
+            f"{math.degrees(spread[3 + k]):.3f}°",
+        )
+    console.print(table)
+    console.print("quaternion w x y z: " + " ".join(f"{q:.6f}" for q in mean[3:]))
+    if recording.truth is not None:
+        points = recording.part.surface_points()
+        console.print(
+            f"ADD: {1e3 * belief.weighted_add(points, recording.truth):.3f} mm over the particles by weight, "
+            f"{1e3 * float(average_distance(belief.mean, points, recording.truth)):.3f} mm at the mean "
+            f"(ADD-S {1e3 * float(average_nearest_distance(belief.mean, points, recording.truth)):.3f} mm)"
+        )
+    wall = sum(step.info.seconds for step in steps)
+    spent = [f"wall time {wall:.2f} s"]
+    for name in steps[-1].info.effort:
+        efforts = [step.info.effort[name] for step in steps if name in step.info.effort]
+        unit = {"rendering": "images", "physics": "rollouts"}.get(name, "items")
+        spent.append(f"{name} {sum(e.seconds for e in efforts):.2f} s ({sum(e.items for e in efforts)} {unit})")
+        if name == "physics":
+            spent[-1] = spent[-1][:-1] + f", {sum(e.amount for e in efforts):.0f} s simulated)"
+    console.print(", ".join(spent))
+
+
+def _draw(folder: Path, recording: Recording, steps: Sequence[Any]) -> None:
+    points = recording.part.surface_points()
+    known = recording.truth is not None
+    true = recording.truth if known else steps[-1].belief.mean
+    adds = np.stack([step.belief.add(points, true).numpy() for step in steps])
+    weights = np.stack([step.belief.weights.numpy() for step in steps])
+    kinds = ["prior", *(m.kind for m in recording.measurements)][: len(steps)]
+    touched = [k for k, kind in enumerate(kinds) if kind in ("window", "push")]
+    labels = [step.info.label for step in steps]
+    contact = touched[0] if touched and "view" in kinds else None
+    figure = add_over_time(np.arange(len(steps), dtype=np.float64), adds, weights, labels, contact)
+    if not known:
+        figure.axes[0].set_ylabel("distance from the final mean (mm)")
+    figure.savefig(folder / "add_over_time.png", dpi=150)
+    views = [k for k, kind in enumerate(kinds) if kind == "view"]
+    middle = views[-1] if views else len(steps) // 2
+    panels = dict.fromkeys([0, middle, len(steps) - 1])
+    titles = {0: "start", middle: "after vision" if views else f"after {labels[middle]}"}
+    titles[len(steps) - 1] = ("after contact" if touched else "after vision") if len(steps) > 1 else "start"
+    shown = [(titles[k], steps[k].belief.world_from_part.numpy(), steps[k].belief.log_weights.numpy()) for k in panels]
+    belief_in_3d(recording.part, shown, recording.truth).savefig(folder / "belief_in_3d.png", dpi=150)

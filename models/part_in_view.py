@@ -1,0 +1,117 @@
+"""A part is seen by a depth camera, among clutter that nobody has modelled.
+
+The pose of a part is drawn from the prior, and every view is a depth image of it: Laplace noise where the ray
+meets the part, any depth at all where it does not or where something stands in the way. No mask is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyro
+import torch
+from torch import Tensor
+
+from bcppl.distributions.depth import RobustDepth
+from bcppl.distributions.poses import prior_from_guess
+from bcppl.errors import InputError
+from bcppl.parts import Part
+from bcppl.recordings.measurements import DepthImage, Measurement, Recording, View
+from bcppl.simulators.camera import Camera
+from bcppl.simulators.effort import Effort
+from bcppl.simulators.renderer import DepthRenderer
+from bcppl.traces import Model
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is known of the camera.
+
+    Attributes:
+        scale: of the Laplace noise, metres.
+        outlier: the probability that a pixel on the part shows something else.
+        effective_pixels: how many independent pixels an image is worth; None for all of them.
+        stride: every stride-th pixel in each direction is looked at.
+    """
+
+    scale: float = 0.005
+    outlier: float = 0.2
+    effective_pixels: float | None = None
+    stride: int = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What stays the same over a run: the part, the prior of its pose, its renderer, and what may be seen of it."""
+
+    part: Part
+    prior: Any
+    renderer: DepthRenderer
+    background: Mapping[str, npt.NDArray[np.float64]]
+    settings: Settings
+    regions: dict[str, npt.NDArray[np.bool_]] = field(default_factory=dict)
+
+    @property
+    def efforts(self) -> Mapping[str, Effort]:
+        """What each simulator has done so far."""
+        return {"rendering": self.renderer.effort}
+
+    def region(self, camera: Camera) -> npt.NDArray[np.bool_]:
+        """The pixels that count: a grid of the given stride."""
+        if camera.name not in self.regions:
+            grid = np.zeros((camera.height, camera.width), dtype=bool)
+            grid[:: self.settings.stride, :: self.settings.stride] = True
+            self.regions[camera.name] = grid
+        return self.regions[camera.name]
+
+
+def part_in_view(scene: Scene, actions: Sequence[View]) -> None:
+    """The program: the part's pose, then a depth image for every view."""
+    part = pyro.sample("part", scene.prior)
+    for k, view in enumerate(actions):
+        depth = RobustDepth(
+            scene.renderer,
+            view.camera,
+            part,
+            scale=scene.settings.scale,
+            outlier=scene.settings.outlier,
+            background=scene.background.get(view.camera.name),
+            effective_pixels=scene.settings.effective_pixels,
+            region=scene.region(view.camera),
+        )
+        pyro.sample(f"depth_{k}", depth)
+
+
+def prepare(recording: Recording, **settings: Any) -> Scene:
+    """The scene of a recording; `settings` are fields of `Settings`."""
+    return Scene(
+        recording.part,
+        prior_from_guess(recording.guess),
+        DepthRenderer(recording.part),
+        recording.background,
+        Settings(**settings),
+    )
+
+
+def observe(scene: Scene, measurements: Sequence[Measurement]) -> Mapping[str, Tensor]:
+    """The depth images, by address.
+
+    Raises:
+        InputError: a measurement is not a view.
+    """
+    values: dict[str, Tensor] = {}
+    for k, measurement in enumerate(measurements):
+        image = measurement.observation
+        if not isinstance(measurement.action, View) or not isinstance(image, DepthImage):
+            raise InputError(
+                f"measurement {k} is a {measurement.kind} and part_in_view explains views only; choose another model."
+            )
+        values[f"depth_{k}"] = torch.from_numpy(image.depth)
+    return values
+
+
+model = Model(program=part_in_view, prepare=prepare, observe=observe, pose="part")
