@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.contact import ChamferContacts, PegPose, chamfer
+from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose, chamfer
 from bcppl.errors import InputError
 
 NAN = math.nan
@@ -153,3 +154,52 @@ def test_the_pose_likelihood_looks_at_every_nth_stamp_of_the_probe() -> None:
     )
     lost = Felt(torch.zeros(2, 30, 3), torch.full((2, 30, 7), NAN).double(), torch.tensor([True, True]))
     assert PegPose(lost, 8, 18, 0.001, 0.01, 5).log_prob(value).tolist() == [-math.inf, -math.inf]
+
+
+def test_the_normalised_contact_likelihood_is_normalised() -> None:
+    torch.manual_seed(3)
+    settings: dict[str, Any] = {
+        "scale": 0.002,
+        "missed": 0.1,
+        "invented": 0.2,
+        "outlier": 0.3,
+        "reach": 0.03,
+        "every": 1,
+    }
+    place = points((10, -5, 3))
+    for contact in (place, torch.full((1, 3), NAN, dtype=torch.float64)):
+        one = ContactsInTime(Felt(contact[None]), 0, 1, **settings)
+        none = float(one.log_prob(torch.full((1, 3), NAN, dtype=torch.float64)).exp())
+        count = 200_000
+        width = torch.tensor([0.002, 0.03], dtype=torch.float64)
+        pick = torch.rand(count, 1, dtype=torch.float64) < 0.5
+        drawn = torch.where(
+            pick, place + width[0] * torch.randn(count, 3), width[1] * torch.randn(count, 3)
+        ).double()
+        gaussian = torch.distributions.Normal(torch.stack([place[0], 0 * place[0]]), width[:, None])
+        proposal = gaussian.log_prob(drawn[:, None]).sum(dim=-1).logsumexp(dim=-1) - math.log(2.0)
+        many = ContactsInTime(Felt(contact.expand(count, 1, 3)), 0, 1, **settings)
+        weight = torch.exp(many.log_prob(drawn[:, None]) - proposal)
+        assert none + float(weight.mean()) == pytest.approx(1.0, abs=0.01)
+        assert none == pytest.approx(0.1 if contact is place else 0.8)
+
+
+def test_the_normalised_contact_likelihood_samples_what_it_says() -> None:
+    torch.manual_seed(4)
+    contacts = torch.zeros(300, 100, 3, dtype=torch.float64)
+    contacts[:, ::2] = NAN
+    settings: dict[str, Any] = {
+        "scale": 0.001,
+        "missed": 0.1,
+        "invented": 0.2,
+        "outlier": 0.3,
+        "reach": 0.05,
+        "every": 1,
+    }
+    drawn = ContactsInTime(Felt(contacts), 0, 100, **settings).sample()
+    felt = torch.isfinite(drawn).all(dim=-1)
+    assert float(felt[:, ::2].double().mean()) == pytest.approx(0.2, abs=0.012)
+    assert float(felt[:, 1::2].double().mean()) == pytest.approx(0.9, abs=0.009)
+    far = drawn[:, 1::2][felt[:, 1::2]].norm(dim=-1) > 0.005
+    assert float(far.double().mean()) == pytest.approx(0.3, abs=0.015)
+    assert float(drawn[:, ::2][felt[:, ::2]].std()) == pytest.approx(0.05, rel=0.03)

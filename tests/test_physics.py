@@ -60,7 +60,7 @@ def test_pressing_on_a_plane_gives_the_spring_s_force_upwards(peg: Part) -> None
     force = rollout.wrench[0, -1, 2]
     assert force == pytest.approx(2000 * 0.003, rel=0.02)
     assert force == pytest.approx(2000 * (rollout.world_from_peg[0, -1, 2] - 0.047), rel=1e-3)
-    assert rollout.world_from_peg[0, -1, 2] == pytest.approx(0.05, abs=2e-5)
+    assert rollout.world_from_peg[0, -1, 2] == pytest.approx(0.05, abs=5e-5)
 
 
 def test_the_spring_acts_along_the_commanded_axes_and_the_wrench_is_in_the_peg_s() -> None:
@@ -71,7 +71,7 @@ def test_the_spring_acts_along_the_commanded_axes_and_the_wrench_is_in_the_peg_s
     rollout = PegPhysics(part, SQUARE).start(at((0.05, 0.0, 0.05)), probe).advance(150)
     np.testing.assert_allclose(turn.apply([0, 0, -1]), [1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(rollout.wrench[0, -1, :3], [0, 0, 2000 * 0.003], atol=0.12)
-    np.testing.assert_allclose(rollout.world_from_peg[0, -1, :3], [-0.05, 0, 0], atol=2e-5)
+    np.testing.assert_allclose(rollout.world_from_peg[0, -1, :3], [-0.05, 0, 0], atol=5e-5)
 
 
 def test_a_side_touch_stops_at_the_face() -> None:
@@ -120,6 +120,16 @@ def test_a_peg_enters_an_aligned_hole_and_not_one_that_is_off_by_a_millimetre() 
     assert depth[1] == pytest.approx(0.0, abs=1e-4)
     assert abs(rollout.wrench[0, -1]).max() < 0.01
     assert rollout.wrench[1, -1, 2] > 5.0
+
+
+def test_a_peg_slides_without_chatter() -> None:
+    probe = path((0, -0.015, 0.003, 0.055), (0.6, -0.015, 0.003, 0.047), (1.6, -0.005, 0.001, 0.047))
+    rollout = PegPhysics(block((0.1, 0.1, 0.02)), SQUARE).start(at((0, 0, 0)), probe).advance(150)
+    force = rollout.wrench[0, 100:]
+    assert force[:, 2].std() < 0.01
+    # Sliding along +x: friction pulls back with 0.3 of the normal force.
+    np.testing.assert_allclose(np.hypot(force[:, 0], force[:, 1]), 0.3 * force[:, 2], rtol=0.01)
+    assert (force[:, 0] < 0).all() and (force[:, 1] > 0).all()
 
 
 SEARCH = path((0, 0, 0, 0.06), (0.5, 0, 0, 0.047), (1.0, 0.006, 0.002, 0.045), (1.2, 0.006, 0.002, 0.03))

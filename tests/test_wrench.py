@@ -7,8 +7,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose
 from bcppl.errors import InputError
 from bcppl.recordings.measurements import Probe, Touch
+from bcppl.simulators.peg_model import ContactParameters
 from bcppl.simulators.physics import PegPhysics
 from bcppl.simulators.shapes import block, block_with_square_hole, box_peg, round_peg
 from bcppl.simulators.track import ContactTrack
@@ -172,3 +174,44 @@ def test_tracks_are_indexed_and_merged_like_the_poses_they_hang_on() -> None:
     wanted = torch.where(mask[:, None, None], expected, expected.flip(0))
     torch.testing.assert_close(merged.window(0, 150)[0], wanted, rtol=0, atol=0, equal_nan=True)
     torch.testing.assert_close(merged.inputs[0], torch.where(mask[:, None], part, part.flip(0)))
+
+
+def test_the_truth_explains_its_own_recording_best() -> None:
+    # Recorded with steps four times as fine, and with a sensor that is noisy and not at zero.
+    rng = np.random.default_rng(5)
+    hole = block_with_square_hole()
+    # Against the block's side 10 mm below its top, back, over it, and down onto its top, sliding.
+    corners = np.array(
+        [
+            [0.0, -0.045, 0.0, 0.04],
+            [0.3, -0.045, 0.0, 0.04],
+            [1.3, -0.033, 0.001, 0.04],
+            [1.6, -0.045, 0.0, 0.04],
+            [1.8, -0.045, 0.0, 0.06],
+            [2.3, -0.015, 0.003, 0.06],
+            [2.9, -0.015, 0.003, 0.047],
+            [3.5, -0.010, 0.002, 0.047],
+        ]
+    )
+    command = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], dtype=np.float64), (8, 1))
+    command[:, :3] = corners[:, 1:]
+    stamps = np.arange(0.0, 3.5, 0.01)
+    probe = Probe("side, then top", corners[:, 0], command, STIFFNESS, DAMPING, stamps)
+    truth = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64)
+    real = PegPhysics(hole, PEG, ContactParameters(time_step=0.0005)).start(truth, probe).advance(350)
+    noise = rng.normal(size=(350, 6)) * ([0.1] * 3 + [0.003] * 3) + [1.0, -1, 2, 0.1, 0, 0.1]
+    sensing = Sensing(PEG, rate=100.0, tare=20)
+    contacts, pose = sensing.measure([Touch(stamps, real.wrench[0] + noise, real.world_from_peg[0])])[0]
+
+    offsets = torch.tensor([[0.0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 0, 1], [0, 0, -1], [3, 0, 0], [0, 0, 3]])
+    part = truth.repeat(len(offsets), 1)
+    part[:, :3] += 0.001 * offsets
+    track = ContactTrack.start(PegPhysics(hole, PEG), sensing, part, probe)
+    for likelihood, value in (
+        (ChamferContacts(track, 0, 350, 0.001, 18e-6), contacts),
+        (ContactsInTime(track, 0, 350, 0.001), contacts),
+        (PegPose(track, 0, 350, 0.0002, 0.001), pose),
+    ):
+        log_prob = likelihood.log_prob(value)
+        assert (log_prob[0] > log_prob[1:] + 0.1).all()
+        assert (log_prob[[5, 6]] < log_prob[[1, 3]]).all()

@@ -63,6 +63,11 @@ def _check_positive(name: str, **settings: float) -> None:
             raise InputError(f"{name} has {setting} = {value!r}; give a number greater than 0.")
 
 
+def _log_gaussian(squared: Tensor, scale: float) -> Tensor:
+    """Log-density of an isotropic Gaussian in three dimensions at a squared distance."""
+    return -0.5 * squared / scale**2 - 3.0 * math.log(scale) - 1.5 * math.log(2.0 * math.pi)
+
+
 class ChamferContacts(LazyDistribution):
     """Contact locations felt during stamps `first` to `last` of a probe: log p = -D_ch / (2 scale^2).
 
@@ -118,12 +123,87 @@ class ChamferContacts(LazyDistribution):
         return torch.where(gone[..., None], math.nan, noisy)
 
 
+class ContactsInTime(LazyDistribution):
+    """A contact location or none at every `every`-th stamp of `first` to `last` of a probe: normalised.
+
+    Where the simulated peg touches, nothing is felt with probability `missed`, else a location: Gaussian
+    about the simulated one, or, with probability `outlier`, anywhere. Where it does not touch, a location
+    anywhere is felt with probability `invented`, else none. Anywhere is a Gaussian of standard deviation
+    `reach` along each axis about the origin of the simulated peg. The density is with respect to counting
+    measure on "none" plus Lebesgue measure on locations (cubic metres), at each stamp looked at.
+
+    The event is (last - first, 3): locations in the world, a row of NaN where nothing was touched. Particles
+    whose physics diverged have log p = -inf.
+
+    Args:
+        track: the probe as the particles feel it.
+        first: the first stamp.
+        last: the stamp after the last.
+        scale: standard deviation of a location along each axis, metres.
+        missed: probability that a contact is not felt.
+        invented: probability that one is felt without a contact.
+        outlier: probability that a contact is felt at the wrong place.
+        reach: metres.
+        every: stamps whose number is a multiple of this are looked at, for errors of neighbours go together.
+    """
+
+    def __init__(
+        self,
+        track: Track,
+        first: int,
+        last: int,
+        scale: float,
+        missed: float = 0.02,
+        invented: float = 0.02,
+        outlier: float = 0.05,
+        reach: float = 0.05,
+        every: int = 10,
+    ) -> None:
+        _check_window("ContactsInTime", first, last)
+        _check_positive("ContactsInTime", scale=scale, reach=reach, every=every)
+        for name, value in (("missed", missed), ("invented", invented), ("outlier", outlier)):
+            if not 0 < value < 1:
+                raise InputError(
+                    f"ContactsInTime has {name} = {value!r}; give a probability above 0 and below 1."
+                )
+        self.track, self.first, self.last = track, first, last
+        self.scale, self.missed, self.invented, self.outlier = scale, missed, invented, outlier
+        self.reach, self.every = reach, every
+        super().__init__(len(track), (last - first, 3), track.inputs)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-probability (N,) of locations (T, 3), or (N, T, 3)."""
+        contacts, pose = self.track.window(self.first, self.last)
+        chosen = slice(-self.first % self.every, None, self.every)
+        contacts, pose = contacts[:, chosen], pose[:, chosen]
+        value = value.to(torch.float64)[..., chosen, :]
+        touching, felt = torch.isfinite(contacts).all(dim=-1), torch.isfinite(value).all(dim=-1)
+        value = torch.nan_to_num(value)
+        anywhere = _log_gaussian((value - pose[..., :3]).square().sum(dim=-1), self.reach)
+        near = _log_gaussian((value - torch.nan_to_num(contacts)).square().sum(dim=-1), self.scale)
+        here = torch.logaddexp(near + math.log1p(-self.outlier), anywhere + math.log(self.outlier))
+        of_touch = torch.where(felt, here + math.log1p(-self.missed), math.log(self.missed))
+        of_none = torch.where(felt, anywhere + math.log(self.invented), math.log1p(-self.invented))
+        log_prob = torch.where(touching, of_touch, of_none).sum(dim=-1)
+        return torch.where(self.track.diverged, -math.inf, log_prob)
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """Locations (N, T, 3), NaN where none is felt; all stamps are drawn, independently."""
+        contacts, pose = self.track.window(self.first, self.last)
+        shape = contacts.shape[:-1]
+
+        def happens(probability: float) -> Tensor:
+            return torch.rand(shape, dtype=torch.float64) < probability
+
+        touching = torch.isfinite(contacts).all(dim=-1)
+        felt = torch.where(touching, ~happens(self.missed), happens(self.invented))
+        astray = (~touching | happens(self.outlier))[..., None]
+        noise = torch.randn(*shape, 3, dtype=torch.float64)
+        location = torch.where(astray, pose[..., :3] + self.reach * noise, contacts + self.scale * noise)
+        return torch.where(felt[..., None], location, math.nan)
+
+
 _WIDER, _WIDE_WEIGHT = 10.0, 0.05
-
-
-def _log_gaussian(squared: Tensor, scale: float) -> Tensor:
-    """Log-density of an isotropic Gaussian in three dimensions at a squared distance."""
-    return -0.5 * squared / scale**2 - 3.0 * math.log(scale) - 1.5 * math.log(2.0 * math.pi)
 
 
 def _log_mass_within_pi(scale: float) -> float:

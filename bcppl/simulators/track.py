@@ -41,8 +41,10 @@ class ContactTrack:
         """Before the first stamp, for poses (N, 7) of the part.
 
         Raises:
-            InputError: the poses are not (N, 7) and finite, or the probe cannot be simulated.
+            InputError: the poses are not (N, 7) and finite, the probe cannot be simulated, or its stamps are
+                not at sensing's rate.
         """
+        sensing.check_rate(probe.stamps, f"probe {probe.name!r}")
         rollout = physics.start(world_from_part, probe)
         particles = len(rollout)
         return cls(

@@ -124,6 +124,20 @@ class Sensing:
         """The state before the first sample of N signals."""
         return SensingState(np.empty((signals, 0, 6)), np.zeros((signals, len(self._sections), 2, 6)))
 
+    def check_rate(self, times: Array, name: str) -> None:
+        """Refuse times (T,) that are not `rate` per second.
+
+        Raises:
+            InputError: the mean rate is off by more than 2 %.
+        """
+        if len(times) < 2:
+            return
+        rate = (len(times) - 1) / (times[-1] - times[0])
+        if not abs(rate / self.rate - 1.0) <= 0.02:
+            raise InputError(
+                f"{name} has {rate:.4g} samples per second, not {self.rate:.4g}; set Sensing's rate to that."
+            )
+
     def clean(self, wrench: Array, state: SensingState) -> tuple[Array, SensingState]:
         """Tared and filtered wrenches (N, T, 6) of a chunk of raw ones, NaN while taring, and the new state.
 
@@ -231,13 +245,7 @@ class Sensing:
                     f"window {k} has {len(touch.times)} times, wrenches {touch.wrench.shape} and peg poses "
                     f"{touch.world_from_peg.shape}; give (T,), (T, 6) and (T, 7)."
                 )
-            if len(touch.times) > 1:
-                rate = (len(touch.times) - 1) / (touch.times[-1] - touch.times[0])
-                if abs(rate / self.rate - 1.0) > 0.02:
-                    raise InputError(
-                        f"window {k} has {rate:.4g} samples per second, not {self.rate:.4g}; "
-                        "set Sensing's rate to the recording's."
-                    )
+            self.check_rate(touch.times, f"window {k}")
             locations, state = self.contacts(touch.wrench[None].astype(np.float64), state)
             pose = torch.from_numpy(np.array(touch.world_from_peg, dtype=np.float64))
             measured.append((in_world(torch.from_numpy(locations[0]), pose), pose))
