@@ -25,7 +25,7 @@ class ContactParameters:
 
     Attributes:
         time_step: seconds. Going down and sliding into a hole, a peg is off its path at 0.25 ms by at most
-            5 um at 1 ms, 13 um at 2 ms, 19 um at 4 ms (medians over poses), save where it just finds the hole.
+            5 um at 1 ms, 13 at 2 and 19 at 4 (medians over poses), save where it just finds the hole.
         friction: Coulomb's coefficient between peg and part.
         time_constant: of a contact that settles, seconds (MuJoCo's solref; taken as at least two time steps).
         damping_ratio: of a contact that settles; 1 is critical.

@@ -123,10 +123,13 @@ class Rollout:
         particles = len(world_from_part)
         free, level = np.zeros(particles, dtype=np.int64), np.zeros(particles, dtype=np.int64)
         standing = session.clocks[0].beginning(particles)
-        if session.skip:
-            free = first_possible_touch(session.approach, session.part, session.peg, world_from_part)
-            standing = session.approach.standing[free]
         return cls(session, world_from_part, np.empty((particles, 0, SENSED)), standing, free, level)
+
+    def _skip_approach(self) -> None:
+        """Begin each simulation at the last stamp of its free approach."""
+        session = self.session
+        self._free = first_possible_touch(session.approach, session.part, session.peg, self.world_from_part)
+        self._standing = session.approach.standing[self._free]
 
     def __len__(self) -> int:
         return len(self.world_from_part)
@@ -202,6 +205,8 @@ class Rollout:
         if count <= done or len(self) == 0:
             return self if count <= done else self._extended(np.empty((0, count - done, SENSED)))
         with self.session.effort.measure(items=len(self) if done == 0 else 0):
+            if done == 0 and self.session.skip:
+                self._skip_approach()
             fresh = np.full((len(self), count - done, SENSED), np.nan)
             full = np.flatnonzero(self._level == _FULL)
             halved = np.flatnonzero(self._level == _HALVED)
