@@ -109,7 +109,9 @@ class Belief:
         return float(self.weights @ self.add(points, truth))
 
 
-def average_distance(world_from_part: Tensor, points: np.ndarray | Tensor, truth: np.ndarray | Tensor) -> Tensor:
+def average_distance(
+    world_from_part: Tensor, points: np.ndarray | Tensor, truth: np.ndarray | Tensor
+) -> Tensor:
     """ADD (...) of poses (..., 7) against a true pose (7,) over model points (M, 3), metres."""
     points, truth = torch.as_tensor(points), torch.as_tensor(truth, dtype=torch.float64)
     there = poses.transform(truth, points)

@@ -52,7 +52,9 @@ def drift_and_weigh(fit: Fit, resample: Resample) -> Assimilate:
     ) -> Assimilated:
         population = drifted(population, fit)
         longer, log_likelihood = extend(population.trace, args, observations)
-        population = Population(longer, population.log_weights, population.log_evidence).reweighed(log_likelihood)
+        population = Population(longer, population.log_weights, population.log_evidence).reweighed(
+            log_likelihood
+        )
         population, _ = resample(population)
         return Assimilated(population, float("nan"), (1.0,))
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import torch
 from dataclasses import dataclass, replace
+
+import torch
 from torch import Tensor
 
 from bcppl.beliefs import Belief, effective_sample_size
@@ -45,7 +46,9 @@ class Population:
 
     def selected(self, ancestors: Tensor) -> Population:
         """The particles at `ancestors` (N,), equally weighted."""
-        return replace(self, trace=self.trace[ancestors], log_weights=torch.zeros(len(ancestors), dtype=torch.float64))
+        return replace(
+            self, trace=self.trace[ancestors], log_weights=torch.zeros(len(ancestors), dtype=torch.float64)
+        )
 
     def __getitem__(self, index: Tensor) -> Population:
         return replace(self, trace=self.trace[index], log_weights=self.log_weights[index])

@@ -40,7 +40,9 @@ def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fit:
 
     def fit(population: Population) -> Callable[[Trace], None]:
         freedom = getattr(population.trace.distributions[address], "freedom", None)
-        covariance = _pose_spread(population, address, freedom) if freedom else _vector_spread(population, address)
+        covariance = (
+            _pose_spread(population, address, freedom) if freedom else _vector_spread(population, address)
+        )
         covariance = covariance * (2.38**2 / len(covariance))
         factor = torch.linalg.cholesky(covariance)
 
@@ -50,11 +52,17 @@ def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fit:
                 value = trace[address]
                 event = value.shape[1:]
                 flat = dist.MultivariateNormal(
-                    value.reshape(len(value), -1), scale_tril=size[:, None, None] * factor, validate_args=False
+                    value.reshape(len(value), -1),
+                    scale_tril=size[:, None, None] * factor,
+                    validate_args=False,
                 )
-                pyro.sample(address, dist.TransformedDistribution(flat, _reshape(event)) if len(event) != 1 else flat)
+                pyro.sample(
+                    address, dist.TransformedDistribution(flat, _reshape(event)) if len(event) != 1 else flat
+                )
             else:
-                pyro.sample(address, NormalPose(trace[address], size[:, None, None] ** 2 * covariance, freedom))
+                pyro.sample(
+                    address, NormalPose(trace[address], size[:, None, None] ** 2 * covariance, freedom)
+                )
 
         return random_walk
 

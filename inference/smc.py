@@ -133,7 +133,13 @@ class Step(NamedTuple):
 
 
 def smc(
-    model: Model, recording: Any, *, assimilate: Assimilate, particles: int = 75, seed: int = 0, scene: Any = None
+    model: Model,
+    recording: Any,
+    *,
+    assimilate: Assimilate,
+    particles: int = 75,
+    seed: int = 0,
+    scene: Any = None,
 ) -> Iterator[Step]:
     """Run SMC over a recording: yields the prior's belief first, then one step for each measurement.
 
@@ -154,7 +160,9 @@ def smc(
         trace, log_weights = generate(model.program, (scene, []), {}, particles)
     population = Population(trace, log_weights)
     truth = _truth(model, scene, recording, trace)
-    started = Info("prior", float("nan"), float(particles), 0.0, particles, float("nan"), (), float("nan"), 0.0, {})
+    started = Info(
+        "prior", float("nan"), float(particles), 0.0, particles, float("nan"), (), float("nan"), 0.0, {}
+    )
     yield Step(population.belief(model.pose), started, population, state[0])
     for count, measurement in enumerate(recording.measurements, start=1):
         label = f"{measurement.kind} {count}"
@@ -211,5 +219,3 @@ def _effort(scene: Any) -> dict[str, Any]:
 def _time(measurement: Any) -> float:
     times = getattr(measurement.observation, "times", None)
     return float(times[-1]) if times is not None and len(times) else float("nan")
-
-

@@ -56,7 +56,9 @@ def test_gaussian_evidence_and_posterior() -> None:
     assert abs(errors.mean()) < 0.05
     assert errors.std(ddof=1) < 0.1
     posterior = torch.linalg.inv(torch.eye(6, dtype=torch.float64) + torch.linalg.inv(covariance))
-    second = torch.stack([(w := torch.softmax(p.log_weights, 0)) @ p.trace["x"] ** 2 for p in populations]).mean(0)
+    second = torch.stack(
+        [(w := torch.softmax(p.log_weights, 0)) @ p.trace["x"] ** 2 for p in populations]
+    ).mean(0)
     torch.testing.assert_close(second, posterior.diagonal(), rtol=0.06, atol=0.0)
 
 
@@ -81,7 +83,9 @@ def test_known_correspondence_evidence(diagonal: tuple[float, ...], log_c: float
     turn = roma.rotvec_to_rotmat(torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64))
     seen = model @ turn.T
     exact = (
-        -4.5 * math.log(2 * math.pi * noise**2) - float((seen**2).sum() + (model**2).sum()) / (2 * noise**2) + log_c
+        -4.5 * math.log(2 * math.pi * noise**2)
+        - float((seen**2).sum() + (model**2).sum()) / (2 * noise**2)
+        + log_c
     )
 
     def program(count: int) -> None:
@@ -94,7 +98,10 @@ def test_known_correspondence_evidence(diagonal: tuple[float, ...], log_c: float
     assert abs(errors.mean()) < 0.05
     assert errors.std(ddof=1) < 0.1
     best = populations[0].belief("pose").mean
-    assert float(torch.rad2deg(poses.local(best, poses.from_rotation_matrix(torch.zeros(3), turn))[3:].norm())) < 10
+    assert (
+        float(torch.rad2deg(poses.local(best, poses.from_rotation_matrix(torch.zeros(3), turn))[3:].norm()))
+        < 10
+    )
 
 
 def test_coins_have_no_variance() -> None:

@@ -37,7 +37,9 @@ def haar_reference(center: torch.Tensor, half_width: float, freedom: Freedom) ->
         import roma
 
         quaternion = roma.rotvec_to_unitquat(turn)
-    draws = poses.compose(center, poses.from_translation_quaternion_xyzw(torch.zeros(3, dtype=torch.float64), quaternion))
+    draws = poses.compose(
+        center, poses.from_translation_quaternion_xyzw(torch.zeros(3, dtype=torch.float64), quaternion)
+    )
     draws[:, :3] = center[:3] + shift
     return draws, len(freedom.translation) * math.log(2 * half_width)
 
@@ -101,7 +103,9 @@ def test_composition_matches_matrices_and_points() -> None:
     inner = poses.transform(b, points)
     outer = inner @ poses.rotation_matrix(a).transpose(-1, -2) + a[:, None, :3]
     torch.testing.assert_close(composed, outer)
-    torch.testing.assert_close(poses.compose(a, poses.inverse(a))[:, :3], torch.zeros(50, 3, dtype=torch.float64))
+    torch.testing.assert_close(
+        poses.compose(a, poses.inverse(a))[:, :3], torch.zeros(50, 3, dtype=torch.float64)
+    )
 
 
 def test_antipodal_quaternions_are_one_pose() -> None:

@@ -29,7 +29,9 @@ def recording(name: str) -> Recording:
         shipped = importlib.resources.files(bcppl.models) / "recordings"
         names = sorted(p.name.removesuffix(".h5") for p in shipped.iterdir() if p.name.endswith(".h5"))
         if name not in names:
-            raise InputError(f"there is no recording {name!r}: give a file, or one that ships: {', '.join(names)}.")
+            raise InputError(
+                f"there is no recording {name!r}: give a file, or one that ships: {', '.join(names)}."
+            )
         with importlib.resources.as_file(shipped / f"{name}.h5") as file:
             found = load(file)
     else:
@@ -81,7 +83,9 @@ def _defined(name: str, package: ModuleType, attribute: str, kind: type | None) 
 
 def _from_file(path: Path, package: ModuleType, word: str) -> ModuleType:
     if not path.is_file():
-        raise InputError(f"there is no {word} file {path}; give an existing file ending in .py, or a shipped name.")
+        raise InputError(
+            f"there is no {word} file {path}; give an existing file ending in .py, or a shipped name."
+        )
     # A shipped file given by its path is the shipped module: loaded twice, its classes would exist twice.
     for home in package.__path__:
         if path.resolve().parent == Path(home).resolve():
@@ -98,7 +102,9 @@ def _from_file(path: Path, package: ModuleType, word: str) -> ModuleType:
     except InputError:
         raise
     except SyntaxError as error:
-        raise InputError(f"the {word} file {path} is no valid Python: {error.msg}, line {error.lineno}.") from error
+        raise InputError(
+            f"the {word} file {path} is no valid Python: {error.msg}, line {error.lineno}."
+        ) from error
     except Exception as error:
         raise InputError(
             f"the {word} file {path} stopped with {type(error).__name__}: {error}; run `python {path}` to see where."

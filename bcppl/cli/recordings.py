@@ -48,7 +48,9 @@ def simulate(
     """Write a recording that a model's own world makes up: a true pose drawn from the prior, and noisy sensors."""
     chosen = loading.model(model)
     if chosen.invent is None:
-        raise InputError(f"model {model!r} invents no recordings; give one that has `invent`, such as peg_in_hole.")
+        raise InputError(
+            f"model {model!r} invents no recordings; give one that has `invent`, such as peg_in_hole."
+        )
     _write(chosen.invent(seed), out)
 
 
@@ -71,7 +73,9 @@ def _importing(command: Callable[..., Recording]) -> Callable[..., None]:
         _write(command(**options), out)
 
     signature = inspect.signature(command)
-    added = inspect.Parameter("out", inspect.Parameter.KEYWORD_ONLY, annotation=OUT, default=Path("recording.h5"))
+    added = inspect.Parameter(
+        "out", inspect.Parameter.KEYWORD_ONLY, annotation=OUT, default=Path("recording.h5")
+    )
     parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in signature.parameters.values()]
     wrapped.__signature__ = signature.replace(parameters=[*parameters, added], return_annotation=None)  # type: ignore[attr-defined]
     wrapped.__annotations__ = {p.name: p.annotation for p in [*parameters, added]}

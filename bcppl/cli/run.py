@@ -22,7 +22,18 @@ from bcppl.figures import add_over_time, belief_in_3d
 from bcppl.recordings import Recording
 from bcppl.recordings.beliefs import save_belief
 
-HEADER = ("measurement", "time s", "ESS", "distinct", "log Z", "accepted", "steps", "ADD mm", "truth gap", "wall s")
+HEADER = (
+    "measurement",
+    "time s",
+    "ESS",
+    "distinct",
+    "log Z",
+    "accepted",
+    "steps",
+    "ADD mm",
+    "truth gap",
+    "wall s",
+)
 WIDTHS = (12, 7, 6, 8, 10, 8, 5, 7, 9, 7)
 
 
@@ -147,7 +158,9 @@ def _report(console: Console, recording: Recording, steps: Sequence[Any]) -> Non
     for name in steps[-1].info.effort:
         efforts = [step.info.effort[name] for step in steps if name in step.info.effort]
         unit = {"rendering": "images", "physics": "rollouts"}.get(name, "items")
-        spent.append(f"{name} {sum(e.seconds for e in efforts):.2f} s ({sum(e.items for e in efforts)} {unit})")
+        spent.append(
+            f"{name} {sum(e.seconds for e in efforts):.2f} s ({sum(e.items for e in efforts)} {unit})"
+        )
         if name == "physics":
             spent[-1] = spent[-1][:-1] + f", {sum(e.amount for e in efforts):.0f} s simulated)"
     console.print(", ".join(spent))
@@ -172,5 +185,8 @@ def _draw(folder: Path, recording: Recording, steps: Sequence[Any]) -> None:
     panels = dict.fromkeys([0, middle, len(steps) - 1])
     titles = {0: "start", middle: "after vision" if views else f"after {labels[middle]}"}
     titles[len(steps) - 1] = ("after contact" if touched else "after vision") if len(steps) > 1 else "start"
-    shown = [(titles[k], steps[k].belief.world_from_part.numpy(), steps[k].belief.log_weights.numpy()) for k in panels]
+    shown = [
+        (titles[k], steps[k].belief.world_from_part.numpy(), steps[k].belief.log_weights.numpy())
+        for k in panels
+    ]
     belief_in_3d(recording.part, shown, recording.truth).savefig(folder / "belief_in_3d.png", dpi=150)

@@ -157,7 +157,9 @@ class SwingTwistPose(_PoseDistribution):
         rotation = "all" if self.tilt > 0 else "z" if self.yaw > 0 else "none"
         self.widths, freedom = _half_widths(translation, rotation)
         super().__init__(poses.as_pose(center, "the centre of a pose prior"), freedom)
-        volume = (0.5 * (1.0 - math.cos(self.tilt)) if self.tilt > 0 else 1.0) * (self.yaw / math.pi if self.yaw else 1.0)
+        volume = (0.5 * (1.0 - math.cos(self.tilt)) if self.tilt > 0 else 1.0) * (
+            self.yaw / math.pi if self.yaw else 1.0
+        )
         free = self.widths[self.widths > 0]
         self.log_density = -math.log(volume) - float(torch.log(2.0 * free).sum())
 
@@ -256,7 +258,8 @@ class NormalPose(_PoseDistribution):
                 stretch = 1.0 + winding / angle.clamp_min(1e-12)
                 wound = torch.cat([tangent[..., :3], tangent[..., 3:] * stretch[..., None]], dim=-1)
             terms.append(
-                self._normal.log_prob(self.freedom.coordinates(wound)) - self.freedom.log_base_density(angle + winding)
+                self._normal.log_prob(self.freedom.coordinates(wound))
+                - self.freedom.log_base_density(angle + winding)
             )
         density = terms[0] if len(terms) == 1 else torch.logsumexp(torch.stack(terms), dim=0)
         return torch.where(self.freedom.off_axis(tangent) <= HELD, density, -torch.inf)

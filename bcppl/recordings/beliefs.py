@@ -33,7 +33,9 @@ def save_belief(
     unfinished = path.with_name(path.name + ".part")
     try:
         with h5py.File(unfinished, "w") as file:
-            file.attrs.update(format=FORMAT, schema_version=SCHEMA_VERSION, label=label, log_evidence=log_evidence)
+            file.attrs.update(
+                format=FORMAT, schema_version=SCHEMA_VERSION, label=label, log_evidence=log_evidence
+            )
             file.attrs.update(
                 free_translation=belief.freedom.translation, free_rotation=belief.freedom.rotation
             )
@@ -60,7 +62,10 @@ def load_belief(path: str | os.PathLike[str]) -> Belief:
             if file.attrs.get("format") != FORMAT or int(file.attrs["schema_version"]) > SCHEMA_VERSION:
                 raise InputError(f"{path} holds no belief that this version of bcppl reads; run it again.")
             freedom = Freedom(str(file.attrs["free_translation"]), str(file.attrs["free_rotation"]))
-            poses, log_weights = torch.from_numpy(file["world_from_part"][:]), torch.from_numpy(file["log_weights"][:])
+            poses, log_weights = (
+                torch.from_numpy(file["world_from_part"][:]),
+                torch.from_numpy(file["log_weights"][:]),
+            )
     except (OSError, KeyError) as error:
         raise InputError(f"{path} is no whole belief file ({error}); run it again.") from error
     return Belief(poses, log_weights, freedom)

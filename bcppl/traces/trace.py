@@ -55,7 +55,9 @@ def run(
             recorded = tracer.get_trace()
     except RuntimeError as error:
         if "Multiple" in str(error) and "sites named" in str(error):
-            raise InputError(f"the program visits an address twice: {error}; give each site its own.") from error
+            raise InputError(
+                f"the program visits an address twice: {error}; give each site its own."
+            ) from error
         raise
     distributions: dict[str, Any] = {}
     values: dict[str, Tensor] = {}
@@ -66,7 +68,9 @@ def run(
         if site["infer"].get("_deterministic"):
             continue
         if site["infer"].get("enumerate"):
-            raise InputError(f"site {address!r} is enumerated, which particles cannot be; remove `enumerate`.")
+            raise InputError(
+                f"site {address!r} is enumerated, which particles cannot be; remove `enumerate`."
+            )
         distribution, value = site["fn"], site["value"]
         shape = tuple(distribution.batch_shape)
         if shape != (particles,):

@@ -19,7 +19,9 @@ from bcppl.traces.carried import Entry
 from bcppl.traces.trace import Program, Run, Trace, run
 
 
-def _trace(program: Program, args: tuple[Any, ...], particles: int, ran: Run, observed: Mapping[str, Tensor]) -> Trace:
+def _trace(
+    program: Program, args: tuple[Any, ...], particles: int, ran: Run, observed: Mapping[str, Tensor]
+) -> Trace:
     hidden = {a: v for a, v in ran.values.items() if a not in observed and a not in ran.fixed}
     return Trace(program, args, particles, hidden, dict(observed), dict(ran.carried))
 
@@ -84,7 +86,9 @@ def extend(trace: Trace, args: tuple[Any, ...], observations: Mapping[str, Tenso
     old = {**trace.choices, **trace.observations}
     again = [a for a in observations if a in old]
     if again:
-        raise InputError(f"address {again[0]!r} was observed or sampled before; extend takes new addresses only.")
+        raise InputError(
+            f"address {again[0]!r} was observed or sampled before; extend takes new addresses only."
+        )
     ran = run(trace.program, args, trace.particles, {**old, **observations}, trace.carried)
     _refuse_unvisited(observations, ran)
     lost = [a for a in old if a not in ran.distributions]
@@ -115,7 +119,7 @@ class Update:
 
     @cached_property
     def log_ratio(self) -> Tensor:
-        """log p(new trace) - log p(old trace), (N,)."""
+        """Log p(new trace) - log p(old trace), (N,)."""
         return self.trace.log_prob() - self.previous.log_prob()
 
 
@@ -154,5 +158,7 @@ def assess(program: Program, args: tuple[Any, ...], choices: Mapping[str, Tensor
     _refuse_unvisited(choices, ran)
     missing = [a for a in ran.values if a not in choices and a not in ran.fixed]
     if missing:
-        raise InputError(f"assess needs a value for address {missing[0]!r}; give one for every choice of the program.")
+        raise InputError(
+            f"assess needs a value for address {missing[0]!r}; give one for every choice of the program."
+        )
     return _trace(program, args, particles, ran, choices).log_prob()
