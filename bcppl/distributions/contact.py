@@ -27,7 +27,7 @@ class Track(Protocol):
     def __len__(self) -> int: ...
 
     def window(self, first: int, last: int) -> tuple[Tensor, Tensor]:
-        """Contacts (N, T, 3) in the world, NaN where none, and peg poses (N, T, 7), of some stamps."""
+        """Contacts (N, T, 3) in the peg's frame, NaN where none, and peg poses (N, T, 7), of some stamps."""
 
 
 def chamfer(a: Tensor, b: Tensor, one_empty: float) -> Tensor:
@@ -77,7 +77,7 @@ class ChamferContacts(LazyDistribution):
     never latent. For one point on each side D_ch = 2 d^2, a standard deviation of scale / sqrt(2). Its
     sharpness grows with the number of windows, not with the number of stamps in one: the model fixes them.
 
-    The event is (last - first, 3): locations in the world, a row of NaN where nothing was touched. Particles
+    The event is (last - first, 3): locations in the peg's frame, a row of NaN where nothing was touched. Particles
     whose physics diverged have log p = -inf.
 
     Args:
@@ -133,7 +133,7 @@ class ContactsInTime(LazyDistribution):
     `reach` along each axis about the origin of the simulated peg. The density is with respect to counting
     measure on "none" plus Lebesgue measure on locations (cubic metres), at each stamp looked at.
 
-    The event is (last - first, 3): locations in the world, a row of NaN where nothing was touched. Particles
+    The event is (last - first, 3): locations in the peg's frame, a row of NaN where nothing was touched. Particles
     whose physics diverged have log p = -inf.
 
     Args:

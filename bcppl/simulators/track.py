@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bcppl.recordings.measurements import Probe
 from bcppl.simulators.physics import PegPhysics, Rollout, Selection, rows_of
-from bcppl.simulators.wrench import Sensing, SensingState, in_world
+from bcppl.simulators.wrench import Sensing, SensingState
 
 Array = npt.NDArray[np.float64]
 
@@ -77,12 +77,12 @@ class ContactTrack:
         """Stamps `first` to `last` (exclusive), simulated only if they are not known yet.
 
         Returns:
-            Contact locations (N, last-first, 3) in the world, NaN where there is none, and the peg's poses
+            Contact locations (N, last-first, 3) in the peg's frame, NaN where there is none, and its poses
             (N, last-first, 7), NaN where the physics diverged.
         """
         self.advance(last)
         pose = torch.from_numpy(self.rollout.world_from_peg[:, first:last].copy())
-        return in_world(torch.from_numpy(self._contacts[:, first:last].copy()), pose), pose
+        return torch.from_numpy(self._contacts[:, first:last].copy()), pose
 
     def __getitem__(self, index: Selection) -> ContactTrack:
         """The tracks of some particles, in the order of an index tensor, a mask or a slice."""

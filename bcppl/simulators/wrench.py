@@ -20,7 +20,6 @@ from embreex.rtcore_scene import EmbreeScene
 from scipy.signal import butter, sosfilt
 from torch import Tensor
 
-from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.recordings.measurements import Touch
@@ -64,7 +63,10 @@ class Sensing:
         tare: the number of first samples, free of contact, whose mean is the sensor's zero; no contact is
             reported during them.
         cutoff: Hz, of the causal second-order Butterworth low-pass; None for no filter.
-        force: newtons from which on there is a contact.
+        force: newtons from which on there is a contact. A line of action is off by the torque's noise over
+            the force: at 3 N and 5 mN m by 1.7 mm before filtering.
+        friction: the steepest friction that a contact may have. Where a line of action enters the peg so
+            flatly that it would take more, it has passed beside the contact: the nearest edge is the contact.
         miss_tolerance: metres; where noise lets the line of action pass beside the peg by no more than this,
             the nearest point of the peg's convex hull is the contact; beyond it there is none.
     """
@@ -73,7 +75,8 @@ class Sensing:
     rate: float
     tare: int = 10
     cutoff: float | None = 20.0
-    force: float = 1.0
+    force: float = 3.0
+    friction: float = 1.0
     miss_tolerance: float = 0.002
 
     def __post_init__(self) -> None:
@@ -108,11 +111,23 @@ class Sensing:
         return corners[:, 0], normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     @cached_property
-    def _edges(self) -> tuple[Array, Array]:
-        """Start (E, 3) and extent (E, 3) of the convex hull's edges."""
+    def _edges(self) -> tuple[Array, Array, Array]:
+        """Start (E, 3) and extent (E, 3) of the convex hull's edges; outward normals (E, 3, 3) at each.
+
+        The normals are those of the two faces that meet there, and the one halfway between.
+        """
         hull = self.peg.mesh.convex_hull
-        ends = np.asarray(hull.vertices)[hull.edges_unique]
-        return ends[:, 0], ends[:, 1] - ends[:, 0]
+        sharp = hull.face_adjacency_angles > 1e-3
+        ends = np.asarray(hull.vertices)[hull.face_adjacency_edges[sharp]]
+        normals = np.asarray(hull.face_normals)[hull.face_adjacency[sharp]]
+        between = normals.sum(axis=1, keepdims=True)
+        between /= np.linalg.norm(between, axis=-1, keepdims=True)
+        return ends[:, 0], ends[:, 1] - ends[:, 0], np.concatenate([normals, between], axis=1)
+
+    @property
+    def _least_slope(self) -> float:
+        """The cosine of the friction cone's half angle."""
+        return float(1.0 / np.hypot(1.0, self.friction))
 
     @cached_property
     def _ball(self) -> tuple[Array, float]:
@@ -202,13 +217,19 @@ class Sensing:
         slope = np.sum(direction[hit] * normal, axis=1)
         reach = np.sum((anchor - origin[hit]) * normal, axis=1) / slope
         found[hit] = origin[hit] + reach[:, None] * direction[hit]
-        found[~hit] = self._beside(point[~hit], direction[~hit])
+        flat = np.zeros(len(point), dtype=bool)
+        flat[hit] = -slope < self._least_slope
+        missed = ~hit | flat
+        found[missed] = self._beside(point[missed], direction[missed])
         locations[near] = found
         return locations
 
     def _beside(self, point: Array, direction: Array) -> Array:
-        """The convex hull's nearest points (M, 3) to lines (M, 3) that miss it, NaN beyond the tolerance."""
-        start, extent = self._edges
+        """The points (M, 3) of the convex hull's edges nearest to lines (M, 3), NaN beyond the tolerance.
+
+        Only edges that the force pushes into the peg, within the friction cone of a normal there, can be touched.
+        """
+        start, extent, normals = self._edges
         nearest = np.full((len(point), 3), np.nan)
         for first in range(0, len(point), _BATCH):
             p, d = point[first : first + _BATCH, None], direction[first : first + _BATCH, None]
@@ -219,6 +240,8 @@ class Sensing:
             length = np.sum(edge * edge, axis=-1)
             share = np.clip(-np.sum(gap * edge, axis=-1) / np.maximum(length, 1e-30), 0.0, 1.0)
             distance = np.linalg.norm(gap + share[..., None] * edge, axis=-1)
+            pushed = np.einsum("ekj,mj->mek", -normals, d[:, 0]).max(axis=-1)
+            distance[pushed < self._least_slope] = np.inf
             best = distance.argmin(axis=1)
             rows = np.arange(len(best))
             found = start[best] + share[rows, best][:, None] * extent[best]
@@ -227,7 +250,7 @@ class Sensing:
         return nearest
 
     def measure(self, touches: Sequence[Touch]) -> list[tuple[Tensor, Tensor]]:
-        """Contact locations (T, 3) in the world, and peg poses (T, 7), of consecutive windows of one probe.
+        """Contact locations (T, 3) in the peg's frame, and its poses (T, 7), of consecutive windows of one probe.
 
         The first window must be the probe's first, for it holds the samples that the sensor's zero is taken
         from; the filter is carried from window to window.
@@ -248,11 +271,5 @@ class Sensing:
             self.check_rate(touch.times, f"window {k}")
             locations, state = self.contacts(touch.wrench[None].astype(np.float64), state)
             pose = torch.from_numpy(np.array(touch.world_from_peg, dtype=np.float64))
-            measured.append((in_world(torch.from_numpy(locations[0]), pose), pose))
+            measured.append((torch.from_numpy(locations[0]), pose))
         return measured
-
-
-def in_world(locations: Tensor, world_from_peg: Tensor) -> Tensor:
-    """Locations (..., 3) in the peg's frame, each at its own pose (..., 7), in the world."""
-    rotation = poses.rotation_matrix(world_from_peg)
-    return (rotation @ locations[..., None])[..., 0] + world_from_peg[..., :3]

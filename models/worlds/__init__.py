@@ -1,1 +1,1 @@
-"""Worlds that models invent recordings from."""
+"""Worlds: what makes recordings up, with parameters of its own that inference is not told."""
