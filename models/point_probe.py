@@ -215,7 +215,7 @@ def learn(recording: Recording, **settings: Any) -> Settings:
 
     Args:
         recording: ten pushes or more, with the true pose.
-        settings: fields of `Settings` that are not learnt.
+        settings: fields of `Settings` that are held and not learnt.
 
     Raises:
         InputError: the recording has no true pose, or fewer than 10 of its pushes touch.
@@ -223,7 +223,8 @@ def learn(recording: Recording, **settings: Any) -> Settings:
     if recording.truth is None:
         raise InputError("settings are learnt at a known pose; give a recording with its true pose.")
     truth = torch.as_tensor(recording.truth, dtype=torch.float64)
-    distance, start = SignedDistance(recording.part), replace(Settings(), finger=(0.0, 0.0, 0.0), **settings)
+    distance = SignedDistance(recording.part)
+    start = replace(Settings(), **{**settings, "finger": (0.0, 0.0, 0.0)})  # what is read is the recorded tip
     pushes = [_push(measurement, k) for k, measurement in enumerate(recording.measurements)]
     seen = [felt(push, touch, start) for push, touch in pushes]
     kept = [k for k, one in enumerate(seen) if not bool(one.direction.isnan())]
@@ -237,13 +238,14 @@ def learn(recording: Recording, **settings: Any) -> Settings:
         [rotation_matrix(torch.from_numpy(pushes[k][0].world_from_tip[0])) for k in kept]
     )
 
-    finger = tips.new_zeros(3)
-    for _ in range(3):
+    finger = tips.new_tensor(settings.get("finger", start.finger))
+    for _ in range(0 if "finger" in settings else 3):
         near = distance(transform(inverse(truth), tips + world_from_tips @ finger))
         normals = near.normal @ rotation_matrix(truth).T
         in_tip = (world_from_tips.transpose(-1, -2) @ normals[..., None])[:, :2, 0]
         finger[:2] -= torch.linalg.lstsq(in_tip, near.distance[:, None]).solution[:, 0]
-    depth = -distance(transform(inverse(truth), tips + world_from_tips @ finger)).distance
+    near = distance(transform(inverse(truth), tips + world_from_tips @ finger))
+    depth, normals = -near.distance, near.normal @ rotation_matrix(truth).T
 
     inward = torch.atan2(-normals[:, 1], -normals[:, 0])
     paths = [Path(finger_points(pushes[k][0], start)).thinned(start.spacing) for k in kept]
@@ -259,9 +261,8 @@ def learn(recording: Recording, **settings: Any) -> Settings:
         minimize_scalar(lambda a: float((error(a) ** 2).sum()), bounds=(0.02, 1.4), method="bounded").x
     )
     spread = float(depth.std())
-    return replace(
-        start,
-        finger=(float(finger[0]), float(finger[1]), 0.0),
+    learnt = Settings(
+        finger=(float(finger[0]), float(finger[1]), float(finger[2])),
         offset=float(depth.mean()),
         spread=spread,
         friction=math.tan(cone),
@@ -269,6 +270,7 @@ def learn(recording: Recording, **settings: Any) -> Settings:
         tolerance=float(depth.max()),
         free_spread=spread,
     )
+    return replace(learnt, **settings)
 
 
 def _wrapped(angle: Tensor) -> Tensor:
