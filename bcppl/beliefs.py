@@ -83,7 +83,7 @@ class Belief:
 
     @cached_property
     def covariance(self) -> Tensor:
-        """Weighted covariance (6, 6) in the tangent space at the mean: m^2, m rad, rad^2 (see `bcppl.poses`)."""
+        """Weighted covariance (6, 6) in the tangent space at the mean: m^2, m rad, rad^2 (`bcppl.poses`)."""
         tangent = poses.local(self.mean, self.world_from_part)
         tangent = tangent - self.weights @ tangent
         return (self.weights[:, None] * tangent).T @ tangent
@@ -94,7 +94,7 @@ class Belief:
         return self.covariance.diagonal().clamp_min(0.0).sqrt()
 
     def add(self, points: np.ndarray | Tensor, truth: np.ndarray | Tensor) -> Tensor:
-        """ADD (N,) of every particle: the mean distance of model points from where the true pose puts them, metres.
+        """ADD (N,) of every particle, metres: the mean distance of points from where the true pose puts them.
 
         Args:
             points: (M, 3) on the part's surface, in its frame.
@@ -128,5 +128,5 @@ def average_nearest_distance(
     points, truth = torch.as_tensor(points), torch.as_tensor(truth, dtype=torch.float64)
     there = poses.transform(truth, points).numpy()
     moved = poses.transform(world_from_part.reshape(-1, 7), points).numpy()
-    each = [float(cKDTree(particle).query(there)[0].mean()) for particle in moved]
+    each = [float(np.mean(cKDTree(particle).query(there)[0])) for particle in moved]
     return torch.tensor(each, dtype=torch.float64).reshape(world_from_part.shape[:-1])

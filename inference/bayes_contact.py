@@ -1,8 +1,8 @@
-"""BayesContact's own filter, as a baseline: every particle drifts before each measurement and is then weighed.
+"""BayesContact's own filter, as a baseline: every particle drifts before a measurement and is then weighed.
 
-The paper weighs a drifted particle by w p(o | q) p(q) / pi, which is right for the first measurement only: the
-pose does not move, so the measurements before belong in the weight too. The weight used here is that of the
-SMC sampler with the drift as its forward and its backward kernel (Del Moral, Doucet and Jasra, JRSS B 68,
+The paper weighs a drifted particle by w p(o | q) p(q) / pi, which is right for the first measurement only:
+the pose does not move, so the measurements before belong in the weight too. The weight used here is that of
+the SMC sampler with the drift as its forward and its backward kernel (Del Moral, Doucet and Jasra, JRSS B 68,
 2006, eq. 12), p(q') p(o_1..o_t | q') / (p(q) p(o_1..o_{t-1} | q)) times backward over forward. There is no
 tempering and no accept-reject step.
 """

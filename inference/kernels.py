@@ -97,9 +97,10 @@ def repeat(kernel: Kernel, times: int) -> Kernel:
 
 
 def rejuvenate(population: Population, kernel: Kernel, target: Target, sweeps: int = 1) -> Moved:
-    """Move every particle; each half of the population learns from the other, so no particle shapes its own proposal.
+    """Move every particle.
 
-    The particles are split at random: copies of one ancestor lie side by side after resampling.
+    Each half of the population learns from the other, so no particle shapes its own proposal. The particles
+    are split at random: copies of one ancestor lie side by side after resampling.
     """
     accepted = []
     for _ in range(sweeps):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bcppl.beliefs import Belief, effective_sample_size
+from bcppl.beliefs import Belief, effective_sample_size, normalised
 from bcppl.poses import FREE
 from bcppl.traces import Trace
 
@@ -35,12 +35,16 @@ class Population:
         return effective_sample_size(self.log_weights)
 
     def reweighed(self, log_factor: Tensor) -> Population:
-        """Every weight multiplied by exp(log_factor) (N,), and the evidence by the weighted mean of the factors.
+        """Every weight times exp(log_factor) (N,), and the evidence times the weighted mean of the factors.
 
         The evidence's factor is a difference of two logsumexps, so it is right whether or not the
         population was resampled before.
+
+        Raises:
+            InferenceError: no particle has any weight left.
         """
         log_weights = self.log_weights + log_factor
+        normalised(log_weights)
         gained = torch.logsumexp(log_weights, 0) - torch.logsumexp(self.log_weights, 0)
         return replace(self, log_weights=log_weights, log_evidence=self.log_evidence + float(gained))
 

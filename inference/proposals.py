@@ -74,7 +74,7 @@ def _pair(low: float, high: float) -> tuple[Tensor, Tensor]:
 
 
 def _reshape(event: torch.Size) -> torch.distributions.Transform:
-    return torch.distributions.transforms.ReshapeTransform((math.prod(event),), tuple(event))
+    return torch.distributions.transforms.ReshapeTransform(torch.Size([math.prod(event)]), event)
 
 
 def _pose_spread(population: Population, address: str, freedom: Freedom) -> Tensor:
@@ -91,6 +91,6 @@ def _vector_spread(population: Population, address: str) -> Tensor:
 
 
 def _conditioned(covariance: Tensor) -> Tensor:
-    """A covariance from few, partly equal particles made safely positive definite by shrinking its correlations."""
+    """A covariance from few, partly equal particles, made positive definite by shrinking correlations."""
     diagonal = torch.diag(covariance.diagonal() + FLOOR**2)
     return 0.9 * covariance + 0.1 * diagonal

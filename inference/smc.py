@@ -1,9 +1,9 @@
 """Sequential Monte Carlo over measurements, with tempering within a measurement and rejuvenation.
 
-`tempered` makes the step that takes one measurement in: extend the traces, let the new likelihood in by steps, resample and
-move the particles after each. `smc` is the loop over a recording, an iterator that can be stopped, looked
-into and gone on with. Del Moral, Doucet and Jasra, Sequential Monte Carlo samplers, JRSS B 68, 2006; Chopin
-and Papaspiliopoulos, An Introduction to Sequential Monte Carlo, 2020, chapter 17.
+`tempered` makes the step that takes one measurement in: extend the traces, let the new likelihood in by
+steps, resample and move the particles after each. `smc` is the loop over a recording, an iterator that can
+be stopped, looked into and gone on with. Del Moral, Doucet and Jasra, Sequential Monte Carlo samplers, JRSS
+B 68, 2006; Chopin and Papaspiliopoulos, An Introduction to Sequential Monte Carlo, 2020, chapter 17.
 
 With fixed exponents and fixed proposals the estimate of the evidence is unbiased; with adaptive tempering
 and fitted proposals it is consistent only. Evidence that contains a surrogate likelihood is a surrogate's.
@@ -69,7 +69,7 @@ Assimilate = Callable[[Population, tuple[Any, ...], Mapping[str, Tensor]], Assim
 def tempered(
     kernel: Kernel | None = None, *, sweeps: int = 3, resample: Resample | None = None, share: float = 0.5
 ) -> Assimilate:
-    """How to take a measurement in: let its likelihood in by steps, resample and move the particles after each.
+    """How to take a measurement in: let its likelihood in by steps, resample and move after each.
 
     Args:
         kernel: moves the particles after each resampling; None leaves them where they are.
@@ -159,7 +159,10 @@ def smc(
     with _random_state(state):
         trace, log_weights = generate(model.program, (scene, []), {}, particles)
     population = Population(trace, log_weights)
-    truth = _truth(model, scene, recording, trace)
+    # The truth draws from a generator of its own: a belief does not depend on whether it is known.
+    aside = [torch.Generator().manual_seed(seed).get_state()]
+    with _random_state(aside):
+        truth = _truth(model, scene, recording, trace)
     started = Info(
         "prior", float("nan"), float(particles), 0.0, particles, float("nan"), (), float("nan"), 0.0, {}
     )
@@ -180,7 +183,8 @@ def smc(
         elapsed = time.perf_counter() - begun
         gap = float("nan")
         if truth is not None:
-            truth, _ = extend(truth, args, new)
+            with _random_state(aside):
+                truth, _ = extend(truth, args, new)
             observed = list(population.trace.observations)
             best = population.trace.log_prob(*observed)[population.log_weights > -torch.inf].max()
             gap = float(truth.log_prob(*observed) - best)

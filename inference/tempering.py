@@ -25,7 +25,7 @@ def conditional_effective_sample_size(log_weights: Tensor, log_factor: Tensor) -
 def next_exponent(log_weights: Tensor, log_likelihood: Tensor, exponent: float, share: float = 0.5) -> float:
     """The next exponent in (exponent, 1] for a likelihood (N,) let in up to `exponent`.
 
-    Particles with a log-likelihood of -inf lose their weight at any exponent; the bisection runs over the others.
+    Particles with a log-likelihood of -inf lose their weight at any exponent; the others are bisected over.
     """
     finite = torch.isfinite(log_likelihood) & (log_weights > -torch.inf)
     if not bool(finite.any()):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from bcppl.errors import InputError
 from bcppl.parts import Part, Piece
 from bcppl.recordings.measurements import Probe
 from bcppl.simulators.peg_model import ContactParameters, commands
-from bcppl.simulators.physics import PegPhysics
+from bcppl.simulators.physics import PegPhysics, Rollout
 from bcppl.simulators.shapes import block, block_with_square_hole, box_peg, round_peg
 
 STIFFNESS = np.array([1500.0, 1000.0, 2000.0, 60.0, 50.0, 40.0])
@@ -22,20 +23,18 @@ DAMPING = np.array([80.0, 80.0, 80.0, 2.0, 2.0, 2.0])
 SQUARE = box_peg(0.016, 0.05)
 
 
-def path(
-    *points: tuple[float, float, float, float], turn: Rotation | None = None, **options: object
-) -> Probe:
+def path(*points: tuple[float, float, float, float], turn: Rotation | None = None, **options: Any) -> Probe:
     """A probe through (time, x, y, z) of the peg's origin, at a fixed rotation."""
     values = np.array(points)
     command = np.zeros((len(values), 7))
     command[:, :3] = values[:, 1:]
     command[:, 3:] = (Rotation.identity() if turn is None else turn).as_quat()[[3, 0, 1, 2]]
-    settings = {
+    settings: dict[str, Any] = {
         "stiffness": STIFFNESS,
         "damping": DAMPING,
         "stamps": np.arange(0.0, values[-1, 0] + 1e-9, 0.01),
     } | options
-    return Probe("probe", values[:, 0], command, **settings)  # type: ignore[arg-type]
+    return Probe("probe", values[:, 0], command, **settings)
 
 
 def at(*translations: tuple[float, float, float]) -> torch.Tensor:
@@ -145,9 +144,9 @@ def poses(count: int = 7) -> torch.Tensor:
     return pose
 
 
-def same(a: object, b: object) -> None:
-    np.testing.assert_array_equal(a.wrench, b.wrench)  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(a.world_from_peg, b.world_from_peg)  # type: ignore[attr-defined]
+def same(a: Rollout, b: Rollout) -> None:
+    np.testing.assert_array_equal(a.wrench, b.wrench)
+    np.testing.assert_array_equal(a.world_from_peg, b.world_from_peg)
 
 
 def test_chunks_batches_order_and_skipping_change_nothing() -> None:

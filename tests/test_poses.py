@@ -1,6 +1,7 @@
 """Poses, their exponential map, and the one base measure of all pose densities."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -138,7 +139,7 @@ def test_tilt_and_yaw_of_known_rotations() -> None:
         (lambda: poses.as_pose([float("nan")] * 7), "finite"),
     ],
 )
-def test_bad_input_is_one_sentence(make, word) -> None:  # type: ignore[no-untyped-def]
+def test_bad_input_is_one_sentence(make: Callable[[], object], word: str) -> None:
     with pytest.raises(InputError, match=word) as caught:
         make()
     assert "\n" not in str(caught.value)

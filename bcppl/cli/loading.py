@@ -46,7 +46,7 @@ def model(name: str) -> Model:
     Raises:
         InputError: there is no such model, or the file cannot be run.
     """
-    return _defined(name, bcppl.models, "model", Model)  # type: ignore[no-any-return]
+    return _defined(name, bcppl.models, "model", Model)
 
 
 def inference(name: str) -> Any:
@@ -72,7 +72,8 @@ def _defined(name: str, package: ModuleType, attribute: str, kind: type | None) 
         module = importlib.import_module(f"{package.__name__}.{name}")
     else:
         raise InputError(
-            f"there is no {word} {name!r}: give one of {', '.join(offered(package, attribute))}, or a file ending in .py."
+            f"there is no {word} {name!r}: give one of {', '.join(offered(package, attribute))}, "
+            "or a file ending in .py."
         )
     found = getattr(module, attribute, None)
     if found is None or (kind is not None and not isinstance(found, kind)) or not (kind or callable(found)):
@@ -107,6 +108,7 @@ def _from_file(path: Path, package: ModuleType, word: str) -> ModuleType:
         ) from error
     except Exception as error:
         raise InputError(
-            f"the {word} file {path} stopped with {type(error).__name__}: {error}; run `python {path}` to see where."
+            f"the {word} file {path} stopped with {type(error).__name__}: {error}; "
+            f"run `python {path}` to see where."
         ) from error
     return module

@@ -45,7 +45,7 @@ def simulate(
     out: OUT = Path("recording.h5"),
     seed: Annotated[int, typer.Option(help="Same seed, same recording.")] = 0,
 ) -> None:
-    """Write a recording that a model's own world makes up: a true pose drawn from the prior, and noisy sensors."""
+    """Write a recording that a model's own world makes up: a true pose from the prior, and noisy sensors."""
     chosen = loading.model(model)
     if chosen.invent is None:
         raise InputError(
@@ -69,15 +69,16 @@ def _importing(command: Callable[..., Recording]) -> Callable[..., None]:
     """The command of an importer with `--out` added, its other options as the importer declares them."""
 
     @functools.wraps(command)
-    def wrapped(*, out: Path, **options: Any) -> None:
+    def importing(*, out: Path, **options: Any) -> None:
         _write(command(**options), out)
 
+    wrapped: Any = importing
     signature = inspect.signature(command)
     added = inspect.Parameter(
         "out", inspect.Parameter.KEYWORD_ONLY, annotation=OUT, default=Path("recording.h5")
     )
     parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in signature.parameters.values()]
-    wrapped.__signature__ = signature.replace(parameters=[*parameters, added], return_annotation=None)  # type: ignore[attr-defined]
+    wrapped.__signature__ = signature.replace(parameters=[*parameters, added], return_annotation=None)
     wrapped.__annotations__ = {p.name: p.annotation for p in [*parameters, added]}
     return wrapped
 

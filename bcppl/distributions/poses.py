@@ -57,7 +57,8 @@ def _half_widths(translation: Any, freedom_rotation: str) -> tuple[Tensor, Freed
     widths = torch.as_tensor(translation, dtype=torch.float64).expand(3)
     if not bool(torch.isfinite(widths).all()) or bool((widths < 0).any()):
         raise InputError(
-            f"a pose prior has half widths {widths.tolist()} m; give three numbers, positive or 0 for a held axis."
+            f"a pose prior has half widths {widths.tolist()} m; "
+            "give three numbers, positive or 0 for a held axis."
         )
     free = "".join(axis for axis, width in zip("xyz", widths.tolist(), strict=True) if width > 0)
     return widths, Freedom(free, freedom_rotation)
@@ -152,7 +153,8 @@ class SwingTwistPose(_PoseDistribution):
         self.tilt, self.yaw = _angle(tilt, "tilt"), _angle(yaw, "yaw")
         if self.tilt > 0 and self.yaw == 0:
             raise InputError(
-                "a pose prior with free tilt and held yaw has no Haar measure; give yaw a small positive limit."
+                "a pose prior with free tilt and held yaw has no Haar measure; "
+                "give yaw a small positive limit."
             )
         rotation = "all" if self.tilt > 0 else "z" if self.yaw > 0 else "none"
         self.widths, freedom = _half_widths(translation, rotation)
@@ -189,7 +191,7 @@ class SwingTwistPose(_PoseDistribution):
 
 
 def tilt_and_yaw(center: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-    """Tilt of the z axis (0 to pi) and twist about it (-pi to pi) from `center` to `pose`, radians, each (...,)."""
+    """Tilt of the z axis (0 to pi) and twist about it (-pi to pi) from `center` to `pose`, (...,) radians."""
     first, second = torch.broadcast_tensors(
         roma.quat_conjugation(poses.quaternion_xyzw(center)), poses.quaternion_xyzw(pose)
     )
@@ -209,8 +211,8 @@ class NormalPose(_PoseDistribution):
         freedom: which axes are free.
 
     The density is that of the normal over rotation vectors divided by d(Haar)/d(rotation vector)
-    (Chirikjian, Stochastic Models, Information Theory, and Lie Groups, vol. 2, 10.6), summed over the windings
-    next to the principal one where the spread is wide enough for them to matter.
+    (Chirikjian, Stochastic Models, Information Theory, and Lie Groups, vol. 2, 10.6), summed over the
+    windings next to the principal one where the spread is wide enough for them to matter.
 
     Raises:
         InputError: the covariance has the wrong size or is not positive definite.
@@ -279,7 +281,7 @@ class _Guess(Protocol):
 
 
 def prior_from_guess(guess: _Guess) -> UniformPose | SwingTwistPose:
-    """The prior that a recording's guess states: uniform within an angle, or swing and twist with their own limits."""
+    """The prior that a recording's guess states: uniform within an angle, or within a tilt and a yaw."""
     if guess.angle is not None:
         return UniformPose(guess.world_from_part, guess.translation, guess.angle)
     return SwingTwistPose(guess.world_from_part, guess.translation, guess.tilt, guess.yaw)

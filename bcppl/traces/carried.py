@@ -1,4 +1,4 @@
-"""Simulator state that a trace carries: run once per particle, indexed with the trace, gone on with when extended.
+"""Simulator state that a trace carries: run once per particle, indexed with the trace, extended with it.
 
 A program asks for it by name, `rollout = carried("probe", pose, start)`. The first time, `start()` makes it;
 when the same particles are run again with the same inputs, the one that the trace carries is handed back.
@@ -39,9 +39,11 @@ class Entry:
     state: Any
 
     def take(self, index: Tensor) -> Entry:
+        """The entry of the particles at `index` (K,)."""
         return Entry(tuple(x[index] for x in self.inputs), self.state[index])
 
     def where(self, mask: Tensor, other: Entry) -> Entry:
+        """This entry where `mask` (N,) is true, the other's elsewhere."""
         pairs = zip(self.inputs, other.inputs, strict=True)
         inputs = tuple(torch.where(_spread(mask, a), a, b) for a, b in pairs)
         return Entry(inputs, self.state.where(mask, other.state))
@@ -83,7 +85,7 @@ def carried(name: str, inputs: Tensor | tuple[Tensor, ...], start: Callable[[], 
     if entry is None or not same_inputs(entry.inputs, inputs):
         entry = Entry(inputs, start())
     frame.used[name] = entry
-    return entry.state  # type: ignore[no-any-return]
+    return entry.state
 
 
 @contextmanager
