@@ -229,9 +229,6 @@ def test_every_object_comes_back_from_disk_as_it_was(tmp_path: Path) -> None:
         save(recording, tmp_path / "a.h5")
         loaded = load(tmp_path / "a.h5").measurements[0].observation
         saved = recording.measurements[0].observation
-            load(tmp_path / "a.h5").measurements[0].observation,
-            recording.measurements[0].observation,
-        )
         assert isinstance(loaded, DepthImage) and isinstance(saved, DepthImage)
         np.testing.assert_array_equal(loaded.depth, saved.depth)
     assert "open mesh" in notes(recording)[0]  # object 10 has a hole in its mesh
