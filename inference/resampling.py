@@ -22,9 +22,10 @@ def systematic(log_weights: Tensor) -> Tensor:
     """Ancestors (N,) int64 by one uniform draw and N equal steps: unbiased, of low variance."""
     count = len(log_weights)
     points = (torch.arange(count, dtype=torch.float64) + torch.rand((), dtype=torch.float64)) / count
-    cumulative = normalised(log_weights).cumsum(0)
-    # Rounding may leave the last sum short of the last point.
-    return torch.searchsorted(cumulative, points, right=True).clamp_max(count - 1)
+    weights = normalised(log_weights)
+    # Rounding may leave the last sum short of the last point: that falls to the last particle with weight.
+    last = int(weights.nonzero()[-1])
+    return torch.searchsorted(weights.cumsum(0), points, right=True).clamp_max(last)
 
 
 def always(scheme: Scheme = systematic) -> Resample:

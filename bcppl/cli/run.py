@@ -56,6 +56,9 @@ def run(
     chosen = loading.model(model or found.model)
     infer = loading.inference(inference)
     folder = out or Path("runs") / Path(recording).stem
+    blocked = next((p for p in (folder, *folder.parents) if p.exists() and not p.is_dir()), None)
+    if blocked is not None:
+        raise InputError(f"--out {folder} cannot be made, {blocked} is a file; give a folder.")
     scene = chosen.prepare(found)
     chosen.observe(scene, found.measurements)  # what cannot be read is refused before anything is written
     console = Console(highlight=False)

@@ -17,12 +17,12 @@ from bcppl.errors import InferenceError, InputError
 from bcppl.traces.carried import Entry, carrying, same_inputs
 
 Program = Callable[..., Any]
-Index = Tensor | Sequence[int] | slice
+Index = Tensor | Sequence[int] | slice | int
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What one pass through a program left: distributions and values by address, and the states it carries."""
+    """What one pass through a program left: distributions, values and carried states by name."""
 
     distributions: dict[str, Any]
     values: dict[str, Tensor]
@@ -41,9 +41,16 @@ def run(
     """Run a program under the plate `particles`, its sites set to `given` and the others sampled.
 
     Raises:
-        InputError: a duplicate address, an enumerated site, a site outside the particle axis, or a value of
-            the wrong shape; the sentence names the address.
+        InputError: no particles, a duplicate address, an enumerated site, a site outside the particle axis,
+            or a value that is no tensor or has the wrong shape; the sentence names the address.
     """
+    if particles < 1:
+        raise InputError(f"a program was to be run for {particles} particles; give 1 or more.")
+    for address, value in given.items():
+        if not isinstance(value, Tensor):
+            raise InputError(
+                f"the value given for address {address!r} is a {type(value).__name__}; give a tensor."
+            )
 
     def plated() -> Any:
         with pyro.plate("particles", particles, dim=-1):
@@ -53,16 +60,26 @@ def run(
         with carrying(carried) as used, torch.no_grad(), pyro.validation_enabled(False):
             tracer = poutine.trace(poutine.condition(plated, data=dict(given)))
             recorded = tracer.get_trace()
-    except RuntimeError as error:
-        if "Multiple" in str(error) and "sites named" in str(error):
+    except (RuntimeError, ValueError) as error:
+        # Pyro raises a copy of what went wrong, its message followed by a table of shapes.
+        cause = error.__cause__ if type(error.__cause__) is type(error) else error
+        said = str(cause).partition("\n")[0].rstrip(".")
+        if "Multiple" in said and "sites named" in said:
             raise InputError(
-                f"the program visits an address twice: {error}; give each site its own."
-            ) from error
-        raise
+                f"the program visits an address twice ({said}); give each site its own."
+            ) from cause
+        if said.startswith("Shape mismatch inside plate('particles')"):
+            raise InputError(
+                f"a site does not fit {particles} particles ({said}); give its parameters and values the "
+                "particle axis first, and put further dimensions into the event with `.to_event()`."
+            ) from cause
+        raise cause from None
     distributions: dict[str, Any] = {}
     values: dict[str, Tensor] = {}
     fixed = set()
-    for address, site in recorded.nodes.items():
+    # Pyro types a message's entries as optional; those of a sample site are all there.
+    nodes: Mapping[str, Any] = recorded.nodes
+    for address, site in nodes.items():
         if site["type"] != "sample" or type(site["fn"]).__name__ == "_Subsample":
             continue
         if site["infer"].get("_deterministic"):
@@ -75,29 +92,29 @@ def run(
         shape = tuple(distribution.batch_shape)
         if shape != (particles,):
             raise InputError(
-                f"site {address!r} has batch shape {shape} and not ({particles},), one entry for each particle; "
-                "put further dimensions into the event with `.to_event()`."
+                f"site {address!r} has batch shape {shape} and not ({particles},), "
+                "one entry for each particle; put further dimensions into the event with `.to_event()`."
             )
         event = tuple(distribution.event_shape)
         own = tuple(value.shape) == (particles, *event)
         if not own and not (site["is_observed"] and tuple(value.shape) == event):
             raise InputError(
                 f"the value of site {address!r} has shape {tuple(value.shape)}; "
-                f"its event has shape {event}, for {particles} particles ({particles}, *{event})."
+                f"its event has shape {event}, for {particles} particles {(particles, *event)}."
             )
         distributions[address] = distribution
         values[address] = value
         if site["is_observed"] and address not in given:
             fixed.add(address)
-    return Run(distributions, values, frozenset(fixed), dict(used), recorded.nodes["_RETURN"]["value"])
+    return Run(distributions, values, frozenset(fixed), dict(used), nodes["_RETURN"]["value"])
 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
     """Values by address for N particles, and the log-probability of every site, evaluated when asked for.
 
-    `trace["hole"]` is a value; `trace[ancestors]`, `trace[mask]` and `trace[:50]` are traces of those particles.
-    Treat it as immutable: the verbs of `bcppl.traces` make new ones.
+    `trace["hole"]` is a value; `trace[ancestors]`, `trace[mask]` and `trace[:50]` are traces of those
+    particles. Treat it as immutable: the verbs of `bcppl.traces` make new ones.
 
     Attributes:
         program, args: what was run.
@@ -117,7 +134,7 @@ class Trace:
 
     @cached_property
     def _run(self) -> Run:
-        """The program run again at these values: distributions are cheap, what they compute is kept in `known`."""
+        """The program run again at these values: that is cheap, and what sites compute is kept in `known`."""
         given = {**self.choices, **self.observations}
         again = run(self.program, self.args, self.particles, given, self.carried)
         self.carried_states().update(again.carried)
@@ -159,10 +176,16 @@ class Trace:
         if address not in self.known:
             if address not in self._run.distributions:
                 raise InputError(
-                    f"the program visits no address {address!r}; it visits {', '.join(self.addresses) or 'none'}."
+                    f"the program visits no address {address!r}; "
+                    f"it visits {', '.join(self.addresses) or 'none'}."
                 )
             with torch.no_grad():
                 value = self._run.distributions[address].log_prob(self._run.values[address])
+            if tuple(value.shape) not in ((), (self.particles,)):
+                raise InputError(
+                    f"site {address!r} has log-probabilities of shape {tuple(value.shape)}; its distribution "
+                    f"must give ({self.particles},), one for each particle."
+                )
             value = value.to(torch.float64).expand(self.particles)
             bad = torch.isnan(value) | (value == torch.inf)
             if bool(bad.any()):
@@ -182,7 +205,9 @@ class Trace:
             if key in self.observations:
                 return self.observations[key]
             raise KeyError(f"the trace has no value at address {key!r}")
-        index = torch.arange(self.particles)[key]
+        index = torch.arange(self.particles)[key if isinstance(key, slice) else torch.as_tensor(key)].reshape(
+            -1
+        )
         return Trace(
             self.program,
             self.args,
@@ -200,7 +225,7 @@ class Trace:
         return self.particles
 
     def where(self, mask: Tensor, other: Trace) -> Trace:
-        """This trace's particles where `mask` (N,) is true, the other's (same program, same addresses) elsewhere."""
+        """This trace where `mask` (N,) is true, the other (same program, same addresses) elsewhere."""
         shared = set(self.known) & set(other.known)
         return Trace(
             self.program,
@@ -216,7 +241,7 @@ class Trace:
         )
 
     def at(self, values: Mapping[str, Tensor]) -> Trace:
-        """The same run with other values at some latent addresses; log-probabilities that cannot have changed are kept.
+        """The same run with other values at some latent addresses; what cannot have changed is kept.
 
         Raises:
             InputError: an address is not latent, or a value has the wrong shape.

@@ -35,6 +35,17 @@ def _refuse_unvisited(observations: Mapping[str, Tensor], ran: Run) -> None:
         )
 
 
+def _refuse_one_each(observations: Mapping[str, Tensor], ran: Run) -> None:
+    """An observation is the same for all particles: resampling would not carry one for each along."""
+    for address, value in observations.items():
+        event = tuple(ran.distributions[address].event_shape)
+        if tuple(value.shape) != event:
+            raise InputError(
+                f"the observation at address {address!r} has shape {tuple(value.shape)}, "
+                f"its site's event {event}; give one value, the same for all particles."
+            )
+
+
 def simulate(program: Program, args: tuple[Any, ...] = (), particles: int = 1) -> Trace:
     """Run a program forward: every site is sampled, what would be observed included.
 
@@ -51,16 +62,21 @@ def generate(
     """Run a program with some sites constrained, the others drawn from the program itself.
 
     Args:
+        program: a Pyro program.
+        args: its arguments.
+        particles: N.
         observations: values by address, of the site's event shape: the same for all particles.
 
     Returns:
         The trace and the log weight (N,): the summed log-probability of what was constrained.
 
     Raises:
-        InputError: an observed address is never visited, or see `bcppl.traces.trace.run`.
+        InputError: an observed address is never visited, or an observation has not its site's event shape;
+            see also `bcppl.traces.trace.run`.
     """
     ran = run(program, args, particles, observations, {})
     _refuse_unvisited(observations, ran)
+    _refuse_one_each(observations, ran)
     trace = _trace(program, args, particles, ran, observations)
     constrained = [a for a in ran.distributions if a in observations or a in ran.fixed]
     weight = trace.log_prob(*constrained) if constrained else torch.zeros(particles, dtype=torch.float64)
@@ -74,6 +90,7 @@ def extend(trace: Trace, args: tuple[Any, ...], observations: Mapping[str, Tenso
     have the distributions they had.
 
     Args:
+        trace: what is extended.
         args: the new arguments.
         observations: values of new addresses.
 
@@ -81,7 +98,8 @@ def extend(trace: Trace, args: tuple[Any, ...], observations: Mapping[str, Tenso
         The longer trace and its log weight (N,): the log-probability of the new observations.
 
     Raises:
-        InputError: an address vanishes, or an observation is of an old address or of one never visited.
+        InputError: an address vanishes, or an observation is of an old address, of one never visited, or
+            of the wrong shape.
     """
     old = {**trace.choices, **trace.observations}
     again = [a for a in observations if a in old]
@@ -91,6 +109,7 @@ def extend(trace: Trace, args: tuple[Any, ...], observations: Mapping[str, Tenso
         )
     ran = run(trace.program, args, trace.particles, {**old, **observations}, trace.carried)
     _refuse_unvisited(observations, ran)
+    _refuse_one_each(observations, ran)
     lost = [a for a in old if a not in ran.distributions]
     if lost:
         raise InputError(f"with the new arguments the program no longer visits address {lost[0]!r}.")
