@@ -35,11 +35,11 @@ def _refuse_unvisited(observations: Mapping[str, Tensor], ran: Run) -> None:
         )
 
 
-def _refuse_one_each(observations: Mapping[str, Tensor], ran: Run) -> None:
+def _refuse_one_each(observations: Mapping[str, Tensor], ran: Run, particles: int) -> None:
     """An observation is the same for all particles: resampling would not carry one for each along."""
     for address, value in observations.items():
         event = tuple(ran.distributions[address].event_shape)
-        if tuple(value.shape) != event:
+        if tuple(value.shape) != event and particles > 1:
             raise InputError(
                 f"the observation at address {address!r} has shape {tuple(value.shape)}, "
                 f"its site's event {event}; give one value, the same for all particles."
@@ -76,7 +76,7 @@ def generate(
     """
     ran = run(program, args, particles, observations, {})
     _refuse_unvisited(observations, ran)
-    _refuse_one_each(observations, ran)
+    _refuse_one_each(observations, ran, particles)
     trace = _trace(program, args, particles, ran, observations)
     constrained = [a for a in ran.distributions if a in observations or a in ran.fixed]
     weight = trace.log_prob(*constrained) if constrained else torch.zeros(particles, dtype=torch.float64)
@@ -109,7 +109,7 @@ def extend(trace: Trace, args: tuple[Any, ...], observations: Mapping[str, Tenso
         )
     ran = run(trace.program, args, trace.particles, {**old, **observations}, trace.carried)
     _refuse_unvisited(observations, ran)
-    _refuse_one_each(observations, ran)
+    _refuse_one_each(observations, ran, trace.particles)
     lost = [a for a in old if a not in ran.distributions]
     if lost:
         raise InputError(f"with the new arguments the program no longer visits address {lost[0]!r}.")

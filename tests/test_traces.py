@@ -1,0 +1,467 @@
+"""Traces and the verbs on them: what is evaluated, what is kept, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.poses import NormalPose, UniformPose
+from bcppl.errors import InferenceError, InputError
+from bcppl.traces import Trace, assess, carried, extend, generate, propose, simulate, update
+
+N = 5
+
+
+def number(value: float) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def normal_log(value: Tensor, mean: Tensor | float, scale: float) -> Tensor:
+    """The normal's log-density, written out."""
+    return -0.5 * ((value - mean) / scale) ** 2 - math.log(scale * math.sqrt(2 * math.pi))
+
+
+class Counted(LazyDistribution):
+    """A normal about x that counts how often its log-probability is computed."""
+
+    def __init__(self, calls: list[str], name: str, x: Tensor) -> None:
+        self.calls, self.name, self.x = calls, name, x
+        super().__init__(len(x), (), (x,))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        self.calls.append(self.name)
+        return normal_log(value, self.x, 0.5)
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        return self.x + 0.5 * torch.randn(len(self.x), dtype=torch.float64)
+
+
+def counted(calls: list[str]) -> Callable[[int], None]:
+    """Two latents, and one counted observation of each for every step."""
+
+    def program(steps: int) -> None:
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        z = pyro.sample("z", dist.Normal(x, 2.0))
+        for k in range(steps):
+            pyro.sample(f"a_{k}", Counted(calls, f"a_{k}", x))
+            pyro.sample(f"b_{k}", Counted(calls, f"b_{k}", z))
+
+    return program
+
+
+def seen(steps: int, first: int = 0) -> dict[str, Tensor]:
+    return {f"{s}_{k}": number(0.3 * k + (s == "b")) for k in range(first, steps) for s in "ab"}
+
+
+def several(steps: int) -> None:
+    """Continuous, discrete, vector and pose latents, some of which come with time."""
+    coin = pyro.sample("coin", dist.Bernoulli(number(0.3)))
+    x = pyro.sample("x", dist.Normal(torch.zeros(3, dtype=torch.float64), 1.0).to_event(1))
+    pose = pyro.sample("pose", UniformPose(poses.identity(), 0.1, 2.0))
+    for k in range(steps):
+        kind = pyro.sample(f"kind_{k}", dist.Categorical(torch.tensor([0.2, 0.3, 0.5], dtype=torch.float64)))
+        pyro.sample(f"y_{k}", dist.Normal(x + pose[:, :3] + coin[:, None], 1.0 + kind[:, None]).to_event(1))
+
+
+def several_seen(steps: int, first: int = 0) -> dict[str, Tensor]:
+    return {f"y_{k}": torch.tensor([k, -1.0, 0.5], dtype=torch.float64) for k in range(first, steps)}
+
+
+def test_tracing_costs_nothing_and_extending_only_the_new_sites() -> None:
+    calls: list[str] = []
+    trace, weight = generate(counted(calls), (0,), {}, N)
+    assert calls == [] and torch.equal(weight, torch.zeros(N, dtype=torch.float64))
+    trace, _ = extend(trace, (2,), seen(2))
+    assert sorted(calls) == ["a_0", "a_1", "b_0", "b_1"]
+    calls.clear()
+    trace, weight = extend(trace, (3,), seen(3, 2))
+    assert sorted(calls) == ["a_2", "b_2"]
+    torch.testing.assert_close(weight, trace.log_prob("a_2", "b_2"))
+    trace.log_prob()
+    assert sorted(calls) == ["a_2", "b_2"], "what was known before is not computed again"
+
+
+def test_extending_in_pieces_weighs_as_generating_all() -> None:
+    latent = generate(several, (3,), {}, N)[0].choices
+    latent = {a: v for a, v in latent.items() if not a.startswith("y")}
+    whole, total = generate(several, (3,), several_seen(3), N)
+    whole = whole.at(latent)
+    observed = [f"y_{k}" for k in range(3)]
+    start = {a: latent[a] for a in ("coin", "x", "pose")}
+    pieces = simulate(several, (0,), N).at(start)
+    by_hand = torch.zeros(N, dtype=torch.float64)
+    for k in range(3):
+        pieces, weight = extend(pieces, (k + 1,), several_seen(k + 1, k))
+        mean = pieces["x"] + pieces["pose"][:, :3] + pieces["coin"][:, None]
+        scale = 1.0 + pieces[f"kind_{k}"][:, None]
+        expected = torch.stack(
+            [normal_log(several_seen(3)[f"y_{k}"], mean[n], float(scale[n])).sum() for n in range(N)]
+        )
+        torch.testing.assert_close(weight, expected)
+        by_hand += expected
+    assert list(pieces.choices) == ["coin", "x", "pose", "kind_0", "kind_1", "kind_2"]
+    torch.testing.assert_close(pieces.log_prob(*observed), by_hand)
+    # The same values, all at once.
+    again = whole.at({a: v for a, v in pieces.choices.items()})
+    torch.testing.assert_close(again.log_prob(*observed), by_hand)
+    torch.testing.assert_close(again.log_prob(), pieces.log_prob())
+    assert total.shape == (N,)
+
+
+def test_a_site_that_the_program_observes_itself_is_weighed_once() -> None:
+    def program(steps: int) -> None:
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        for k in range(steps):
+            pyro.sample(f"y_{k}", dist.Normal(x, 1.0), obs=number(2.0))
+            pyro.factor(f"f_{k}", -(x**2))
+
+    trace, weight = generate(program, (1,), {}, N)
+    one = normal_log(trace["x"], 2.0, 1.0) - trace["x"] ** 2
+    torch.testing.assert_close(weight, one)
+    trace, weight = extend(trace, (2,), {})
+    torch.testing.assert_close(weight, one)
+    assert list(trace.choices) == ["x"]
+
+
+def test_the_log_ratio_is_that_of_the_densities() -> None:
+    calls: list[str] = []
+    trace, _ = generate(counted(calls), (2,), seen(2), N)
+    x, z, new = trace["x"], trace["z"], trace["x"] + 0.7
+    trace.log_prob()
+    calls.clear()
+    updated = update(trace, {"x": new})
+    assert calls == [], "nothing is evaluated before the ratio is asked for"
+    expected = normal_log(new, 0.0, 1.0) - normal_log(x, 0.0, 1.0)
+    expected = expected + normal_log(z, new, 2.0) - normal_log(z, x, 2.0)
+    for k in range(2):
+        value = seen(2)[f"a_{k}"]
+        expected = expected + normal_log(value, new, 0.5) - normal_log(value, x, 0.5)
+    torch.testing.assert_close(updated.log_ratio, expected)
+    assert set(calls) == {"a_0", "a_1"}, "what does not hang on x is kept"
+    assert torch.equal(updated.discarded["x"], x) and set(updated.discarded) == {"x"}
+    assert torch.equal(trace["x"], x), "the trace itself is as it was"
+    back = update(updated.trace, updated.discarded)
+    torch.testing.assert_close(back.log_ratio, -expected)
+
+
+@pytest.mark.parametrize(
+    "index",
+    [
+        torch.tensor([3, 3, 0]),
+        torch.tensor([True, False, True, True, False]),
+        slice(None, 3),
+        [4, 1],
+        (4, 1),
+        2,
+    ],
+    ids=["ancestors", "mask", "slice", "list", "tuple", "one"],
+)
+def test_indexing_takes_everything_along(index: Any) -> None:
+    calls: list[str] = []
+    trace, _ = generate(counted(calls), (2,), seen(2), N)
+    whole = trace.log_prob()
+    rows = torch.arange(N)[index if isinstance(index, slice) else torch.as_tensor(index)].reshape(-1)
+    calls.clear()
+    part = trace[index]
+    assert isinstance(part, Trace) and len(part) == len(rows)
+    assert torch.equal(part["z"], trace["z"][rows])
+    torch.testing.assert_close(part.log_prob(), whole[rows])
+    assert calls == [], "known log-probabilities are indexed, not computed"
+    # Computed anew for these particles they are the same: none was given to another particle.
+    fresh = Trace(part.program, part.args, len(part), part.choices, part.observations)
+    torch.testing.assert_close(fresh.log_prob(), whole[rows])
+
+
+def test_where_takes_each_particle_whole() -> None:
+    calls: list[str] = []
+    trace, _ = generate(counted(calls), (1,), seen(1), N)
+    other = update(trace, {"x": trace["x"] + 1.0, "z": trace["z"] - 1.0}).trace
+    first, second = trace.log_prob(), other.log_prob()
+    calls.clear()
+    mask = torch.tensor([True, False, False, True, False])
+    mixed = trace.where(mask, other)
+    assert torch.equal(mixed["x"], torch.where(mask, trace["x"], other["x"]))
+    torch.testing.assert_close(mixed.log_prob(), torch.where(mask, first, second))
+    assert calls == []
+
+
+@dataclass(eq=False)
+class Counter:
+    """Carried state: counts how far each particle was run, and remembers what it was started from."""
+
+    start: Tensor
+    steps: Tensor
+    log: list[str]
+
+    def __getitem__(self, index: Tensor) -> Counter:
+        return Counter(self.start[index], self.steps[index], self.log)
+
+    def where(self, mask: Tensor, other: Counter) -> Counter:
+        self.log.append("merged")
+        return Counter(
+            torch.where(mask, self.start, other.start), torch.where(mask, self.steps, other.steps), self.log
+        )
+
+
+def carrying(log: list[str]) -> Callable[[int], Any]:
+    """A program that carries a counter; it hangs on x, not on z, and every window runs it on by one step."""
+
+    def program(windows: int) -> Any:
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        pyro.sample("z", dist.Normal(number(0.0), 1.0))
+
+        def start() -> Counter:
+            log.append(f"started {len(x)}")
+            return Counter(x.clone(), torch.zeros(len(x), dtype=torch.int64), log)
+
+        state = carried("counter", x, start)
+
+        class Window(LazyDistribution):
+            def __init__(self, k: int) -> None:
+                self.k = k
+                super().__init__(len(x), (), (x,))
+
+            def log_prob(self, value: Tensor) -> Tensor:
+                assert torch.equal(state.start, x), "the state belongs to other particles"
+                log.extend(["ran"] * int((self.k + 1 - state.steps).clamp_min(0).max()))
+                state.steps = state.steps.clamp_min(self.k + 1)
+                return normal_log(value, x, 1.0)
+
+        for k in range(windows):
+            pyro.sample(f"w_{k}", Window(k))
+        return state
+
+    return program
+
+
+def test_carried_state_goes_on_and_is_indexed_and_merged_with_its_particles() -> None:
+    log: list[str] = []
+    trace, _ = generate(carrying(log), (1,), {"w_0": number(0.0)}, N)
+    assert log == [f"started {N}", "ran"]
+    trace, _ = extend(trace, (2,), {"w_1": number(0.0)})
+    assert log == [f"started {N}", "ran", "ran"], "the second window goes on from the first"
+    log.clear()
+    trace = trace[torch.tensor([4, 4, 1, 0])]
+    trace, _ = extend(trace, (3,), {"w_2": number(1.0)})
+    assert log == ["ran"], "resampled particles keep their state"
+    log.clear()
+    moved = update(trace, {"z": trace["z"] + 1.0})
+    moved.log_ratio  # noqa: B018
+    assert log == [], "the state does not hang on z"
+    moved = update(trace, {"x": trace["x"] + 1.0})
+    moved.log_ratio  # noqa: B018
+    assert log == ["started 4", "ran", "ran", "ran"], "a new x throws the state away"
+    log.clear()
+    mixed = moved.trace.where(torch.tensor([True, False, False, True]), trace)
+    mixed, _ = extend(mixed, (4,), {"w_3": number(1.0)})
+    assert log == ["merged", "ran"], "accepted and refused particles keep their own states"
+    assert torch.equal(mixed.result.start, mixed["x"])
+
+
+def test_a_state_started_for_other_inputs_is_not_merged_in() -> None:
+    log: list[str] = []
+    trace, _ = generate(carrying(log), (1,), {"w_0": number(0.0)}, N)
+    moved = update(trace, {"x": trace["x"] + 1.0}).trace
+    again = update(moved, {"x": trace["x"]}).trace
+    mixed = again.where(torch.zeros(N, dtype=torch.bool), moved)
+    mixed, _ = extend(mixed, (2,), {"w_1": number(0.0)})
+    assert torch.equal(mixed.result.start, moved["x"])
+
+
+def test_what_was_simulated_assesses_to_its_own_density() -> None:
+    torch.manual_seed(0)
+    trace = simulate(several, (2,), N)
+    torch.testing.assert_close(assess(several, (2,), trace.choices, N), trace.log_prob())
+    proposed = propose(several, (2,), N)
+    torch.testing.assert_close(assess(several, (2,), proposed.choices, N), proposed.log_prob)
+    # The latents' own part, written out: a coin, three normals, a uniform pose, two categoricals.
+    coin = torch.where(trace["coin"] == 1, number(math.log(0.3)), number(math.log(0.7)))
+    volume = 0.2**3 * (2.0 - math.sin(2.0)) / math.pi
+    kinds = torch.tensor([0.2, 0.3, 0.5], dtype=torch.float64).log()
+    expected = coin + normal_log(trace["x"], 0.0, 1.0).sum(-1) - math.log(volume)
+    expected = expected + kinds[trace["kind_0"]] + kinds[trace["kind_1"]]
+    torch.testing.assert_close(trace.log_prob("coin", "x", "pose", "kind_0", "kind_1"), expected)
+
+
+def test_a_pose_update_is_weighed_by_the_pose_density() -> None:
+    center = poses.as_pose([0.1, 0.0, 0.0, 0.8, 0.6, 0.0, 0.0])
+    spread = torch.tensor([0.1, 0.1, 0.1, 0.8, 0.8, 0.8], dtype=torch.float64)
+
+    def program() -> None:
+        pyro.sample("pose", NormalPose(center, spread))
+
+    trace = simulate(program, (), N)
+    new = simulate(program, (), N)["pose"]
+    ratio = update(trace, {"pose": new}).log_ratio
+    prior = NormalPose(center, spread)
+    torch.testing.assert_close(ratio, prior.log_prob(new) - prior.log_prob(trace["pose"]))
+    assert float(ratio.abs().min()) > 1e-6
+    # q and -q are one pose.
+    torch.testing.assert_close(
+        assess(program, (), {"pose": torch.cat([new[:, :3], -new[:, 3:]], -1)}, N), prior.log_prob(new)
+    )
+
+
+def test_verbs_leave_pyros_settings_and_draw_from_torchs_generator_only() -> None:
+    torch.manual_seed(3)
+    first = simulate(several, (2,), N)
+    torch.manual_seed(3)
+    second = simulate(several, (2,), N)
+    assert all(torch.equal(first[a], second[a]) for a in first.choices)
+    state = torch.get_rng_state()
+    extend(generate(counted([]), (0,), {}, N)[0], (0,), {})
+    assert not torch.equal(state, torch.get_rng_state())
+    state = torch.get_rng_state()
+    first.log_prob()
+    update(first, {"x": first["x"] + 1}).log_ratio  # noqa: B018
+    assert torch.equal(state, torch.get_rng_state()), "known values are not drawn again"
+
+
+# ---- what is refused
+
+
+def latent_and_seen(*, scale: Any = 1.0) -> None:
+    x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+    pyro.sample("y", dist.Normal(x, scale))
+
+
+def twice() -> None:
+    pyro.sample("x", dist.Normal(number(0.0), 1.0))
+    pyro.sample("x", dist.Normal(number(0.0), 1.0))
+
+
+def stacked() -> None:
+    pyro.sample("x", dist.Normal(torch.zeros(3, N), 1.0))
+
+
+def beside_the_plate() -> None:
+    pyro.sample("x", dist.Normal(torch.zeros(3), 1.0))
+
+
+def inner_plate() -> None:
+    with pyro.plate("points", 3):
+        pyro.sample("x", dist.Normal(number(0.0), 1.0))
+
+
+def enumerated() -> None:
+    pyro.sample("x", dist.Bernoulli(number(0.5)), infer={"enumerate": "parallel"})
+
+
+def refusing() -> None:
+    pyro.sample("x", dist.Normal(number(0.0), 1.0))
+    raise InputError("the scene has no part; give one.")
+
+
+def vanishing(steps: int) -> None:
+    if steps == 0:
+        pyro.sample("x", dist.Normal(number(0.0), 1.0))
+
+
+def wide() -> None:
+    class Wide(Counted):
+        def log_prob(self, value: Tensor) -> Tensor:
+            return torch.zeros(3, N)
+
+    pyro.sample("x", dist.Normal(number(0.0), 1.0))
+    pyro.sample("y", Wide([], "y", torch.zeros(N)))
+
+
+def branching() -> None:
+    x = pyro.sample("x", dist.Bernoulli(number(0.5)))
+    if bool((x == 1).all()):
+        pyro.sample("only then", dist.Normal(number(0.0), 1.0))
+
+
+def updated(values: dict[str, Tensor]) -> Any:
+    return update(generate(latent_and_seen, (), {"y": number(0.0)}, N)[0], values)
+
+
+ones = torch.ones(N, dtype=torch.float64)
+REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
+    "never visited": (
+        lambda: generate(latent_and_seen, (), {"q": number(0.0)}, N),
+        "'q'.* never visits.* x, y",
+    ),
+    "never visited, extend": (
+        lambda: extend(generate(counted([]), (0,), {}, N)[0], (1,), {"a_9": number(0.0)}),
+        "'a_9'.* never visits",
+    ),
+    "observed again": (
+        lambda: extend(generate(counted([]), (1,), seen(1), N)[0], (1,), seen(1)),
+        "'a_0' was observed or sampled before",
+    ),
+    "vanished": (lambda: extend(simulate(vanishing, (0,), N), (1,), {}), "no longer visits address 'x'"),
+    "no tensor": (lambda: generate(latent_and_seen, (), {"y": 1.0}, N), "'y' is a float"),  # type: ignore[dict-item]
+    "wrong shape": (
+        lambda: generate(latent_and_seen, (), {"y": torch.zeros(3)}, N),
+        "'y' has shape \\(3,\\)",
+    ),
+    "one observation for each": (
+        lambda: generate(latent_and_seen, (), {"y": torch.zeros(N)}, N),
+        "'y' has shape \\(5,\\).* the same for all particles",
+    ),
+    "twice": (lambda: simulate(twice, (), N), "twice .*'x'"),
+    "batch (3, N)": (lambda: simulate(stacked, (), N), r"'x' has batch shape \(3, 5\)"),
+    "batch (3,)": (lambda: simulate(beside_the_plate, (), N), "site x .* 5 vs 3"),
+    "inner plate": (lambda: simulate(inner_plate, (), N), r"'x' has batch shape \(3, 5\)"),
+    "enumerated": (lambda: simulate(enumerated, (), N), "'x' is enumerated"),
+    "log-probabilities": (lambda: simulate(wide, (), N).log_prob(), r"'y' has log-probabilities .*\(3, 5\)"),
+    "no such site": (lambda: simulate(latent_and_seen, (), N).log_prob("q"), "no address 'q'"),
+    "update of an observation": (lambda: updated({"y": ones}), "'y' was given, which is no latent.* x"),
+    "update of nothing": (lambda: updated({"q": ones}), "'q' was given, which is no latent"),
+    "update of wrong shape": (lambda: updated({"x": ones[:3]}), r"'x' has shape \(3,\), the old one \(5,\)"),
+    "update that changes the addresses": (
+        lambda: update(t := simulate(branching, (), 1), {"x": 1.0 - t["x"]}),
+        "which addresses",
+    ),
+    "assess without a choice": (
+        lambda: assess(latent_and_seen, (), {"x": ones}, N),
+        "a value for address 'y'",
+    ),
+    "assess with one too many": (
+        lambda: assess(latent_and_seen, (), {"x": ones, "y": ones, "q": ones}, N),
+        "'q'.* never visits",
+    ),
+    "assess of wrong length": (
+        lambda: assess(latent_and_seen, (), {"x": ones[:3], "y": ones}, N),
+        "5 particles .* 5 vs 3",
+    ),
+    "no particles": (lambda: simulate(latent_and_seen, (), 0), "for 0 particles; give 1 or more"),
+    "an error of the program itself": (
+        lambda: simulate(refusing, (), N),
+        "^the scene has no part; give one.$",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refusals_are_one_sentence_that_names_the_address(case: str) -> None:
+    act, says = REFUSED[case]
+    with pytest.raises(InputError, match=says) as caught:
+        act()
+    text = str(caught.value)
+    assert "\n" not in text and text.endswith(".") and ". " not in text, text
+
+
+@pytest.mark.parametrize(("bad", "said"), [(math.nan, "nan"), (math.inf, "inf")])
+def test_a_log_probability_that_is_no_number_names_site_and_particles(bad: float, said: str) -> None:
+    class Broken(Counted):
+        def log_prob(self, value: Tensor) -> Tensor:
+            return torch.tensor([0.0, bad, -math.inf, bad, 0.0], dtype=torch.float64)
+
+    def program() -> None:
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        pyro.sample("felt", Broken([], "felt", x))
+
+    with pytest.raises(InferenceError, match=rf"'felt' .* {said} for 2 of 5 particles \(first: 1, 3\)"):
+        generate(program, (), {"felt": number(0.0)}, N)
