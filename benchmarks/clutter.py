@@ -2,7 +2,7 @@
 
 The guess is the truth moved by a draw from the prior, 40 mm to either side and up to 25 degrees. An object
 counts as found where the posterior mean is closer to the truth than a tenth of its diameter, by ADD over the
-vertices of its mesh, or by ADD-S where it looks the same from several sides (Hinterstoisser et al., ACCV 2012).
+mesh's vertices, or by ADD-S where it looks the same from several sides (Hinterstoisser et al., ACCV 2012).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """How well real touches find a part: pushes of an aluminium triangle by a robot's finger.
 
-The true pose is known. The finger and its scatter are learnt on one log, and pushes drawn from another log are
+The true pose is known. The finger and its scatter are learnt on one log, pushes drawn from another log are
 explained. One run over the longest series gives the beliefs after every shorter one.
 """
 
