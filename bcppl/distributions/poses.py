@@ -119,7 +119,7 @@ class UniformPose(_PoseDistribution):
         inside = (tangent[..., :3].abs() <= self.widths + HELD).all(dim=-1)
         inside &= tangent[..., 3:].norm(dim=-1) <= self.angle + HELD
         inside &= self.freedom.off_axis(tangent) <= HELD
-        return torch.where(inside, self.log_density, -torch.inf)
+        return torch.where(inside, value.new_tensor(self.log_density), -torch.inf)
 
 
 def _haar_angle(shape: torch.Size, largest: float) -> Tensor:
@@ -187,7 +187,7 @@ class SwingTwistPose(_PoseDistribution):
         inside = (shift.abs() <= self.widths + HELD).all(dim=-1)
         # The angle of a vanishing tilt is the square root of rounding in the quaternion.
         inside &= (tilt <= self.tilt + 1e-7) & (yaw.abs() <= self.yaw + HELD)
-        return torch.where(inside, self.log_density, -torch.inf)
+        return torch.where(inside, value.new_tensor(self.log_density), -torch.inf)
 
 
 def tilt_and_yaw(center: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
