@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -178,6 +179,27 @@ def test_an_observation_that_was_written_to_is_read_again() -> None:
     image[5:9] = 0.3
     assert torch.equal(site.log_prob(image), distribution(True, poses_near(3)).log_prob(image))
     assert not torch.equal(site.log_prob(image), before)
+
+
+@pytest.mark.parametrize("changed", ["scale", "effective_pixels", "background", "region", "outlier", "far"])
+def test_an_observation_is_read_again_where_the_distribution_differs(changed: str) -> None:
+    image, pose, shape = observation(), poses_near(3), (CAMERA.height, CAMERA.width)
+    first = {"scale": 0.002, "effective_pixels": 90.0, "background": None, "region": None, "outlier": 0.1}
+    region = np.zeros(shape, dtype=bool)
+    region[::2] = True
+    other = {
+        "scale": 0.004,
+        "effective_pixels": 30.0,
+        "background": np.full(shape, 0.7),
+        "region": region,
+        "outlier": 0.3,
+    }
+    camera = replace(CAMERA, far=CAMERA.far + 1.0) if changed == "far" else CAMERA
+    settings = {k: other[k] if k == changed else v for k, v in first.items()}
+    RobustDepth(RENDERER, CAMERA, pose, **first).log_prob(image)
+    again = RobustDepth(RENDERER, camera, pose, **settings).log_prob(image)
+    assert torch.equal(again, RobustDepth(RENDERER, camera, pose, **settings).log_prob(image.clone()))
+    assert not torch.equal(again, RobustDepth(RENDERER, CAMERA, pose, **first).log_prob(image))
 
 
 def test_truth_beats_poses_nearby() -> None:

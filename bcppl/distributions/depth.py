@@ -8,12 +8,14 @@ pixels (0, NaN, out of range) never count, and which are missing depends on the 
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
@@ -55,20 +57,28 @@ class _Observed(NamedTuple):
     """What an observation alone says, computed once for all particles.
 
     Attributes:
-        value: the observation, (H, W) or (N, H, W).
-        version: changes when the tensor is written to.
+        version: of the observation, (H, W) or (N, H, W); changes when the tensor is written to.
+        parameters, background, region: those of the distribution that read it.
+        behind: the depth of the background, +inf where unknown, (H * W,).
         depth: its pixels, (1 or N, H * W).
         valid: which of them count, (1 or N, H * W).
         empty: their log-density where no ray meets the part, 0 where they do not count, (1 or N, H * W).
         power: what the log-likelihood is multiplied by, (1 or N,).
     """
 
-    value: Tensor
     version: int
+    parameters: tuple[Any, ...]
+    background: Array | Tensor | None
+    region: Mask | Tensor | None
+    behind: Array
     depth: Array
     valid: Mask
     empty: Array
     power: Array
+
+
+# Every run of a program makes its distributions anew, at other poses: what an image says is kept with it.
+_OBSERVED: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 
 class _Depth(LazyDistribution):
@@ -112,13 +122,23 @@ class _Depth(LazyDistribution):
         self.pose = pose
         self.scale = float(scale)
         self.effective_pixels = effective_pixels
-        behind = np.full(shape, np.nan) if background is None else np.asarray(background, dtype=np.float64)
-        known = np.isfinite(behind) & (behind > 0.0)
-        # +inf stands for unknown, so that the nearer of part and background is their minimum.
-        self._background = np.where(known, behind, np.inf).reshape(-1)
-        self._region = None if region is None else np.asarray(region, dtype=bool).reshape(-1)
+        self.background = background
+        self.region = region
         self._log_uniform = -math.log(camera.far - camera.near)
-        self._observed: _Observed | None = None
+
+    @cached_property
+    def _behind(self) -> Array:
+        """The depth of the background, (H * W,): +inf where unknown, so that the nearer is the minimum."""
+        if self.background is None:
+            return np.full(self.camera.height * self.camera.width, np.inf)
+        behind = np.asarray(self.background, dtype=np.float64).reshape(-1)
+        return np.where(np.isfinite(behind) & (behind > 0.0), behind, np.inf)
+
+    @property
+    def _parameters(self) -> tuple[Any, ...]:
+        """All that the density of a pixel hangs on beside what is observed and rendered there."""
+        camera = self.camera
+        return (type(self), camera.near, camera.far, self.scale, self.effective_pixels)
 
     def _log_density(self, residual: Tensor) -> Tensor:
         """Log-density of pixels, given how far they are from the depth rendered there, metres."""
@@ -138,7 +158,7 @@ class _Depth(LazyDistribution):
         seen = self._observe(value)
         hits = self.renderer.hits(self.camera, self.pose.detach(), counted=np.asarray(seen.valid.any(axis=0)))
         pixel = hits.pixel
-        rendered = np.minimum(hits.depth, self._background.take(pixel))
+        rendered = np.minimum(hits.depth, seen.behind.take(pixel))
         if len(seen.depth) > 1:
             pixel = pixel + hits.particle * seen.depth.shape[1]
         gain = self._log_density(torch.from_numpy(seen.depth.take(pixel) - rendered)).numpy()
@@ -165,7 +185,7 @@ class _Depth(LazyDistribution):
             )
         self._check_pose()
         images = torch.from_numpy(self.renderer.images(self.camera, self.pose.detach()))
-        rendered = torch.minimum(images, torch.from_numpy(self._background).reshape(self.event_shape))
+        rendered = torch.minimum(images, torch.from_numpy(self._behind).reshape(self.event_shape))
         unknown = torch.isinf(rendered)
         noisy = self._noisy(torch.where(unknown, 0.0, rendered))
         return torch.where(unknown, self._uniform(rendered), noisy)
@@ -174,8 +194,14 @@ class _Depth(LazyDistribution):
         return self.camera.near + (self.camera.far - self.camera.near) * torch.rand_like(like)
 
     def _observe(self, value: Tensor) -> _Observed:
-        cached = self._observed
-        if cached is not None and cached.value is value and cached.version == value._version:
+        cached: _Observed | None = _OBSERVED.get(value)
+        if (
+            cached is not None
+            and cached.version == value._version
+            and cached.parameters == self._parameters
+            and cached.background is self.background
+            and cached.region is self.region
+        ):
             return cached
         batch = (self.batch_shape[0], *self.event_shape)
         if value.shape not in (self.event_shape, torch.Size(batch)):
@@ -183,18 +209,20 @@ class _Depth(LazyDistribution):
                 f"a depth image of camera {self.camera.name!r} has shape {tuple(value.shape)}; "
                 f"give {tuple(self.event_shape)}, or {batch} for one image per particle."
             )
-        depth = value.detach().to(torch.float64).reshape(-1, self._background.size).numpy()
+        depth = value.detach().to(torch.float64).reshape(-1, self._behind.size).numpy()
         valid = np.isfinite(depth) & (depth > 0.0) & (depth >= self.camera.near) & (depth <= self.camera.far)
-        if self._region is not None:
-            valid &= self._region
-        known = np.isfinite(self._background)
-        behind = self._log_density(torch.from_numpy(depth - np.where(known, self._background, 0.0))).numpy()
-        empty = np.where(valid, np.where(known, behind, self._log_uniform), 0.0)
+        if self.region is not None:
+            valid &= np.asarray(self.region, dtype=bool).reshape(-1)
+        known = np.isfinite(self._behind)
+        shown = self._log_density(torch.from_numpy(depth - np.where(known, self._behind, 0.0))).numpy()
+        empty = np.where(valid, np.where(known, shown, self._log_uniform), 0.0)
         power = np.ones(len(depth))
         if self.effective_pixels is not None:
             power = np.minimum(1.0, self.effective_pixels / np.maximum(valid.sum(axis=1), 1))
-        self._observed = _Observed(value, value._version, depth, valid, empty, power)
-        return self._observed
+        read = (self._parameters, self.background, self.region)
+        observed = _Observed(value._version, *read, self._behind, depth, valid, empty, power)
+        _OBSERVED[value] = observed
+        return observed
 
     def _check_pose(self) -> None:
         bad = torch.nonzero(~torch.isfinite(self.pose).all(dim=-1)).flatten().tolist()
@@ -273,6 +301,10 @@ class RobustDepth(_Depth):
             raise InputError(f"the probability of an outlier is {outlier}; give a number between 0 and 1.")
         self.outlier = float(outlier)
         super().__init__(renderer, camera, pose, scale, background, effective_pixels, region)
+
+    @property
+    def _parameters(self) -> tuple[Any, ...]:
+        return (*super()._parameters, self.outlier)
 
     def _log_density(self, residual: Tensor) -> Tensor:
         inlier = torch.exp(-residual.abs() / self.scale) * ((1.0 - self.outlier) / (2.0 * self.scale))
