@@ -182,7 +182,7 @@ def test_composed_kernels_and_tempered_targets_are_invariant() -> None:
 
 
 def leaning(_: Population) -> Callable[[Trace], None]:
-    """Pulled to the origin, by a pull that is chosen first and whose chances hang on where the particle is."""
+    """Pulled to the origin by a pull that is chosen first, its chances hanging on where the particle is."""
 
     def propose(trace: Trace) -> None:
         x = trace["x"]
@@ -224,7 +224,7 @@ def test_a_proposal_that_moves_nothing_latent_is_refused() -> None:
         return lambda trace: pyro.sample("elsewhere", dist.Normal(trace["x"], 1.0).to_event(1))
 
     trace = correlated_draws(4)
-    with pytest.raises(InferenceError, match="elsewhere.* latent are x"):
+    with pytest.raises(InferenceError, match=r"elsewhere.* latent are x"):
         metropolis_hastings(fit)(equal_weights(trace))(trace, POSTERIOR)
 
 

@@ -1,0 +1,362 @@
+"""SMC: resampling, tempering, evidence that is unbiased, and runs that can be had again bit for bit."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from torch import Tensor
+
+from bcppl.errors import InferenceError
+from bcppl.inference import bayes_contact, smc, tempered_smc
+from bcppl.inference.bayes_contact import drift_and_weigh
+from bcppl.inference.kernels import metropolis_hastings
+from bcppl.inference.population import Population
+from bcppl.inference.proposals import drift
+from bcppl.inference.resampling import Resample, adaptive, always, never, systematic
+from bcppl.inference.smc import Assimilate, Step, tempered
+from bcppl.inference.tempering import conditional_effective_sample_size, next_exponent
+from bcppl.models.point_probe import model
+from bcppl.recordings import Recording, load
+from bcppl.traces import Trace, generate
+from bcppl.traces import update as real_update
+
+
+def number(value: float) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+# ---- resampling
+
+
+def test_systematic_resampling_is_unbiased_and_even() -> None:
+    torch.manual_seed(0)
+    log_weights = torch.tensor([0.0, -1.0, 2.0, -torch.inf, 0.5, -3.0, 1.0], dtype=torch.float64)
+    share = 7 * torch.softmax(log_weights, 0)
+    runs = 4000
+    counts = torch.stack([torch.bincount(systematic(log_weights), minlength=7) for _ in range(runs)]).double()
+    assert bool((counts >= share.floor()).all()) and bool((counts <= share.floor() + 1).all())
+    error = (counts.mean(0) - share).abs() / (counts.std(0) / math.sqrt(runs)).clamp_min(1e-9)
+    assert float(error.max()) < 4.5
+    assert float(counts[:, 3].sum()) == 0
+
+
+def test_systematic_resampling_holds_at_a_million() -> None:
+    torch.manual_seed(0)
+    count = 1_000_000
+    log_weights = torch.linspace(0.0, 3.0, count, dtype=torch.float64)
+    ancestors = systematic(log_weights)
+    assert int(ancestors.min()) >= 0 and int(ancestors.max()) < count
+    copies = torch.bincount(ancestors, minlength=count).double()
+    assert float((copies - count * torch.softmax(log_weights, 0)).abs().max()) < 1 + 1e-6
+    assert torch.equal(systematic(torch.zeros(count, dtype=torch.float64)), torch.arange(count))
+
+
+@pytest.mark.parametrize("count", [3, 1_000_000])
+def test_the_last_point_falls_to_a_particle_with_weight(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "rand", lambda *_, **__: number(1 - 2**-53))
+    log_weights = torch.full((count,), -1.2345, dtype=torch.float64)
+    log_weights[-1] = -torch.inf
+    assert int(systematic(log_weights).max()) == count - 2
+
+
+def test_when_to_resample() -> None:
+    def program() -> None:
+        pyro.sample("x", dist.Normal(number(0.0), 1.0))
+
+    trace, _ = generate(program, (), {}, 4)
+    even = Population(trace, torch.tensor([0.0, 0.0, 0.0, -0.1], dtype=torch.float64), -3.0)
+    uneven = Population(trace, torch.tensor([0.0, -9.0, -9.0, -9.0], dtype=torch.float64), -3.0)
+    assert never(uneven) == (uneven, False)
+    assert adaptive(systematic, 0.5)(even) == (even, False)
+    for resample, population in (
+        (adaptive(systematic, 0.5), uneven),
+        (always(), uneven),
+        (always(), even),
+    ):
+        chosen, done = resample(population)
+        assert done and float(chosen.log_weights.abs().max()) == 0.0
+        assert chosen.log_evidence == -3.0, "resampling leaves the evidence"
+    assert float((always()(uneven)[0].trace["x"] == trace["x"][0]).double().mean()) == 1.0
+
+
+# ---- tempering
+
+
+def test_the_next_exponent_keeps_the_share_asked_for() -> None:
+    torch.manual_seed(0)
+    for sharpness in (30.0, 1e4):
+        log_likelihood = -sharpness * torch.rand(200, dtype=torch.float64) - 5e5
+        log_weights = torch.randn(200, dtype=torch.float64)
+        reached = 0.0
+        for share in (0.9, 0.5):
+            exponent = next_exponent(log_weights, log_likelihood, reached, share)
+            step = (exponent - reached) * log_likelihood
+            assert reached < exponent < 1
+            assert conditional_effective_sample_size(log_weights, step) / 200 == pytest.approx(
+                share, abs=1e-4
+            )
+            reached = exponent
+    # By hand: weights 1/4 3/4, factors 1 and e: CESS = 2 (1/4 + 3e/4)^2 / (1/4 + 3e^2/4).
+    by_hand = 2 * (0.25 + 0.75 * math.e) ** 2 / (0.25 + 0.75 * math.e**2)
+    uneven = torch.tensor([0.25, 0.75], dtype=torch.float64).log() + 7.0
+    assert conditional_effective_sample_size(uneven, torch.tensor([10.0, 11.0]).double()) == pytest.approx(
+        by_hand
+    )
+    assert next_exponent(log_weights, torch.zeros(200, dtype=torch.float64), 0.3, 0.5) == 1.0
+
+
+def test_particles_that_cannot_be_do_not_steer_the_exponent() -> None:
+    torch.manual_seed(0)
+    log_likelihood = -200.0 * torch.rand(100, dtype=torch.float64)
+    weights = torch.zeros(100, dtype=torch.float64)
+    alone = next_exponent(weights, log_likelihood, 0.0, 0.5)
+    gone = torch.full((60,), -torch.inf, dtype=torch.float64)
+    both = next_exponent(torch.zeros(160, dtype=torch.float64), torch.cat([log_likelihood, gone]), 0.0, 0.5)
+    assert both == pytest.approx(alone, rel=1e-9)
+
+
+def half_line(steps: int) -> None:
+    """A coin that decides whether what is seen can be: seen to be above x."""
+    x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+    for k in range(steps):
+        pyro.sample(f"y_{k}", dist.Uniform(x, 10.0))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize("resample", [never, always(), adaptive()])
+def test_nothing_left_is_an_error_that_says_what_to_try(share: float, resample: Resample) -> None:
+    trace, weights = generate(half_line, (0,), {}, 50)
+    kernel = metropolis_hastings(drift("x"))
+    assimilate = tempered(kernel, resample=resample, share=share)
+    some = assimilate(Population(trace, weights), (1,), {"y_0": number(0.3)}).population
+    if resample is not never:
+        assert bool((some.trace["x"][some.log_weights > -torch.inf] <= 0.3).all())
+    with pytest.raises(InferenceError, match=r"no particle has any weight left.*widen the prior") as caught:
+        assimilate(some, (2,), {"y_1": number(11.0)})
+    assert str(caught.value).count("\n") == 0
+
+
+# ---- evidence: the mean of the estimate over the truth is 1
+
+OBSERVED = [0.8, -0.3, 1.9]
+NOISE = 0.6
+
+
+def static(steps: int) -> None:
+    x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+    for k in range(steps):
+        pyro.sample(f"y_{k}", dist.Normal(x, NOISE))
+
+
+def static_evidence() -> float:
+    y = torch.tensor(OBSERVED, dtype=torch.float64)
+    covariance = torch.ones(3, 3, dtype=torch.float64) + NOISE**2 * torch.eye(3, dtype=torch.float64)
+    return float(torch.distributions.MultivariateNormal(torch.zeros(3).double(), covariance).log_prob(y))
+
+
+TRANSITION = torch.tensor([[0.4, 0.4, 0.2], [0.2, 0.3, 0.5], [0.9, 0.05, 0.05]], dtype=torch.float64)
+EMISSION = torch.tensor([[0.1, 0.2, 0.7], [0.2, 0.7, 0.1], [0.7, 0.2, 0.1]], dtype=torch.float64)
+HIDDEN_SEEN = [0, 0, 1, 2]
+
+
+def hidden_markov(steps: int) -> None:
+    """Gen.jl's particle filter test."""
+    state = pyro.sample("z_0", dist.Categorical(torch.tensor([0.2, 0.3, 0.5], dtype=torch.float64)))
+    for k in range(steps):
+        if k:
+            state = pyro.sample(f"z_{k}", dist.Categorical(TRANSITION[state]))
+        pyro.sample(f"y_{k}", dist.Categorical(EMISSION[state]))
+
+
+def ratios(
+    program: Callable[[int], None],
+    values: list[Tensor],
+    exact: float,
+    take: Assimilate,
+    runs: int,
+    particles: int,
+) -> np.ndarray[Any, Any]:
+    """Zhat / Z of many runs."""
+    found = []
+    for seed in range(runs):
+        torch.manual_seed(seed)
+        population = Population(*generate(program, (0,), {}, particles))
+        for k, value in enumerate(values):
+            population = take(population, (k + 1,), {f"y_{k}": value}).population
+        found.append(math.exp(population.log_evidence - exact))
+    return np.array(found)
+
+
+def standard_errors(found: np.ndarray[Any, Any]) -> float:
+    """How far from 1 the mean is, in its own standard errors."""
+    return float(abs(found.mean() - 1) / (found.std(ddof=1) / math.sqrt(len(found))))
+
+
+def fixed_drift(_: Population) -> Callable[[Trace], None]:
+    """A proposal that learns nothing and is not symmetric."""
+
+    def propose(trace: Trace) -> None:
+        pyro.sample("x", dist.Normal(0.9 * trace["x"] + 0.1, 0.4))
+
+    return propose
+
+
+def by_halves(_: Tensor, __: Tensor, exponent: float, ___: float) -> float:
+    return exponent + 0.5
+
+
+def kept_weights(population: Population) -> tuple[Population, bool]:
+    """Mutant: resampled particles keep their weights."""
+    ancestors = systematic(population.log_weights)
+    trace = population.trace[ancestors]
+    return Population(trace, population.log_weights[ancestors], population.log_evidence), True
+
+
+SCHEMES = {"never": never, "always": always(), "adaptive": adaptive(systematic, 0.7)}
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_evidence_is_unbiased_with_fixed_exponents(scheme: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(smc, "next_exponent", by_halves)
+    values = [number(y) for y in OBSERVED]
+    take = tempered(metropolis_hastings(fixed_drift), sweeps=1, resample=SCHEMES[scheme])
+    found = ratios(static, values, static_evidence(), take, 150, 60)
+    assert standard_errors(found) < 4
+    assert 0.01 < found.std() < 0.6
+
+
+def test_mutant_that_keeps_weights_when_resampling(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = [number(y) for y in OBSERVED]
+    take = tempered(None, resample=kept_weights, share=0.0)
+    assert standard_errors(ratios(static, values, static_evidence(), take, 200, 60)) > 8
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_hidden_markov_model(scheme: str) -> None:
+    take = tempered(None, resample=SCHEMES[scheme], share=0.0)
+    values = [torch.tensor(y) for y in HIDDEN_SEEN]
+    found = ratios(hidden_markov, values, -4.8764508, take, 200, 100)
+    assert standard_errors(found) < 4
+    # The resolution of this test: a hundredth of Z.
+    assert found.std(ddof=1) / math.sqrt(len(found)) < 0.015
+
+
+# ---- BayesContact's own filter
+
+
+def test_the_baseline_weighs_by_all_measurements(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = [number(y) for y in OBSERVED]
+    for fit, resample in ((fixed_drift, always()), (drift("x", (0.2, 0.21)), adaptive())):
+        found = ratios(static, values, static_evidence(), drift_and_weigh(fit, resample), 120, 100)
+        assert standard_errors(found) < 4
+        assert found.std() < 0.8
+
+    @dataclasses.dataclass
+    class PriorOnly:
+        """Mutant, the paper's weight taken literally: the past likelihoods are left out."""
+
+        trace: Trace
+        previous: Trace
+        discarded: Any
+
+        @property
+        def log_ratio(self) -> Tensor:
+            return self.trace.log_prob("x") - self.previous.log_prob("x")
+
+    def mutant(trace: Trace, new: Any) -> PriorOnly:
+        updated = real_update(trace, new)
+        return PriorOnly(updated.trace, updated.previous, updated.discarded)
+
+    monkeypatch.setattr(bayes_contact, "update", mutant)
+    take = drift_and_weigh(fixed_drift, always())
+    assert standard_errors(ratios(static, values, static_evidence(), take, 200, 100)) > 8
+
+
+def test_mutant_of_the_baseline_without_the_way_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        bayes_contact, "assess", lambda program, args, choices, count: torch.zeros(count, dtype=torch.float64)
+    )
+    values = [number(y) for y in OBSERVED]
+    take = drift_and_weigh(fixed_drift, always())
+    # A few huge ratios make the mean's own error huge: it is the median that gives this one away.
+    assert np.median(ratios(static, values, static_evidence(), take, 50, 100)) > 4
+
+
+# ---- runs that can be had again
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    whole = load(files("bcppl.models") / "recordings/point_probe_10_pushes.h5")  # type: ignore[arg-type]
+    return dataclasses.replace(whole, measurements=whole.measurements[:4])
+
+
+def same(first: list[Step], second: list[Step]) -> bool:
+    return len(first) == len(second) and all(
+        torch.equal(a.belief.world_from_part, b.belief.world_from_part)
+        and torch.equal(a.belief.log_weights, b.belief.log_weights)
+        and torch.equal(a.random_state, b.random_state)
+        and a.info.log_evidence == b.info.log_evidence
+        for a, b in zip(first, second, strict=True)
+    )
+
+
+@pytest.mark.parametrize("infer", [tempered_smc.infer, bayes_contact.infer])
+def test_the_same_seed_gives_the_same_beliefs(
+    infer: Callable[..., Iterator[Step]], recording: Recording
+) -> None:
+    torch.manual_seed(5)
+    state = torch.get_rng_state()
+    first = list(infer(model, recording, particles=20, seed=3))
+    assert torch.equal(state, torch.get_rng_state()), "the caller's random state is left as it was"
+    torch.rand(7)
+    np.random.seed(1)
+    assert same(first, list(infer(model, recording, particles=20, seed=3)))
+    assert not same(first, list(infer(model, recording, particles=20, seed=4)))
+    # Whether the truth is known changes nothing.
+    unknown = dataclasses.replace(recording, truth=None)
+    assert same(first, list(infer(model, unknown, particles=20, seed=3)))
+
+
+def test_stopping_half_way_and_going_on_equals_a_whole_run(recording: Recording) -> None:
+    whole = list(tempered_smc.infer(model, recording, particles=20, seed=3))
+    iterator = tempered_smc.infer(model, recording, particles=20, seed=3)
+    torch.manual_seed(11)
+    pieces = [next(iterator), next(iterator)]
+    outside = torch.rand(3)
+    other = tempered_smc.infer(model, recording, particles=10, seed=9)
+    next(other), next(other)
+    pieces += list(iterator)
+    assert same(whole, pieces)
+    torch.manual_seed(11)
+    assert torch.equal(outside, torch.rand(3)), "a run does not draw from the caller's generator"
+
+
+def test_an_error_names_the_measurement(recording: Recording) -> None:
+    def impossible(scene: Any, actions: Any) -> None:
+        part = pyro.sample("part", scene.prior)
+        for k, _ in enumerate(actions):
+            pyro.sample(f"onset_{k}", dist.Uniform(part[:, 0] + 5.0 * (k == 1), part[:, 0] + 9.0))
+
+    def observe(scene: Any, measurements: Any) -> dict[str, Tensor]:
+        return {f"onset_{k}": number(3.0) for k in range(len(measurements))}
+
+    broken = dataclasses.replace(model, program=impossible, observe=observe)
+    for infer in (tempered_smc.infer, bayes_contact.infer):
+        seen = []
+        state = torch.get_rng_state()
+        with pytest.raises(InferenceError, match=r"^push 2: no particle has any weight left"):
+            seen.extend(infer(broken, recording, particles=20))
+        assert torch.equal(state, torch.get_rng_state())
+    iterator = smc.smc(broken, recording, assimilate=tempered(None, resample=never, share=0.0), particles=20)
+    with pytest.raises(InferenceError, match=r"^push 2: no particle"):
+        list(iterator)
