@@ -58,6 +58,16 @@ def inference(name: str) -> Any:
     return _defined(name, bcppl.inference, "infer", None)
 
 
+def refuse_seed(seed: int) -> None:
+    """Refuse a seed that a generator does not take.
+
+    Raises:
+        InputError: it is negative, or does not fit into 63 bits.
+    """
+    if not 0 <= seed < 2**63:
+        raise InputError(f"--seed is {seed}; give a number from 0 to {2**63 - 1}.")
+
+
 def offered(package: ModuleType, attribute: str) -> list[str]:
     """The names of a package's files that define `attribute`."""
     names = [info.name for info in pkgutil.iter_modules(package.__path__) if not info.ispkg]
@@ -106,7 +116,7 @@ def _from_file(path: Path, package: ModuleType, word: str) -> ModuleType:
         raise InputError(
             f"the {word} file {path} is no valid Python: {error.msg}, line {error.lineno}."
         ) from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(
             f"the {word} file {path} stopped with {type(error).__name__}: {error}; "
             f"run `python {path}` to see where."

@@ -46,6 +46,7 @@ def simulate(
     seed: Annotated[int, typer.Option(help="Same seed, same recording.")] = 0,
 ) -> None:
     """Write a recording that a model's own world makes up: a true pose from the prior, and noisy sensors."""
+    loading.refuse_seed(seed)
     chosen = loading.model(model)
     if chosen.invent is None:
         raise InputError(
@@ -61,6 +62,8 @@ def _write(recording: Recording, out: Path) -> None:
     validate(recording)
     if not out.parent.is_dir():
         raise InputError(f"there is no folder {out.parent} to write {out.name} into; make it first.")
+    if out.is_dir():
+        raise InputError(f"{out} is a folder; give the name of a file to write.")
     save(recording, out)
     Console().print(f"wrote {out}: {dict(describe(recording))['measurements']}", highlight=False)
 
@@ -70,6 +73,7 @@ def _importing(command: Callable[..., Recording]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def importing(*, out: Path, **options: Any) -> None:
+        loading.refuse_seed(options.get("seed", 0))
         _write(command(**options), out)
 
     wrapped: Any = importing

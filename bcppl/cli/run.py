@@ -52,6 +52,7 @@ def run(
     """Find the part: one row for each measurement, the final pose with its spread, beliefs and figures."""
     if particles < 2:
         raise InputError(f"--particles is {particles}; give 2 or more, 75 is a good start.")
+    loading.refuse_seed(seed)
     found = loading.recording(recording)
     chosen = loading.model(model or found.model)
     infer = loading.inference(inference)

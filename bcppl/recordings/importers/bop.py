@@ -49,7 +49,7 @@ def command(
         InputError: a file of the scene is missing or unreadable, or the frame or object is not in it.
     """
     scene = Path(scene)
-    if translation < 0 or not 0 < angle <= 180:
+    if not 0 <= translation < math.inf or not 0 < angle <= 180:
         raise InputError(
             "the prior's half width cannot be negative; give an angle above 0, at most 180 degrees."
         )

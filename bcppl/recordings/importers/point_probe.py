@@ -195,7 +195,7 @@ def command(
             f"{pushes} pushes were asked for but {names} holds {len(touching)} with a contact; "
             f"give --pushes between 1 and {len(touching)}."
         )
-    if translation < 0 or not 0 <= yaw <= 180 or after < 0:
+    if not 0 <= translation < math.inf or not 0 <= yaw <= 180 or not after >= 0:
         raise InputError(
             "the prior's half widths and --after cannot be negative, nor yaw more than 180 degrees."
         )

@@ -1,0 +1,368 @@
+"""The command line: what is wrong is one sentence and exit code 2, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from bcppl.cli import main
+from bcppl.recordings import DepthImage, Measurement, Recording, View, load, problems, save
+from bcppl.simulators.camera import Camera
+
+SHIPPED = Path(str(files("bcppl.models") / "recordings/point_probe_10_pushes.h5"))
+PROBE = Path(str(files("bcppl.models") / "point_probe.py"))
+DATA = Path(__file__).parents[2] / "shared/data"
+replace = dataclasses.replace
+
+
+@dataclasses.dataclass
+class Ran:
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def bcppl(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Callable[..., Ran]:
+    """Runs a command in an empty folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.delenv("BCPPL_TRACEBACK", raising=False)
+
+    def run(*words: object) -> Ran:
+        monkeypatch.setattr(sys, "argv", ["bcppl", *map(str, words)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as caught:
+            main()
+        said = capsys.readouterr()
+        code = caught.value.code
+        return Ran(code if isinstance(code, int) else 0 if code is None else 1, said.out, said.err)
+
+    return run
+
+
+def assert_refused(ran: Ran, says: str) -> None:
+    lines = ran.err.strip().splitlines()
+    assert ran.code == 2, (ran.code, ran.err)
+    assert len(lines) == 1 and lines[0].startswith("bcppl: ") and lines[0].endswith("."), ran.err
+    assert says in lines[0], lines[0]
+    assert "Traceback" not in ran.err + ran.out
+
+
+def short(count: int = 3) -> Recording:
+    whole = load(SHIPPED)
+    return replace(whole, measurements=whole.measurements[:count])
+
+
+def changed(values: Any, place: Any, to: float) -> Any:
+    values = np.array(values)
+    values[place] = to
+    return values
+
+
+def first_push(**changes: Any) -> Recording:
+    """The recording with the first push's action or touch changed."""
+    whole = short()
+    first = whole.measurements[0]
+    action = {k: v for k, v in changes.items() if k == "world_from_tip"}
+    touch = {k: v for k, v in changes.items() if k not in action}
+    new = Measurement(replace(first.action, **action), replace(first.observation, **touch))
+    return replace(whole, measurements=[new, *whole.measurements[1:]])
+
+
+def viewed(height: float = 0.5, rows: int = 6) -> Recording:
+    """One depth image from above the part."""
+    camera = Camera("above", 8, 6, 9.0, 9.0, 4.0, 3.0, np.array([0.03, 0.03, height, 0, 1, 0, 0]), 0.05, 4.0)
+    return replace(
+        short(),
+        measurements=[Measurement(View(camera), DepthImage(np.full((rows, 8), 0.45)))],
+        model="part_in_view",
+    )
+
+
+def part(**changes: Any) -> Recording:
+    whole = short()
+    return replace(whole, part=replace(whole.part, **changes))
+
+
+def touch_of(recording: Recording) -> Any:
+    return recording.measurements[0].observation
+
+
+BAD: dict[str, tuple[Callable[[], Recording], str]] = {
+    "mesh in millimetres": (lambda: part(vertices=1e3 * short().part.vertices), "millimetres"),
+    "open mesh": (lambda: part(faces=short().part.faces[1:]), "open mesh"),
+    "empty mesh": (lambda: part(faces=np.zeros((0, 3), dtype=np.int64)), "empty mesh"),
+    "camera inside the part": (lambda: viewed(height=0.01), "inside it"),
+    "camera in millimetres": (lambda: viewed(height=500.0), "wrong units"),
+    "depth image of another size": (lambda: viewed(rows=5), "8×5"),
+    "times that run backwards": (
+        lambda: first_push(times=changed(touch_of(short()).times, 7, 0.0)),
+        "run backwards at row 7",
+    ),
+    "NaN in a wrench": (
+        lambda: first_push(wrench=changed(touch_of(short()).wrench, (4, 1), np.nan)),
+        "measurement 0 has a wrench that is not finite at row 4",
+    ),
+    "no measurement": (lambda: short(0), "no measurement"),
+    "unknown model in the file": (lambda: replace(short(), model="nobody"), "no model 'nobody': give one of"),
+    "a model for other measurements": (lambda: replace(short(), model="part_in_view"), "explains views only"),
+    "views for a model of pushes": (lambda: replace(viewed(), model="point_probe"), "explains pushes only"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_recording_is_refused_before_anything_is_written(
+    case: str, bcppl: Callable[..., Ran], tmp_path: Path
+) -> None:
+    make, says = BAD[case]
+    save(make(), tmp_path / "bad.h5")
+    assert_refused(bcppl("run", "bad.h5", "--particles", 5), says)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.h5"]
+
+
+@pytest.mark.parametrize("case", [c for c in BAD if problems(BAD[c][0]())])
+def test_check_says_what_is_wrong(case: str, bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    make, says = BAD[case]
+    save(make(), tmp_path / "bad.h5")
+    ran = bcppl("check", "bad.h5")
+    assert ran.code == 2 and "Traceback" not in ran.err + ran.out, ran
+    assert says in " ".join(ran.out.split()), ran.out
+    assert "nothing wrong" not in ran.out
+
+
+def test_check_lists_all_problems(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    bad = first_push(wrench=changed(touch_of(short()).wrench, (4, 1), np.nan))
+    bad = replace(bad, part=replace(bad.part, faces=bad.part.faces[1:]), truth=np.full(7, np.nan))
+    save(bad, tmp_path / "bad.h5")
+    ran = bcppl("check", "bad.h5")
+    assert ran.code == 2 and ran.out.count("wrong:") == 3
+    for says in ("open mesh", "the truth", "measurement 0 has a wrench"):
+        assert says in ran.out
+    assert bcppl("check", SHIPPED).code == 0
+
+
+def newer(path: Path) -> None:
+    path.write_bytes(SHIPPED.read_bytes())
+    with h5py.File(path, "r+") as file:
+        file.attrs["schema_version"] = 99
+
+
+def truncated(path: Path) -> None:
+    content = SHIPPED.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+FILES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "newer schema": (newer, "schema version 99"),
+    "truncated": (truncated, "file.h5"),
+    "text": (lambda path: path.write_text("not a recording"), "not an HDF5 file"),
+    "missing": (lambda path: None, "not a file"),
+    "directory": (lambda path: path.mkdir(), "not a file"),
+}
+
+
+@pytest.mark.parametrize("command", ["run", "check"])
+@pytest.mark.parametrize("case", FILES)
+def test_a_file_that_is_no_recording_is_refused(
+    case: str, command: str, bcppl: Callable[..., Ran], tmp_path: Path
+) -> None:
+    make, says = FILES[case]
+    make(tmp_path / "file.h5")
+    before = sorted(tmp_path.iterdir())
+    assert_refused(bcppl(command, "file.h5"), says)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+NO_MODEL = "import math\n"
+USER_FILES = {
+    "syntax error": ("def model(:\n", "no valid Python", "line 1"),
+    "nothing defined": (NO_MODEL, "defines no", "named"),
+    "raises": ("raise ValueError('no\\nthing')\n", "stopped with ValueError", "no thing"),
+    "exits": ("import sys\nsys.exit(0)\n", "stopped with SystemExit", "0"),
+    "imports what is missing": ("import no_such_package\n", "no_such_package", "stopped with"),
+    "of another kind": ("model = 3\ninfer = 3\n", "defines no", "needs"),
+    "binary": ("\0\1", "is no valid Python", "null"),
+}
+
+
+@pytest.mark.parametrize("option", ["--model", "--inference"])
+@pytest.mark.parametrize("case", USER_FILES)
+def test_a_users_file_that_cannot_be_run(
+    case: str, option: str, bcppl: Callable[..., Ran], tmp_path: Path
+) -> None:
+    text, *says = USER_FILES[case]
+    (tmp_path / "mine.py").write_text(text)
+    ran = bcppl("run", SHIPPED, option, "mine.py")
+    for each in ("mine.py", *says):
+        assert_refused(ran, each)
+    assert not (tmp_path / "runs").exists()
+
+
+OPTIONS = {
+    "unknown model": (["--model", "nobody"], "no model 'nobody': give one of "),
+    "unknown inference": (
+        ["--inference", "magic"],
+        "no inference program 'magic': give one of bayes_contact",
+    ),
+    "missing model file": (["--model", "nowhere.py"], "no model file nowhere.py"),
+    "missing inference file": (["--inference", "nowhere.py"], "no inference program file nowhere.py"),
+    "model file is a folder": (["--model", "./"], "no model file"),
+    "inference given as model": (["--model", "tempered_smc"], "no model 'tempered_smc'"),
+    "no particles": (["--particles", "0"], "--particles is 0"),
+    "fewer than none": (["--particles", "-3"], "--particles is -3"),
+    "negative seed": (["--seed", "-1"], "--seed is -1"),
+    "endless seed": (["--seed", "9" * 30], "--seed is 999"),
+    "out is a file": (["--out", "file"], "file is a file"),
+    "out is in a file": (["--out", "file/deep/er"], "file is a file"),
+}
+
+
+@pytest.mark.parametrize("case", OPTIONS)
+def test_a_bad_option_is_refused(case: str, bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    words, says = OPTIONS[case]
+    (tmp_path / "file").write_text("mine")
+    assert_refused(bcppl("run", SHIPPED, *words), says)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"] and (tmp_path / "file").read_text() == "mine"
+
+
+def test_an_unknown_name_lists_the_recordings_that_ship(bcppl: Callable[..., Ran]) -> None:
+    assert_refused(bcppl("run", "nothing"), "point_probe_10_pushes")
+
+
+IMPORTS = {
+    "missing log": (["point-probe", "nowhere.txt"], "nowhere.txt"),
+    "log that is none": (["point-probe", "words.txt"], "words.txt"),
+    "missing scene": (["bop", "nowhere", "--object", "5"], "scene_gt.json is missing"),
+}
+
+
+@pytest.mark.parametrize("case", IMPORTS)
+def test_a_bad_import_writes_nothing(case: str, bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    words, says = IMPORTS[case]
+    (tmp_path / "words.txt").write_text("no numbers here")
+    assert_refused(bcppl("import", *words, "--out", "made.h5"), says)
+    assert [p.name for p in tmp_path.iterdir()] == ["words.txt"]
+
+
+@pytest.mark.skipif(
+    not (DATA / "lmo_scene2_frame3").is_dir(), reason="the BOP scene is not beside the repository"
+)
+def test_an_unknown_object_is_refused(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    scene = DATA / "lmo_scene2_frame3"
+    assert_refused(
+        bcppl("import", "bop", scene, "--object", 7, "--out", "made.h5"), "no object 7; give --object one"
+    )
+    assert list(tmp_path.iterdir()) == []
+    assert_refused(bcppl("import", "bop", scene, "--object", 5, "--translation", "nan"), "half width")
+    for out, says in (("no/where.h5", "no folder no"), (".", "is a folder")):
+        assert_refused(bcppl("import", "bop", scene, "--object", 5, "--out", out), says)
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_simulate_refuses(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    assert_refused(bcppl("simulate", "nobody"), "no model 'nobody'")
+    assert_refused(bcppl("simulate", "part_in_view"), "invents no recordings")
+    assert_refused(bcppl("simulate", "point_probe", "--out", "no/where.h5"), "no folder no")
+    assert_refused(bcppl("simulate", "point_probe", "--out", "."), "is a folder")
+    assert_refused(bcppl("simulate", "point_probe", "--seed", -1), "--seed is -1")
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---- what works
+
+
+def test_a_users_own_files_are_taken_as_readily_as_names(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    mine = (
+        PROBE.read_text().replace('f"onset_{k}"', 'f"begin_{k}"').replace("def point_probe(", "def my_probe(")
+    )
+    (tmp_path / "my_probe.py").write_text(mine.replace("program=point_probe", "program=my_probe"))
+    (tmp_path / "my_smc.py").write_text(
+        "from bcppl.inference.smc import smc, tempered\n"
+        "def infer(model, recording, *, particles, seed, scene):\n"
+        "    options = {'particles': particles, 'seed': seed, 'scene': scene}\n"
+        "    yield from smc(model, recording, assimilate=tempered(), **options)\n"
+    )
+    save(short(), tmp_path / "short.h5")
+    words = ("--particles", 8, "--model", "my_probe.py", "--inference", tmp_path / "my_smc.py")
+    ran = bcppl("run", "short.h5", *words)
+    assert ran.code == 0, ran.err
+    assert "push 3" in ran.out and "standard deviation" in ran.out
+    found = sorted(p.name for p in (tmp_path / "runs/short").iterdir())
+    assert found == ["add_over_time.png", *(f"belief_{k:03d}.h5" for k in range(4)), "belief_in_3d.png"]
+
+
+def test_the_same_seed_writes_the_same_beliefs(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    save(short(2), tmp_path / "short.h5")
+    for out, seed in (("a", 1), ("b", 1), ("c", 2)):
+        assert bcppl("run", "short.h5", "--particles", 8, "--seed", seed, "--out", out).code == 0
+    read = {out: h5py.File(tmp_path / out / "belief_002.h5") for out in "abc"}
+    poses = {out: np.array(file["world_from_part"]) for out, file in read.items()}
+    assert np.array_equal(poses["a"], poses["b"]) and not np.array_equal(poses["a"], poses["c"])
+
+
+STOPS = {
+    "RuntimeError('boom')": (1, "boom"),
+    "InferenceError('no particle is left; use more.')": (1, "no particle is left; use more."),
+    "InputError('what was given is wrong.')": (2, "what was given is wrong."),
+    "KeyboardInterrupt": (130, None),
+}
+
+
+@pytest.mark.parametrize("error", STOPS)
+def test_what_was_computed_before_a_stop_is_kept(
+    error: str, bcppl: Callable[..., Ran], tmp_path: Path
+) -> None:
+    (tmp_path / "stops.py").write_text(
+        "from bcppl.errors import InferenceError, InputError\n"
+        "from bcppl.inference.tempered_smc import infer as whole\n"
+        "def infer(*args, **options):\n"
+        "    for count, step in enumerate(whole(*args, **options)):\n"
+        "        if count == 3:\n"
+        f"            raise {error}\n"
+        "        yield step\n"
+    )
+    ran = bcppl("run", SHIPPED, "--particles", 8, "--inference", "stops.py", "--out", "kept")
+    code, says = STOPS[error]
+    assert ran.code == code and "Traceback" not in ran.err + ran.out
+    if says is not None:
+        assert says in ran.err and len(ran.err.strip().splitlines()) == 1
+    found = sorted(p.name for p in (tmp_path / "kept").iterdir())
+    assert found == ["add_over_time.png", *(f"belief_{k:03d}.h5" for k in range(3)), "belief_in_3d.png"]
+    assert "push 2" in ran.out and "standard deviation" in ran.out
+
+
+def test_an_earlier_runs_beliefs_do_not_lie_among_the_new(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    save(short(1), tmp_path / "short.h5")
+    (tmp_path / "out").mkdir()
+    for name in ("belief_007.h5", "old.png", "notes.txt"):
+        (tmp_path / "out" / name).write_text("old")
+    assert bcppl("run", "short.h5", "--particles", 4, "--out", "out").code == 0
+    found = {p.name for p in (tmp_path / "out").iterdir()}
+    assert "notes.txt" in found and "belief_007.h5" not in found
+
+
+def test_as_a_program() -> None:
+    """The entry point in a process of its own: exit code, and no traceback on either stream."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    ran = subprocess.run(
+        [sys.executable, "-m", "bcppl.cli", "run", "nowhere.h5"],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
+    )
+    assert ran.returncode == 2 and ran.stdout == ""
+    assert ran.stderr == "bcppl: nowhere.h5 is not a file; give the path of a recording (.h5).\n"
