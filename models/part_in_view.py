@@ -34,14 +34,15 @@ class Settings:
     Attributes:
         scale: of the Laplace noise, metres.
         outlier: the probability that a pixel on the part shows something else.
-        effective_pixels: how many independent pixels an image is worth; None for all of them.
+        effective_pixels: how many independent pixels a whole image is worth, those that do not show the part
+            included; None for all. Neighbouring pixels err together: with all, a belief is sure of errors.
         stride: every stride-th pixel in each direction is looked at.
     """
 
     scale: float = 0.005
-    outlier: float = 0.2
-    effective_pixels: float | None = None
-    stride: int = 2
+    outlier: float = 0.05
+    effective_pixels: float | None = 500.0
+    stride: int = 4
 
 
 @dataclass(frozen=True, eq=False)
