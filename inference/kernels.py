@@ -97,7 +97,7 @@ def repeat(kernel: Kernel, times: int) -> Kernel:
 
 
 def rejuvenate(population: Population, kernel: Kernel, target: Target, sweeps: int = 1) -> Moved:
-    """Move every particle.
+    """Move every particle, `sweeps` times.
 
     Each half of the population learns from the other, so no particle shapes its own proposal. The particles
     are split at random: copies of one ancestor lie side by side after resampling.

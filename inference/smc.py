@@ -26,7 +26,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.resampling import Resample, adaptive
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.inference.tempering import next_exponent
-from bcppl.traces import Model, extend, generate
+from bcppl.traces import Model, Trace, extend, generate
 
 
 class Info(NamedTuple):
@@ -63,17 +63,18 @@ class Assimilated(NamedTuple):
     exponents: tuple[float, ...]
 
 
+Sweeps = int | Callable[[Trace], int]
 Assimilate = Callable[[Population, tuple[Any, ...], Mapping[str, Tensor]], Assimilated]
 
 
 def tempered(
-    kernel: Kernel | None = None, *, sweeps: int = 3, resample: Resample | None = None, share: float = 0.5
+    kernel: Kernel | None = None, *, sweeps: Sweeps = 3, resample: Resample | None = None, share: float = 0.5
 ) -> Assimilate:
     """How to take a measurement in: let its likelihood in by steps, resample and move after each.
 
     Args:
         kernel: moves the particles after each resampling; None leaves them where they are.
-        sweeps: how many moves of every particle after each resampling.
+        sweeps: how many moves of every particle after each resampling, or a function of the trace that says so.
         resample: when and how; by default systematic below half the effective sample size.
         share: tempering keeps the conditional effective sample size above this share of the particles;
             0 lets a likelihood in at once.
@@ -102,7 +103,9 @@ def tempered(
             population, resampled = resample(population)
             if resampled and kernel is not None:
                 target = POSTERIOR if exponent == 1.0 else Target(dict.fromkeys(observations, exponent))
-                population, acceptance = rejuvenate(population, kernel, target, sweeps)
+                population, acceptance = rejuvenate(
+                    population, kernel, target, sweeps(population.trace) if callable(sweeps) else sweeps
+                )
                 acceptances.append(acceptance)
             log_likelihood = population.trace.log_prob(*observations)
         acceptance = sum(acceptances) / len(acceptances) if acceptances else float("nan")

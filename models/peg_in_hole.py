@@ -33,7 +33,7 @@ from bcppl.simulators.wrench import Sensing
 from bcppl.traces import Model, carried
 
 # What inference believes of the contact. The worlds that make recordings have parameters of their own.
-CONTACT = ContactParameters(time_step=0.002, friction=0.3, time_constant=0.006, impratio=10.0)
+CONTACT = ContactParameters(time_step=0.004, friction=0.3, time_constant=0.008)
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,12 @@ class Settings:
 
     depth_scale: float = 0.003
     outlier: float = 0.1
-    effective_pixels: float = 150.0
+    effective_pixels: float = 80.0
     contact_scale: float = 0.002
     one_empty: float = 2.0 * 0.006**2
-    translation_scale: float = 0.0005
+    translation_scale: float = 0.0007
     rotation_scale: float = 0.005
-    pose_every: int = 10
+    pose_every: int = 25
     contact: ContactParameters = CONTACT
 
 

@@ -32,9 +32,10 @@ HEADER = (
     "steps",
     "ADD mm",
     "truth gap",
+    "sim. s",
     "wall s",
 )
-WIDTHS = (12, 7, 6, 8, 10, 8, 5, 7, 9, 7)
+WIDTHS = (12, 7, 6, 8, 9, 8, 5, 7, 9, 7, 6)
 
 
 def run(
@@ -128,6 +129,7 @@ def _cells(step: Any, recording: Recording) -> list[str]:
         str(len(info.exponents) or ""),
         _number(add, 2),
         _number(info.truth_gap, 2),
+        _number(info.effort["physics"].amount if "physics" in info.effort else math.nan, 0),
         _number(info.seconds, 2),
     ]
 

@@ -90,6 +90,8 @@ class ChamferContacts(LazyDistribution):
             probability that a contact goes unnoticed.
     """
 
+    cost = 2
+
     def __init__(
         self,
         track: Track,
@@ -147,6 +149,8 @@ class ContactsInTime(LazyDistribution):
         reach: metres.
         every: stamps whose number is a multiple of this are looked at, for errors of neighbours go together.
     """
+
+    cost = 2
 
     def __init__(
         self,
@@ -231,6 +235,8 @@ class PegPose(LazyDistribution):
         rotation_scale: radians, about each axis.
         every: stamps whose number is a multiple of this are looked at, for errors of neighbours go together.
     """
+
+    cost = 2
 
     def __init__(
         self,

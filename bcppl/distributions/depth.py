@@ -84,6 +84,8 @@ _OBSERVED: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 class _Depth(LazyDistribution):
     """A depth image whose pixels are independent given the pose: all but the density of one pixel."""
 
+    cost = 1
+
     def __init__(
         self,
         renderer: RendersDepth,

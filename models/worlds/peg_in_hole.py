@@ -37,7 +37,7 @@ from bcppl.simulators.shapes import block, block_with_square_hole, box_peg
 Array = npt.NDArray[np.float64]
 
 # The world's contact: finer in time, more slippery and harder than inference believes.
-CONTACT = ContactParameters(time_step=0.0005, friction=0.2, time_constant=0.003, impratio=20.0)
+CONTACT = ContactParameters(time_step=0.0005, friction=0.2, time_constant=0.003)
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,9 @@ def cameras(generator: np.random.Generator) -> list[Camera]:
         distance = generator.uniform(0.35, 0.6)
         height = math.radians(generator.uniform(30.0, 60.0))
         around = heading + k * math.radians(90.0)
-        back = np.array([math.cos(height) * math.cos(around), math.cos(height) * math.sin(around), math.sin(height)])
+        back = np.array(
+            [math.cos(height) * math.cos(around), math.cos(height) * math.sin(around), math.sin(height)]
+        )
         right = np.cross([0.0, 0.0, 1.0], back)
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(-back, right), -back], axis=1)
@@ -184,7 +186,9 @@ def record(seed: int, world: World | None = None) -> Recording:
         depth = np.minimum(behind.images(there, poses.identity(1))[0], renderer.images(there, truth[None])[0])
         depth = depth + generator.laplace(scale=world.depth_noise, size=depth.shape)
         depth[~np.isfinite(depth) | (depth < camera.near) | (depth > camera.far)] = np.nan
-        measurements.append(Measurement(View(camera), DepthImage(depth.astype(np.float32).astype(np.float64))))
+        measurements.append(
+            Measurement(View(camera), DepthImage(depth.astype(np.float32).astype(np.float64)))
+        )
 
     action = probe(shifted(truth, world.estimate_shift, world.estimate_turn, generator))
     rollout = PegPhysics(part, peg, world.contact).start(truth[None], action)
@@ -194,7 +198,9 @@ def record(seed: int, world: World | None = None) -> Recording:
     bias = generator.normal(size=6) * ([world.force_bias] * 3 + [world.torque_bias] * 3)
     wrench = rollout.wrench[0] + noise + bias
     wobble = generator.normal(size=(count, 6)) * ([world.peg_noise] * 3 + [world.peg_turn] * 3)
-    world_from_peg = poses.retract(torch.from_numpy(rollout.world_from_peg[0].copy()), torch.from_numpy(wobble)).numpy()
+    world_from_peg = poses.retract(
+        torch.from_numpy(rollout.world_from_peg[0].copy()), torch.from_numpy(wobble)
+    ).numpy()
     step = round(WINDOW * RATE)
     for first in range(0, count, step):
         rows = slice(first, first + step)
