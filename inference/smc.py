@@ -74,7 +74,7 @@ def tempered(
 
     Args:
         kernel: moves the particles after each resampling; None leaves them where they are.
-        sweeps: how many moves of every particle after each resampling, or a function of the trace that says so.
+        sweeps: how many moves of every particle after each resampling, or a function of the trace.
         resample: when and how; by default systematic below half the effective sample size.
         share: tempering keeps the conditional effective sample size above this share of the particles;
             0 lets a likelihood in at once.

@@ -47,7 +47,7 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stays the same over a run: the part, the prior of its pose, its renderer, and what may be seen of it."""
+    """What stays the same over a run: the part, its pose's prior, its renderer, and what may be seen."""
 
     part: Part
     prior: Any
@@ -109,7 +109,8 @@ def observe(scene: Scene, measurements: Sequence[Measurement]) -> Mapping[str, T
         image = measurement.observation
         if not isinstance(measurement.action, View) or not isinstance(image, DepthImage):
             raise InputError(
-                f"measurement {k} is a {measurement.kind} and part_in_view explains views only; choose another model."
+                f"measurement {k} is a {measurement.kind} and part_in_view explains views only; "
+                "choose another model."
             )
         values[f"depth_{k}"] = torch.from_numpy(image.depth)
     return values

@@ -83,7 +83,7 @@ class Scene:
 
 
 def peg_in_hole(scene: Scene, actions: Sequence[View | ProbeWindow]) -> None:
-    """The program: the part's pose, then a depth image for every view, contacts and peg poses for every window."""
+    """The program: the part's pose, a depth image for every view, contacts and peg poses for every window."""
     settings = scene.settings
     hole = pyro.sample("hole", scene.prior)
     for k, action in enumerate(actions):
@@ -150,7 +150,8 @@ def observe(scene: Scene, measurements: Sequence[Measurement]) -> Mapping[str, T
             touches.setdefault(action.probe.name, []).append((k, seen))
         else:
             raise InputError(
-                f"measurement {k} is a {measurement.kind}, which peg_in_hole does not explain; choose another model."
+                f"measurement {k} is a {measurement.kind}, which peg_in_hole does not explain; "
+                "choose another model."
             )
     for windows in touches.values():
         assert scene.sensing is not None

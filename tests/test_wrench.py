@@ -222,6 +222,6 @@ def test_the_truth_explains_its_own_recording_best() -> None:
 
 
 def test_a_press_beside_the_tip_is_felt_at_the_tip() -> None:
-    """A line along the peg passes the tip's edge and the upper end's equally near; only the tip can be pushed."""
+    """A line along the peg passes the tip's edge and the upper end's equally near; only the tip is pushed."""
     located = PLAIN.locate(wrench(np.array([[0.0085, 0.002, -0.05]]), np.array([[0.1, 0.0, 8.0]])))
     np.testing.assert_allclose(located, [[0.008, 0.002, -0.05]], atol=1e-4)

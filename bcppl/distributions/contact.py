@@ -77,8 +77,8 @@ class ChamferContacts(LazyDistribution):
     never latent. For one point on each side D_ch = 2 d^2, a standard deviation of scale / sqrt(2). Its
     sharpness grows with the number of windows, not with the number of stamps in one: the model fixes them.
 
-    The event is (last - first, 3): locations in the peg's frame, a row of NaN where nothing was touched. Particles
-    whose physics diverged have log p = -inf.
+    The event is (last - first, 3): locations in the peg's frame, a row of NaN where nothing was
+    touched. Particles whose physics diverged have log p = -inf.
 
     Args:
         track: the probe as the particles feel it.
@@ -135,8 +135,8 @@ class ContactsInTime(LazyDistribution):
     `reach` along each axis about the origin of the simulated peg. The density is with respect to counting
     measure on "none" plus Lebesgue measure on locations (cubic metres), at each stamp looked at.
 
-    The event is (last - first, 3): locations in the peg's frame, a row of NaN where nothing was touched. Particles
-    whose physics diverged have log p = -inf.
+    The event is (last - first, 3): locations in the peg's frame, a row of NaN where nothing was
+    touched. Particles whose physics diverged have log p = -inf.
 
     Args:
         track: the probe as the particles feel it.

@@ -227,7 +227,7 @@ class Sensing:
     def _beside(self, point: Array, direction: Array) -> Array:
         """The points (M, 3) of the convex hull's edges nearest to lines (M, 3), NaN beyond the tolerance.
 
-        Only edges that the force pushes into the peg, within the friction cone of a normal there, can be touched.
+        Only edges that the force pushes into the peg, within the friction cone of a normal there, count.
         """
         start, extent, normals = self._edges
         nearest = np.full((len(point), 3), np.nan)
@@ -250,7 +250,7 @@ class Sensing:
         return nearest
 
     def measure(self, touches: Sequence[Touch]) -> list[tuple[Tensor, Tensor]]:
-        """Contact locations (T, 3) in the peg's frame, and its poses (T, 7), of consecutive windows of one probe.
+        """Contact locations (T, 3) in the peg's frame, its poses (T, 7), of consecutive windows of one probe.
 
         The first window must be the probe's first, for it holds the samples that the sensor's zero is taken
         from; the filter is carried from window to window.

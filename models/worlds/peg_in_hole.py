@@ -42,14 +42,14 @@ CONTACT = ContactParameters(time_step=0.0005, friction=0.2, time_constant=0.003)
 
 @dataclass(frozen=True)
 class World:
-    """What the bench is like; lengths in metres, angles in radians, standard deviations unless said otherwise.
+    """What the bench is like: metres, radians, and standard deviations where nothing else is said.
 
     Attributes:
         hole, clearance: side of the square hole, and how much narrower the peg is.
         offset: where the hole is in the block's frame.
         translation, tilt, yaw: limits of the prior of the block's pose.
         depth_noise: scale of the Laplace noise of a depth pixel.
-        camera_shift, camera_turn: how far off the cameras' poses are believed to be, along and about each axis.
+        camera_shift, camera_turn: how far off the cameras' stated poses are, along and about each axis.
         estimate_shift, estimate_turn: how far off the look is that the probe is laid out by, likewise.
         force_noise, torque_noise: of the wrench, N and N m.
         force_bias, torque_bias: of the untared sensor's zero, N and N m.
@@ -83,9 +83,9 @@ STIFFNESS = np.array([2500.0, 2500.0, 2500.0, 150.0, 150.0, 150.0])
 DAMPING = np.array([120.0, 120.0, 120.0, 2.5, 2.5, 2.5])
 GUESS = (0.5, 0.0, 0.15)  # m: where the block is thought to be; the table's top is z = 0
 
-# Metrology's 3-2-1 in two presses and slides on the top and one side and a press on the next: when (s) the tip is
-# where (m, in the block's frame). Strokes go 7 mm past the face, so that a look that is off by millimetres still
-# meets it, and meet it at 60 mm/s or less. The slides keep off the hole.
+# Metrology's 3-2-1: a press and slides on the top, the same on one side, a press on the next. Strokes go 7 mm
+# past the face, so that a look that is off by millimetres still meets it, at 60 mm/s or less; slides keep off
+# the hole. A knot says when (s) the tip is where (m, in the block's frame).
 STROKE, CLEAR, DEEP = 0.007, 0.005, -0.014
 SIDE = 0.03 + 0.00775
 KNOTS = (
