@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from bcppl.beliefs import Belief
-from bcppl.errors import InferenceError
+from bcppl.errors import InferenceError, InputError
 from bcppl.inference.kernels import Kernel, rejuvenate
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Resample, adaptive
@@ -83,7 +83,14 @@ def tempered(
         `assimilate(population, args, observations)`, with the program's arguments up to and including the new
         measurement, and the values of the new addresses. It raises InferenceError where no particle is left
         with any weight.
+
+    Raises:
+        InputError: `share` is not in [0, 1).
     """
+    if not 0.0 <= share < 1.0:
+        raise InputError(
+            f"tempering is asked to keep a share of {share} of the particles; give 0 up to below 1."
+        )
     resample = adaptive() if resample is None else resample
 
     def assimilate(
@@ -114,16 +121,23 @@ def tempered(
     return assimilate
 
 
+# Below this many particles, sharing a tensor out among threads takes longer than working on it.
+FEW_PARTICLES = 5000
+
+
 @contextmanager
-def _random_state(box: list[Tensor]) -> Iterator[None]:
-    """Torch's generator set to the run's own state within, and the caller's put back afterwards."""
-    outside = torch.get_rng_state()
+def _own_state(box: list[Tensor], particles: int) -> Iterator[None]:
+    """Torch's generator and threads set to the run's own within, and the caller's put back afterwards."""
+    outside, threads = torch.get_rng_state(), torch.get_num_threads()
     torch.set_rng_state(box[0])
+    if particles < FEW_PARTICLES:
+        torch.set_num_threads(1)
     try:
         yield
     finally:
         box[0] = torch.get_rng_state()
         torch.set_rng_state(outside)
+        torch.set_num_threads(threads)
 
 
 class Step(NamedTuple):
@@ -159,12 +173,12 @@ def smc(
     """
     scene = model.prepare(recording) if scene is None else scene
     state = [torch.Generator().manual_seed(seed).get_state()]
-    with _random_state(state):
+    with _own_state(state, particles):
         trace, log_weights = generate(model.program, (scene, []), {}, particles)
     population = Population(trace, log_weights)
     # The truth draws from a generator of its own: a belief does not depend on whether it is known.
     aside = [torch.Generator().manual_seed(seed).get_state()]
-    with _random_state(aside):
+    with _own_state(aside, 1):
         truth = _truth(model, scene, recording, trace)
     started = Info(
         "prior", float("nan"), float(particles), 0.0, particles, float("nan"), (), float("nan"), 0.0, {}
@@ -177,7 +191,7 @@ def smc(
         new = _new(model.observe(scene, measurements), population.trace.observations)
         args = (scene, [m.action for m in measurements])
         try:
-            with _random_state(state):
+            with _own_state(state, particles):
                 population, acceptance, exponents = assimilate(population, args, new)
         except InferenceError as error:
             raise InferenceError(f"{label}: {error}") from error
@@ -186,7 +200,7 @@ def smc(
         elapsed = time.perf_counter() - begun
         gap = float("nan")
         if truth is not None:
-            with _random_state(aside):
+            with _own_state(aside, 1):
                 truth, _ = extend(truth, args, new)
             observed = list(population.trace.observations)
             best = population.trace.log_prob(*observed)[population.log_weights > -torch.inf].max()

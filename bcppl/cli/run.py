@@ -35,6 +35,7 @@ HEADER = (
     "sim. s",
     "wall s",
 )
+FEWEST = 20
 WIDTHS = (12, 7, 6, 8, 9, 8, 5, 7, 9, 7, 6)
 
 
@@ -65,6 +66,12 @@ def run(
     chosen.observe(scene, found.measurements)  # what cannot be read is refused before anything is written
     console = Console(highlight=False)
     steps: list[Any] = []
+    if particles < FEWEST:
+        console.print(
+            f"--particles is {particles}: so few tend to collapse on a wrong pose and be sure of it; "
+            "75 is a good start.",
+            style="yellow",
+        )
     try:
         with _progress(console) as progress:
             task = progress.add_task("prior", total=len(found.measurements))
