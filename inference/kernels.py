@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bcppl.errors import InferenceError
 from bcppl.inference.population import Population
-from bcppl.inference.targets import Target
+from bcppl.inference.targets import Target, above
 from bcppl.traces import Trace, assess, propose, update
 
 Move = Callable[[Trace, Target], tuple[Trace, Tensor]]
@@ -57,11 +57,13 @@ def metropolis_hastings(fit: Fit) -> Kernel:
             updated = update(trace, new)
             back = {**forward.choices, **updated.discarded}
             backward = assess(program, (updated.trace,), back, trace.particles)
-            log_ratio = target(updated.trace) - target(trace) + backward - forward.log_prob
-            # A particle that cannot be (-inf before and after) may as well move.
-            log_ratio = torch.where(torch.isnan(log_ratio), 0.0, log_ratio)
-            accepted = torch.log(torch.rand(trace.particles, dtype=torch.float64)) < log_ratio
-            return updated.trace.where(accepted, trace), accepted
+            # With the chance drawn first, it is known what a proposal must reach to be accepted.
+            chance = torch.log(torch.rand(trace.particles, dtype=torch.float64))
+            needed = chance + target(trace) - backward + forward.log_prob
+            passed, survivors = above(target, updated.trace, needed)
+            accepted = torch.zeros(trace.particles, dtype=torch.bool)
+            accepted[passed] = True
+            return put(trace, passed, survivors), accepted
 
         return move
 
@@ -118,9 +120,16 @@ def rejuvenate(population: Population, kernel: Kernel, target: Target, sweeps: i
 
 def replaced(population: Population, index: Tensor, moved: Trace) -> Population:
     """The population with the particles at `index` (K,) replaced by those of a trace of K particles."""
-    source = torch.zeros(len(population), dtype=torch.int64)
-    source[index] = torch.arange(len(index))
-    mask = torch.zeros(len(population), dtype=torch.bool)
-    mask[index] = True
-    trace = moved[source].where(mask, population.trace)
+    trace = put(population.trace, index, moved)
     return Population(trace, population.log_weights, population.log_evidence)
+
+
+def put(trace: Trace, index: Tensor, other: Trace) -> Trace:
+    """A trace with the particles at `index` (K,) replaced by those of a trace of K particles."""
+    if len(index) == 0:
+        return trace
+    source = torch.zeros(len(trace), dtype=torch.int64)
+    source[index] = torch.arange(len(index))
+    mask = torch.zeros(len(trace), dtype=torch.bool)
+    mask[index] = True
+    return other[source].where(mask, trace)

@@ -45,6 +45,8 @@ def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fit:
         )
         covariance = covariance * (2.38**2 / len(covariance))
         factor = torch.linalg.cholesky(covariance)
+        if freedom is None:
+            factor = factor.to(population.trace[address])
 
         def random_walk(trace: Trace) -> None:
             size = torch.exp(pyro.sample("drift scale", dist.Uniform(*_pair(smallest, largest))))
@@ -53,7 +55,7 @@ def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fit:
                 event = value.shape[1:]
                 flat = dist.MultivariateNormal(
                     value.reshape(len(value), -1),
-                    scale_tril=size[:, None, None] * factor,
+                    scale_tril=size.to(value)[:, None, None] * factor,
                     validate_args=False,
                 )
                 pyro.sample(
@@ -84,7 +86,7 @@ def _pose_spread(population: Population, address: str, freedom: Freedom) -> Tens
 
 
 def _vector_spread(population: Population, address: str) -> Tensor:
-    value = population.trace[address].reshape(len(population), -1)
+    value = population.trace[address].to(torch.float64).reshape(len(population), -1)
     weights = normalised(population.log_weights)
     centred = value - weights @ value
     return _conditioned((weights[:, None] * centred).T @ centred)

@@ -63,12 +63,15 @@ class Assimilated(NamedTuple):
     exponents: tuple[float, ...]
 
 
-Sweeps = int | Callable[[Trace], int]
 Assimilate = Callable[[Population, tuple[Any, ...], Mapping[str, Tensor]], Assimilated]
 
 
 def tempered(
-    kernel: Kernel | None = None, *, sweeps: Sweeps = 3, resample: Resample | None = None, share: float = 0.5
+    kernel: Kernel | None = None,
+    *,
+    sweeps: int | Callable[[Trace], int] = 3,
+    resample: Resample | None = None,
+    share: float | Callable[[Trace], float] = 0.5,
 ) -> Assimilate:
     """How to take a measurement in: let its likelihood in by steps, resample and move after each.
 
@@ -77,7 +80,7 @@ def tempered(
         sweeps: how many moves of every particle after each resampling, or a function of the trace.
         resample: when and how; by default systematic below half the effective sample size.
         share: tempering keeps the conditional effective sample size above this share of the particles;
-            0 lets a likelihood in at once.
+            0 lets a likelihood in at once. A number, or a function of the trace, as `sweeps`.
 
     Returns:
         `assimilate(population, args, observations)`, with the program's arguments up to and including the new
@@ -87,7 +90,7 @@ def tempered(
     Raises:
         InputError: `share` is not in [0, 1).
     """
-    if not 0.0 <= share < 1.0:
+    if not callable(share) and not 0.0 <= share < 1.0:
         raise InputError(
             f"tempering is asked to keep a share of {share} of the particles; give 0 up to below 1."
         )
@@ -102,8 +105,9 @@ def tempered(
         while exponent < 1.0:
             reached = exponent
             exponent = 1.0
-            if share > 0.0:
-                exponent = next_exponent(population.log_weights, log_likelihood, reached, share)
+            kept = share(population.trace) if callable(share) else share
+            if kept > 0.0:
+                exponent = next_exponent(population.log_weights, log_likelihood, reached, kept)
             exponents.append(exponent)
             # 0 times -inf is no number, so a particle that cannot be loses its weight here, once.
             population = population.reweighed((exponent - reached) * log_likelihood)

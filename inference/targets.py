@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -21,14 +21,59 @@ class Target:
 
     exponents: Mapping[str, float] = field(default_factory=dict)
 
+    def exponent(self, address: str) -> float:
+        """How much of a site is let in."""
+        return self.exponents.get(address, 1.0)
+
     def __call__(self, trace: Trace) -> Tensor:
-        """log-density (N,). Cheap sites come first: where they forbid a particle, its total is -inf."""
-        full = [a for a in trace.addresses if a not in self.exponents]
-        total = trace.log_prob(*full) if full else torch.zeros(trace.particles, dtype=torch.float64)
-        for address, exponent in self.exponents.items():
-            if exponent > 0.0:
-                total = total + exponent * trace.log_prob(address)
+        """The log-density (N,)."""
+        total = torch.zeros(trace.particles, dtype=torch.float64)
+        for address in trace.addresses:
+            if self.exponent(address) > 0.0:
+                total = total + self.exponent(address) * trace.log_prob(address)
         return total
+
+    def above(self, trace: Trace, needed: Tensor) -> tuple[Tensor, Trace]:
+        """The particles whose log-density is above what is needed, found for as little work as possible.
+
+        Sites are asked in the order of their cost and then of the program. A particle that could not reach
+        what it needs even if every site still to be asked gave its upper bound is dropped, so physics is run
+        only for particles still in play, and only as far as they stay in play. The answer is the same to the
+        bit as that of evaluating everything.
+
+        Args:
+            trace: of N particles.
+            needed: (N,) log-densities.
+
+        Returns:
+            Their indices (K,) in increasing order, and the trace of these K particles.
+        """
+        sites = [(a, s) for a, s in trace.distributions.items() if self.exponent(a) > 0.0]
+        sites.sort(key=lambda site: getattr(site[1], "cost", 0))
+        bounds = [self.exponent(a) * float(getattr(s, "log_prob_bound", torch.inf)) for a, s in sites]
+        index = torch.arange(trace.particles)
+        total = torch.zeros(trace.particles, dtype=torch.float64)
+        for k, (address, _) in enumerate(sites):
+            total = total + self.exponent(address) * trace.log_prob(address)
+            last = k + 1 == len(sites)
+            # Rounding in another order of summation must not drop a particle that would just pass.
+            reach = 0.0 if last else sum(bounds[k + 1 :]) + 1e-6
+            alive = total + reach > needed
+            dear = not last and getattr(sites[k + 1][1], "cost", 0) > 0
+            if (last or dear) and not bool(alive.all()):
+                kept = alive.nonzero().flatten()
+                index, trace, total, needed = index[kept], trace[kept], total[kept], needed[kept]
+            if len(index) == 0:
+                break
+        return index, trace
 
 
 POSTERIOR = Target()
+
+
+def above(target: Callable[[Trace], Tensor], trace: Trace, needed: Tensor) -> tuple[Tensor, Trace]:
+    """`Target.above`, or for a plain function of the trace the same by evaluating everything."""
+    if isinstance(target, Target):
+        return target.above(trace, needed)
+    index = (target(trace) > needed).nonzero().flatten()
+    return index, trace[index]

@@ -1,8 +1,8 @@
 """The default inference program: SMC with tempering and random walks shaped by the particles' own spread.
 
-Each measurement is let in by steps that keep half of the conditional effective sample size; after each
-resampling every particle makes several moves, fewer of them where each one costs a simulation. Copy this file
-to write your own: `bcppl run RECORDING --inference FILE.py` takes any file that defines `infer`.
+Where a move costs little (pushes, depth images), a measurement is let in by small steps, with many moves of
+every particle after each; once moves cost simulations, by larger steps with fewer moves. Copy this file to
+write your own: `bcppl run RECORDING --inference FILE.py` takes any file that defines `infer`.
 """
 
 from __future__ import annotations
@@ -11,15 +11,18 @@ from collections.abc import Iterator
 from typing import Any
 
 from bcppl.inference.kernels import Kernel, metropolis_hastings
+from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.inference.smc import Step, smc, tempered
 from bcppl.traces import Model, Trace
 
+PHYSICS = 2  # the cost of a site that simulates contact (`bcppl.distributions.lazy`)
+
 
 def kernel(pose: str) -> Kernel:
-    """How particles are moved: a random walk on the pose at an address."""
-    return metropolis_hastings(drift(pose, (0.2, 1.2)))
+    """How particles are moved: a random walk on the pose at an address, some of its steps long ones."""
+    return metropolis_hastings(drift(pose, (0.2, 2.0)))
 
 
 def infer(
@@ -28,8 +31,8 @@ def infer(
     *,
     particles: int = 75,
     seed: int = 0,
-    sweeps: int = 8,
-    physics_sweeps: int = 3,
+    sweeps: tuple[int, int] = (12, 4),
+    share: tuple[float, float] = (0.8, 0.5),
     scene: Any = None,
 ) -> Iterator[Step]:
     """Beliefs over a recording, one step for each measurement, the prior first.
@@ -39,16 +42,22 @@ def infer(
         recording: a `bcppl.recordings.Recording`.
         particles: how many.
         seed: same seed, same beliefs.
-        sweeps: moves of every particle after each resampling.
-        physics_sweeps: the same once physics has to be simulated for every move.
+        sweeps: moves of every particle after each resampling: without, and with physics in the program.
+        share: particles are resampled below this effective sample size, and a likelihood is let in by steps
+            that keep this conditional one, as shares of N: without, and with physics.
         scene: what `model.prepare(recording)` gives, if it is at hand.
     """
 
-    def affordable(trace: Trace) -> int:
-        costs = [getattr(trace.distributions[address], "cost", 0) for address in trace.observations]
-        return physics_sweeps if max(costs, default=0) >= 2 else sweeps
+    def by_physics(trace: Trace) -> int:
+        return int(any(getattr(site, "cost", 0) >= PHYSICS for site in trace.distributions.values()))
+
+    def resample(population: Population) -> tuple[Population, bool]:
+        return adaptive(systematic, share[by_physics(population.trace)])(population)
 
     assimilate = tempered(
-        kernel(model.pose), sweeps=affordable, resample=adaptive(systematic, 0.5), share=0.5
+        kernel(model.pose),
+        sweeps=lambda trace: sweeps[by_physics(trace)],
+        resample=resample,
+        share=lambda trace: share[by_physics(trace)],
     )
     return smc(model, recording, assimilate=assimilate, particles=particles, seed=seed, scene=scene)

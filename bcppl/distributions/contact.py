@@ -111,6 +111,11 @@ class ChamferContacts(LazyDistribution):
         self.scale, self.one_empty, self.noise = scale, one_empty, noise
         super().__init__(len(track), (last - first, 3), track.inputs)
 
+    @property
+    def log_prob_bound(self) -> float:
+        """0: no two sets are nearer than equal ones."""
+        return 0.0
+
     def log_prob(self, value: Tensor) -> Tensor:
         """Log of the surrogate (N,) of locations (T, 3), or (N, T, 3)."""
         contacts, _ = self.track.window(self.first, self.last)
@@ -254,6 +259,16 @@ class PegPose(LazyDistribution):
         self.track, self.first, self.last = track, first, last
         self.translation_scale, self.rotation_scale, self.every = translation_scale, rotation_scale, every
         super().__init__(len(track), (last - first, 7), track.inputs)
+
+    @property
+    def log_prob_bound(self) -> float:
+        """Its value where the peg is just where it was measured."""
+        # Below 2 rad the normal falls faster than the Haar measure of a rotation vector does.
+        if _WIDER * self.rotation_scale > 2.0:
+            return math.inf
+        none = torch.zeros(1, dtype=torch.float64)
+        stamps = len(range(self.first, self.last)[-self.first % self.every :: self.every])
+        return stamps * float(self._log_translation(none) + self._log_rotation(none))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-probability (N,) of poses (T, 7), or (N, T, 7)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -46,6 +47,14 @@ class LazyDistribution(TorchDistribution):
             f"{type(self).__name__} was made for {self.batch_shape[0]} particles and cannot be spread over "
             f"a plate of shape {tuple(batch_shape)}; build it from values sampled in the same program."
         )
+
+    @property
+    def log_prob_bound(self) -> float:
+        """What no log-probability exceeds, whatever the value and the inputs; +inf where that is not known.
+
+        It lets a kernel reject a particle before its dear sites are evaluated.
+        """
+        return math.inf
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-probability (N,) of one observation, or of one for each particle."""
