@@ -31,8 +31,8 @@ def infer(
     *,
     particles: int = 75,
     seed: int = 0,
-    sweeps: tuple[int, int] = (12, 4),
-    share: tuple[float, float] = (0.8, 0.5),
+    sweeps: tuple[int, int] = (12, 6),
+    share: tuple[float, float] = (0.8, 0.6),
     scene: Any = None,
 ) -> Iterator[Step]:
     """Beliefs over a recording, one step for each measurement, the prior first.
