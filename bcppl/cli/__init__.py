@@ -42,8 +42,8 @@ def main() -> None:
         _stop("stopped.", 130)
     except Exception as error:
         _stop(
-            f"something went wrong inside bcppl ({type(error).__name__}: {error}); "
-            "set BCPPL_TRACEBACK=1 to see where, and report it.",
+            f"something went wrong ({type(error).__name__}: {error}); "
+            "set BCPPL_TRACEBACK=1 to see where, and report it if it is not in a file of yours.",
             FAILED,
         )
 

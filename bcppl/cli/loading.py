@@ -24,6 +24,17 @@ def recording(name: str) -> Recording:
     Raises:
         InputError: there is none, it cannot be read, or it has a problem.
     """
+    found = unchecked_recording(name)
+    validate(found)
+    return found
+
+
+def unchecked_recording(name: str) -> Recording:
+    """The recording in a file, or a shipped one by name, whatever is wrong with it.
+
+    Raises:
+        InputError: there is none, or it cannot be read.
+    """
     path = Path(name)
     if not path.exists() and not path.suffix:
         shipped = importlib.resources.files(bcppl.models) / "recordings"
@@ -33,11 +44,8 @@ def recording(name: str) -> Recording:
                 f"there is no recording {name!r}: give a file, or one that ships: {', '.join(names)}."
             )
         with importlib.resources.as_file(shipped / f"{name}.h5") as file:
-            found = load(file)
-    else:
-        found = load(path)
-    validate(found)
-    return found
+            return load(file)
+    return load(path)
 
 
 def model(name: str) -> Model:

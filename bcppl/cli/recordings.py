@@ -14,28 +14,28 @@ from rich.table import Table
 
 from bcppl.cli import loading
 from bcppl.errors import InputError
-from bcppl.recordings import Recording, describe, load, notes, problems, save, validate
+from bcppl.recordings import Recording, describe, notes, problems, save, validate
 from bcppl.recordings.importers import importers
 
 OUT = Annotated[Path, typer.Option("--out", "-o", help="The recording to write (.h5).")]
 
 
 def check(
-    file: Annotated[Path, typer.Argument(help="A recording.")],
+    recording: Annotated[str, typer.Argument(help="A recording (.h5), or the name of a shipped one.")],
 ) -> None:
     """Say what a recording holds, and what is wrong with it (exit code 2 if anything is)."""
-    recording = load(file)
+    found = loading.unchecked_recording(recording)
     console = Console()
     table = Table(show_header=False, box=None, pad_edge=False)
-    for what, value in describe(recording):
+    for what, value in describe(found):
         table.add_row(f"[bold]{what}[/bold]", value)
     console.print(table)
-    for note in notes(recording):
+    for note in notes(found):
         console.print(f"[yellow]note:[/yellow] {note}", highlight=False)
-    found = problems(recording)
-    for problem in found:
+    wrong = problems(found)
+    for problem in wrong:
         console.print(f"[red]wrong:[/red] {problem}", highlight=False)
-    if found:
+    if wrong:
         raise typer.Exit(2)
     console.print("[green]nothing wrong was found.[/green]")
 

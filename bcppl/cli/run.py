@@ -158,7 +158,9 @@ def _report(console: Console, recording: Recording, steps: Sequence[Any]) -> Non
             f"{math.degrees(spread[3 + k]):.3f}°",
         )
     console.print(table)
-    console.print("quaternion w x y z: " + " ".join(f"{q:.6f}" for q in mean[3:]))
+    # q and -q are one rotation: the one with w >= 0 is what people compare.
+    sign = -1.0 if mean[3] < 0 else 1.0
+    console.print("quaternion w x y z: " + " ".join(f"{sign * q:.6f}" for q in mean[3:]))
     if recording.truth is not None:
         points = recording.part.surface_points()
         console.print(
