@@ -63,7 +63,7 @@ def invent(
     actions = [_push(rng, scene, truth) for _ in range(pushes)]
 
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(int(rng.integers(2**62)))
         trace, _ = generate(point_probe, (scene, actions), {"part": torch.from_numpy(truth)[None]}, 1)
     measurements = []
     for k, push in enumerate(actions):
