@@ -22,6 +22,8 @@ def normalised(log_weights: Tensor) -> Tensor:
     Raises:
         InferenceError: no particle has any weight.
     """
+    if bool((torch.isnan(log_weights) | (log_weights == torch.inf)).any()):
+        raise InferenceError("a particle's weight is not a number; a kernel or a resampler gave NaN or +inf.")
     if not bool((log_weights > -torch.inf).any()):
         raise InferenceError(
             "no particle has any weight left: every particle says that what was measured cannot be; "

@@ -190,10 +190,14 @@ def belief_in_3d(
     }
     if true is not None:
         entries["truth"] = Line2D([], [], color=TRUTH, linewidth=4.5)
+    # Four entries side by side are as wide as three panels.
+    columns = len(entries) if len(panels) >= 3 else 2 if len(panels) == 2 else 1
+    rows = -(-len(entries) // columns)
     figure.legend(
-        entries.values(), entries.keys(), loc="lower center", ncols=len(entries), frameon=False, fontsize=9
+        entries.values(), entries.keys(), loc="lower center", ncols=columns, frameon=False, fontsize=9
     )
-    figure.subplots_adjust(left=0.02, right=0.95, top=0.88, bottom=0.12, wspace=0.12)
+    bottom = 0.12 + 0.05 * (rows - 1)
+    figure.subplots_adjust(left=0.02, right=0.95, top=0.88, bottom=bottom, wspace=0.12)
     return figure
 
 

@@ -38,8 +38,8 @@ def drifted(population: Population, fit: Fit) -> Population:
         back = {**forward.choices, **updated.discarded}
         backward = assess(program, (updated.trace,), back, len(mine))
         ratio = updated.log_ratio + backward - forward.log_prob
-        # Impossible before and after is impossible still.
-        factor[mine] = torch.nan_to_num(ratio, nan=0.0, posinf=torch.inf, neginf=-torch.inf)
+        # A particle without weight stays without: it is not brought back by drifting where it could be.
+        factor[mine] = torch.where(population.log_weights[mine] == -torch.inf, 0.0, ratio)
         population = replaced(population, mine, updated.trace)
     return population.reweighed(factor)
 

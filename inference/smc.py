@@ -99,7 +99,10 @@ def tempered(
     def assimilate(
         population: Population, args: tuple[Any, ...], observations: Mapping[str, Tensor]
     ) -> Assimilated:
+        before = set(population.trace.addresses)
         longer, log_likelihood = extend(population.trace, args, observations)
+        # Sites that the program itself fixes (`obs=`, `pyro.factor`) are let in with the observations.
+        new = [a for a in longer.addresses if a not in before and a not in longer.choices]
         population = Population(longer, population.log_weights, population.log_evidence)
         exponent, exponents, acceptances = 0.0, [], []
         while exponent < 1.0:
@@ -113,12 +116,12 @@ def tempered(
             population = population.reweighed((exponent - reached) * log_likelihood)
             population, resampled = resample(population)
             if resampled and kernel is not None:
-                target = POSTERIOR if exponent == 1.0 else Target(dict.fromkeys(observations, exponent))
+                target = POSTERIOR if exponent == 1.0 else Target(dict.fromkeys(new, exponent))
                 population, acceptance = rejuvenate(
                     population, kernel, target, sweeps(population.trace) if callable(sweeps) else sweeps
                 )
                 acceptances.append(acceptance)
-            log_likelihood = population.trace.log_prob(*observations)
+            log_likelihood = population.trace.log_prob(*new) if new else torch.zeros_like(log_likelihood)
         acceptance = sum(acceptances) / len(acceptances) if acceptances else float("nan")
         return Assimilated(population, acceptance, tuple(exponents))
 
@@ -179,6 +182,11 @@ def smc(
     state = [torch.Generator().manual_seed(seed).get_state()]
     with _own_state(state, particles):
         trace, log_weights = generate(model.program, (scene, []), {}, particles)
+    if model.pose not in trace:
+        raise InputError(
+            f"the model's pose is said to be at address {model.pose!r}, which its program never samples; "
+            f"it samples {', '.join(trace.choices) or 'nothing'} before any measurement."
+        )
     population = Population(trace, log_weights)
     # The truth draws from a generator of its own: a belief does not depend on whether it is known.
     aside = [torch.Generator().manual_seed(seed).get_state()]
@@ -203,6 +211,8 @@ def smc(
         spent = {name: after.since(before[name]) for name, after in _effort(scene).items()}
         elapsed = time.perf_counter() - begun
         gap = float("nan")
+        if set(population.trace.choices) != {model.pose}:
+            truth = None
         if truth is not None:
             with _own_state(aside, 1):
                 truth, _ = extend(truth, args, new)

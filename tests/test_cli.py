@@ -301,7 +301,12 @@ def test_a_users_own_files_are_taken_as_readily_as_names(bcppl: Callable[..., Ra
     assert ran.code == 0, ran.err
     assert "push 3" in ran.out and "standard deviation" in ran.out
     found = sorted(p.name for p in (tmp_path / "runs/short").iterdir())
-    assert found == ["add_over_time.png", *(f"belief_{k:03d}.h5" for k in range(4)), "belief_in_3d.png"]
+    assert found == [
+        "add_over_time.png",
+        *(f"belief_{k:03d}.h5" for k in range(4)),
+        "belief_in_3d.png",
+        "run.json",
+    ]
 
 
 def test_the_same_seed_writes_the_same_beliefs(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
@@ -340,7 +345,12 @@ def test_what_was_computed_before_a_stop_is_kept(
     if says is not None:
         assert says in ran.err and len(ran.err.strip().splitlines()) == 1
     found = sorted(p.name for p in (tmp_path / "kept").iterdir())
-    assert found == ["add_over_time.png", *(f"belief_{k:03d}.h5" for k in range(3)), "belief_in_3d.png"]
+    assert found == [
+        "add_over_time.png",
+        *(f"belief_{k:03d}.h5" for k in range(3)),
+        "belief_in_3d.png",
+        "run.json",
+    ]
     assert "push 2" in ran.out and "standard deviation" in ran.out
 
 

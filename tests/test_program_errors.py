@@ -174,3 +174,19 @@ def test_a_log_probability_that_is_no_number_names_site_and_particles(bad: float
 
     with pytest.raises(InferenceError, match=rf"'felt' .* {said} for 2 of 5 particles \(first: 1, 3\)"):
         generate(program, (), {"felt": number(0.0)}, N)
+
+
+def test_a_scaled_or_masked_site_is_refused_by_name() -> None:
+    """A handler's scale would be dropped silently."""
+
+    def scaled() -> None:
+        with pyro.poutine.scale(scale=0.5):
+            pyro.sample("x", dist.Normal(torch.tensor(0.0), 1.0))
+
+    def masked() -> None:
+        with pyro.poutine.mask(mask=torch.tensor(False)):
+            pyro.sample("x", dist.Normal(torch.tensor(0.0), 1.0))
+
+    for program in (scaled, masked):
+        with pytest.raises(InputError, match="'x'"):
+            simulate(program, (), 3)

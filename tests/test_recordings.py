@@ -87,7 +87,7 @@ def full(seed: int = 0) -> Recording:
     times = np.cumsum(rng.uniform(0.01, 0.02, 400))
     windows = [
         Measurement(ProbeWindow(p, a, b), touch(p.stamps[a:b], rng))
-        for p, a, b in ((slide, 0, 7), (press, 3, 9), (slide, 7, 20))
+        for p, a, b in ((slide, 0, 7), (press, 0, 9), (slide, 7, 20))
     ]
     colour = rng.integers(0, 255, (6, 8, 3)).astype(np.uint8)
     views = [
@@ -434,6 +434,10 @@ WRONG: dict[str, tuple[Recording, str]] = {
     "view with a touch": (
         replace(full(), measurements=[Measurement(View(camera("left")), full().measurements[3].observation)]),
         "measurement 0 pairs a View with a Touch",
+    ),
+    "window left out": (
+        replace(full(), measurements=[m for m in full().measurements if getattr(m.action, "last", 0) != 7]),
+        "leaves out stamps 0 to 7",
     ),
     "background size": (replace(full(), background={"left": np.ones((3, 3))}), "background of camera 'left'"),
 }

@@ -360,3 +360,43 @@ def test_an_error_names_the_measurement(recording: Recording) -> None:
     iterator = smc.smc(broken, recording, assimilate=tempered(None, resample=never, share=0.0), particles=20)
     with pytest.raises(InferenceError, match=r"^push 2: no particle"):
         list(iterator)
+
+
+def test_sites_that_the_program_fixes_are_let_in_like_observations() -> None:
+    """What `obs=` fixes is tempered too: left out after the first step, it would cost 0.4 of log Z."""
+    exact = -0.5 * math.log(1.0 + 1.0 / 0.01 + 1.0 / 0.01) - math.log(2 * math.pi * 0.01)
+
+    def fixing(count: int) -> None:
+        x = pyro.sample("x", dist.Normal(torch.tensor(0.0, dtype=torch.float64), 1.0))
+        if count:
+            zero = torch.tensor(0.0, dtype=torch.float64)
+            pyro.sample("seen", dist.Normal(x, 0.1))
+            pyro.sample("fixed", dist.Normal(x, 0.1), obs=zero)
+
+    estimates = []
+    for seed in range(12):
+        torch.manual_seed(seed)
+        trace, weights = generate(fixing, (0,), {}, 1000)
+        take = tempered(metropolis_hastings(drift("x", (0.5, 1.0))), sweeps=5, share=0.7)
+        done = take(Population(trace, weights), (1,), {"seen": torch.tensor(0.0, dtype=torch.float64)})
+        estimates.append(done.population.log_evidence)
+    assert abs(sum(estimates) / len(estimates) - exact) < 0.1
+
+
+def test_a_particle_without_weight_does_not_come_back_as_not_a_number() -> None:
+    """BayesContact's filter drifts particles out of a bounded prior and back: weights stay numbers."""
+
+    def bounded(count: int) -> None:
+        one = torch.tensor(1.0, dtype=torch.float64)
+        x = pyro.sample("x", dist.Uniform(-one, one))
+        for k in range(count):
+            pyro.sample(f"y_{k}", dist.Normal(x, 10.0))
+
+    torch.manual_seed(0)
+    trace, weights = generate(bounded, (0,), {}, 400)
+    population = Population(trace, weights)
+    take = drift_and_weigh(drift("x", (0.2, 0.21)), never)
+    for k in range(4):
+        population, *_ = take(population, (k + 1,), {f"y_{k}": torch.tensor(0.0, dtype=torch.float64)})
+        assert not bool(torch.isnan(population.log_weights).any())
+    assert bool((population.log_weights == -torch.inf).any())

@@ -324,3 +324,25 @@ def test_verbs_leave_pyros_settings_and_draw_from_torchs_generator_only() -> Non
     first.log_prob()
     update(first, {"x": first["x"] + 1}).log_ratio  # noqa: B018
     assert torch.equal(state, torch.get_rng_state()), "known values are not drawn again"
+
+
+def test_two_windows_of_one_run_share_the_state_that_the_first_began() -> None:
+    started = []
+
+    class State:
+        def __getitem__(self, index: torch.Tensor) -> State:
+            return self
+
+        def where(self, mask: torch.Tensor, other: State) -> State:
+            return self
+
+    def start() -> State:
+        started.append(1)
+        return State()
+
+    def twice() -> None:
+        x = pyro.sample("x", dist.Normal(torch.tensor(0.0, dtype=torch.float64), 1.0))
+        assert carried("state", x, start) is carried("state", x, start)
+
+    simulate(twice, (), 5)
+    assert len(started) == 1

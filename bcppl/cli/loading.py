@@ -116,6 +116,8 @@ def _from_file(path: Path, package: ModuleType, word: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     # Dataclasses look their module up while it is being run.
     sys.modules[name] = module
+    # A user's file may import what lies beside it, as `python FILE` would.
+    sys.path.append(str(path.resolve().parent))
     try:
         spec.loader.exec_module(module)
     except InputError:

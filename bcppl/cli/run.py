@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
+import json
 import math
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,6 +39,7 @@ HEADER = (
     "wall s",
 )
 FEWEST = 20
+LARGEST_GAP = 5.0  # nats: the truth may score better than the best particle by chance, not by more
 WIDTHS = (12, 7, 6, 8, 9, 8, 5, 7, 9, 7, 6)
 
 
@@ -58,6 +62,13 @@ def run(
     found = loading.recording(recording)
     chosen = loading.model(model or found.model)
     infer = loading.inference(inference)
+    try:
+        inspect.signature(infer).bind(chosen, found, particles=particles, seed=seed, scene=None)
+    except TypeError as error:
+        raise InputError(
+            f"`infer` of {inference} cannot be called ({error}); "
+            "define it as infer(model, recording, *, particles=75, seed=0, scene=None)."
+        ) from error
     folder = out or Path("runs") / Path(recording).stem
     blocked = next((p for p in (folder, *folder.parents) if p.exists() and not p.is_dir()), None)
     if blocked is not None:
@@ -66,6 +77,14 @@ def run(
     chosen.observe(scene, found.measurements)  # what cannot be read is refused before anything is written
     console = Console(highlight=False)
     steps: list[Any] = []
+    made = {
+        "recording": recording,
+        "model": model or found.model,
+        "inference": inference,
+        "particles": particles,
+        "seed": seed,
+        "version": version("bcppl"),
+    }
     if particles < FEWEST:
         console.print(
             f"--particles is {particles}: so few tend to collapse on a wrong pose and be sure of it; "
@@ -81,11 +100,18 @@ def run(
                     progress.console.print(_row(HEADER), style="bold", soft_wrap=True)
                 _keep(folder, len(steps), step)
                 steps.append(step)
+                _write_record(folder, made, steps, found)
                 progress.console.print(_row(_cells(step, found)), soft_wrap=True)
                 progress.update(task, completed=len(steps) - 1, description=step.info.label)
     finally:
         # Whatever stopped the run, what was computed is shown and kept.
         if steps:
+            if len(steps) <= len(found.measurements):
+                console.print(
+                    f"stopped after {steps[-1].info.label}: {len(steps) - 1} of {len(found.measurements)} "
+                    "measurements were taken in.",
+                    style="yellow",
+                )
             _report(console, found, steps)
             _draw(folder, found, steps)
             console.print(f"beliefs and figures are in {folder}")
@@ -110,6 +136,14 @@ def _keep(folder: Path, number: int, step: Any) -> None:
         log_evidence=step.info.log_evidence,
         random_state=step.random_state,
     )
+
+
+def _write_record(folder: Path, made: dict[str, Any], steps: Sequence[Any], recording: Recording) -> None:
+    """What was run, and the table so far, as JSON."""
+    rows = [dict(zip(HEADER, _cells(step, recording), strict=True)) for step in steps]
+    unfinished = folder / "run.json.part"
+    unfinished.write_text(json.dumps({**made, "rows": rows}, indent=1), encoding="utf-8")
+    unfinished.replace(folder / "run.json")
 
 
 def _row(cells: Sequence[str]) -> str:
@@ -167,6 +201,13 @@ def _report(console: Console, recording: Recording, steps: Sequence[Any]) -> Non
             f"ADD: {1e3 * belief.weighted_add(points, recording.truth):.3f} mm over the particles by weight, "
             f"{1e3 * float(average_distance(belief.mean, points, recording.truth)):.3f} mm at the mean "
             f"(ADD-S {1e3 * float(average_nearest_distance(belief.mean, points, recording.truth)):.3f} mm)"
+        )
+    gap = steps[-1].info.truth_gap
+    if gap > LARGEST_GAP:
+        console.print(
+            f"the particles missed the truth, which scores {gap:.0f} nats better than the best of them: "
+            "try more particles or another seed.",
+            style="yellow",
         )
     wall = sum(step.info.seconds for step in steps)
     spent = [f"wall time {wall:.2f} s"]

@@ -267,6 +267,11 @@ def _window(where: str, window: ProbeWindow, touch: Touch, end: int) -> Iterator
         return
     if first < end:
         yield f"{span} begins before an earlier window ended, at {end}; give them in order, without overlap."
+    if first > end:
+        yield (
+            f"{span} leaves out stamps {end} to {first}; keep every window from the probe's start, "
+            "for the first ones tell the sensor's zero."
+        )
     if touch.times.shape != (last - first,):
         yield f"{span} holds {touch.times.size} wrench times, not {last - first}; read them at the stamps."
     elif (far := np.abs(touch.times - stamps[first:last]) > SAME_TIME).any():

@@ -26,6 +26,7 @@ Selection = Tensor | npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice
 _FARTHEST = (
     1.0  # m: a peg that is farther than this from where it would be in free motion has been flung away
 )
+_LONGEST_GAP = 0.025  # s between stamps up to which the free approach may be skipped
 _FULL, _HALVED, _DIVERGED = 0, 1, 2
 
 
@@ -87,6 +88,12 @@ class Session:
         self.begin = float(probe.command_times[0])
         self.clocks = [Clock(physics.model, probe, physics.parameters.time_step / k) for k in (1, 2)]
 
+    @property
+    def densely_read(self) -> bool:
+        """Whether the stamps follow the motion closely enough to tell from them where the peg has been."""
+        times = np.concatenate([[self.begin], self.stamps])
+        return bool((np.diff(times) <= _LONGEST_GAP).all())
+
     @functools.cached_property
     def approach(self) -> Approach:
         """The whole probe with the part out of reach."""
@@ -128,6 +135,8 @@ class Rollout:
     def _skip_approach(self) -> None:
         """Begin each simulation at the last stamp of its free approach."""
         session = self.session
+        if not session.densely_read:
+            return
         self._free = first_possible_touch(session.approach, session.part, session.peg, self.world_from_part)
         self._standing = session.approach.standing[self._free]
 

@@ -81,7 +81,7 @@ def carried(name: str, inputs: Tensor | tuple[Tensor, ...], start: Callable[[], 
     frame = _frame.get()
     if frame is None:
         return start()
-    entry = frame.available.get(name)
+    entry = frame.used.get(name) or frame.available.get(name)
     if entry is None or not same_inputs(entry.inputs, inputs):
         entry = Entry(inputs, start())
     frame.used[name] = entry

@@ -88,6 +88,11 @@ def run(
             raise InputError(
                 f"site {address!r} is enumerated, which particles cannot be; remove `enumerate`."
             )
+        if site["mask"] is not None or not isinstance(site["scale"], int | float) or site["scale"] != 1:
+            raise InputError(
+                f"site {address!r} is scaled or masked by a handler, which traces do not read; "
+                "use the distribution's own `.mask()`, or weigh inside a distribution."
+            )
         distribution, value = site["fn"], site["value"]
         shape = tuple(distribution.batch_shape)
         if shape != (particles,):

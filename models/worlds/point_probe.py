@@ -63,7 +63,7 @@ def invent(
     actions = [_push(rng, scene, truth) for _ in range(pushes)]
 
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**62)))
+        torch.manual_seed(noise_seed(seed))
         trace, _ = generate(point_probe, (scene, actions), {"part": torch.from_numpy(truth)[None]}, 1)
     measurements = []
     for k, push in enumerate(actions):
@@ -74,6 +74,11 @@ def invent(
         )
         measurements.append(Measurement(push, _touch(rng, scene, push, trace[f"onset_{k}"][0], angle)))
     return Recording(part, guess, measurements, truth=truth, model="point_probe", source="made up by bcppl")
+
+
+def noise_seed(seed: int) -> int:
+    """The seed of a recording's noise: inference may be given the same seed, and must not share its draws."""
+    return int(np.random.default_rng([seed, 1]).integers(2**62))
 
 
 def _push(rng: np.random.Generator, scene: Scene, truth: Array) -> Push:
