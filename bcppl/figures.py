@@ -119,7 +119,7 @@ def add_over_time(
         first = times[contact_start]
         edge = 0.5 * (first + times[contact_start - 1]) if contact_start > 0 else first - 0.25 * margin
         axes.axvspan(edge, times.max() + 1.7 * margin, color="#0072B2", alpha=0.06, linewidth=0)
-        axes.text(edge, 1.01, " contact", transform=axes.get_xaxis_transform(), color="#0072B2")
+        axes.text(edge, 1.01, " probing", transform=axes.get_xaxis_transform(), color="#0072B2")
     particle = Line2D([], [], color=PARTICLE, linewidth=1.0, marker="o", markersize=3)
     average = Line2D([], [], color=STRONG, linewidth=2.5, marker="o", markersize=5)
     figure.legend(
