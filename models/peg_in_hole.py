@@ -55,7 +55,7 @@ class Settings:
 
     depth_scale: float = 0.003
     outlier: float = 0.1
-    effective_pixels: float = 100.0
+    effective_pixels: float = 50.0
     contact_scale: float = 0.002
     one_empty: float = 2.0 * 0.006**2
     translation_scale: float = 0.0007
