@@ -3,17 +3,20 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 RECORDINGS := point_probe_10_pushes peg_probe
+# Packages that the benchmarks measure beside bcppl; each gets an environment of its own.
+PEERS := particles blackjax
 # Test processes; each keeps to one thread.
 JOBS ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: run test lint long check-links clean help
+.PHONY: run test lint long peers check-links clean help
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make run          find the part in the shipped recordings; pictures and beliefs go to runs/"
 	@echo "make test         style, types and tests"
 	@echo "make long         the tests that take minutes"
+	@echo "make peers        environments of the packages that the benchmarks compare with, in benchmarks/.peers"
 	@echo "make check-links  are bcppl/models and bcppl/inference symbolic links?"
 	@echo "make clean        remove what was built, the virtual environment too"
 
@@ -30,6 +33,13 @@ lint: $(STAMP)
 
 long: $(STAMP)
 	$(PYTEST) -m long
+
+peers: $(PEERS:%=benchmarks/.peers/%/.installed)
+
+benchmarks/.peers/%/.installed: benchmarks/peers/%.txt | $(STAMP)
+	$(BIN)/python -m venv --clear $(@D)
+	$(@D)/bin/python -m pip install --quiet --requirement $<
+	@touch $@
 
 # torch goes first and alone: pip then takes the build of that version that the machine offers (a local CPU one,
 # say), and the calls after it leave it as it is.
@@ -60,5 +70,5 @@ check-links:
 	done
 
 clean:
-	rm -rf $(VENV) build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) benchmarks/.peers build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find bcppl models inference tests notebooks benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,50 @@
+"""Problems with exact answers, in plain numpy, as every peer's environment and bcppl's own can read them."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+# Prior N(0, I), likelihood N(x; 0, covariance) at 0: six correlated axes with spreads from 0.05 to 0.3.
+GAUSSIAN_AXES = 6
+_spread = np.linspace(0.05, 0.3, GAUSSIAN_AXES)
+_order = np.arange(GAUSSIAN_AXES)
+GAUSSIAN_COVARIANCE = np.outer(_spread, _spread) * 0.5 ** np.abs(np.subtract.outer(_order, _order))
+GAUSSIAN_PRECISION = np.linalg.inv(GAUSSIAN_COVARIANCE)
+GAUSSIAN_PEAK = -0.5 * (GAUSSIAN_AXES * np.log(2 * np.pi) + np.linalg.slogdet(GAUSSIAN_COVARIANCE)[1])
+GAUSSIAN_LOG_EVIDENCE = -0.5 * (
+    GAUSSIAN_AXES * np.log(2 * np.pi) + np.linalg.slogdet(GAUSSIAN_COVARIANCE + np.eye(GAUSSIAN_AXES))[1]
+)
+
+# Two shells exp(-(|x - c| - r)^2 / 2w^2) / sqrt(2 pi w^2) with centres at +-SHELL_CENTRE on the first axis,
+# uniform on [-SHELL_HALF, SHELL_HALF]^2: Feroz and Hobson, Multimodal nested sampling, MNRAS 384, 2008, 5.3.
+SHELL_RADIUS, SHELL_WIDTH, SHELL_CENTRE, SHELL_HALF = 2.0, 0.1, 3.5, 6.0
+SHELLS_LOG_EVIDENCE = -1.745642
+
+# x_0 ~ N(0, 1), x_t = x_{t-1} + N(0, WALK^2), y_t = x_t + N(0, NOISE^2), the first y being y_1.
+WALK, NOISE = 0.5, 0.3
+
+
+def linear_gaussian(steps: int, seed: int = 0) -> tuple[np.ndarray[Any, Any], float]:
+    """Observations (T,) of the linear-Gaussian series and their exact log evidence, by Kalman's filter."""
+    generator = np.random.default_rng(seed)
+    x = generator.normal()
+    observed = np.empty(steps)
+    for k in range(steps):
+        x += WALK * generator.normal()
+        observed[k] = x + NOISE * generator.normal()
+    mean, variance, log_evidence = 0.0, 1.0, 0.0
+    for y in observed:
+        variance += WALK**2
+        spread = variance + NOISE**2
+        log_evidence -= 0.5 * (np.log(2 * np.pi * spread) + (y - mean) ** 2 / spread)
+        gain = variance / spread
+        mean, variance = mean + gain * (y - mean), (1 - gain) * variance
+    return observed, float(log_evidence)
+
+
+def emit(**fields: Any) -> None:
+    """Print one result as a JSON line."""
+    print(json.dumps(fields), flush=True)
