@@ -27,6 +27,18 @@ SHELLS_LOG_EVIDENCE = -1.745642
 WALK, NOISE = 0.5, 0.3
 
 
+def gaussian_log_likelihood(x: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Of values (N, 6)."""
+    return GAUSSIAN_PEAK - 0.5 * ((x @ GAUSSIAN_PRECISION) * x).sum(1)
+
+
+def shells_log_likelihood(x: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Of values (N, 2)."""
+    off = [np.hypot(x[:, 0] - centre, x[:, 1]) - SHELL_RADIUS for centre in (-SHELL_CENTRE, SHELL_CENTRE)]
+    nearest = np.logaddexp(*(-(each**2) / (2 * SHELL_WIDTH**2) for each in off))
+    return nearest - 0.5 * np.log(2 * np.pi * SHELL_WIDTH**2)
+
+
 def linear_gaussian(steps: int, seed: int = 0) -> tuple[np.ndarray[Any, Any], float]:
     """Observations (T,) of the linear-Gaussian series and their exact log evidence, by Kalman's filter."""
     generator = np.random.default_rng(seed)
