@@ -5,7 +5,7 @@ the weighted particles after each tempering step, times 2.38^2 / d. One line per
 reported apart. Single precision, JAX's default, unless --double.
 
 Its order is resample, move at the temperature before, weigh: the last particles are weighted and have not
-been moved at temperature 1. So for each tempering step and particle the likelihood is asked for once to choose
+been moved at temperature 1. So for each tempering step and particle the likelihood is asked once to choose
 the temperature, once to begin the chain, once for each move and once for the weight; all of them count.
 """
 

@@ -1,7 +1,7 @@
 """`particles`: evidence by adaptive tempering, standard and waste-free.
 
 Its defaults: the next exponent keeps the effective sample size at half of N, systematic resampling, chains
-of ten whose nine moves are random walks shaped by the particles' covariance. One line per problem, N, variant.
+of ten whose nine moves are random walks shaped by the particles' covariance. One line for each N and variant.
 Waste-free runs with N particles in all: `SMC(N=)` counts chains there, so it is given N over their length.
 """
 
