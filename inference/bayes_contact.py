@@ -15,15 +15,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bcppl.inference.kernels import Fit, replaced
+from bcppl.inference.kernels import replaced
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import drift
+from bcppl.inference.proposals import Proposal, drift, program_of
 from bcppl.inference.resampling import Resample, adaptive
 from bcppl.inference.smc import Assimilate, Assimilated, Step, smc
 from bcppl.traces import Model, assess, extend, propose, update
 
 
-def drifted(population: Population, fit: Fit) -> Population:
+def drifted(population: Population, proposal: Proposal) -> Population:
     """Every particle moved by a proposal program, and weighed for it; each half learns from the other."""
     order = torch.randperm(len(population))
     halves = [order[: len(order) // 2], order[len(order) // 2 :]]
@@ -31,7 +31,7 @@ def drifted(population: Population, fit: Fit) -> Population:
     for mine, others in (halves, halves[::-1]):
         if len(mine) == 0 or len(others) == 0:
             continue
-        program = fit(population[others])
+        program = program_of(proposal, (), population[others])
         trace = population.trace[mine]
         forward = propose(program, (trace,), len(mine))
         updated = update(trace, {a: v for a, v in forward.choices.items() if a in trace.choices})
@@ -44,13 +44,13 @@ def drifted(population: Population, fit: Fit) -> Population:
     return population.reweighed(factor)
 
 
-def drift_and_weigh(fit: Fit, resample: Resample) -> Assimilate:
+def drift_and_weigh(proposal: Proposal, resample: Resample) -> Assimilate:
     """Take a measurement in by drifting, weighing and, when needed, resampling."""
 
     def assimilate(
         population: Population, args: tuple[Any, ...], observations: Mapping[str, Tensor]
     ) -> Assimilated:
-        population = drifted(population, fit)
+        population = drifted(population, proposal)
         longer, log_likelihood = extend(population.trace, args, observations)
         population = Population(longer, population.log_weights, population.log_evidence).reweighed(
             log_likelihood

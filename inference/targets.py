@@ -67,13 +67,40 @@ class Target:
                 break
         return index, trace
 
+    def accept(self, old: Trace, new: Trace, log_ratio: Tensor) -> tuple[Tensor, Trace]:
+        """Which particles take their proposals: Metropolis-Hastings, decided for as little work as possible.
+
+        Args:
+            old: of N particles.
+            new: their proposals.
+            log_ratio: (N,) log-density of the way back minus that of the way there, Jacobian included.
+
+        Returns:
+            The indices (K,) of those that do, and the trace of their proposals.
+        """
+        # With the chance drawn first, it is known what a proposal must reach to be accepted.
+        chance = torch.log(torch.rand(old.particles, dtype=torch.float64))
+        return self.above(new, chance + self(old) - log_ratio)
+
+    def visible(self, trace: Trace) -> Trace:
+        """What a proposal may read of a proposed trace on its way back: here all of it."""
+        return trace
+
 
 POSTERIOR = Target()
 
 
-def above(target: Callable[[Trace], Tensor], trace: Trace, needed: Tensor) -> tuple[Tensor, Trace]:
-    """`Target.above`, or for a plain function of the trace the same by evaluating everything."""
+def accept(
+    target: Callable[[Trace], Tensor], old: Trace, new: Trace, log_ratio: Tensor
+) -> tuple[Tensor, Trace]:
+    """`Target.accept`, or for a plain function of the trace the same by evaluating everything."""
     if isinstance(target, Target):
-        return target.above(trace, needed)
-    index = (target(trace) > needed).nonzero().flatten()
-    return index, trace[index]
+        return target.accept(old, new, log_ratio)
+    chance = torch.log(torch.rand(old.particles, dtype=torch.float64))
+    index = (target(new) + log_ratio > chance + target(old)).nonzero().flatten()
+    return index, new[index]
+
+
+def visible(target: Callable[[Trace], Tensor], trace: Trace) -> Trace:
+    """`Target.visible`, or for a plain function of the trace all of it."""
+    return target.visible(trace) if isinstance(target, Target) else trace

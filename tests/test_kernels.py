@@ -19,10 +19,9 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.poses import NormalPose, UniformPose
 from bcppl.errors import InferenceError
-from bcppl.inference import kernels
 from bcppl.inference.kernels import Kernel, cycle, metropolis_hastings, rejuvenate, repeat
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import drift
+from bcppl.inference.proposals import Fitted, drift
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.poses import Freedom
 from bcppl.traces import Trace, generate, simulate
@@ -181,25 +180,17 @@ def test_composed_kernels_and_tempered_targets_are_invariant() -> None:
 # ---- proposals that are not symmetric, and that choose more than the new value
 
 
-def leaning(_: Population) -> Callable[[Trace], None]:
+def leaning(trace: Trace) -> None:
     """Pulled to the origin by a pull that is chosen first, its chances hanging on where the particle is."""
-
-    def propose(trace: Trace) -> None:
-        x = trace["x"]
-        strong = pyro.sample("strong", dist.Bernoulli(torch.sigmoid(x[:, 0])))
-        pull = torch.where(strong == 1, number(0.2), number(0.8))[:, None]
-        pyro.sample("x", dist.Normal(pull * x + 0.1, 0.5 + 0.3 * strong[:, None]).to_event(1))
-
-    return propose
+    x = trace["x"]
+    strong = pyro.sample("strong", dist.Bernoulli(torch.sigmoid(x[:, 0])))
+    pull = torch.where(strong == 1, number(0.2), number(0.8))[:, None]
+    pyro.sample("x", dist.Normal(pull * x + 0.1, 0.5 + 0.3 * strong[:, None]).to_event(1))
 
 
-def fresh(_: Population) -> Callable[[Trace], None]:
+def fresh(trace: Trace) -> None:
     """A pose drawn anew about the centre, wherever the particle is."""
-
-    def propose(trace: Trace) -> None:
-        pyro.sample("pose", NormalPose(CENTER.expand(len(trace), 7), 0.7 * WIDE))
-
-    return propose
+    pyro.sample("pose", NormalPose(CENTER.expand(len(trace), 7), 0.7 * WIDE))
 
 
 ASYMMETRIC = {
@@ -210,22 +201,23 @@ ASYMMETRIC = {
 
 @pytest.mark.parametrize("name", ASYMMETRIC)
 def test_the_way_back_is_weighed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    fit, case = ASYMMETRIC[name]
+    proposal, case = ASYMMETRIC[name]
     exact, address, functions = CASES[case]
-    assert worst_z(exact, metropolis_hastings(fit), address, functions) < SOUND
+    assert worst_z(exact, metropolis_hastings(proposal), address, functions) < SOUND
     monkeypatch.setattr(
-        kernels, "assess", lambda program, args, choices, count: torch.zeros(count, dtype=torch.float64)
+        "bcppl.inference.kernels.hastings.assess",
+        lambda program, args, choices, count: torch.zeros(count, dtype=torch.float64),
     )
-    assert worst_z(exact, metropolis_hastings(fit), address, functions) > BROKEN
+    assert worst_z(exact, metropolis_hastings(proposal), address, functions) > BROKEN
 
 
 def test_a_proposal_that_moves_nothing_latent_is_refused() -> None:
-    def fit(_: Population) -> Callable[[Trace], Any]:
-        return lambda trace: pyro.sample("elsewhere", dist.Normal(trace["x"], 1.0).to_event(1))
+    def elsewhere(trace: Trace) -> None:
+        pyro.sample("elsewhere", dist.Normal(trace["x"], 1.0).to_event(1))
 
     trace = correlated_draws(4)
     with pytest.raises(InferenceError, match=r"elsewhere.* latent are x"):
-        metropolis_hastings(fit)(equal_weights(trace))(trace, POSTERIOR)
+        metropolis_hastings(elsewhere)(equal_weights(trace))(trace, POSTERIOR)
 
 
 def test_drift_moves_scalars_and_matrices_too() -> None:
@@ -266,7 +258,7 @@ def test_no_particle_shapes_its_own_proposal(count: int) -> None:
     trace = simulate(program, (), count)
     tags = set(trace["tag"].tolist())
     sweeps = 3
-    done = rejuvenate(equal_weights(trace), metropolis_hastings(spying), POSTERIOR, sweeps)
+    done = rejuvenate(equal_weights(trace), metropolis_hastings(Fitted(spying)), POSTERIOR, sweeps)
     assert len(learnt) == len(moved) == 2 * sweeps
     for others, mine in zip(learnt, moved, strict=True):
         assert not others & mine and others | mine == tags

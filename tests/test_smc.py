@@ -201,13 +201,9 @@ def standard_errors(found: np.ndarray[Any, Any]) -> float:
     return float(abs(found.mean() - 1) / (found.std(ddof=1) / math.sqrt(len(found))))
 
 
-def fixed_drift(_: Population) -> Callable[[Trace], None]:
+def fixed_drift(trace: Trace) -> None:
     """A proposal that learns nothing and is not symmetric."""
-
-    def propose(trace: Trace) -> None:
-        pyro.sample("x", dist.Normal(0.9 * trace["x"] + 0.1, 0.4))
-
-    return propose
+    pyro.sample("x", dist.Normal(0.9 * trace["x"] + 0.1, 0.4))
 
 
 def by_halves(_: Tensor, __: Tensor, exponent: float, ___: float) -> float:

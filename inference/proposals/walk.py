@@ -1,7 +1,4 @@
-"""Proposals are programs: any Pyro program that, given the trace, chooses new values at latent addresses.
-
-What a proposal learns from a population is fixed before it runs (see `bcppl.inference.kernels`).
-"""
+"""Drift: a random walk shaped by the particles' own spread."""
 
 from __future__ import annotations
 
@@ -16,16 +13,15 @@ from torch import Tensor
 from bcppl.beliefs import normalised
 from bcppl.distributions.poses import NormalPose
 from bcppl.inference.population import Population
+from bcppl.inference.proposals.proposal import Fitted
 from bcppl.poses import Freedom
 from bcppl.traces import Trace
-
-Fit = Callable[[Population], Callable[[Trace], None]]
 
 # Spreads below these are rounding, not belief: metres and radians for poses, the value's own unit otherwise.
 FLOOR = 1e-6
 
 
-def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fit:
+def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fitted:
     """A random walk shaped by the weighted covariance of the particles, its scale drawn anew for each move.
 
     Poses are moved in their tangent space along the free axes, other values as vectors.
@@ -37,12 +33,11 @@ def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fit:
             Statistical Science 16, 2001).
     """
     smallest, largest = (math.log(s) for s in scales)
+    spread = spread_of(address)
 
     def fit(population: Population) -> Callable[[Trace], None]:
         freedom = getattr(population.trace.distributions[address], "freedom", None)
-        covariance = (
-            _pose_spread(population, address, freedom) if freedom else _vector_spread(population, address)
-        )
+        covariance = spread(population)
         covariance = covariance * (2.38**2 / len(covariance))
         factor = torch.linalg.cholesky(covariance)
         if freedom is None:
@@ -68,7 +63,7 @@ def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fit:
 
         return random_walk
 
-    return fit
+    return Fitted(fit)
 
 
 def _pair(low: float, high: float) -> tuple[Tensor, Tensor]:
@@ -77,6 +72,21 @@ def _pair(low: float, high: float) -> tuple[Tensor, Tensor]:
 
 def _reshape(event: torch.Size) -> torch.distributions.Transform:
     return torch.distributions.transforms.ReshapeTransform(torch.Size([math.prod(event)]), event)
+
+
+def spread_of(address: str) -> Callable[[Population], Tensor]:
+    """What a proposal may learn: the weighted covariance (d, d) of the particles at a latent address.
+
+    For a pose it is that of its free axes in the tangent space at the mean (m^2, m rad, rad^2).
+    """
+
+    def spread(population: Population) -> Tensor:
+        freedom = getattr(population.trace.distributions[address], "freedom", None)
+        if freedom is None:
+            return _vector_spread(population, address)
+        return _pose_spread(population, address, freedom)
+
+    return spread
 
 
 def _pose_spread(population: Population, address: str, freedom: Freedom) -> Tensor:

@@ -1,0 +1,55 @@
+"""Metropolis-Hastings with a proposal program: run forward by `propose`, back by `assess`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bcppl.errors import InferenceError
+from bcppl.inference.kernels.kernel import Kernel, Move, put
+from bcppl.inference.population import Population
+from bcppl.inference.proposals.proposal import Proposal, program_of
+from bcppl.inference.targets import Target, accept, visible
+from bcppl.traces import Trace, assess, propose, update
+
+
+def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any]) -> Kernel:
+    """Metropolis-Hastings with a proposal program.
+
+    Args:
+        proposal: a Pyro program `proposal(trace, *values)`, or a shipped one such as `drift("hole")`. Its
+            choices at latent addresses of the trace are new values; its other choices are auxiliary and keep
+            their values on the way back (so their distribution must not depend on what is moved in a way
+            that forbids that).
+        learned: functions of a population, such as `spread_of("hole")`; what they give is handed to the
+            program as `values`. They see other particles than those that are moved.
+
+    The acceptance ratio is that of Hastings, Biometrika 57, 1970, on the pair (trace, auxiliary choices).
+    """
+
+    def kernel(population: Population) -> Move:
+        program = program_of(proposal, learned, population)
+
+        def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
+            forward = propose(program, (trace,), trace.particles)
+            new = {a: v for a, v in forward.choices.items() if a in trace.choices}
+            if not new:
+                chosen = ", ".join(forward.choices) or "nothing"
+                raise InferenceError(
+                    f"a proposal has no choice at a latent address: it chooses {chosen}, "
+                    f"latent are {', '.join(trace.choices)}."
+                )
+            updated = update(trace, new)
+            back = {**forward.choices, **updated.discarded}
+            backward = assess(program, (visible(target, updated.trace),), back, trace.particles)
+            passed, survivors = accept(target, trace, updated.trace, backward - forward.log_prob)
+            accepted = torch.zeros(trace.particles, dtype=torch.float64)
+            accepted[passed] = 1.0
+            return put(trace, passed, survivors), accepted
+
+        return move
+
+    return kernel
