@@ -16,6 +16,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.poses import NormalPose, UniformPose
+from bcppl.errors import InputError
 from bcppl.traces import Trace, assess, carried, extend, generate, propose, simulate, update
 
 N = 5
@@ -346,3 +347,34 @@ def test_two_windows_of_one_run_share_the_state_that_the_first_began() -> None:
 
     simulate(twice, (), 5)
     assert len(started) == 1
+
+
+def test_a_hidden_site_says_nothing_whatever_is_made_of_the_trace() -> None:
+    calls: list[str] = []
+    trace, _ = generate(counted(calls), (2,), seen(2), N)
+    calls.clear()
+    secret = trace.hiding(["a_1"])
+    moved = secret.at({"x": secret["x"] + 1.0})
+    for each in (
+        secret,
+        secret[:3],
+        moved,
+        moved.where(torch.ones(N, dtype=torch.bool), trace),
+        trace.where(torch.ones(N, dtype=torch.bool), secret),
+        secret.hiding(["b_0"]),
+    ):
+        for ask in (
+            lambda t=each: t.distributions["a_1"],
+            lambda t=each: dict(t.distributions),
+            lambda t=each: t.log_prob("a_1"),
+            lambda t=each: t.log_prob(),
+        ):
+            with pytest.raises(InputError, match=r"'(a_1|b_0)' is hidden"):
+                ask()
+        assert list(each.distributions) == each.addresses == list(trace.addresses)
+        each.distributions["a_0"]
+    torch.testing.assert_close(secret.log_prob("a_0", "x"), trace.log_prob("a_0", "x"))
+    assert "a_1" not in calls and torch.equal(secret["a_1"], trace["a_1"])
+    with pytest.raises(InputError, match=r"'q' was to be hidden.* never visits"):
+        trace.hiding(["q"])
+    assert trace.log_prob("a_1").shape == (N,), "the trace itself is as it was"

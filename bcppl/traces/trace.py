@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -114,6 +114,30 @@ def run(
     return Run(distributions, values, frozenset(fixed), dict(used), nodes["_RETURN"]["value"])
 
 
+def _read(address: str) -> InputError:
+    return InputError(
+        f"site {address!r} is hidden from a proposal, which asked for its distribution or log-probability; "
+        "let the proposal read earlier sites only."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Hiding(Mapping[str, Any]):
+    distributions: Mapping[str, Any]
+    hidden: frozenset[str]
+
+    def __getitem__(self, address: str) -> Any:
+        if address in self.hidden:
+            raise _read(address)
+        return self.distributions[address]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.distributions)
+
+    def __len__(self) -> int:
+        return len(self.distributions)
+
+
 @dataclass(frozen=True, eq=False)
 class Trace:
     """Values by address for N particles, and the log-probability of every site, evaluated when asked for.
@@ -127,6 +151,8 @@ class Trace:
         choices: the latent values, particle axis first.
         observations: the constrained values, the same for all particles.
         carried: simulator states by name, particle axis first (see `bcppl.traces.carried`).
+        known: log-probabilities (N,) that were evaluated already, by address.
+        hidden: addresses whose distribution and log-probability may not be asked for (see `hiding`).
     """
 
     program: Program
@@ -136,6 +162,7 @@ class Trace:
     observations: Mapping[str, Tensor]
     carried: Mapping[str, Entry] = field(default_factory=dict)
     known: dict[str, Tensor] = field(default_factory=dict, repr=False)
+    hidden: frozenset[str] = frozenset()
 
     @cached_property
     def _run(self) -> Run:
@@ -152,7 +179,13 @@ class Trace:
 
     @property
     def distributions(self) -> Mapping[str, Any]:
-        """The distribution of every site at these values, by address in the program's order."""
+        """The distribution of every site at these values, by address in the program's order.
+
+        Raises:
+            InputError: the distribution of a hidden site is asked for.
+        """
+        if self.hidden:
+            return _Hiding(self._run.distributions, self.hidden)
         return MappingProxyType(self._run.distributions)
 
     @property
@@ -178,6 +211,8 @@ class Trace:
         return total
 
     def _site(self, address: str) -> Tensor:
+        if address in self.hidden:
+            raise _read(address)
         if address not in self.known:
             if address not in self._run.distributions:
                 raise InputError(
@@ -221,6 +256,7 @@ class Trace:
             self.observations,
             {a: e.take(index) for a, e in self.carried.items()},
             {a: v[index] for a, v in self.known.items()},
+            self.hidden,
         )
 
     def __contains__(self, address: object) -> bool:
@@ -243,7 +279,27 @@ class Trace:
             self.observations,
             {a: e.where(mask, other.carried[a]) for a, e in self.carried.items() if a in other.carried},
             {a: torch.where(mask, self.known[a], other.known[a]) for a in shared},
+            self.hidden | other.hidden,
         )
+
+    def hiding(self, addresses: Iterable[str]) -> Trace:
+        """The same trace for a proposal to read, in which some sites may not be asked what they say.
+
+        Asking it for the distribution or the log-probability of a hidden site, also after indexing or new
+        values, raises an error that names the address. Values stay readable: they are the trace's own.
+
+        Raises:
+            InputError: the program visits no such address.
+        """
+        hidden = frozenset(addresses)
+        for address in sorted(hidden - set(self.addresses)):
+            raise InputError(
+                f"address {address!r} was to be hidden, which the program never visits; "
+                f"it visits {', '.join(self.addresses) or 'none'}."
+            )
+        secret = replace(self, known=dict(self.known), hidden=self.hidden | hidden)
+        secret.__dict__["_run"] = self._run
+        return secret
 
     def at(self, values: Mapping[str, Tensor]) -> Trace:
         """The same run with other values at some latent addresses; what cannot have changed is kept.
@@ -269,6 +325,7 @@ class Trace:
             {**self.choices, **values},
             self.observations,
             dict(self.carried),
+            hidden=self.hidden,
         )
         if set(new.addresses) != set(self.addresses):
             raise InputError("new values changed which addresses the program visits; mask sites instead.")
