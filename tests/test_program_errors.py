@@ -126,8 +126,8 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "enumerated": (lambda: simulate(enumerated, (), N), "'x' is enumerated"),
     "log-probabilities": (lambda: simulate(wide, (), N).log_prob(), r"'y' has log-probabilities .*\(3, 5\)"),
     "no such site": (lambda: simulate(latent_and_seen, (), N).log_prob("q"), "no address 'q'"),
-    "update of an observation": (lambda: updated({"y": ones}), "'y' was given, which is no latent.* x"),
-    "update of nothing": (lambda: updated({"q": ones}), "'q' was given, which is no latent"),
+    "update of an observation": (lambda: updated({"y": ones}), "'y' was given or asked for, which is no latent.* x"),
+    "update of nothing": (lambda: updated({"q": ones}), "'q' was given or asked for, which is no latent"),
     "update of wrong shape": (lambda: updated({"x": ones[:3]}), r"'x' has shape \(3,\), the old one \(5,\)"),
     "update that changes the addresses": (
         lambda: update(t := simulate(branching, (), 1), {"x": 1.0 - t["x"]}),

@@ -17,7 +17,7 @@ from bcppl import poses
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.poses import NormalPose, UniformPose
 from bcppl.errors import InputError
-from bcppl.traces import Trace, assess, carried, extend, generate, propose, simulate, update
+from bcppl.traces import Trace, assess, carried, extend, generate, propose, regenerate, simulate, update
 
 N = 5
 
@@ -284,6 +284,7 @@ def test_what_was_simulated_assesses_to_its_own_density() -> None:
     torch.testing.assert_close(assess(several, (2,), trace.choices, N), trace.log_prob())
     proposed = propose(several, (2,), N)
     torch.testing.assert_close(assess(several, (2,), proposed.choices, N), proposed.log_prob)
+    assert propose(lambda: pyro.sample("x", dist.Normal(number(0.0), 1.0)), (), N).result.shape == (N,)
     # The latents' own part, written out: a coin, three normals, a uniform pose, two categoricals.
     coin = torch.where(trace["coin"] == 1, number(math.log(0.3)), number(math.log(0.7)))
     volume = 0.2**3 * (2.0 - math.sin(2.0)) / math.pi
@@ -378,3 +379,65 @@ def test_a_hidden_site_says_nothing_whatever_is_made_of_the_trace() -> None:
     with pytest.raises(InputError, match=r"'q' was to be hidden.* never visits"):
         trace.hiding(["q"])
     assert trace.log_prob("a_1").shape == (N,), "the trace itself is as it was"
+
+
+def test_regenerating_weighs_what_was_not_drawn_anew() -> None:
+    calls: list[str] = []
+    trace, _ = generate(counted(calls), (2,), seen(2), N)
+    calls.clear()
+    drawn = regenerate(trace, "x")
+    assert calls == [] and set(drawn.discarded) == {"x"}
+    x, z, new = trace["x"], trace["z"], drawn.trace["x"]
+    assert torch.equal(drawn.trace["z"], z) and bool((new != x).all())
+    # The prior's ratio cancels against the proposal's; z and what is seen of x remain.
+    expected = normal_log(z, new, 2.0) - normal_log(z, x, 2.0)
+    for k in range(2):
+        value = seen(2)[f"a_{k}"]
+        expected = expected + normal_log(value, new, 0.5) - normal_log(value, x, 0.5)
+    torch.testing.assert_close(drawn.log_weight, expected)
+    assert set(calls) == {"a_0", "a_1"}, "what does not hang on x is not evaluated"
+    both = regenerate(trace, ["z", "x"])
+    prior = both.trace.log_prob("x", "z") - trace.log_prob("x", "z")
+    torch.testing.assert_close(both.log_weight, update(trace, both.trace.choices).log_ratio - prior)
+    with pytest.raises(InputError, match="'a_0' was given or asked for, which is no latent"):
+        regenerate(trace, ["x", "a_0"])
+
+
+def test_later_addresses_are_regenerated_given_the_earlier_ones_new_values() -> None:
+    def program() -> None:
+        x = pyro.sample("x", dist.Normal(number(0.0), 100.0))
+        y = pyro.sample("y", dist.Normal(x, 0.01))
+        pyro.sample("w", dist.Normal(y, 0.01))
+
+    drawn = regenerate(simulate(program, (), N), {"w", "y", "x"}).trace
+    assert float((drawn["y"] - drawn["x"]).abs().max()) < 0.1
+    assert float((drawn["w"] - drawn["y"]).abs().max()) < 0.1
+
+
+@pytest.mark.parametrize("mutant", ["", "sign", "own", "never"])
+def test_moves_by_regeneration_leave_the_posterior_as_it_is(mutant: str) -> None:
+    """From exact draws of x given y = 1 (prior N(0, 1), noise 1: N(1/2, 1/2)), after moves, exact moments."""
+    torch.manual_seed(1)
+    count = 20000
+
+    def program() -> None:
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        pyro.sample("y", dist.Normal(x, 1.0))
+
+    trace, _ = generate(program, (), {"y": number(1.0)}, count)
+    trace = trace.at({"x": 0.5 + math.sqrt(0.5) * torch.randn(count, dtype=torch.float64)})
+    for _ in range(4):
+        drawn = regenerate(trace, "x")
+        ratio = drawn.log_weight
+        if mutant == "sign":
+            ratio = -ratio
+        elif mutant == "own":  # the regenerated site's own prior forgotten to cancel
+            ratio = update(trace, drawn.trace.choices).log_ratio
+        elif mutant == "never":  # always accepted
+            ratio = torch.zeros(count, dtype=torch.float64)
+        accepted = torch.rand(count, dtype=torch.float64).log() < ratio
+        trace = drawn.trace.where(accepted, trace)
+    z_mean = float((trace["x"].mean() - 0.5) / math.sqrt(0.5 / count))
+    z_square = float((((trace["x"] - 0.5) ** 2).mean() - 0.5) / (0.5 * math.sqrt(2 / count)))
+    worst = max(abs(z_mean), abs(z_square))
+    assert worst > 8 if mutant else worst < 3.5, worst

@@ -2,12 +2,15 @@
 
 from bcppl.traces.carried import carried
 from bcppl.traces.model import Model
+from bcppl.traces.propose import Proposed, assess, propose
 from bcppl.traces.trace import Trace
-from bcppl.traces.verbs import Proposed, Update, assess, extend, generate, propose, simulate, update
+from bcppl.traces.update import Regenerated, Update, regenerate, update
+from bcppl.traces.verbs import extend, generate, simulate
 
 __all__ = [
     "Model",
     "Proposed",
+    "Regenerated",
     "Trace",
     "Update",
     "assess",
@@ -15,6 +18,7 @@ __all__ = [
     "extend",
     "generate",
     "propose",
+    "regenerate",
     "simulate",
     "update",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -172,6 +172,11 @@ class Trace:
         self.carried_states().update(again.carried)
         return again
 
+    def _ran(self, ran: Run) -> None:
+        """Keep the run that these values come from, so that the program is not run again for them."""
+        self.__dict__["_run"] = ran
+        self.carried_states().update(ran.carried)
+
     def carried_states(self) -> dict[str, Entry]:
         """The carried states, as a dictionary that states started later are added to."""
         assert isinstance(self.carried, dict)
@@ -298,7 +303,7 @@ class Trace:
                 f"it visits {', '.join(self.addresses) or 'none'}."
             )
         secret = replace(self, known=dict(self.known), hidden=self.hidden | hidden)
-        secret.__dict__["_run"] = self._run
+        secret._ran(self._run)
         return secret
 
     def at(self, values: Mapping[str, Tensor]) -> Trace:
@@ -307,35 +312,51 @@ class Trace:
         Raises:
             InputError: an address is not latent, or a value has the wrong shape.
         """
+        self._refuse_other_than_latent(values)
         for address, value in values.items():
-            if address not in self.choices:
-                raise InputError(
-                    f"a new value for {address!r} was given, which is no latent address; "
-                    f"latent are {', '.join(self.choices) or 'none'}."
-                )
             if value.shape != self.choices[address].shape:
                 raise InputError(
                     f"the new value of {address!r} has shape {tuple(value.shape)}, "
                     f"the old one {tuple(self.choices[address].shape)}; give one for each particle."
                 )
-        new = Trace(
-            self.program,
-            self.args,
-            self.particles,
-            {**self.choices, **values},
-            self.observations,
-            dict(self.carried),
-            hidden=self.hidden,
-        )
-        if set(new.addresses) != set(self.addresses):
+        return self._moved({**self.choices, **values}, frozenset(values))
+
+    def regenerated(self, addresses: Collection[str]) -> Trace:
+        """The same run with some latent addresses drawn anew from the program, in its order.
+
+        Raises:
+            InputError: an address is not latent, or the values drawn change which addresses are visited.
+        """
+        self._refuse_other_than_latent(addresses)
+        held = {a: v for a, v in self.choices.items() if a not in addresses}
+        ran = run(self.program, self.args, self.particles, {**held, **self.observations}, self.carried)
+        return self._moved({a: ran.values.get(a, v) for a, v in self.choices.items()}, addresses, ran)
+
+    def _refuse_other_than_latent(self, addresses: Iterable[str]) -> None:
+        for address in addresses:
+            if address not in self.choices:
+                raise InputError(
+                    f"a new value for {address!r} was given or asked for, which is no latent address; "
+                    f"latent are {', '.join(self.choices) or 'none'}."
+                )
+
+    def _moved(self, choices: Mapping[str, Tensor], new: Collection[str], ran: Run | None = None) -> Trace:
+        """This run at other choices, of which those at `new` differ; what cannot have changed is kept."""
+        moved = replace(self, choices=choices, carried=dict(self.carried), known={})
+        if ran is not None:
+            moved._ran(ran)
+        if set(moved.addresses) != set(self.addresses):
             raise InputError("new values changed which addresses the program visits; mask sites instead.")
         for address, value in self.known.items():
-            if address in values:
-                continue
-            then, now = self._run.distributions[address], new._run.distributions[address]
-            if hasattr(now, "inputs") and same_inputs(then.inputs, now.inputs):
-                new.known[address] = value
+            if address not in new and unchanged(self, moved, address):
+                moved.known[address] = value
         # A state that was thrown away must not be merged back in later.
-        for name in [n for n in new.carried_states() if n not in new._run.carried]:
-            del new.carried_states()[name]
-        return new
+        for name in [n for n in moved.carried_states() if n not in moved._run.carried]:
+            del moved.carried_states()[name]
+        return moved
+
+
+def unchanged(first: Trace, second: Trace, address: str) -> bool:
+    """Whether a site of the same value in two traces hangs on the same inputs, so that it says the same."""
+    then, now = first._run.distributions[address], second._run.distributions[address]
+    return hasattr(now, "inputs") and same_inputs(then.inputs, now.inputs)

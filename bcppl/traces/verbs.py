@@ -1,4 +1,4 @@
-"""The verbs on traces, Gen's: simulate, generate, extend, update, and for proposals propose and assess.
+"""The verbs that make and lengthen traces, Gen's: simulate, generate, extend.
 
 Cusumano-Towner et al., Gen: a general-purpose probabilistic programming system with programmable inference,
 PLDI 2019, section 4 (the generative function interface). All of them act on N particles at once.
@@ -7,26 +7,27 @@ PLDI 2019, section 4 (the generative function interface). All of them act on N p
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.traces.carried import Entry
 from bcppl.traces.trace import Program, Run, Trace, run
 
 
-def _trace(
+def trace_of(
     program: Program, args: tuple[Any, ...], particles: int, ran: Run, observed: Mapping[str, Tensor]
 ) -> Trace:
+    """The trace of a run in which the addresses `observed` were constrained."""
     hidden = {a: v for a, v in ran.values.items() if a not in observed and a not in ran.fixed}
-    return Trace(program, args, particles, hidden, dict(observed), dict(ran.carried))
+    trace = Trace(program, args, particles, hidden, dict(observed))
+    trace._ran(ran)
+    return trace
 
 
-def _refuse_unvisited(observations: Mapping[str, Tensor], ran: Run) -> None:
+def refuse_unvisited(observations: Mapping[str, Tensor], ran: Run) -> None:
+    """An error that names an address that a value was given for and that was not visited."""
     missing = [a for a in observations if a not in ran.distributions]
     if missing:
         raise InputError(
@@ -53,7 +54,7 @@ def simulate(program: Program, args: tuple[Any, ...] = (), particles: int = 1) -
         InputError: see `bcppl.traces.trace.run`.
     """
     ran = run(program, args, particles, {}, {})
-    return _trace(program, args, particles, ran, {})
+    return trace_of(program, args, particles, ran, {})
 
 
 def generate(
@@ -75,9 +76,9 @@ def generate(
             see also `bcppl.traces.trace.run`.
     """
     ran = run(program, args, particles, observations, {})
-    _refuse_unvisited(observations, ran)
+    refuse_unvisited(observations, ran)
     _refuse_one_each(observations, ran, particles)
-    trace = _trace(program, args, particles, ran, observations)
+    trace = trace_of(program, args, particles, ran, observations)
     constrained = [a for a in ran.distributions if a in observations or a in ran.fixed]
     weight = trace.log_prob(*constrained) if constrained else torch.zeros(particles, dtype=torch.float64)
     return trace, weight
@@ -108,76 +109,15 @@ def extend(trace: Trace, args: tuple[Any, ...], observations: Mapping[str, Tenso
             f"address {again[0]!r} was observed or sampled before; extend takes new addresses only."
         )
     ran = run(trace.program, args, trace.particles, {**old, **observations}, trace.carried)
-    _refuse_unvisited(observations, ran)
+    refuse_unvisited(observations, ran)
     _refuse_one_each(observations, ran, trace.particles)
     lost = [a for a in old if a not in ran.distributions]
     if lost:
         raise InputError(f"with the new arguments the program no longer visits address {lost[0]!r}.")
-    longer = _trace(trace.program, args, trace.particles, ran, {**trace.observations, **observations})
+    longer = trace_of(trace.program, args, trace.particles, ran, {**trace.observations, **observations})
     longer.known.update(trace.known)
     new = [
         a for a in ran.distributions if a in observations or (a in ran.fixed and a not in trace.distributions)
     ]
     weight = longer.log_prob(*new) if new else torch.zeros(trace.particles, dtype=torch.float64)
     return longer, weight
-
-
-@dataclass(frozen=True, eq=False)
-class Update:
-    """What `update` returns; its log ratio is evaluated when it is asked for.
-
-    Attributes:
-        trace: at the new values.
-        previous: the trace that was updated.
-        discarded: the values that were replaced, by address.
-    """
-
-    trace: Trace
-    previous: Trace
-    discarded: Mapping[str, Tensor]
-
-    @cached_property
-    def log_ratio(self) -> Tensor:
-        """Log p(new trace) - log p(old trace), (N,)."""
-        return self.trace.log_prob() - self.previous.log_prob()
-
-
-def update(trace: Trace, values: Mapping[str, Tensor]) -> Update:
-    """Give some latent addresses new values (N, *event); the others and the arguments stay.
-
-    Raises:
-        InputError: an address is not latent, or a value has the wrong shape.
-    """
-    new = trace.at(values)
-    return Update(new, trace, {a: trace.choices[a] for a in values})
-
-
-@dataclass(frozen=True, eq=False)
-class Proposed:
-    """What `propose` returns: values by address (N, *event), and their log-density (N,) under the program."""
-
-    choices: Mapping[str, Tensor]
-    log_prob: Tensor = field(repr=False)
-
-
-def propose(program: Program, args: tuple[Any, ...], particles: int) -> Proposed:
-    """Run a proposal program forward: its choices and their log-density."""
-    trace = simulate(program, args, particles)
-    return Proposed(trace.choices, trace.log_prob())
-
-
-def assess(program: Program, args: tuple[Any, ...], choices: Mapping[str, Tensor], particles: int) -> Tensor:
-    """Log-density (N,) of a program at given values for all of its choices.
-
-    Raises:
-        InputError: a choice is missing, or an address is never visited.
-    """
-    none: dict[str, Entry] = {}
-    ran = run(program, args, particles, choices, none)
-    _refuse_unvisited(choices, ran)
-    missing = [a for a in ran.values if a not in choices and a not in ran.fixed]
-    if missing:
-        raise InputError(
-            f"assess needs a value for address {missing[0]!r}; give one for every choice of the program."
-        )
-    return _trace(program, args, particles, ran, choices).log_prob()

@@ -1,0 +1,50 @@
+"""The verbs for proposals, Gen's: propose runs a program forward, assess says how likely its choices are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+from bcppl.errors import InputError
+from bcppl.traces.trace import Program, run
+from bcppl.traces.verbs import refuse_unvisited, simulate, trace_of
+
+
+@dataclass(frozen=True, eq=False)
+class Proposed:
+    """What `propose` returns.
+
+    Attributes:
+        choices: values by address (N, *event).
+        log_prob: their log-density (N,) under the program.
+        result: what the program returned.
+    """
+
+    choices: Mapping[str, Tensor]
+    log_prob: Tensor = field(repr=False)
+    result: Any = field(default=None, repr=False)
+
+
+def propose(program: Program, args: tuple[Any, ...], particles: int) -> Proposed:
+    """Run a proposal program forward: its choices and their log-density."""
+    trace = simulate(program, args, particles)
+    return Proposed(trace.choices, trace.log_prob(), trace.result)
+
+
+def assess(program: Program, args: tuple[Any, ...], choices: Mapping[str, Tensor], particles: int) -> Tensor:
+    """Log-density (N,) of a program at given values for all of its choices.
+
+    Raises:
+        InputError: a choice is missing, or an address is never visited.
+    """
+    ran = run(program, args, particles, choices, {})
+    refuse_unvisited(choices, ran)
+    missing = [a for a in ran.values if a not in choices and a not in ran.fixed]
+    if missing:
+        raise InputError(
+            f"assess needs a value for address {missing[0]!r}; give one for every choice of the program."
+        )
+    return trace_of(program, args, particles, ran, choices).log_prob()
