@@ -1,0 +1,240 @@
+"""A belief: weighted poses, what they say together, and where they fall apart into modes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.beliefs import entropy, modes
+from bcppl.beliefs.distances import average_distance
+from bcppl.beliefs.merged import merged
+from bcppl.beliefs.regions import Measure, Region, pose_deviation, region
+from bcppl.beliefs.weights import effective_sample_size, normalised, weighted_quantiles
+from bcppl.poses import FREE, Freedom
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """Weighted particles over the pose of a part.
+
+    Attributes:
+        world_from_part: (N, 7) poses.
+        log_weights: (N,) unnormalised.
+        freedom: which axes of the pose are free.
+    """
+
+    world_from_part: Tensor
+    log_weights: Tensor
+    freedom: Freedom = FREE
+
+    def __len__(self) -> int:
+        return len(self.log_weights)
+
+    @cached_property
+    def weights(self) -> Tensor:
+        """Normalised weights (N,)."""
+        return normalised(self.log_weights)
+
+    @property
+    def effective_sample_size(self) -> float:
+        """1 / sum of squared weights."""
+        return effective_sample_size(self.log_weights)
+
+    @cached_property
+    def distinct(self) -> int:
+        """How many particles with weight differ from one another."""
+        return len(self.merged)
+
+    @cached_property
+    def mean(self) -> Tensor:
+        """The posterior mean (7,): weighted mean translation, chordal mean rotation.
+
+        The rotation minimises the weighted sum of squared chordal distances (Markley et al., Averaging
+        quaternions, JGCD 30, 2007, eq. 12).
+        """
+        weights = self.weights.numpy()
+        rotation = Rotation.from_quat(poses.quaternion_xyzw(self.world_from_part).numpy()).mean(weights)
+        return poses.from_translation_quaternion_xyzw(
+            self.weights @ self.world_from_part[:, :3], torch.from_numpy(np.asarray(rotation.as_quat()))
+        )
+
+    @cached_property
+    def tangent(self) -> Tensor:
+        """The particles in the tangent space at the mean (N, 6), metres and radians; 0 along held axes."""
+        free = self.freedom.coordinates(poses.local(self.mean, self.world_from_part))
+        return self.freedom.embed(free)
+
+    @cached_property
+    def covariance(self) -> Tensor:
+        """Weighted covariance (6, 6) in the tangent space at the mean: m^2, m rad, rad^2 (`bcppl.poses`)."""
+        centred = self.tangent - self.weights @ self.tangent
+        return (self.weights[:, None] * centred).T @ centred
+
+    @property
+    def spread(self) -> Tensor:
+        """Standard deviations (6,): metres along the world's axes, radians about the part's."""
+        return self.covariance.diagonal().clamp_min(0.0).sqrt()
+
+    def quantiles(self, probabilities: object) -> Tensor:
+        """Weighted quantiles of every tangent coordinate at the mean by itself: metres, then radians.
+
+        Args:
+            probabilities: one or several in [0, 1].
+
+        Returns:
+            (Q, 6), or (6,) for a single probability; 0 along held axes. See `weighted_quantiles`.
+
+        Raises:
+            InputError: a probability is not in [0, 1].
+        """
+        return weighted_quantiles(self.tangent, self.weights, probabilities)
+
+    @cached_property
+    def merged(self) -> Belief:
+        """The same belief with the copies of a pose made one particle, which has the sum of their weights."""
+        world_from_part, weights = merged(self.world_from_part, self.weights)
+        return Belief(world_from_part, weights.log(), self.freedom)
+
+    def credible_region(self, mass: float, measure: Measure = pose_deviation) -> Region:
+        """The poses around the mean that hold the truth with probability `mass` (`bcppl.beliefs.regions`).
+
+        Args:
+            mass: in (0, 1).
+            measure: how far a pose is from the mean: `pose_deviation`, `translation_deviation`,
+                `rotation_deviation` (standard deviations), `translation_distance` (metres), `rotation_angle`
+                (radians) or `average_point_distance(points)` (ADD, metres).
+
+        Raises:
+            InputError: the mass is not in (0, 1), or every axis of the measure is held.
+        """
+        return region(self.merged, mass, measure)
+
+    def add_radius(self, points: np.ndarray | Tensor, mass: float) -> float:
+        """The ADD from the mean pose, metres, that `mass` of the belief's weight does not exceed.
+
+        It is a quantile of the belief as it stands; `credible_region` makes room for few particles as well.
+
+        Args:
+            points: (M, 3) on the part's surface, in its frame.
+            mass: in [0, 1].
+
+        Raises:
+            InputError: the mass is not in [0, 1].
+        """
+        return float(weighted_quantiles(self.add(points, self.mean), self.weights, mass))
+
+    def modes(
+        self, translation: float = 0.01, rotation: float = 0.2, symmetries: Tensor | None = None
+    ) -> list[Mode]:
+        """The clusters that the particles fall into, the heaviest first.
+
+        Two clusters are apart where a gap parts them: (metres / translation)^2 + (radians / rotation)^2 > 1
+        between every particle of one and every particle of the other (`bcppl.beliefs.modes.cluster`).
+
+        Args:
+            translation: metres.
+            rotation: radians.
+            symmetries: (K, 7) `part_from_part`, a group under which the part looks the same: poses that
+                differ by one are the same, and a mode gathers them around its heaviest particle.
+
+        Raises:
+            InputError: a scale is not positive, or there are more than 10,000 distinct particles.
+        """
+        whole = self.merged
+        label = modes.cluster(whole.world_from_part, translation, rotation, symmetries)
+        found = []
+        for which in range(int(label.max()) + 1):
+            within = label == which
+            poses_within, weights = whole.world_from_part[within], whole.weights[within]
+            if symmetries is not None:
+                poses_within = modes.gathered(
+                    poses_within, poses_within[weights.argmax()], translation, rotation, symmetries
+                )
+            belief = Belief(poses_within, weights.log(), self.freedom)
+            found.append(Mode(float(weights.sum()), belief))
+        return sorted(found, key=lambda mode: -mode.mass)
+
+    @property
+    def weight_entropy(self) -> float:
+        """Entropy of the weights of the distinct particles, nats: at most log of how many there are."""
+        return entropy.weight_entropy(self.merged.weights)
+
+    @property
+    def gaussian_entropy(self) -> float:
+        """Entropy in nats, against the base measure, of the Gaussian at the mean (`bcppl.beliefs.entropy`).
+
+        Too high where there are several modes: use `entropy_of_modes`. -inf where the particles do not span
+        the free axes.
+        """
+        whole = self.merged
+        return entropy.gaussian_entropy(whole.world_from_part, whole.weights, self.mean, self.freedom)
+
+    def nearest_neighbour_entropy(self, neighbours: int = 3) -> float:
+        """Entropy in nats, against the base measure, by distances to neighbours (`bcppl.beliefs.entropy`).
+
+        It asks for no shape, but for many particles. -inf where they do not span the free axes.
+
+        Raises:
+            InputError: `neighbours` is below 1.
+        """
+        whole = self.merged
+        return entropy.nearest_neighbour_entropy(
+            whole.world_from_part, whole.weights, self.mean, self.freedom, neighbours
+        )
+
+    def add(self, points: np.ndarray | Tensor, truth: np.ndarray | Tensor) -> Tensor:
+        """ADD (N,) of every particle, metres: the mean distance of points from where the true pose puts them.
+
+        Args:
+            points: (M, 3) on the part's surface, in its frame.
+            truth: (7,) true `world_from_part`.
+
+        Source: Hinterstoisser et al., Model based training, detection and pose estimation, ACCV 2012, eq. 3.
+        """
+        return average_distance(self.world_from_part, points, truth)
+
+    def weighted_add(self, points: np.ndarray | Tensor, truth: np.ndarray | Tensor) -> float:
+        """ADD averaged over the particles by weight, metres."""
+        return float(self.weights @ self.add(points, truth))
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """A cluster of particles.
+
+    Attributes:
+        mass: its share of the weight.
+        belief: its particles, copies merged: their mean pose, spread and quantiles are the mode's.
+    """
+
+    mass: float
+    belief: Belief
+
+    @property
+    def mean(self) -> Tensor:
+        """The mean pose (7,), `world_from_part`."""
+        return self.belief.mean
+
+    @property
+    def spread(self) -> Tensor:
+        """Standard deviations (6,), metres and radians."""
+        return self.belief.spread
+
+
+def entropy_of_modes(modes: Sequence[Mode]) -> float:
+    """Entropy in nats, against the base measure, of a mixture with a Gaussian for each mode.
+
+    The entropy of the masses plus the mean entropy of the Gaussians: exact where they do not overlap, an
+    upper bound where they do (Huber et al., On entropy approximation for Gaussian mixture random vectors,
+    MFI 2008, eq. 8). -inf where the particles of a mode do not span the free axes.
+    """
+    masses = torch.tensor([mode.mass for mode in modes], dtype=torch.float64)
+    within = sum(mode.mass * mode.belief.gaussian_entropy for mode in modes)
+    return entropy.weight_entropy(masses) + within

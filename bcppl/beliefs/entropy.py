@@ -1,0 +1,106 @@
+"""Entropies of a belief, in nats: of its weights, and of its density against the base measure of poses.
+
+The base measure is Lebesgue on the free translations times the normalised Haar measure on the free rotations
+(`bcppl.poses.Freedom`). A density p over the tangent coordinates at the mean is p / J against it, J being the
+base measure's density there, so an entropy against it is that of the coordinates plus the mean of log J. All
+of them read merged copies, so doubling every particle changes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from scipy.special import digamma
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.errors import InputError
+from bcppl.poses import Freedom
+
+
+def weight_entropy(weights: Tensor) -> float:
+    """-sum w log w of normalised weights (K,): log K where they are equal."""
+    return float(torch.special.entr(weights).sum())
+
+
+def gaussian_entropy(world_from_part: Tensor, weights: Tensor, mean: Tensor, freedom: Freedom) -> float:
+    """Entropy of the Gaussian in the tangent space at a mean that has the particles' covariance.
+
+    1/2 log det(2 pi e covariance), plus the mean of log J; -inf where the particles do not span the axes.
+
+    Args:
+        world_from_part: (K, 7) distinct poses.
+        weights: (K,) normalised.
+        mean: (7,).
+        freedom: which axes are free.
+    """
+    tangent = poses.local(mean, world_from_part)
+    factor = _cholesky(freedom.coordinates(tangent), weights)
+    if factor is None:
+        return -math.inf
+    determinant = float(factor.diagonal().log().sum())
+    gaussian = 0.5 * freedom.dimension * math.log(2.0 * math.pi * math.e) + determinant
+    return gaussian + _mean_log_base_density(tangent, weights, freedom)
+
+
+def nearest_neighbour_entropy(
+    world_from_part: Tensor, weights: Tensor, mean: Tensor, freedom: Freedom, neighbours: int
+) -> float:
+    """Entropy by the distance to the k-th nearest neighbour, whatever the shape of the belief.
+
+    Kozachenko and Leonenko, Sample estimate of the entropy of a random vector, Problems of Information
+    Transmission 23, 1987, for k neighbours as in Kraskov, Stögbauer and Grassberger, Physical Review E 69,
+    2004, eq. 20. Distances are Mahalanobis distances in the tangent space at the mean. The distances tell the
+    density q of the particles; that of the belief is q times K times the weight thereabouts, which is the
+    mean weight of the k neighbours (the particle's own would count itself twice).
+
+    It is biased upwards by what density changes within that distance: with few particles and many axes by
+    tenths of a nat and more.
+
+    Args:
+        world_from_part: (K, 7) distinct poses.
+        weights: (K,) normalised.
+        mean: (7,).
+        freedom: which axes are free.
+        neighbours: k.
+
+    Raises:
+        InputError: k is below 1.
+    """
+    if neighbours < 1:
+        raise InputError(f"an entropy by {neighbours} neighbours was asked for; give 1 or more.")
+    tangent = poses.local(mean, world_from_part)
+    coordinates = freedom.coordinates(tangent)
+    count, dimension = coordinates.shape
+    factor = _cholesky(coordinates, weights)
+    if count <= neighbours or factor is None:
+        return -math.inf
+    white = torch.linalg.solve_triangular(factor, coordinates.T, upper=False).T.numpy()
+    radius, near = cKDTree(white).query(white, k=neighbours + 1)
+    thereabouts = weights[torch.from_numpy(np.asarray(near)[:, 1:])].mean(dim=1)
+    ball = 0.5 * dimension * math.log(math.pi) - math.lgamma(0.5 * dimension + 1.0)
+    volume = ball + dimension * torch.from_numpy(np.asarray(radius)[:, -1]).log()
+    particles_density = float(digamma(neighbours) - digamma(count)) - volume
+    found = -float(weights @ (particles_density + (count * thereabouts).log()))
+    return found + float(factor.diagonal().log().sum()) + _mean_log_base_density(tangent, weights, freedom)
+
+
+def _cholesky(coordinates: Tensor, weights: Tensor) -> Tensor | None:
+    """The lower factor of the weighted covariance of coordinates (K, d); None where it is singular."""
+    centred = coordinates - weights @ coordinates
+    covariance = (weights[:, None] * centred).T @ centred
+    scale = covariance.diagonal().sqrt()
+    # A picometre is rounding.
+    if not bool((scale > 1e-12).all()):
+        return None
+    correlation = covariance / torch.outer(scale, scale)
+    if float(torch.linalg.eigvalsh(correlation)[0]) < 1e-10:
+        return None
+    return scale[:, None] * torch.linalg.cholesky(correlation)
+
+
+def _mean_log_base_density(tangent: Tensor, weights: Tensor, freedom: Freedom) -> float:
+    return float(weights @ freedom.log_base_density(tangent[:, 3:].norm(dim=-1)))

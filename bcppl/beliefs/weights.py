@@ -1,0 +1,69 @@
+"""Weights of particles: normalised, counted, and their quantiles."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bcppl.errors import InferenceError, InputError
+
+
+def normalised(log_weights: Tensor) -> Tensor:
+    """Weights (N,) that sum to 1, from log weights (N,).
+
+    Raises:
+        InferenceError: no particle has any weight.
+    """
+    if bool((torch.isnan(log_weights) | (log_weights == torch.inf)).any()):
+        raise InferenceError("a particle's weight is not a number; a kernel or a resampler gave NaN or +inf.")
+    if not bool((log_weights > -torch.inf).any()):
+        raise InferenceError(
+            "no particle has any weight left: every particle says that what was measured cannot be; "
+            "widen the prior, use more particles, or check the recording with `bcppl check`."
+        )
+    return torch.softmax(log_weights, dim=0)
+
+
+def effective_sample_size(log_weights: Tensor) -> float:
+    """1 / sum of squared normalised weights (Kong, Liu and Wong, JASA 89, 1994)."""
+    return float(1.0 / (normalised(log_weights) ** 2).sum())
+
+
+# What rounding leaves of a cumulative sum of weights.
+ROUNDING = 1e-12
+
+
+def weighted_quantiles(values: Tensor, weights: Tensor, probabilities: object) -> Tensor:
+    """Quantiles of each column of weighted values.
+
+    The mean of the left and the right inverse of the weighted distribution function (definition 2 of Hyndman
+    and Fan, Sample quantiles in statistical packages, The American Statistician 50, 1996, for weights): a
+    value that has weight, or midway between two where the function is flat. It does not change when every
+    particle is doubled, and mirrors when the values do.
+
+    Args:
+        values: (N, *event).
+        weights: (N,) normalised.
+        probabilities: one or several in [0, 1].
+
+    Returns:
+        (Q, *event), or (*event) where a single number was asked for; float64, in the units of the values.
+
+    Raises:
+        InputError: a probability is not in [0, 1].
+    """
+    asked = torch.as_tensor(probabilities, dtype=torch.float64)
+    if bool(((asked < 0) | (asked > 1) | torch.isnan(asked)).any()):
+        raise InputError(f"quantiles were asked for at {asked.tolist()}; give probabilities from 0 to 1.")
+    carrying = weights > 0
+    kept = (
+        values[carrying].to(torch.float64).flatten(1) if values.ndim > 1 else values[carrying, None].double()
+    )
+    ordered, order = kept.sort(dim=0)
+    cumulative = weights[carrying][order].cumsum(dim=0).T.contiguous()
+    points = asked.reshape(1, -1).expand(len(cumulative), -1).contiguous()
+    last = len(ordered) - 1
+    left = torch.searchsorted(cumulative, points - ROUNDING).clamp_max(last)
+    right = torch.searchsorted(cumulative, points + ROUNDING, right=True).clamp_max(last)
+    found = 0.5 * (ordered.gather(0, left.T) + ordered.gather(0, right.T))
+    return found.reshape((*asked.shape, *values.shape[1:]))
