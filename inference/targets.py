@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from bcppl.traces import Trace
+
+
+def cost_of(site: Any) -> int:
+    """What evaluating a site takes: 0 arithmetic, 1 rendering, 2 physics (`bcppl.distributions.lazy`)."""
+    return int(getattr(site, "cost", 0))
 
 
 @dataclass(frozen=True)
@@ -27,13 +33,19 @@ class Target:
 
     def __call__(self, trace: Trace) -> Tensor:
         """The log-density (N,)."""
+        return self.part(trace, trace.addresses)
+
+    def part(self, trace: Trace, addresses: Sequence[str]) -> Tensor:
+        """What some sites add to the log-density (N,)."""
         total = torch.zeros(trace.particles, dtype=torch.float64)
-        for address in trace.addresses:
+        for address in addresses:
             if self.exponent(address) > 0.0:
                 total = total + self.exponent(address) * trace.log_prob(address)
         return total
 
-    def above(self, trace: Trace, needed: Tensor) -> tuple[Tensor, Trace]:
+    def above(
+        self, trace: Trace, needed: Tensor, addresses: Sequence[str] | None = None
+    ) -> tuple[Tensor, Trace]:
         """The particles whose log-density is above what is needed, found for as little work as possible.
 
         Sites are asked in the order of their cost and then of the program. A particle that could not reach
@@ -44,12 +56,14 @@ class Target:
         Args:
             trace: of N particles.
             needed: (N,) log-densities.
+            addresses: the sites that count, here with others left out; all by default.
 
         Returns:
             Their indices (K,) in increasing order, and the trace of these K particles.
         """
-        sites = [(a, s) for a, s in trace.distributions.items() if self.exponent(a) > 0.0]
-        sites.sort(key=lambda site: getattr(site[1], "cost", 0))
+        counted = trace.distributions if addresses is None else set(addresses)
+        sites = [(a, s) for a, s in trace.distributions.items() if a in counted and self.exponent(a) > 0.0]
+        sites.sort(key=lambda site: cost_of(site[1]))
         bounds = [self.exponent(a) * float(getattr(s, "log_prob_bound", torch.inf)) for a, s in sites]
         index = torch.arange(trace.particles)
         total = torch.zeros(trace.particles, dtype=torch.float64)
@@ -59,7 +73,7 @@ class Target:
             # Rounding in another order of summation must not drop a particle that would just pass.
             reach = 0.0 if last else sum(bounds[k + 1 :]) + 1e-6
             alive = total + reach > needed
-            dear = not last and getattr(sites[k + 1][1], "cost", 0) > 0
+            dear = not last and cost_of(sites[k + 1][1]) > 0
             if (last or dear) and not bool(alive.all()):
                 kept = alive.nonzero().flatten()
                 index, trace, total, needed = index[kept], trace[kept], total[kept], needed[kept]

@@ -1,18 +1,27 @@
 """Kernels: moves that leave a target invariant, and how they are put together."""
 
-from bcppl.inference.kernels.combinators import cycle, repeat
+from bcppl.inference.kernels.combinators import cycle, mixture, repeat, sequence
 from bcppl.inference.kernels.hastings import metropolis_hastings
 from bcppl.inference.kernels.kernel import Kernel, Move, put, replaced
-from bcppl.inference.kernels.rejuvenation import Moved, rejuvenate
+from bcppl.inference.kernels.rejuvenation import Moved, Until, displacement, distinct, rejuvenate, until
+from bcppl.inference.kernels.staged import Staged, delayed_acceptance
 
 __all__ = [
     "Kernel",
     "Move",
     "Moved",
+    "Staged",
+    "Until",
     "cycle",
+    "delayed_acceptance",
+    "displacement",
+    "distinct",
     "metropolis_hastings",
+    "mixture",
     "put",
     "rejuvenate",
     "repeat",
     "replaced",
+    "sequence",
+    "until",
 ]

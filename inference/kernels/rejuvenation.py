@@ -2,37 +2,157 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
+from bcppl import poses
+from bcppl.beliefs import normalised
+from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import Kernel, replaced
 from bcppl.inference.population import Population
 from bcppl.inference.targets import Target
 
 
 class Moved(NamedTuple):
-    """A rejuvenated population, and the share of proposals that were accepted."""
+    """A rejuvenated population, and the share of proposals that were accepted, NaN without sweeps."""
 
     population: Population
     acceptance: float
 
 
-def rejuvenate(population: Population, kernel: Kernel, target: Target, sweeps: int = 1) -> Moved:
+@dataclass(frozen=True)
+class Until:
+    """Sweeps until a population has come far enough: see `until`."""
+
+    distinct: int | None
+    displacement: float | None
+    most: int
+
+    def reached(self, start: Population, now: Population) -> bool:
+        """Whether a population that began at `start` has come far enough."""
+        if self.distinct is not None and distinct(now) < min(self.distinct, len(now)):
+            return False
+        return self.displacement is None or bool((displacement(start, now) >= self.displacement).all())
+
+
+def until(*, distinct: int | None = None, displacement: float | None = None, most: int = 50) -> Until:
+    """Sweeps until the particles differ, or have left where they began, or both.
+
+    A particle that stopped when it liked where it is would be there too often: a chain that is looked at just
+    after it moved sees places that are easy to get to. So no particle has a stop of its own. All stop
+    together, on a mean or a count over the population in which each has a share of 1/N; what is left of the
+    bias falls as 1/N, as that of fitted proposals and adaptive tempering does. With a fixed number of
+    sweeps there is none.
+
+    Args:
+        distinct: how many particles shall differ in some latent value (all, if the population has fewer).
+        displacement: the weighted mean squared displacement since the start that is asked for on every
+            axis of every continuous latent value, as a share of its variance in the population. Far apart is
+            2; 0.5 says that the correlation with the start has fallen to about 0.75.
+        most: stop after so many sweeps at any rate.
+
+    Raises:
+        InputError: nothing is asked for, or what no population can reach.
+    """
+    if distinct is None and displacement is None:
+        raise InputError("until is given nothing to wait for; give distinct, displacement or both.")
+    if distinct is not None and distinct < 1:
+        raise InputError(f"until is to wait for {distinct} distinct particles; give 1 or more.")
+    if displacement is not None and not 0.0 < displacement < 2.0:
+        raise InputError(
+            f"until is to wait for a displacement of {displacement} variances; give more than 0, less than 2."
+        )
+    if most < 1:
+        raise InputError(f"until may make {most} sweeps at most; give 1 or more.")
+    return Until(distinct, displacement, most)
+
+
+def distinct(population: Population) -> int:
+    """How many particles with weight differ in some latent value."""
+    alive = population.log_weights > -torch.inf
+    columns = [v[alive].reshape(int(alive.sum()), -1).double() for v in population.trace.choices.values()]
+    return len(torch.unique(torch.cat(columns, dim=1), dim=0)) if columns else 1
+
+
+def displacement(start: Population, now: Population) -> Tensor:
+    """Weighted mean squared displacement (K,) on each axis, as a share of the axis's variance now.
+
+    Axes are the free axes of poses, in the tangent space at their mean, and the coordinates of other
+    continuous latent values. An axis without any spread has come nowhere: 0.
+    """
+    weights = normalised(now.log_weights)
+    shares = [torch.empty(0, dtype=torch.float64)]
+    for address in now.trace.choices:
+        if not now.trace[address].is_floating_point():
+            continue
+        step, place = _coordinates(start, now, address)
+        variance = weights @ (place - weights @ place).square()
+        share = weights @ step.square() / variance
+        shares.append(torch.where(variance > 0.0, share, 0.0))
+    return torch.cat(shares)
+
+
+def _coordinates(start: Population, now: Population, address: str) -> tuple[Tensor, Tensor]:
+    """How far each particle came, and where it is, along the free axes (N, K)."""
+    old, new = start.trace[address], now.trace[address]
+    freedom = getattr(now.trace.distributions[address], "freedom", None)
+    if freedom is None:
+        old, new = (v.reshape(len(now), -1).to(torch.float64) for v in (old, new))
+        return new - old, new
+    mean = now.belief(address).mean
+    before, after = (freedom.coordinates(poses.local(mean, pose)) for pose in (old, new))
+    return after - before, after
+
+
+def rejuvenate(population: Population, kernel: Kernel, target: Target, sweeps: int | Until = 1) -> Moved:
     """Move every particle, `sweeps` times.
 
     Each half of the population learns from the other, so no particle shapes its own proposal. The particles
     are split at random: copies of one ancestor lie side by side after resampling.
+
+    Args:
+        population: what is moved.
+        kernel: fitted anew to each half.
+        target: what the moves leave invariant.
+        sweeps: how many; 0 leaves the population as it is. Or `until(...)`.
+
+    Raises:
+        InputError: a negative number of sweeps.
     """
-    accepted = []
-    for _ in range(sweeps):
-        order = torch.randperm(len(population))
-        halves = [order[: len(order) // 2], order[len(order) // 2 :]]
-        for mine, others in (halves, halves[::-1]):
-            if len(mine) == 0:
-                continue
-            move = kernel(population[others] if len(others) else population)
-            moved, share = move(population.trace[mine], target)
-            accepted.append(share.to(torch.float64))
-            population = replaced(population, mine, moved)
-    return Moved(population, float(torch.cat(accepted).mean()))
+    most = sweeps.most if isinstance(sweeps, Until) else sweeps
+    if most < 0:
+        raise InputError(f"a population is to be moved {most} times; give 0 or more sweeps.")
+    start, shares, made = population, [], 0
+    while made < most and not (isinstance(sweeps, Until) and sweeps.reached(start, population)):
+        population, accepted = _sweep(population, kernel, target)
+        shares.append(accepted)
+        made += 1
+    acceptance = float(torch.cat(shares).mean()) if shares else float("nan")
+    return Moved(population, acceptance)
+
+
+def _sweep(population: Population, kernel: Kernel, target: Target) -> tuple[Population, Tensor]:
+    order = torch.randperm(len(population))
+    halves = [order[: len(order) // 2], order[len(order) // 2 :]]
+    shares = []
+    for mine, others in (halves, halves[::-1]):
+        if len(mine) == 0:
+            continue
+        move = kernel(_teachers(population[others] if len(others) else population))
+        moved, share = move(population.trace[mine], target)
+        shares.append(share.to(torch.float64))
+        population = replaced(population, mine, moved)
+    return population, torch.cat(shares)
+
+
+def _teachers(population: Population) -> Population:
+    """What is learned from; particles that have no weight at all teach with equal weights.
+
+    Whatever is learned from others makes a valid move, only a poorer one.
+    """
+    if bool((population.log_weights > -torch.inf).any()):
+        return population
+    return replace(population, log_weights=torch.zeros_like(population.log_weights))
