@@ -1,0 +1,368 @@
+"""How well kernels move particles: exact problems beside other packages, a real image, a simulated probe.
+
+1. Two problems whose evidence is known, every kernel in tempered SMC: error of log Z and effective draws.
+2. The same problems beside `particles` and BlackJAX, at the same number of likelihood calls.
+3. A real depth image (a frame of LM-O), every kernel that can move a pose.
+4. A simulated probe: what delayed acceptance saves of the physics.
+
+"Effective" counts independent draws that would estimate the posterior mean as well as one run does, from the
+scatter of several runs, so copies of a particle count once.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from evidence import PROBLEMS, Method, Outcome, effective, ratio, run, within
+from jobs import each
+from peer import ask
+from report import DATA, Row, finish, options, show
+
+from bcppl import poses
+from bcppl.inference.kernels import Kernel, cycle, delayed_acceptance, metropolis_hastings, mixture, repeat
+from bcppl.inference.proposals import drift
+from bcppl.inference.resampling import adaptive, systematic
+from bcppl.inference.smc import smc, tempered
+from bcppl.models import part_in_view, peg_in_hole
+from bcppl.models.worlds.peg_in_hole import record
+from bcppl.recordings.importers.bop import command
+
+SCENE = DATA / "lmo_scene2_frame3"
+OBJECT = 5
+PARTICLES = 75
+COUNTS = (75, 1000, 10_000)
+
+
+def walk(address: str) -> Kernel:
+    """The default program's random walk, some of its steps long ones."""
+    return metropolis_hastings(drift(address, (0.2, 2.0)))
+
+
+def even(address: str) -> Kernel:
+    """A random walk whose steps are between half of the best length for a normal posterior and all of it."""
+    return metropolis_hastings(drift(address, (0.5, 1.0)))
+
+
+# By name, what makes a kernel that moves the value at an address; the combinations make two moves a sweep.
+VECTORS: dict[str, Callable[[str], Kernel]] = {
+    "drift": even,
+    "drift, many scales": walk,
+    "repeat drift twice": lambda address: repeat(even(address), 2),
+    "mixture of two drifts": lambda address: mixture([even(address), walk(address)]),
+    "cycle of two drifts": lambda address: cycle(even(address), walk(address)),
+}
+POSES = VECTORS
+# What is compared with other packages: fixed before the comparison, and the same for both problems.
+COMPARED = Method(even("x"), sweeps=3, share=0.8)
+
+
+class Posed(NamedTuple):
+    """One run over a recording: the belief in brief and what it cost.
+
+    `mean` (7,) and `spread` (6,) are the posterior's in metres and radians, `amount` seconds simulated.
+    """
+
+    log_evidence: float
+    distinct: int
+    images: int
+    amount: float
+    seconds: float
+    mean: list[float]
+    spread: list[float]
+
+
+def scatter(results: list[Posed]) -> float:
+    """Effective draws of a run, from the scatter of the posterior means of several (two or more)."""
+    means = torch.tensor([one.mean for one in results], dtype=torch.float64)
+    middle = means[0]
+    for _ in range(5):
+        middle = poses.retract(middle, poses.local(middle, means).mean(0))
+    off = poses.local(middle, means)
+    within_runs = torch.tensor([one.spread for one in results], dtype=torch.float64).square().mean(0)
+    deviations = off / (within_runs + off.square().mean(0)).sqrt()
+    moved = within_runs > 0.0
+    # The runs' own mean was taken away, which makes their scatter look smaller.
+    return effective((deviations[:, moved] * (len(results) / (len(results) - 1)) ** 0.5).tolist())
+
+
+def tables(seeds: range) -> list[Row]:
+    """Every kernel on the two exact problems."""
+    rows: list[Row] = []
+    for name, problem in PROBLEMS.items():
+        lines: list[list[Any]] = []
+        for title, make in VECTORS.items():
+            outcomes = [run(problem, Method(make("x")), 1000, seed) for seed in seeds]
+            columns = Outcome(*map(np.array, zip(*outcomes, strict=True)))  # type: ignore[arg-type]
+            seconds, calls = float(np.median(columns.seconds)), float(np.mean(columns.calls))
+            draws = effective([outcome.deviation for outcome in outcomes])
+            squared = float(np.mean(np.square(columns.error)))
+            lines.append(
+                [
+                    title,
+                    f"{np.mean(columns.error):+.3f}",
+                    f"{np.std(columns.error):.3f}",
+                    draws,
+                    draws / seconds,
+                    1e3 * draws / calls,
+                    int(calls),
+                    f"{squared * calls:.0f}",
+                    float(np.median(columns.distinct)),
+                    seconds,
+                ]
+            )
+            rows += [
+                Row(f"{name}, {title}: log Z error, mean", float(np.mean(columns.error)), "nats"),
+                Row(f"{name}, {title}: log Z error, sd", float(np.std(columns.error)), "nats"),
+                Row(f"{name}, {title}: effective per second", draws / seconds, "1/s", direction="min"),
+                Row(f"{name}, {title}: likelihood calls, mean", calls, "calls"),
+                Row(f"{name}, {title}: squared error times calls", squared * calls, "nats^2"),
+                Row(
+                    f"{name}, {title}: distinct, median",
+                    float(np.median(columns.distinct)),
+                    "particles",
+                    direction="min",
+                ),
+            ]
+        show(
+            f"{name}: every kernel, 1000 particles, {len(seeds)} runs",
+            [
+                "kernel",
+                "log Z error",
+                "sd",
+                "effective",
+                "per s",
+                "per 1000 calls",
+                "calls",
+                "error^2 x calls",
+                "distinct",
+                "s",
+            ],
+            lines,
+        )
+    return rows
+
+
+def beside(seed: int, runs: int, counts: tuple[int, ...]) -> list[Row]:
+    """Beside other packages: squared errors at the same number of likelihood calls, and times."""
+    asked = [*counts, "--runs", runs, "--seed", seed]
+    one_thread = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    theirs: list[dict[str, Any]] = []
+    for peer in ("particles", "blackjax"):
+        theirs += ask(peer, f"{peer}_tempering.py", *asked, environment=one_thread) or []
+    rows: list[Row] = []
+    lines: list[list[Any]] = []
+    for result in sorted(theirs, key=lambda r: (r["problem"], r["particles"])):
+        problem = PROBLEMS[result["problem"]]
+        allowed = float(np.mean(result["calls"]))
+        particles = within(problem, COMPARED, allowed, seed)
+        ours = [run(problem, COMPARED, particles, seed + k) for k in range(runs)]
+        errors, calls = [one.error for one in ours], float(np.mean([one.calls for one in ours]))
+        against, low, high = ratio(errors, result["errors"])
+        seconds = float(np.median([one.seconds for one in ours]))
+        slower = seconds / float(np.median(result["seconds"]))
+        who = f"{result['peer']} {result['variant']}"
+        lines.append(
+            [
+                result["problem"],
+                who,
+                result["particles"],
+                particles,
+                int(allowed),
+                f"{calls / allowed:.2f}",
+                f"{np.mean(np.square(result['errors'])):.2g}",
+                f"{np.mean(np.square(errors)):.2g}",
+                f"{against:.2f} [{low:.2f}, {high:.2f}]",
+                f"{np.median(result['seconds']):.3g}",
+                f"{seconds:.3g}",
+                slower,
+            ]
+        )
+        name = f"{result['problem']}, {who}, N {result['particles']}"
+        timed = result["peer"] == "particles" and result["particles"] == max(COUNTS)
+        rows += [
+            Row(f"{name}: squared error of log Z, ours over theirs", against, "ratio", 1.0),
+            Row(f"{name}: the same, 2.5 % bound", low, "ratio"),
+            Row(f"{name}: the same, 97.5 % bound", high, "ratio"),
+            Row(f"{name}: likelihood calls, ours over theirs", calls / allowed, "ratio", 1.02),
+            Row(f"{name}: time, ours over theirs", slower, "ratio", 2.0 if timed else None),
+        ]
+    if lines:
+        show(
+            f"beside other packages: {runs} runs each, ratios with 95 % bootstrap intervals, one thread",
+            [
+                "problem",
+                "peer",
+                "its N",
+                "our N",
+                "calls",
+                "ours",
+                "its error^2",
+                "ours",
+                "ratio",
+                "its s",
+                "ours",
+                "ratio",
+            ],
+            lines,
+        )
+    return rows
+
+
+def look(asked: tuple[str, int, int]) -> Posed:
+    """One run of a kernel over the real depth image."""
+    name, recording_seed, seed = asked
+    recording = command(SCENE, object_id=OBJECT, seed=recording_seed)
+    return posed(part_in_view.model, recording, POSES[name]("part"), 3, 0.6, seed)
+
+
+def posed(model: Any, recording: Any, kernel: Kernel, sweeps: int, share: float, seed: int) -> Posed:
+    """One run of tempered SMC over a recording."""
+    scene = model.prepare(recording)
+    assimilate = tempered(kernel, sweeps=sweeps, resample=adaptive(systematic, share), share=share)
+    begun = time.perf_counter()
+    steps = smc(model, recording, assimilate=assimilate, particles=PARTICLES, seed=seed, scene=scene)
+    *_, last = steps
+    seconds = time.perf_counter() - begun
+    physics = scene.efforts.get("physics")
+    return Posed(
+        last.info.log_evidence,
+        last.belief.distinct,
+        scene.efforts["rendering"].items,
+        physics.amount if physics else 0.0,
+        seconds,
+        last.belief.mean.tolist(),
+        last.belief.spread.tolist(),
+    )
+
+
+def images(seed: int, runs: int, jobs: int) -> list[Row]:
+    """Every kernel on one real depth image."""
+    if not SCENE.is_dir():
+        print(f"the real image is left out: the scene is not at {SCENE}.")
+        return []
+    results = each(look, [(name, seed, seed + k) for name in POSES for k in range(runs)], jobs)
+    rows: list[Row] = []
+    lines: list[list[Any]] = []
+    for k, name in enumerate(POSES):
+        mine = results[k * runs : (k + 1) * runs]
+        evidences = [one.log_evidence for one in mine]
+        seconds, draws = float(np.median([one.seconds for one in mine])), scatter(mine)
+        rendered = float(np.mean([one.images for one in mine]))
+        kept = float(np.median([one.distinct for one in mine]))
+        lines.append(
+            [
+                name,
+                float(np.mean(evidences)),
+                float(np.std(evidences)),
+                draws,
+                draws / seconds,
+                int(rendered),
+                kept,
+                seconds,
+            ]
+        )
+        rows += [
+            Row(f"real image, {name}: log Z, mean", float(np.mean(evidences)), "nats", direction="min"),
+            Row(f"real image, {name}: log Z, sd", float(np.std(evidences)), "nats"),
+            Row(f"real image, {name}: effective per second", draws / seconds, "1/s", direction="min"),
+            Row(f"real image, {name}: distinct, median", kept, "particles", direction="min"),
+            Row(f"real image, {name}: images rendered, mean", rendered, "images"),
+        ]
+    show(
+        f"real image: object {OBJECT} of an LM-O frame, {PARTICLES} particles, {runs} runs, {jobs} at a time",
+        ["kernel", "log Z", "sd", "effective", "per s", "images", "distinct", "s"],
+        lines,
+    )
+    return rows
+
+
+PROBES: dict[str, tuple[Callable[[str], Kernel], int]] = {
+    "drift, 3 sweeps": (walk, 3),
+    "drift, 6 sweeps": (walk, 6),
+    "delayed acceptance, 6 sweeps": (lambda a: delayed_acceptance(walk(a), first="depth_*"), 6),
+    "delayed acceptance, 12 sweeps": (lambda a: delayed_acceptance(walk(a), first="depth_*"), 12),
+    "by windows, 12 sweeps": (lambda a: delayed_acceptance(walk(a), first="depth_*", stages=4), 12),
+}
+
+
+def touch(asked: tuple[str, int, int]) -> Posed:
+    """One run of a kernel over a simulated probe."""
+    name, recording_seed, seed = asked
+    make, sweeps = PROBES[name]
+    recording = record(recording_seed)
+    return posed(peg_in_hole.model, recording, make("hole"), sweeps, 0.6, seed)
+
+
+def probes(seed: int, runs: int, recordings: int, jobs: int) -> list[Row]:
+    """What delayed acceptance saves: seconds simulated for an effective draw, with and without."""
+    asked = [(n, seed + r, seed + k) for n in PROBES for r in range(recordings) for k in range(runs)]
+    results = iter(each(touch, asked, jobs))
+    rows: list[Row] = []
+    lines: list[list[Any]] = []
+    price: dict[str, float] = {}
+    for name in PROBES:
+        of_recordings = [[next(results) for _ in range(runs)] for _ in range(recordings)]
+        mine = [one for of_one in of_recordings for one in of_one]
+        draws = float(np.mean([scatter(of_one) for of_one in of_recordings]))
+        simulated = float(np.mean([one.amount for one in mine]))
+        price[name] = simulated / draws
+        kept = float(np.median([one.distinct for one in mine]))
+        evidences = [float(np.std([one.log_evidence for one in of_one])) for of_one in of_recordings]
+        lines.append(
+            [
+                name,
+                float(np.mean(evidences)),
+                draws,
+                simulated,
+                price[name],
+                kept,
+                float(np.median([one.seconds for one in mine])),
+            ]
+        )
+        rows += [
+            Row(f"probe, {name}: simulated for an effective draw", price[name], "s"),
+            Row(f"probe, {name}: effective", draws, "draws", direction="min"),
+            Row(f"probe, {name}: distinct, median", kept, "particles", direction="min"),
+        ]
+    show(
+        f"simulated probe: {PARTICLES} particles, {recordings} recordings, {runs} runs of each",
+        ["kernel", "sd of log Z", "effective", "simulated s", "per effective", "distinct", "s"],
+        lines,
+    )
+    staged = min(price[name] for name, (make, _) in PROBES.items() if make is not walk)
+    plain = min(price[name] for name, (make, _) in PROBES.items() if make is walk)
+    rows.append(Row("probe: simulated for an effective draw, delayed over not", staged / plain, "ratio", 0.5))
+    return rows
+
+
+PARTS = ("kernels", "peers", "image", "probe")
+
+
+def main() -> None:
+    parser = options(__doc__ or "")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="only these")
+    parser.add_argument("--runs", type=int, help="beside other packages; 100 unless told")
+    parser.add_argument(
+        "--jobs", type=int, default=1, help="runs at a time, of image and probe; times then mean little"
+    )
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    quick, seed = arguments.quick, arguments.seed
+    rows: list[Row] = []
+    if "kernels" in arguments.parts:
+        rows += tables(range(seed, seed + (3 if quick else 50)))
+    if "peers" in arguments.parts:
+        rows += beside(seed, arguments.runs or (5 if quick else 100), COUNTS[:1] if quick else COUNTS)
+    if "image" in arguments.parts:
+        rows += images(seed, 2 if quick else 10, arguments.jobs)
+    if "probe" in arguments.parts:
+        rows += probes(seed, 2 if quick else 6, 1 if quick else 3, arguments.jobs)
+    finish(rows, arguments.json)
+
+
+if __name__ == "__main__":
+    main()
