@@ -1,0 +1,185 @@
+"""Populations as ArviZ reads them: draws of equal weight, one chain for each independent run."""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bcppl.beliefs import Belief
+from bcppl.errors import InputError
+from bcppl.inference.population import Population
+from bcppl.inference.resampling import Scheme, systematic
+from bcppl.inference.summaries import is_pose
+
+POSE_COORDINATES = ("x", "y", "z", "qw", "qx", "qy", "qz")
+
+
+def to_arviz(
+    populations: Population | Sequence[Population],
+    *,
+    draws: int | None = None,
+    seed: int = 0,
+    scheme: Scheme = systematic,
+) -> Any:
+    """Equal-weight draws of every latent address, with what is known of them.
+
+    The draws are resampled from the weighted particles and put in random order, so copies count as draws: how
+    many of them are worth something is in `sample_stats`.
+
+    Args:
+        populations: one, or those of independent runs of one program on the same measurements: the chains.
+        draws: how many of each; by default as many as the smallest population has particles.
+        seed: same seed, same draws; torch's own generator is left as it was.
+        scheme: resamples (`bcppl.inference.resampling`).
+
+    Returns:
+        An `arviz.InferenceData` with the groups
+
+        - posterior: every latent address, (chain, draw, *event). A pose has its seven numbers along the
+          dimension `pose` (x y z in metres, qw qx qy qz), with the sign of each quaternion that is nearer to
+          the mean's.
+        - log_likelihood: of every observed address, (chain, draw).
+        - sample_stats: (chain, draw) `lp`, the log-probability of all sites; `log_weight`, unnormalised, of
+          the particle that was drawn; `particle`, which one that was. (chain,) `log_evidence`,
+          `effective_sample_size` and `distinct_particles`, the last the number of different ones drawn.
+        - observed_data: the observations.
+
+    Raises:
+        InputError: ArviZ is not installed; there is no population, or they differ in their addresses or
+            their observations; or `draws` is below 1.
+        InferenceError: no particle of a population has any weight.
+    """
+    arviz = import_arviz()
+    chains = [populations] if isinstance(populations, Population) else list(populations)
+    check_alike(chains)
+    with seeded(seed):
+        chosen = draw(chains, draws, scheme)
+    first = chains[0].trace
+    posterior = {
+        address: at_draws([chain.trace.choices[address] for chain in chains], chosen)
+        for address in first.choices
+    }
+    posed = [address for address in posterior if is_pose(chains[0], address)]
+    for address in posed:
+        posterior[address] = _one_sign(posterior[address])
+    observed = [address for address in first.addresses if address not in first.choices]
+    log_likelihood = {
+        address: at_draws([chain.trace.log_prob(address) for chain in chains], chosen) for address in observed
+    }
+    sample_stats = {
+        "lp": at_draws([chain.trace.log_prob() for chain in chains], chosen),
+        "log_weight": at_draws([chain.log_weights for chain in chains], chosen),
+        "particle": torch.stack(chosen),
+    }
+    data = arviz.from_dict(
+        posterior=_numpy(posterior),
+        log_likelihood=_numpy(log_likelihood) or None,
+        sample_stats=_numpy(sample_stats),
+        observed_data=_numpy(dict(first.observations)) or None,
+        coords={"pose": list(POSE_COORDINATES)} if posed else None,
+        dims={address: ["pose"] for address in posed},
+    )
+    data.sample_stats["log_evidence"] = ("chain", [chain.log_evidence for chain in chains])
+    sizes = [chain.effective_sample_size for chain in chains]
+    data.sample_stats["effective_sample_size"] = ("chain", sizes)
+    data.sample_stats["distinct_particles"] = ("chain", [len(torch.unique(index)) for index in chosen])
+    return data
+
+
+def import_arviz() -> Any:
+    """The package arviz, its notice about version 1 left out.
+
+    Raises:
+        InputError: it is not installed, or is too new.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            arviz = importlib.import_module("arviz")
+    except ImportError as error:
+        raise InputError("ArviZ is not installed; run `pip install 'bcppl[arviz]'`.") from error
+    if not hasattr(arviz, "InferenceData"):
+        raise InputError(f"ArviZ {arviz.__version__} is too new; run `pip install 'arviz>=0.23,<1'`.")
+    return arviz
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Torch's generator started from a seed within, and put back afterwards."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        yield
+
+
+def check_alike(populations: Sequence[Population]) -> None:
+    """Refuse populations that are not of one program and the same observations.
+
+    Raises:
+        InputError: there is none, or they differ; says which run, and in what.
+    """
+    if not populations:
+        raise InputError("no population was given; give one or more.")
+    first = populations[0].trace
+    for number, population in enumerate(populations[1:], start=2):
+        trace = population.trace
+        if set(trace.choices) != set(first.choices) or set(trace.observations) != set(first.observations):
+            raise InputError(
+                f"populations 1 and {number} have different addresses ({', '.join(first.addresses)} and "
+                f"{', '.join(trace.addresses)}); give runs of one program on the same measurements."
+            )
+        for address, value in first.observations.items():
+            if not torch.equal(torch.nan_to_num(value), torch.nan_to_num(trace.observations[address])):
+                raise InputError(
+                    f"populations 1 and {number} have different observations at {address!r}; "
+                    "give runs on the same measurements."
+                )
+
+
+def draw(populations: Sequence[Population], draws: int | None, scheme: Scheme = systematic) -> list[Tensor]:
+    """Which particles equal-weight draws are, (draws,) int64 for each population, in random order.
+
+    Raises:
+        InputError: `draws` is below 1.
+        InferenceError: no particle of a population has any weight.
+    """
+    draws = min(map(len, populations)) if draws is None else draws
+    if draws < 1:
+        raise InputError(f"{draws} draws were asked for; give 1 or more.")
+    return [_ancestors(population.log_weights, draws, scheme) for population in populations]
+
+
+def _ancestors(log_weights: Tensor, draws: int, scheme: Scheme) -> Tensor:
+    """`draws` ancestors by a scheme that gives as many as it is given weights."""
+    # Weightless particles make up the number; of several ancestors for one draw, neighbours in the order of
+    # the scheme and so of one stratum, chance takes one.
+    each = -(-len(log_weights) // draws)
+    padded = torch.full((each * draws,), -torch.inf, dtype=torch.float64)
+    padded[: len(log_weights)] = log_weights
+    ancestors = scheme(padded).reshape(draws, each)
+    taken = ancestors.gather(1, torch.randint(each, (draws, 1)))[:, 0]
+    return taken[torch.randperm(draws)]
+
+
+def at_draws(values: Sequence[Tensor], chosen: Sequence[Tensor]) -> Tensor:
+    """Values (N, *event) of each population at its draws, (chain, draw, *event)."""
+    return torch.stack([value[index] for value, index in zip(values, chosen, strict=True)])
+
+
+def _one_sign(world_from_part: Tensor) -> Tensor:
+    """Poses (chain, draw, 7), every quaternion with the sign that is nearer to that of their mean."""
+    pooled = world_from_part.reshape(-1, 7)
+    mean = Belief(pooled, torch.zeros(len(pooled), dtype=torch.float64)).mean[3:]
+    mean = mean if float(mean[0]) >= 0 else -mean
+    sign = torch.where(pooled[:, 3:] @ mean < 0, -1.0, 1.0)[:, None]
+    return torch.cat([pooled[:, :3], sign * pooled[:, 3:]], dim=1).reshape(world_from_part.shape)
+
+
+def _numpy(values: dict[str, Tensor]) -> dict[str, np.ndarray]:
+    return {address: value.detach().cpu().numpy() for address, value in values.items()}

@@ -1,0 +1,260 @@
+"""Repeated independent runs: do they agree, what do they say together, and how sure is their evidence."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.beliefs import Belief, normalised
+from bcppl.errors import InputError
+from bcppl.inference.arviz import at_draws, check_alike, draw, import_arviz, seeded
+from bcppl.inference.population import Population
+from bcppl.inference.summaries import is_pose, mean
+
+Run = Callable[[int], Any]
+
+
+def repeated(run: Run, times: int, seed: int = 0, *, processes: int = 1) -> Repeated:
+    """Run the same inference several times, independently.
+
+    Args:
+        run: `run(seed)`: gives a population, something that has one (a `Step` of SMC), or an iterator over
+            such, of which the last counts. Torch's generator is set to the seed before each call.
+        times: how many runs.
+        seed: the runs' own seeds are derived from it; torch's own generator is left as it was.
+        processes: above 1, runs are shared out among processes, this one and fresh ones. Then `run` must be
+            something that can be imported there (a function of a module, or a `functools.partial` of one),
+            and a script must keep its own work behind `if __name__ == "__main__":`.
+
+    Raises:
+        InputError: `times` or `processes` is below 1, `run` gives no population, it cannot be sent to
+            another process, or the runs differ in addresses or observations.
+    """
+    if times < 1 or processes < 1:
+        raise InputError(f"{times} runs in {processes} processes were asked for; give at least 1 of each.")
+    seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(times)]
+    processes = min(processes, times)
+    if processes == 1:
+        found = [_population(run, each) for each in seeds]
+    else:
+        found = _shared_out(run, seeds, processes)
+    check_alike(found)
+    return Repeated(tuple(found), tuple(seeds))
+
+
+@dataclass(frozen=True, eq=False)
+class Repeated:
+    """Independent runs of one inference; print it for a table.
+
+    Attributes:
+        populations: one for each run.
+        seeds: that they were run with.
+    """
+
+    populations: tuple[Population, ...]
+    seeds: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.populations)
+
+    @cached_property
+    def log_evidences(self) -> Tensor:
+        """Log of each run's estimate of the evidence (R,)."""
+        return torch.tensor([p.log_evidence for p in self.populations], dtype=torch.float64)
+
+    @property
+    def log_evidence(self) -> float:
+        """Log of the mean of the runs' estimates: the mean is unbiased where each estimate is."""
+        return float(torch.logsumexp(self.log_evidences, 0)) - math.log(len(self))
+
+    @property
+    def standard_error(self) -> float:
+        """Of `log_evidence`, by the delta method: that of the mean estimate, over the mean; NaN of one run.
+
+        It is too small where few runs carry the mean, for then the runs have not seen the others.
+        """
+        if len(self) < 2:
+            return math.nan
+        share = torch.exp(self.log_evidences - self.log_evidence)
+        return float(share.std() / math.sqrt(len(self)))
+
+    @property
+    def jackknife_error(self) -> float:
+        """Standard error of `log_evidence` by leaving out one run at a time; NaN of one run.
+
+        Efron and Stein, The jackknife estimate of variance, Annals of Statistics 9, 1981, eq. 1.3.
+        """
+        count = len(self)
+        if count < 2:
+            return math.nan
+        others = self.log_evidences.expand(count, count).clone()
+        others.fill_diagonal_(-torch.inf)
+        without = torch.logsumexp(others, 1) - math.log(count - 1)
+        return float(without.std(correction=0) * math.sqrt(count - 1))
+
+    @cached_property
+    def pooled(self) -> Population:
+        """All particles of all runs, each run with the weight of its evidence."""
+        traces = [population.trace for population in self.populations]
+        first = traces[0]
+        shared = set.intersection(*(set(trace.known) for trace in traces))
+        trace = replace(
+            first,
+            particles=sum(trace.particles for trace in traces),
+            choices={a: torch.cat([trace.choices[a] for trace in traces]) for a in first.choices},
+            known={a: torch.cat([trace.known[a] for trace in traces]) for a in first.known if a in shared},
+            carried={},
+        )
+        log_weights = [normalised(p.log_weights).log() + p.log_evidence for p in self.populations]
+        return Population(trace, torch.cat(log_weights), self.log_evidence)
+
+    def r_hat(self, draws: int | None = None, seed: int = 0) -> dict[str, Tensor]:
+        """Rank-normalised split R-hat (D,) of every latent address: near 1 where the runs agree.
+
+        Vehtari et al., Rank-normalization, folding, and localization: an improved R-hat, Bayesian Analysis
+        16, 2021, as ArviZ computes it, of equal-weight draws. D is the free axes of a pose, in the tangent
+        space at the pooled mean, and elsewhere the numbers of a value in reading order. NaN where no value
+        differs.
+
+        Args:
+            draws: of each run; by default as many as it has particles.
+            seed: of the draws.
+
+        Raises:
+            InputError: ArviZ is not installed, or there are fewer than two runs, or fewer than four draws.
+        """
+        arviz = import_arviz()
+        if len(self) < 2:
+            raise InputError("R-hat compares runs, but there is one; repeat it 2 times or more.")
+        with seeded(seed):
+            chosen = draw(self.populations, draws)
+        if len(chosen[0]) < 4:
+            raise InputError(f"R-hat of {len(chosen[0])} draws was asked for; give 4 or more.")
+        found = {}
+        for address in self.populations[0].trace.choices:
+            values = at_draws([p.trace.choices[address] for p in self.populations], chosen)
+            if is_pose(self.populations[0], address):
+                freedom = self._pooled_belief(address).freedom
+                center = self._pooled_belief(address).mean
+                values = freedom.coordinates(poses.local(center, values))
+            numbers = values.to(torch.float64).reshape(*values.shape[:2], -1).numpy()
+            with np.errstate(invalid="ignore"):
+                each = [float(arviz.rhat(numbers[..., k])) for k in range(numbers.shape[-1])]
+            found[address] = torch.tensor(each, dtype=torch.float64)
+        return found
+
+    def _pooled_belief(self, address: str) -> Belief:
+        return self.pooled.belief(address)
+
+    def table(self) -> str:
+        """The runs, one to a line, their evidence together, and where ArviZ is installed their R-hat."""
+        shares = torch.softmax(self.log_evidences, 0).tolist()
+        lines = [f"{'run':>4} {'seed':>11} {'log evidence':>14} {'particles':>10} {'ESS':>8} {'share':>7}"]
+        for number, (population, seed, share) in enumerate(
+            zip(self.populations, self.seeds, shares, strict=True), start=1
+        ):
+            lines.append(
+                f"{number:>4} {seed:>11} {population.log_evidence:>14.4f} {len(population):>10} "
+                f"{population.effective_sample_size:>8.1f} {share:>7.3f}"
+            )
+        lines.append(
+            f"log of the mean evidence {self.log_evidence:.4f}, standard error "
+            f"{self.standard_error:.4f} (jackknife {self.jackknife_error:.4f})"
+        )
+        return "\n".join([*lines, *self._agreement()])
+
+    def _agreement(self) -> list[str]:
+        try:
+            ratios = self.r_hat()
+        except InputError:
+            return []
+        lines = []
+        for address, ratio in ratios.items():
+            numbers = " ".join(f"{value:.5g}" for value in mean(self.pooled, address).flatten().tolist()[:8])
+            worst = max(ratio[~ratio.isnan()].tolist(), default=math.nan)
+            lines.append(f"{address}: R-hat at most {worst:.3f}, mean {numbers}")
+        return lines
+
+    def __str__(self) -> str:
+        return self.table()
+
+
+def _population(run: Run, seed: int) -> Population:
+    with seeded(seed):
+        result = run(seed)
+        if isinstance(result, Iterator):
+            last = deque(result, maxlen=1)
+            result = last[0] if last else None
+    found = getattr(result, "population", result)
+    if not isinstance(found, Population):
+        raise InputError(
+            f"a run gave a {type(found).__name__}; "
+            "give a population, a step of SMC, or an iterator over those."
+        )
+    return found
+
+
+def _shared_out(run: Run, seeds: Sequence[int], processes: int) -> list[Population]:
+    """The runs in several processes, this one doing its share.
+
+    A program and its simulators stay where they are: another process sends numbers only, and they are put
+    into the trace of a run made here.
+    """
+    try:
+        pickle.dumps(run)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise InputError(
+            f"the run cannot be sent to another process ({error}); "
+            "give a function of a module, or a functools.partial of one."
+        ) from error
+    here = range(0, len(seeds), processes)
+    threads = max(1, torch.get_num_threads() // processes)
+    with ProcessPoolExecutor(
+        processes - 1, get_context("spawn"), initializer=torch.set_num_threads, initargs=(threads,)
+    ) as pool:
+        elsewhere = {k: pool.submit(_numbers, run, seeds[k]) for k in range(len(seeds)) if k not in here}
+        found = {k: _population(run, seeds[k]) for k in here}
+        found.update({k: _put_into(found[0], *sent.result()) for k, sent in elsewhere.items()})
+    return [found[k] for k in range(len(seeds))]
+
+
+Numbers = dict[str, np.ndarray]
+
+
+def _numbers(run: Run, seed: int) -> tuple[Numbers, Numbers, Numbers, np.ndarray, float]:
+    population = _population(run, seed)
+    trace = population.trace
+    parts = (trace.choices, trace.observations, trace.known)
+    choices, observations, known = ({a: v.numpy() for a, v in part.items()} for part in parts)
+    return choices, observations, known, population.log_weights.numpy(), population.log_evidence
+
+
+def _put_into(
+    first: Population,
+    choices: Numbers,
+    observations: Numbers,
+    known: Numbers,
+    log_weights: np.ndarray,
+    log_evidence: float,
+) -> Population:
+    trace = replace(
+        first.trace,
+        particles=len(log_weights),
+        choices={a: torch.from_numpy(v) for a, v in choices.items()},
+        observations={a: torch.from_numpy(np.asarray(v)) for a, v in observations.items()},
+        known={a: torch.from_numpy(v) for a, v in known.items()},
+        carried={},
+    )
+    return Population(trace, torch.from_numpy(log_weights), log_evidence)

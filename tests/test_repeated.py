@@ -1,0 +1,173 @@
+"""Repeated runs: evidence with an error bar, pooled particles, agreement."""
+
+from __future__ import annotations
+
+import functools
+import math
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.poses import UniformPose
+from bcppl.errors import InputError
+from bcppl.inference.population import Population
+from bcppl.inference.repeated import Repeated, repeated
+from bcppl.inference.summaries import mean
+from bcppl.traces import generate
+
+
+def number(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def program() -> None:
+    x = pyro.sample("x", dist.Normal(number(0.0)[0], 1.0))
+    pyro.sample("same", dist.Delta(number(2.0)[0]))
+    pyro.sample("hole", UniformPose(poses.identity(), (0.02, 0.01, 0.0), 0.5, "z"))
+    pyro.sample("y", dist.Normal(x, 0.5))
+
+
+SEEN = {"y": number(0.7)[0]}
+LOG_EVIDENCE = -0.5 * math.log(2 * math.pi * 1.25) - 0.5 * 0.49 / 1.25
+
+
+def importance(seed: int, particles: int = 100) -> Population:
+    trace, log_weights = generate(program, (), SEEN, particles)
+    return Population(trace, log_weights, float(torch.logsumexp(log_weights, 0)) - math.log(particles))
+
+
+def of_evidences(*evidences: float) -> Repeated:
+    trace, log_weights = generate(program, (), SEEN, 8)
+    return Repeated(
+        tuple(Population(trace, log_weights, math.log(z)) for z in evidences), tuple(range(len(evidences)))
+    )
+
+
+def test_evidence_and_its_errors_by_hand() -> None:
+    runs = of_evidences(1.0, 3.0)
+    assert runs.log_evidence == pytest.approx(math.log(2.0))
+    # Standard deviation sqrt 2 over sqrt 2 over the mean 2; left out, the logs are log 3 and log 1.
+    assert runs.standard_error == pytest.approx(0.5)
+    assert runs.jackknife_error == pytest.approx(0.5 * math.log(3.0))
+    shifted = of_evidences(1e-300, 3e-300)
+    assert shifted.jackknife_error == pytest.approx(runs.jackknife_error)
+    assert shifted.standard_error == pytest.approx(0.5)
+    alone = of_evidences(2.0)
+    assert math.isnan(alone.standard_error) and math.isnan(alone.jackknife_error)
+    three = of_evidences(2.0, 2.0, 2.0)
+    assert three.standard_error == three.jackknife_error == 0.0
+
+
+def test_the_mean_evidence_is_unbiased_and_its_error_bar_right() -> None:
+    ratios, errors, jackknifes = [], [], []
+    for seed in range(150):
+        runs = repeated(functools.partial(importance, particles=10), 8, seed)
+        ratios.append(math.exp(runs.log_evidence - LOG_EVIDENCE))
+        errors.append(runs.standard_error)
+        jackknifes.append(runs.jackknife_error)
+    spread = float(torch.tensor(ratios).log().std())
+    assert abs(sum(ratios) / 150 - 1) < 4 * spread / math.sqrt(150)
+    for found in (errors, jackknifes):
+        assert math.sqrt(sum(e**2 for e in found) / 150) == pytest.approx(spread, rel=0.25)
+
+
+def test_pooled_runs_weigh_by_their_evidence() -> None:
+    few, many = of_evidences(1.0).populations[0], of_evidences(3.0).populations[0]
+    few = Population(few.trace.at({"x": torch.zeros(8, dtype=torch.float64)}), few.log_weights, 0.0)
+    many = Population(
+        many.trace.at({"x": torch.ones(8, dtype=torch.float64)}), many.log_weights + 50.0, math.log(3.0)
+    )
+    pooled = Repeated((few, many), (0, 1)).pooled
+    assert len(pooled) == 16 and pooled.log_evidence == pytest.approx(math.log(2.0))
+    assert float(mean(pooled, "x")) == pytest.approx(0.75)
+    expected = torch.cat([few.trace.log_prob(), many.trace.log_prob()])
+    torch.testing.assert_close(pooled.trace.log_prob(), expected)
+    assert pooled.trace["hole"].shape == (16, 7) and pooled[torch.arange(3)].trace.particles == 3
+
+
+def test_agreeing_runs_have_r_hat_1_and_others_do_not() -> None:
+    runs = repeated(functools.partial(importance, particles=400), 4, 1)
+    ratios = runs.r_hat()
+    assert set(ratios) == {"x", "same", "hole"} and ratios["hole"].shape == (3,)
+    assert float(ratios["x"]) < 1.02 and float(ratios["hole"].max()) < 1.02
+    assert math.isnan(float(ratios["same"]))
+    first, *others = runs.populations
+    turn = poses.retract(first.trace["hole"], number(0, 0, 0, 0, 0, 1.5))
+    apart = Repeated((Population(first.trace.at({"hole": turn}), first.log_weights), *others), runs.seeds)
+    ratios = apart.r_hat()
+    assert float(ratios["hole"][2]) > 1.3 and float(ratios["hole"][:2].max()) < 1.02
+    opposite = first.trace["hole"] * number(1, 1, 1, -1, -1, -1, -1)
+    signs = Repeated((Population(first.trace.at({"hole": opposite}), first.log_weights), *others), runs.seeds)
+    assert float(signs.r_hat()["hole"].max()) < 1.02, "q and -q are one pose"
+    with pytest.raises(InputError, match="compares runs"):
+        Repeated((first,), (0,)).r_hat()
+
+
+def test_the_table_says_all_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = repeated(importance, 3, 7)
+    said = str(runs)
+    assert len(said.splitlines()) == 1 + 3 + 1 + 3
+    assert f"log of the mean evidence {runs.log_evidence:.4f}" in said and "hole: R-hat at most 1.0" in said
+    assert all(str(seed) in said for seed in runs.seeds)
+    monkeypatch.setitem(sys.modules, "arviz", None)
+    assert "R-hat" not in str(runs)
+
+
+def steps(seed: int) -> Iterator[Population]:
+    yield Population(importance(seed).trace, torch.zeros(100, dtype=torch.float64), 99.0)
+    yield importance(seed)
+
+
+def test_runs_hang_on_the_seed_alone_and_the_last_step_counts() -> None:
+    before = torch.get_rng_state()
+    one, two, other = (repeated(importance, 3, seed) for seed in (0, 0, 1))
+    assert torch.equal(before, torch.get_rng_state())
+    assert one.seeds == two.seeds and not set(one.seeds) & set(other.seeds)
+    assert torch.equal(one.log_evidences, two.log_evidences)
+    assert len(set(one.log_evidences.tolist())) == 3
+    assert float(repeated(steps, 2).log_evidences.max()) < 1.0
+    for run, times, processes, said in (
+        (lambda seed: 3.0, 1, 1, "a run gave a float"),
+        (importance, 0, 1, "0 runs in 1 processes"),
+        (lambda seed: importance(seed), 2, 2, "cannot be sent to another process"),
+    ):
+        with pytest.raises(InputError, match=said):
+            repeated(run, times, processes=processes)
+
+
+PROGRAM = """
+import math
+import pyro
+import pyro.distributions as dist
+import torch
+from bcppl.inference.population import Population
+from bcppl.traces import generate
+
+def run(seed):
+    def program():
+        x = pyro.sample("x", dist.Normal(torch.tensor(0.0, dtype=torch.float64), 1.0))
+        pyro.sample("y", dist.Normal(x, 0.5))
+    seen = {"y": torch.tensor(0.7, dtype=torch.float64)}
+    trace, log_weights = generate(program, (), seen, 20)
+    return Population(trace, log_weights, float(torch.logsumexp(log_weights, 0)) - math.log(20))
+"""
+
+
+def test_processes_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a_program_of_its_own.py").write_text(PROGRAM)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    from a_program_of_its_own import run  # type: ignore[import-not-found]
+
+    one, two = repeated(run, 3, 4), repeated(run, 3, 4, processes=2)
+    assert torch.equal(one.log_evidences, two.log_evidences)
+    for mine, other in zip(one.populations, two.populations, strict=True):
+        assert torch.equal(mine.trace["x"], other.trace["x"])
+        assert torch.equal(mine.trace.log_prob(), other.trace.log_prob())
+    assert float(mean(one.pooled, "x")) == float(mean(two.pooled, "x"))

@@ -1,0 +1,77 @@
+"""Summaries of a population's addresses, against weighted sums done by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+
+from bcppl import poses
+from bcppl.distributions.poses import UniformPose
+from bcppl.errors import InputError
+from bcppl.inference.population import Population
+from bcppl.inference.summaries import covariance, mean, probabilities, quantiles
+from bcppl.traces import generate
+
+
+def number(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def program() -> None:
+    pyro.sample("which", dist.Categorical(number(0.2, 0.3, 0.5)))
+    pyro.sample("at", dist.Normal(torch.zeros(2, dtype=torch.float64), 1.0).to_event(1))
+    pyro.sample("hole", UniformPose(poses.identity(), (0.02, 0.01, 0.0), 0.5, "z"))
+    pyro.sample("seen", dist.Normal(number(0.0)[0], 1.0))
+
+
+def population() -> Population:
+    torch.manual_seed(0)
+    trace, _ = generate(program, (), {"seen": number(0.5)[0]}, 4)
+    trace = trace.at(
+        {
+            "which": torch.tensor([2, 0, 2, 1]),
+            "at": torch.stack([number(0, 1, 2, 99), number(1, 1, 3, 99)], 1),
+        }
+    )
+    return Population(trace, number(0.5, 0.25, 0.25, 0.0).log() + 40.0)
+
+
+def test_moments_and_quantiles_by_hand() -> None:
+    found = population()
+    torch.testing.assert_close(mean(found, "at"), number(0.75, 1.5))
+    torch.testing.assert_close(
+        covariance(found, "at"), torch.stack([number(0.6875, 0.625), number(0.625, 0.75)])
+    )
+    torch.testing.assert_close(
+        quantiles(found, "at", [0.5, 0.9]), torch.stack([number(0.5, 1), number(2, 3)])
+    )
+    torch.testing.assert_close(mean(found, "which"), number(1.5)[0])
+    assert float(quantiles(found, "which", 0.1)) == 0.0
+
+
+def test_probabilities_count_weight_and_not_particles() -> None:
+    values, share = probabilities(population(), "which")
+    assert values.tolist() == [0, 2], "the particle without weight has no say"
+    torch.testing.assert_close(share, number(0.25, 0.75))
+
+
+def test_a_pose_is_summed_up_as_a_belief() -> None:
+    found = population()
+    belief = found.belief("hole")
+    assert torch.equal(mean(found, "hole"), belief.mean)
+    assert torch.equal(covariance(found, "hole"), belief.covariance)
+    held = quantiles(found, "hole", [0.1, 0.9])[:, 2:5]
+    assert float(held.abs().max()) == 0.0
+    with pytest.raises(InputError, match="ask its belief for modes"):
+        probabilities(found, "hole")
+
+
+def test_an_address_that_is_not_latent_is_refused() -> None:
+    for address in ("seen", "nowhere"):
+        with pytest.raises(InputError, match=f"{address}' was asked for, which is no latent address"):
+            mean(population(), address)
+    assert math.isfinite(float(mean(population(), "which")))
