@@ -57,9 +57,13 @@ def beside_the_plate() -> None:
     pyro.sample("x", dist.Normal(torch.zeros(3), 1.0))
 
 
-def inner_plate() -> None:
-    with pyro.plate("points", 3):
-        pyro.sample("x", dist.Normal(number(0.0), 1.0))
+def plated(mean: Tensor, dim: int | None = None, name: str = "points", subsample: int | None = None) -> None:
+    with pyro.plate(name, 3, subsample_size=subsample, dim=dim):
+        pyro.sample("x", dist.Normal(mean, 1.0))
+
+
+def sampled_from_a_function() -> None:
+    pyro.sample("x", lambda: torch.zeros(N))
 
 
 def enumerated() -> None:
@@ -119,14 +123,52 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: generate(latent_and_seen, (), {"y": torch.zeros(N)}, N),
         "'y' has shape \\(5,\\).* the same for all particles",
     ),
-    "twice": (lambda: simulate(twice, (), N), "twice .*'x'"),
+    "twice": (lambda: simulate(twice, (), N), "'x' twice"),
     "batch (3, N)": (lambda: simulate(stacked, (), N), r"'x' has batch shape \(3, 5\)"),
-    "batch (3,)": (lambda: simulate(beside_the_plate, (), N), "site x .* 5 vs 3"),
-    "inner plate": (lambda: simulate(inner_plate, (), N), r"'x' has batch shape \(3, 5\)"),
+    "batch (3,)": (
+        lambda: simulate(beside_the_plate, (), N),
+        "'x' has 3 entries at dimension -1 where .* has 5",
+    ),
+    "stacked in a plate": (
+        lambda: simulate(plated, (torch.zeros(2, 3, 1),), N),
+        r"'x' .* \(2, 3, 5\) .* \(3, 5\)",
+    ),
+    "parameters of a plate": (
+        lambda: simulate(plated, (torch.zeros(3),), N),
+        r"'x' has 3 entries at dimension -1 where plate 'particles' has 5.* \(`\[:, None\]`\)",
+    ),
+    "parameters of another plate": (
+        lambda: simulate(plated, (torch.zeros(4, 1),), N),
+        r"'x' has 4 entries at dimension -2 where plate 'points' has 3",
+    ),
+    "plate on the particles' dimension": (
+        lambda: simulate(plated, (torch.zeros(3), -1), N),
+        "'points' is put at dimension -1, .* 'particles'; leave its `dim` out",
+    ),
+    "plate of the particles' name": (
+        lambda: simulate(plated, (torch.zeros(3, 1), None, "particles"), N),
+        "same name .* rename",
+    ),
+    "subsampled plate": (
+        lambda: simulate(plated, (torch.zeros(2, 1), None, "points", 2), N),
+        "'x' .* subsampled plate",
+    ),
+    "observation of a plate": (
+        lambda: generate(plated, (torch.zeros(3, 1),), {"x": torch.zeros(4)}, N),
+        r"'x' has shape \(4,\); one value .* \(3,\), .* \(5, 3\)",
+    ),
+    "observation of a plate for each particle": (
+        lambda: generate(plated, (torch.zeros(3, 1),), {"x": torch.zeros(N, 3)}, N),
+        r"'x' has shape \(5, 3\), .* \(3,\); give one value",
+    ),
+    "no distribution": (lambda: simulate(sampled_from_a_function, (), N), "'x' is sampled from a function"),
     "enumerated": (lambda: simulate(enumerated, (), N), "'x' is enumerated"),
     "log-probabilities": (lambda: simulate(wide, (), N).log_prob(), r"'y' has log-probabilities .*\(3, 5\)"),
     "no such site": (lambda: simulate(latent_and_seen, (), N).log_prob("q"), "no address 'q'"),
-    "update of an observation": (lambda: updated({"y": ones}), "'y' was given or asked for, which is no latent.* x"),
+    "update of an observation": (
+        lambda: updated({"y": ones}),
+        "'y' was given or asked for, which is no latent.* x",
+    ),
     "update of nothing": (lambda: updated({"q": ones}), "'q' was given or asked for, which is no latent"),
     "update of wrong shape": (lambda: updated({"x": ones[:3]}), r"'x' has shape \(3,\), the old one \(5,\)"),
     "update that changes the addresses": (
@@ -143,7 +185,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "assess of wrong length": (
         lambda: assess(latent_and_seen, (), {"x": ones[:3], "y": ones}, N),
-        "5 particles .* 5 vs 3",
+        r"'x' has shape \(3,\); .* particles \(5,\)",
     ),
     "no particles": (lambda: simulate(latent_and_seen, (), 0), "for 0 particles; give 1 or more"),
     "an error of the program itself": (

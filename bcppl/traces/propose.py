@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.traces.trace import Program, run
+from bcppl.traces.run import Program, run
 from bcppl.traces.verbs import refuse_unvisited, simulate, trace_of
 
 

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.traces.trace import Program, Run, Trace, run
+from bcppl.traces.run import Program, Run, run
+from bcppl.traces.trace import Trace
 
 
 def trace_of(
@@ -39,11 +40,12 @@ def refuse_unvisited(observations: Mapping[str, Tensor], ran: Run) -> None:
 def _refuse_one_each(observations: Mapping[str, Tensor], ran: Run, particles: int) -> None:
     """An observation is the same for all particles: resampling would not carry one for each along."""
     for address, value in observations.items():
-        event = tuple(ran.distributions[address].event_shape)
-        if tuple(value.shape) != event and particles > 1:
+        site = ran.distributions[address]
+        one = (*site.batch_shape[:-1], *site.event_shape)
+        if tuple(value.shape) != one and particles > 1:
             raise InputError(
                 f"the observation at address {address!r} has shape {tuple(value.shape)}, "
-                f"its site's event {event}; give one value, the same for all particles."
+                f"its site's plates and event {one}; give one value, the same for all particles."
             )
 
 
@@ -51,7 +53,7 @@ def simulate(program: Program, args: tuple[Any, ...] = (), particles: int = 1) -
     """Run a program forward: every site is sampled, what would be observed included.
 
     Raises:
-        InputError: see `bcppl.traces.trace.run`.
+        InputError: see `bcppl.traces.run.run`.
     """
     ran = run(program, args, particles, {}, {})
     return trace_of(program, args, particles, ran, {})
@@ -66,14 +68,15 @@ def generate(
         program: a Pyro program.
         args: its arguments.
         particles: N.
-        observations: values by address, of the site's event shape: the same for all particles.
+        observations: values by address, of the shape of the site's plates and event: the same for all
+            particles.
 
     Returns:
         The trace and the log weight (N,): the summed log-probability of what was constrained.
 
     Raises:
-        InputError: an observed address is never visited, or an observation has not its site's event shape;
-            see also `bcppl.traces.trace.run`.
+        InputError: an observed address is never visited, or an observation has not its site's shape;
+            see also `bcppl.traces.run.run`.
     """
     ran = run(program, args, particles, observations, {})
     refuse_unvisited(observations, ran)

@@ -1,0 +1,222 @@
+"""One pass through a program for N particles at once: sites set to given values, the others sampled.
+
+Inside the program the particles are the last batch dimension, as Pyro's plates have it, and the plates that
+the program itself opens lie to the left of it: five points have batch shape (5, N). Outside, in a trace, the
+particle axis comes first: (N, 5, *event), and what is observed of them is (5, *event).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import pyro
+import torch
+from pyro.poutine.indep_messenger import IndepMessenger
+from pyro.poutine.messenger import Messenger
+from pyro.poutine.subsample_messenger import _Subsample
+from torch import Tensor
+
+from bcppl.errors import InputError
+from bcppl.traces.carried import Entry, carrying
+
+Program = Callable[..., Any]
+PARTICLES = "particles"
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What one pass through a program left, by address or name.
+
+    Attributes:
+        distributions: of every site, in the order of the program.
+        values: (N, *plates, *event), or (*plates, *event) where a site was set to one value for all.
+        fixed: addresses that the program observes itself (`obs=`, `pyro.factor`).
+        carried: simulator states that it used or started.
+        result: what it returned.
+    """
+
+    distributions: dict[str, Any]
+    values: dict[str, Tensor]
+    fixed: frozenset[str]
+    carried: dict[str, Entry]
+    result: Any
+
+
+def run(
+    program: Program,
+    args: tuple[Any, ...],
+    particles: int,
+    given: Mapping[str, Tensor],
+    carried: Mapping[str, Entry],
+) -> Run:
+    """Run a program under a plate of `particles`, its sites set to `given` and the others sampled.
+
+    Raises:
+        InputError: no particles, a duplicate address, an enumerated site, a subsampled plate, a site that
+            does not fit the particles and the plates around it, or a value that is no tensor or has the
+            wrong shape; the sentence names the address.
+    """
+    if particles < 1:
+        raise InputError(f"a program was to be run for {particles} particles; give 1 or more.")
+    for address, value in given.items():
+        if not isinstance(value, Tensor):
+            raise InputError(
+                f"the value given for address {address!r} is a {type(value).__name__}; give a tensor."
+            )
+    recorder = _Recorder(particles, given)
+    with carrying(carried) as used, torch.no_grad(), pyro.validation_enabled(False):
+        try:
+            with recorder, _Particles(PARTICLES, particles, dim=-1):
+                result = program(*args)
+        except ValueError as error:
+            raise _explained(error, particles) from error
+    return Run(recorder.distributions, recorder.values, frozenset(recorder.fixed), used, result)
+
+
+def inward(value: Tensor, distribution: Any) -> Tensor:
+    """A site's value as its distribution takes it, the particle axis behind the plates, from a trace's."""
+    plates = len(distribution.batch_shape) - 1
+    if plates == 0:
+        return value
+    shared = value.ndim == plates + len(distribution.event_shape)
+    return value.unsqueeze(plates) if shared else value.movedim(0, plates)
+
+
+class _Particles(IndepMessenger):
+    """The plate of the particles: `pyro.plate`, for less where a site has its shape already."""
+
+    def _pyro_sample(self, message: Any) -> None:
+        batch = message["fn"].batch_shape if hasattr(message["fn"], "batch_shape") else None
+        if batch is None or isinstance(message["fn"], _Subsample) or message["infer"].get("_deterministic"):
+            return
+        if not batch or batch[-1] == 1 != self.size:
+            message["fn"] = message["fn"].expand(torch.Size([*batch[:-1], self.size]))
+        elif batch[-1] != self.size:
+            raise ValueError(_MISMATCH.format(PARTICLES, message["name"], -1, self.size, batch[-1]))
+
+    def _process_message(self, message: Any) -> None:
+        super()._process_message(message)
+        if message["type"] == "sample" and not message["done"]:
+            self._pyro_sample(message)
+
+
+class _Recorder(Messenger):
+    """Sets sites to given values and records all; the outermost handler, it sees them as plates made them."""
+
+    def __init__(self, particles: int, given: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        self.particles = particles
+        self.given = given
+        self.distributions: dict[str, Any] = {}
+        self.values: dict[str, Tensor] = {}
+        self.fixed: set[str] = set()
+
+    def _pyro_sample(self, message: Any) -> None:
+        if _is_no_choice(message):
+            return
+        address, distribution = message["name"], message["fn"]
+        if address in self.distributions:
+            raise InputError(f"the program visits address {address!r} twice; give each site its own.")
+        if message["infer"].get("enumerate"):
+            raise InputError(
+                f"site {address!r} is enumerated, which particles cannot be; remove `enumerate`."
+            )
+        if message["mask"] is not None or _scaled(message["scale"]):
+            raise InputError(
+                f"site {address!r} is scaled or masked by a handler or lies in a subsampled plate, which "
+                "traces do not read; use the distribution's own `.mask()`, or weigh inside a distribution."
+            )
+        if not hasattr(distribution, "batch_shape"):
+            raise InputError(
+                f"site {address!r} is sampled from a {type(distribution).__name__}, which has no "
+                "log-probability; give a distribution of `pyro.distributions`."
+            )
+        self._fits(address, tuple(distribution.batch_shape), message["cond_indep_stack"])
+        self.distributions[address] = distribution
+        if address in self.given:
+            value = self.given[address]
+            self._has_shape(address, value, distribution)
+            message["value"], message["is_observed"] = inward(value, distribution), True
+            self.values[address] = value
+
+    def _pyro_post_sample(self, message: Any) -> None:
+        address = message["name"]
+        if _is_no_choice(message) or address in self.values:
+            return
+        value, distribution = message["value"], message["fn"]
+        if message["is_observed"]:
+            self.fixed.add(address)
+            value = self._shared(value, distribution)
+        plates = len(distribution.batch_shape) - 1
+        if plates and value.ndim == plates + 1 + len(distribution.event_shape):
+            value = value.movedim(plates, 0)
+        self._has_shape(address, value, distribution)
+        self.values[address] = value
+
+    def _shared(self, value: Any, distribution: Any) -> Any:
+        """A value that the program observes in its plates, (*plates, 1, *event), without the empty axis."""
+        plates = len(distribution.batch_shape) - 1
+        whole = plates + 1 + len(distribution.event_shape)
+        if plates and value.ndim == whole and value.shape[plates] == 1 != self.particles:
+            return value.squeeze(plates)
+        return value
+
+    def _fits(self, address: str, batch: tuple[int, ...], frames: Any) -> None:
+        """The batch must be the particles and the plates around the site, and nothing else."""
+        if len(frames) == 1 and batch == (self.particles,):
+            return
+        sizes = {frame.dim: frame.size for frame in frames if frame.dim is not None}
+        expected = tuple(sizes.get(-k, 1) for k in range(-min(sizes), 0, -1))
+        if batch != expected:
+            raise InputError(
+                f"site {address!r} has batch shape {batch} and not {expected}, that of the plates around it "
+                f"and of the {self.particles} particles; put further dimensions into the event with "
+                "`.to_event()`, or open a plate for them."
+            )
+
+    def _has_shape(self, address: str, value: Tensor, distribution: Any) -> None:
+        batch, event = tuple(distribution.batch_shape), tuple(distribution.event_shape)
+        one = (*batch[:-1], *event)
+        if tuple(value.shape) not in (one, (self.particles, *one)):
+            raise InputError(
+                f"the value of site {address!r} has shape {tuple(value.shape)}; one value for all particles "
+                f"has shape {one}, one for each of {self.particles} particles {(self.particles, *one)}."
+            )
+
+
+def _is_no_choice(message: Any) -> bool:
+    return isinstance(message["fn"], _Subsample) or bool(message["infer"].get("_deterministic"))
+
+
+def _scaled(scale: Any) -> bool:
+    return not isinstance(scale, int | float) or scale != 1
+
+
+_MISMATCH = "Shape mismatch inside plate('{}') at site {} dim {}, {} vs {}"
+_MISMATCHED = re.compile(r"Shape mismatch inside plate\('(.+)'\) at site (.+) dim (-?\d+), (\d+) vs (\d+)")
+_COLLIDING = re.compile(r'at plates "(.+)" and "(.+)", collide at dim=(-?\d+)')
+
+
+def _explained(error: ValueError, particles: int) -> ValueError:
+    """What Pyro says of plates, in a sentence that names the site and says what to do."""
+    said = str(error).partition("\n")[0]
+    if found := _MISMATCHED.match(said):
+        plate, site, dim, size, given = found.groups()
+        return InputError(
+            f"site {site!r} has {given} entries at dimension {dim} where plate {plate!r} has {size}; inside "
+            "a program the particles are the last batch dimension and plates lie to the left of it, so give "
+            "what hangs on a plate a last axis of 1 (`[:, None]`), and put other dimensions into the event "
+            "with `.to_event()`."
+        )
+    if found := _COLLIDING.match(said):
+        plate, other, dim = found.groups()
+        return InputError(
+            f"plate {plate!r} is put at dimension {dim}, which is that of plate {other!r}"
+            "; leave its `dim` out, or take one further to the left (the particles have -1, so -2)."
+        )
+    if said.startswith("duplicate plate"):
+        return InputError(f"two plates, one within the other, have the same name ({said}); rename one.")
+    return error
