@@ -109,7 +109,8 @@ class Belief:
             mass: in (0, 1).
             measure: how far a pose is from the mean: `pose_deviation`, `translation_deviation`,
                 `rotation_deviation` (standard deviations), `translation_distance` (metres), `rotation_angle`
-                (radians) or `average_point_distance(points)` (ADD, metres).
+                (radians), `average_point_distance(points)` (ADD, metres), or, from the nearest of several
+                modes, `nearest_mode_deviation()`.
 
         Raises:
             InputError: the mass is not in (0, 1), or every axis of the measure is held.
