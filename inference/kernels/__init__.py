@@ -1,7 +1,9 @@
 """Kernels: moves that leave a target invariant, and how they are put together."""
 
 from bcppl.inference.kernels.combinators import cycle, mixture, repeat, sequence
+from bcppl.inference.kernels.hamiltonian import hmc
 from bcppl.inference.kernels.hastings import metropolis_hastings
+from bcppl.inference.kernels.involutions import involutive
 from bcppl.inference.kernels.kernel import Kernel, Move, put, replaced
 from bcppl.inference.kernels.rejuvenation import Moved, Until, displacement, distinct, rejuvenate, until
 from bcppl.inference.kernels.staged import Staged, delayed_acceptance
@@ -16,6 +18,8 @@ __all__ = [
     "delayed_acceptance",
     "displacement",
     "distinct",
+    "hmc",
+    "involutive",
     "metropolis_hastings",
     "mixture",
     "put",

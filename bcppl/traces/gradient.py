@@ -1,0 +1,109 @@
+"""Programs run with gradients: log-densities and return values that can be differentiated.
+
+Traces are evaluated without gradients. Here a program is run again at values that ask for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial, wraps
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bcppl.errors import InputError
+from bcppl.traces.run import Program, Run, inward, run
+from bcppl.traces.trace import Trace
+
+
+def differentiable(program: Program) -> Program:
+    """The same program, keeping gradients also where it is run without."""
+
+    @wraps(program)
+    def graded(*args: Any) -> Any:
+        with torch.enable_grad():
+            return program(*args)
+
+    return graded
+
+
+def result_with_grad(
+    program: Program, args: tuple[Any, ...], choices: Mapping[str, Tensor], particles: int
+) -> Any:
+    """What a program returns at given values of all its choices, attached to those that ask for gradients."""
+    return run(differentiable(program), args, particles, choices, {}).result
+
+
+def log_prob_with_grad(
+    trace: Trace, values: Mapping[str, Tensor], exponents: Mapping[str, float] | None = None
+) -> Tensor:
+    """Log-density of a trace at other values of some latent addresses, attached to these values.
+
+    Args:
+        trace: of N particles.
+        values: (N, *event) by address, asking for gradients.
+        exponents: by address, as in a tempered target; a site that is not named counts in full.
+
+    Returns:
+        (N,) float64, without the sites that hang on none of the values: these add a constant.
+
+    Raises:
+        InputError: a site that hangs on the values runs a simulator, or passes no gradient on.
+    """
+    given = {**trace.choices, **trace.observations, **values}
+    program = differentiable(trace.program)
+    ran: Run = _refusing(partial(run, program, trace.args, trace.particles, given, trace.carried), "", values)
+    total = torch.zeros(trace.particles, dtype=torch.float64, device=next(iter(values.values())).device)
+    with torch.enable_grad():
+        for address, distribution in ran.distributions.items():
+            parameters = _parameters(distribution)
+            if not parameters and not ran.values[address].requires_grad:
+                continue
+            if parameters and getattr(distribution, "cost", 0) > 0:
+                _refuse(address, "runs a simulator, which passes no gradient on", parameters, values)
+            exponent = 1.0 if exponents is None else exponents.get(address, 1.0)
+            if exponent == 0.0:
+                continue
+            density = _refusing(
+                partial(distribution.log_prob, inward(ran.values[address], distribution)), address, values
+            )
+            if parameters and not density.requires_grad:
+                _refuse(address, "passes no gradient on", parameters, values)
+            # Plates lie to the left of the particles.
+            total = total + exponent * density.to(torch.float64).reshape(-1, trace.particles).sum(dim=0)
+    return total
+
+
+def _parameters(distribution: Any) -> list[Tensor]:
+    """The tensors of a distribution that ask for gradients."""
+    found = [*getattr(distribution, "inputs", ())]
+    found += [value for value in vars(distribution).values() if isinstance(value, Tensor)]
+    for inner in ("base_dist", "_categorical", "_mixture_distribution", "_component_distribution"):
+        if inner in vars(distribution):
+            found += _parameters(vars(distribution)[inner])
+    return [value for value in found if value.requires_grad]
+
+
+def _refuse(address: str, why: str, parameters: list[Tensor], values: Mapping[str, Tensor]) -> None:
+    total = torch.stack([value.sum().to(torch.float64) for value in parameters]).sum()
+    slopes = torch.autograd.grad(total, list(values.values()), allow_unused=True)
+    moved = [a for a, slope in zip(values, slopes, strict=True) if slope is not None]
+    raise InputError(
+        f"site {address!r} hangs on {', '.join(map(repr, moved))} and {why}; "
+        "move that address with a proposal that needs no gradient."
+    )
+
+
+def _refusing(evaluate: Callable[[], Any], address: str, values: Mapping[str, Tensor]) -> Any:
+    """What `evaluate` gives; a conversion that gradients do not survive is told as what it is."""
+    try:
+        return evaluate()
+    except RuntimeError as error:
+        if "requires grad" not in str(error):
+            raise
+        where = f"site {address!r}" if address else "the program"
+        raise InputError(
+            f"{where} takes {' or '.join(map(repr, values))} out of torch, which no gradient survives; "
+            "move that address with a proposal that needs no gradient."
+        ) from error

@@ -1,0 +1,233 @@
+"""Hamiltonian Monte Carlo on Euclidean addresses: every particle has its own trajectory and decision."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import biject_to
+
+from bcppl.beliefs import normalised
+from bcppl.errors import InputError
+from bcppl.inference.kernels.jacobian import base, support_of
+from bcppl.inference.kernels.kernel import Kernel, Move, put
+from bcppl.inference.population import Population
+from bcppl.inference.targets import Target, accept
+from bcppl.traces import Trace, update
+from bcppl.traces.gradient import log_prob_with_grad
+from bcppl.traces.run import inward
+
+# A spread below this is rounding, not belief (in the unconstrained coordinates).
+FLOOR = 1e-6
+
+
+def hmc(*addresses: str, step_size: float = 0.5, steps: int = 8, jitter: float = 0.3) -> Kernel:
+    """Hamiltonian Monte Carlo with the leapfrog integrator.
+
+    Neal, MCMC using Hamiltonian dynamics, Handbook of Markov Chain Monte Carlo, 2011, section 5.3.2.1. The
+    inverse mass matrix is the weighted covariance of the particles it learns from (not of those it moves),
+    so a step of 1 is about one standard deviation whatever the units. Constrained values (positive, in an
+    interval, on a simplex) move in unconstrained coordinates, the Jacobian included.
+
+    Args:
+        addresses: latent addresses, moved together; the other latent values stay.
+        step_size: of the leapfrog, in standard deviations.
+        steps: leapfrog steps of a trajectory, each one gradient for all particles.
+        jitter: each trajectory's step size is uniform within this share of `step_size`, so that none runs in
+            circles.
+
+    Returns:
+        A kernel. Fitting it raises InputError where an address is no latent one, a pose, discrete, or has a
+        support without unconstrained coordinates; moving raises it where a site that hangs on the addresses
+        runs a simulator or passes no gradient on. A trajectory that diverges is rejected.
+    """
+    if not addresses:
+        raise InputError("hmc was given no address to move; name at least one.")
+    if not step_size > 0 or steps < 1 or not 0 <= jitter < 1:
+        raise InputError(
+            f"hmc was given step size {step_size}, {steps} steps and jitter {jitter}; give a positive size, "
+            "at least one step and a jitter from 0 to below 1."
+        )
+
+    def kernel(population: Population) -> Move:
+        factor = _factor(_Unconstrained(addresses, population.trace), population)
+
+        def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
+            space = _Unconstrained(addresses, trace)
+            exponents = target.exponents if isinstance(target, Target) else {}
+            start = space.read(trace)
+            scale = 1.0 + jitter * (2.0 * torch.rand(len(trace), 1, dtype=torch.float64) - 1.0)
+            momentum = torch.randn_like(start)
+            position, turned = leapfrog(
+                lambda z: space.slope(trace, z, exponents) @ factor,
+                start,
+                momentum,
+                step_size * scale.to(start.device),
+                steps,
+                factor,
+            )
+            sound = (torch.isfinite(position) & torch.isfinite(turned)).all(dim=1)
+            position = torch.where(sound[:, None], position, start)
+            values, log_stretch = space.values(position)
+            # Where an exponential has run over or under, the particle has left the support.
+            sound &= torch.isfinite(log_stretch) & space.inside(values)
+            values = {a: torch.where(_spread(sound, v), v, trace[a]) for a, v in values.items()}
+            log_ratio = 0.5 * (momentum**2 - turned**2).sum(dim=1) + log_stretch - space.values(start)[1]
+            log_ratio = torch.where(sound, log_ratio, -torch.inf)
+            new = update(trace, values).trace
+            space.refuse_moved_bounds(new)
+            passed, survivors = accept(target, trace, new, log_ratio)
+            accepted = torch.zeros(len(trace), dtype=torch.float64)
+            accepted[passed] = 1.0
+            return put(trace, passed, survivors), accepted
+
+        return move
+
+    return kernel
+
+
+def leapfrog(
+    slope: Callable[[Tensor], Tensor],
+    position: Tensor,
+    momentum: Tensor,
+    size: Tensor,
+    steps: int,
+    factor: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Positions and momenta (N, D) after some leapfrog steps; volumes stay, turned about it goes back.
+
+    Args:
+        slope: of the log-density, in the coordinates of the momentum: gradient @ factor, (N, D).
+        position: (N, D).
+        momentum: (N, D), of mass 1.
+        size: (N, 1) step sizes.
+        steps: how many.
+        factor: (D, D) Cholesky factor of the inverse mass matrix of the position.
+    """
+    momentum = momentum + 0.5 * size * slope(position)
+    for k in range(steps):
+        position = position + size * momentum @ factor.T
+        share = 1.0 if k + 1 < steps else 0.5
+        momentum = momentum + share * size * slope(position)
+    return position, momentum
+
+
+class _Unconstrained:
+    """Latent values read as vectors (N, D) without bounds."""
+
+    def __init__(self, addresses: tuple[str, ...], trace: Trace) -> None:
+        for address in addresses:
+            _refuse_unsuited(address, trace)
+        self.sites = {a: trace.distributions[a] for a in addresses}
+        self.supports = {a: site.support for a, site in self.sites.items()}
+        # As the distribution takes it: the particle axis behind the plates.
+        self.shapes = {a: inward(trace[a], site).shape for a, site in self.sites.items()}
+        self.transforms: dict[str, Any] = {}
+        for address, support in self.supports.items():
+            try:
+                self.transforms[address] = biject_to(support)
+            except NotImplementedError as error:
+                raise InputError(
+                    f"hmc cannot move {address!r}: its support {support} has no unconstrained coordinates; "
+                    "move it with a proposal."
+                ) from error
+        self.dtypes = {a: trace[a].dtype for a in addresses}
+
+    def read(self, trace: Trace) -> Tensor:
+        """(N, D) float64."""
+        flat = []
+        for address, transform in self.transforms.items():
+            free = transform.inv(inward(trace[address], self.sites[address]))
+            flat.append(self._outward(address, free).reshape(len(trace), -1))
+        return torch.cat(flat, dim=1).to(torch.float64)
+
+    def _outward(self, address: str, value: Tensor) -> Tensor:
+        return value.movedim(len(self.sites[address].batch_shape) - 1, 0)
+
+    def values(self, position: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+        """The values at positions (N, D), and log|d value / d position| (N,)."""
+        values, total, start = {}, position.new_zeros(len(position)), 0
+        for address, transform in self.transforms.items():
+            shape = transform.inverse_shape(self.shapes[address])
+            plates = len(self.sites[address].batch_shape) - 1
+            width = math.prod(shape) // len(position)
+            free = position[:, start : start + width]
+            free = free.reshape(len(free), *shape[:plates], *shape[plates + 1 :]).movedim(0, plates)
+            start += width
+            value = transform(free)
+            stretch = self._outward(address, transform.log_abs_det_jacobian(free, value))
+            total = total + stretch.reshape(len(position), -1).sum(dim=1)
+            values[address] = self._outward(address, value).to(self.dtypes[address])
+        return values, total
+
+    def inside(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Where values are finite and in their supports, (N,)."""
+        checks = [_all(torch.isfinite(v)) for v in values.values()]
+        for address, value in values.items():
+            within = self.supports[address].check(inward(value, self.sites[address]))
+            checks.append(_all(self._outward(address, within)))
+        return torch.stack(checks).all(dim=0)
+
+    def refuse_moved_bounds(self, new: Trace) -> None:
+        """Refuse supports that hang on what is moved: the way back would go through other coordinates."""
+        for address, support in self.supports.items():
+            now = new.distributions[address].support
+            if any(not torch.equal(a, b) for a, b in zip(_bounds(support), _bounds(now), strict=True)):
+                others = " or ".join(repr(a) for a in self.shapes if a != address)
+                raise InputError(
+                    f"hmc cannot move {address!r} together with {others}, on which its support hangs; "
+                    "give each a kernel of its own."
+                )
+
+    def slope(self, trace: Trace, position: Tensor, exponents: Mapping[str, float]) -> Tensor:
+        """Gradient (N, D) of the log-density of the position; 0 where it is no number."""
+        leaf = position.detach().requires_grad_()
+        with torch.enable_grad():
+            values, log_stretch = self.values(leaf)
+            density = log_prob_with_grad(trace, values, exponents) + log_stretch
+        if not density.requires_grad:
+            return torch.zeros_like(position)
+        (slope,) = torch.autograd.grad(density.sum(), leaf)
+        # Any function of the position leaves the target invariant; one that is no number leaves none.
+        return torch.nan_to_num(slope, 0.0, 0.0, 0.0)
+
+
+def _bounds(support: Any) -> list[Tensor]:
+    bounds = [v for v in vars(support).values() if isinstance(v, Tensor)]
+    return bounds + (_bounds(support.base_constraint) if hasattr(support, "base_constraint") else [])
+
+
+def _all(mask: Tensor) -> Tensor:
+    return mask.reshape(len(mask), -1).all(dim=1)
+
+
+def _spread(mask: Tensor, like: Tensor) -> Tensor:
+    return mask.reshape(-1, *[1] * (like.ndim - 1))
+
+
+def _refuse_unsuited(address: str, trace: Trace) -> None:
+    if address not in trace.choices:
+        raise InputError(
+            f"hmc was asked to move {address!r}, which is no latent address; "
+            f"latent are {', '.join(trace.choices) or 'none'}."
+        )
+    site = trace.distributions[address]
+    if getattr(base(site), "freedom", None) is not None:
+        raise InputError(f"hmc cannot move {address!r}: it is a pose; move it with `drift({address!r})`.")
+    if support_of(site).is_discrete or not trace[address].is_floating_point():
+        raise InputError(f"hmc cannot move {address!r}: it is discrete; move it with a proposal.")
+
+
+def _factor(space: _Unconstrained, population: Population) -> Tensor:
+    """Cholesky factor (D, D) of the weighted covariance, its correlations shrunk."""
+    position = space.read(population.trace)
+    weights = normalised(population.log_weights)
+    weights = torch.where(torch.isfinite(position).all(dim=1), weights, 0.0)
+    position = torch.nan_to_num(position, 0.0, 0.0, 0.0)
+    weights = weights / weights.sum().clamp_min(torch.finfo(torch.float64).tiny)
+    centred = position - weights @ position
+    covariance = (weights[:, None] * centred).T @ centred
+    return torch.linalg.cholesky(0.9 * covariance + 0.1 * torch.diag(covariance.diagonal() + 10 * FLOOR**2))

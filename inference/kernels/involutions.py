@@ -1,0 +1,141 @@
+"""Involutive MCMC: a program that chooses auxiliary values, and a map that is its own inverse."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bcppl.errors import InputError
+from bcppl.inference.kernels.jacobian import (
+    Charted,
+    Key,
+    charted,
+    log_abs_det_jacobian,
+    refuse_apart,
+    refuse_leaving,
+)
+from bcppl.inference.kernels.kernel import Kernel, Move, put
+from bcppl.inference.population import Population
+from bcppl.inference.proposals.proposal import Proposal, program_of
+from bcppl.inference.targets import Target, accept, visible
+from bcppl.traces import Trace, assess, simulate, update
+
+Values = Mapping[str, Tensor]
+Involution = Callable[[Values, Values], tuple[Values, Values]]
+
+
+def involutive(program: Proposal, involution: Involution, *, check: bool = False) -> Kernel:
+    """Involutive MCMC: auxiliary choices, and a map of them and the latent values that is its own inverse.
+
+    Green's reversible jump (Biometrika 82, 1995) with everything but the map derived: Cusumano-Towner, Lew
+    and Mansinghka, Automating involutive MCMC using probabilistic and differentiable programming, 2020,
+    algorithm 1. The log-ratio of acceptance is log p(new) q(new choices | new) - log p(old) q(choices | old)
+    + log|det J|; J is found by autograd in the coordinates of the densities' base measures
+    (`bcppl.inference.kernels.jacobian`).
+
+    Args:
+        program: a Pyro program `program(trace)`, or one that learns (`Fitted`), that samples the auxiliary
+            choices.
+        involution: `involution(values, choices) -> (new values, new choices)`, mappings from latent addresses
+            and from the program's addresses to tensors (N, *event), each particle's from its own. What it
+            leaves out stays. It is differentiated, so it computes in torch; it may map discrete
+            values too.
+        check: check, at every move, that the map undoes itself, that the Jacobians of both directions cancel,
+            and that it does not mix particles.
+
+    Returns:
+        A kernel. Its move raises InputError where the map gives an unknown address, the wrong shape, nothing
+        new, a value that carries no gradient, more coordinates than it takes, a pose moved along a held axis,
+        or (checked) no way back.
+    """
+
+    def kernel(population: Population) -> Move:
+        choose = program_of(program, (), population)
+
+        def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
+            count = trace.particles
+            forward = simulate(choose, (trace,), count)
+            before = {
+                **charted("latent", trace.choices, trace.distributions),
+                **charted("choice", forward.choices, forward.distributions),
+            }
+            charts = {k: v.chart for k, v in before.items()}
+
+            def mapped(point: Mapping[Key, Tensor]) -> dict[Key, Tensor]:
+                return _mapped(involution, point)
+
+            def stretch(point: Mapping[Key, Tensor], to: Mapping[Key, Tensor]) -> Tensor:
+                return log_abs_det_jacobian(
+                    mapped, _charted(point, charts), _charted(to, charts), check=check
+                )
+
+            start = {k: v.value for k, v in before.items()}
+            after = mapped(start)
+            new = {a: v for (kind, a), v in after.items() if kind == "latent" and v is not trace.choices[a]}
+            if not new:
+                raise InputError(
+                    f"an involution gives no new value at a latent address; "
+                    f"latent are {', '.join(trace.choices)}."
+                )
+            for address, value in new.items():
+                refuse_leaving(address, charts["latent", address], trace.choices[address], value)
+            log_stretch = stretch(start, after)
+            if check:
+                refuse_apart("the involution, applied twice,", before, mapped(after))
+                _refuse_unequal(log_stretch, stretch(after, mapped(after)))
+            updated = update(trace, new)
+            choices = {a: v for (kind, a), v in after.items() if kind == "choice"}
+            backward = assess(choose, (visible(target, updated.trace),), choices, count)
+            log_ratio = backward - forward.log_prob() + log_stretch
+            passed, survivors = accept(target, trace, updated.trace, log_ratio)
+            accepted = torch.zeros(count, dtype=torch.float64)
+            accepted[passed] = 1.0
+            return put(trace, passed, survivors), accepted
+
+        return move
+
+    return kernel
+
+
+def _charted(point: Mapping[Key, Tensor], charts: Mapping[Key, Any]) -> dict[Key, Charted]:
+    return {k: Charted(v, charts[k]) for k, v in point.items()}
+
+
+def _mapped(involution: Involution, point: Mapping[Key, Tensor]) -> dict[Key, Tensor]:
+    given: dict[str, dict[str, Tensor]] = {"latent": {}, "choice": {}}
+    for (kind, address), value in point.items():
+        given[kind][address] = value
+    reached = involution(given["latent"], given["choice"])
+    if not isinstance(reached, tuple) or [isinstance(r, Mapping) for r in reached] != [True, True]:
+        raise InputError(
+            "an involution gives back something else than two mappings; "
+            "return (new values by address, new auxiliary choices by address)."
+        )
+    after = dict(point)
+    for kind, values in zip(given, reached, strict=True):
+        for address, value in values.items():
+            if (kind, address) not in point:
+                raise InputError(
+                    f"an involution gives a {kind} value at {address!r}, which is too many: it takes "
+                    f"{', '.join(given[kind]) or 'none'} and has to give back the same."
+                )
+            if value.shape != point[kind, address].shape:
+                raise InputError(
+                    f"an involution gives a value of {address!r} ({kind}) of shape {tuple(value.shape)}, "
+                    f"it was {tuple(point[kind, address].shape)}; keep the particle axis first."
+                )
+            after[kind, address] = value
+    return after
+
+
+def _refuse_unequal(there: Tensor, back: Tensor) -> None:
+    wrong = ~((there + back).abs() <= 1e-6)
+    if bool(wrong.any()):
+        particle = int(wrong.nonzero()[0])
+        raise InputError(
+            f"the involution stretches volumes by exp({float(there[particle]):.6g}) there and "
+            f"exp({float(back[particle]):.6g}) back for particle {particle}; the two have to cancel."
+        )

@@ -1,0 +1,313 @@
+"""How much a map between values of addresses stretches volumes: log|det J|, by autograd.
+
+Every address has coordinates, those of the base measure of its density: a real value its entries, a point of
+a simplex all entries but the last, a pose its free axes in the tangent space (translation in the frame the
+pose maps to, rotation in the frame it maps from), a discrete value none. Never the seven numbers of a pose:
+its density is with respect to Lebesgue x Haar (`bcppl.poses`), and Haar measure is that of the tangent space
+up to a constant, the same at every rotation.
+
+Cusumano-Towner, Lew and Mansinghka, Automating involutive MCMC using probabilistic and differentiable
+programming, 2020, section 4: an output that is an input is found first, which takes its row and its column
+out of the determinant; only the rest is differentiated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import roma
+import torch
+from pyro.distributions import constraints
+from pyro.distributions.torch_distribution import ExpandedDistribution, MaskedDistribution
+from torch import Tensor
+from torch.distributions import Independent
+
+from bcppl import poses
+from bcppl.errors import InferenceError, InputError
+from bcppl.poses import Freedom
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Coordinates of a value about itself; the base class is that of a discrete value, which has none."""
+
+    dimension: int = 0
+
+    def at(self, value: Tensor, tangent: Tensor) -> Tensor:
+        """A value (N, *event) moved by a tangent (N, dimension): exact to first order, at 0 the value."""
+        return value
+
+    def read(self, value: Tensor) -> Tensor:
+        """Coordinates (N, dimension) that change as those about the value do, to first order."""
+        return value.new_zeros(len(value), 0, dtype=torch.float64)
+
+    def apart(self, first: Tensor, second: Tensor) -> Tensor:
+        """How far two values lie apart, (N,)."""
+        return (first != second).reshape(len(first), -1).any(dim=1).to(torch.float64)
+
+
+@dataclass(frozen=True)
+class Real(Chart):
+    """The entries of a real value."""
+
+    def at(self, value: Tensor, tangent: Tensor) -> Tensor:  # noqa: D102
+        return value + tangent.reshape(value.shape).to(value.dtype)
+
+    def read(self, value: Tensor) -> Tensor:  # noqa: D102
+        return value.reshape(len(value), -1).to(torch.float64)
+
+    def apart(self, first: Tensor, second: Tensor) -> Tensor:  # noqa: D102
+        gap = (first - second).abs() / (1.0 + first.abs())
+        return gap.reshape(len(first), -1).amax(dim=1).to(torch.float64)
+
+
+@dataclass(frozen=True)
+class Simplex(Real):
+    """All entries but the last of a vector that sums to 1."""
+
+    def at(self, value: Tensor, tangent: Tensor) -> Tensor:  # noqa: D102
+        step = tangent.reshape(*value.shape[:-1], value.shape[-1] - 1).to(value.dtype)
+        return value + torch.cat([step, -step.sum(dim=-1, keepdim=True)], dim=-1)
+
+    def read(self, value: Tensor) -> Tensor:  # noqa: D102
+        return value[..., :-1].reshape(len(value), -1).to(torch.float64)
+
+
+@dataclass(frozen=True)
+class Tangent(Chart):
+    """The free axes of a pose."""
+
+    freedom: Freedom = poses.FREE
+
+    def at(self, value: Tensor, tangent: Tensor) -> Tensor:  # noqa: D102
+        whole = self.freedom.embed(tangent.reshape(*value.shape[:-1], self.freedom.dimension))
+        half = 0.5 * whole[..., 3:]
+        # The exponential map has the derivative of q (1, w / 2) at 0, and its gradient is no number there.
+        turn = torch.cat([half, torch.ones_like(half[..., :1])], dim=-1)
+        turned = roma.quat_product(poses.quaternion_xyzw(value), turn)
+        return poses.from_translation_quaternion_xyzw(value[..., :3] + whole[..., :3], turned)
+
+    def read(self, value: Tensor) -> Tensor:  # noqa: D102
+        quaternion = poses.quaternion_xyzw(value)
+        about = quaternion.detach()
+        turn = roma.quat_product(roma.quat_conjugation(about), quaternion)[..., :3]
+        turn = 2.0 * turn / (about**2).sum(dim=-1, keepdim=True)
+        tangent = torch.cat([value[..., :3], turn], dim=-1)
+        return self.freedom.coordinates(tangent).reshape(len(value), -1)
+
+    def apart(self, first: Tensor, second: Tensor) -> Tensor:  # noqa: D102
+        return poses.local(first, second).abs().reshape(len(first), -1).amax(dim=1)
+
+
+# A density over these is not one over their entries.
+_UNCHARTED = (
+    "CorrCholesky",
+    "CorrMatrix",
+    "LowerCholesky",
+    "LowerTriangular",
+    "PositiveDefinite",
+    "PositiveSemidefinite",
+    "Square",
+    "Symmetric",
+    "Sphere",
+)
+
+
+def base(distribution: Any) -> Any:
+    """A distribution without what only gives it another shape."""
+    while isinstance(distribution, Independent | ExpandedDistribution | MaskedDistribution):
+        distribution = distribution.base_dist
+    return distribution
+
+
+def support_of(distribution: Any) -> Any:
+    """A distribution's support without the event dimensions wrapped around it."""
+    support = distribution.support
+    while isinstance(support, constraints.independent):
+        support = support.base_constraint
+    return support
+
+
+def chart_of(address: str, distribution: Any, value: Tensor) -> Chart:
+    """The coordinates of values (N, *event) of a site.
+
+    Raises:
+        InputError: the values lie on a surface that has no chart here (matrices of a kind, a sphere).
+    """
+    freedom = getattr(base(distribution), "freedom", None)
+    if freedom is not None:
+        return Tangent(math.prod(value.shape[1:-1]) * freedom.dimension, freedom)
+    support = support_of(distribution)
+    if support.is_discrete or not value.is_floating_point():
+        return Chart()
+    name = type(support).__name__.strip("_")
+    if name in _UNCHARTED:
+        raise InputError(
+            f"address {address!r} has values in {name}, whose volume is not taken here; "
+            "leave it out of the map, or sample unconstrained values and build it from these."
+        )
+    if name == "Simplex":
+        return Simplex(math.prod(value.shape[1:-1]) * (value.shape[-1] - 1))
+    return Real(math.prod(value.shape[1:]))
+
+
+class Charted(NamedTuple):
+    """A value (N, *event) with its coordinates."""
+
+    value: Tensor
+    chart: Chart
+
+
+# What kind of value it is ("latent", "choice", ...) and its address.
+Key = tuple[str, str]
+Point = Mapping[Key, Charted]
+
+
+def charted(kind: str, values: Mapping[str, Tensor], distributions: Mapping[str, Any]) -> dict[Key, Charted]:
+    """Values by address with their coordinates, which the distributions tell."""
+    return {(kind, a): Charted(v, chart_of(a, distributions[a], v)) for a, v in values.items()}
+
+
+def log_abs_det_jacobian(
+    again: Callable[[dict[Key, Tensor]], Mapping[Key, Tensor]],
+    inputs: Point,
+    outputs: Point,
+    *,
+    check: bool = False,
+) -> Tensor:
+    """Log of how much a map stretches volumes, for every particle.
+
+    Args:
+        again: the map; called once more, with inputs that ask for gradients. What it gives for a particle
+            hangs on that particle alone.
+        inputs: where it is taken.
+        outputs: what it gave there. An output that is the very tensor of an input is not differentiated.
+        check: also check that particles are not mixed.
+
+    Returns:
+        (N,) float64; -inf for a particle where the map is not one-to-one.
+
+    Raises:
+        InputError: there are more coordinates among the outputs than among the inputs or fewer, an output
+            hangs on no input or (checked) on those of other particles, or the map is nowhere one-to-one.
+        InferenceError: the Jacobian is not finite.
+    """
+    columns, rows = _remaining(inputs, outputs)
+    wide = sum(inputs[k].chart.dimension for k in columns)
+    high = sum(outputs[k].chart.dimension for k in rows)
+    if wide != high:
+        more = "gives" if high > wide else "takes"
+        raise InputError(
+            f"a map takes {_listed(inputs, columns)} to {_listed(outputs, rows)}, so it {more} "
+            f"{abs(high - wide)} coordinates too many; what goes in has to come out."
+        )
+    value = next(iter(inputs.values())).value
+    if not rows:
+        return value.new_zeros(len(value), dtype=torch.float64)
+    leaves = [
+        value.new_zeros(len(value), inputs[k].chart.dimension, dtype=torch.float64).requires_grad_()
+        for k in columns
+    ]
+    with torch.enable_grad():
+        lifted = {
+            k: inputs[k].chart.at(inputs[k].value, leaf) for k, leaf in zip(columns, leaves, strict=True)
+        }
+        reached = again({**{k: v.value for k, v in inputs.items()}, **lifted})
+        for kind, address in rows:
+            if not reached[kind, address].requires_grad:
+                raise InputError(
+                    f"a map gives a value of {address!r} ({kind}) from which no gradient leads back, except "
+                    "to what it also hands on as it is; compute it in torch, without `.detach()`, from "
+                    "something that is not used up."
+                )
+        read = torch.cat([outputs[k].chart.read(reached[k]) for k in rows], dim=1)
+        if check:
+            _refuse_mixing(read, leaves)
+        slopes = [_slope(read[:, k].sum(), leaves) for k in range(high)]
+    jacobian = torch.stack(slopes, dim=1)
+    bad = (~torch.isfinite(jacobian)).flatten(1).any(dim=1).nonzero().flatten().tolist()
+    if bad:
+        raise InferenceError(
+            f"the Jacobian from {_listed(inputs, columns)} to {_listed(outputs, rows)} is not finite for "
+            f"{len(bad)} of {len(value)} particles (first: {', '.join(map(str, bad[:5]))})."
+        )
+    stretch = torch.linalg.slogdet(jacobian).logabsdet
+    if bool((stretch == -torch.inf).all()):
+        raise InputError(
+            f"a map from {_listed(inputs, columns)} to {_listed(outputs, rows)} is not one-to-one for any "
+            "particle, so there is no way back."
+        )
+    return stretch
+
+
+def refuse_leaving(address: str, chart: Chart, old: Tensor, new: Tensor) -> None:
+    """Refuse a new pose that has moved along an axis that is held."""
+    if not isinstance(chart, Tangent) or new is old:
+        return
+    # A held axis may stray by rounding.
+    strayed = chart.freedom.off_axis(poses.local(old, new)).reshape(len(old), -1).amax(dim=1) > 1e-9
+    if bool(strayed.any()):
+        raise InputError(
+            f"a map moves {address!r} along an axis that its prior holds fixed "
+            f"(particle {int(strayed.nonzero()[0])}); free are translation {chart.freedom.translation!r} "
+            f"and rotation {chart.freedom.rotation!r}."
+        )
+
+
+def refuse_apart(what: str, first: Point, second: Mapping[Key, Tensor], tolerance: float = 1e-6) -> None:
+    """Refuse a way there and back that does not end where it began.
+
+    Raises:
+        InputError: names the address and the particle.
+    """
+    for (kind, address), (value, chart) in first.items():
+        apart = ~(chart.apart(value, second[kind, address]) <= tolerance)
+        if bool(apart.any()):
+            particle = int(apart.nonzero()[0])
+            raise InputError(
+                f"{what} does not give {address!r} ({kind}) back: particle {particle} began at "
+                f"{_short(value[particle])} and came to {_short(second[kind, address][particle])}."
+            )
+
+
+def _remaining(inputs: Point, outputs: Point) -> tuple[list[Key], list[Key]]:
+    """The inputs and the outputs that are left when those that are one tensor are taken away."""
+    columns = {k: v for k, v in inputs.items()}
+    rows = []
+    for key, (value, chart) in outputs.items():
+        same = next((k for k, v in columns.items() if v.value is value), None)
+        if same is None:
+            rows.append(key)
+        elif columns.pop(same).chart != chart:
+            raise InputError(
+                f"a map takes {same[1]!r} ({same[0]}) to {key[1]!r} ({key[0]}), which has other coordinates; "
+                "give both sites the same support, and poses the same free axes."
+            )
+    return [k for k in columns if columns[k].chart.dimension], [k for k in rows if outputs[k].chart.dimension]
+
+
+def _slope(total: Tensor, leaves: list[Tensor]) -> Tensor:
+    """Derivatives (N, D) of a sum over particles whose terms hang on one particle each."""
+    slopes = torch.autograd.grad(total, leaves, retain_graph=True, allow_unused=True)
+    return torch.cat(
+        [torch.zeros_like(x) if s is None else s for s, x in zip(slopes, leaves, strict=True)], dim=1
+    )
+
+
+def _refuse_mixing(read: Tensor, leaves: list[Tensor]) -> None:
+    if len(read) > 1 and bool((_slope(read[0].sum(), leaves)[1:] != 0).any()):
+        raise InputError(
+            "a map mixes particles: what it gives for one hangs on the values of another; "
+            "let it act on every particle alone."
+        )
+
+
+def _listed(point: Point, keys: list[Key]) -> str:
+    return ", ".join(f"{a!r} ({kind}, {point[kind, a].chart.dimension})" for kind, a in keys) or "nothing"
+
+
+def _short(value: Tensor) -> str:
+    return str([float(f"{x:.6g}") for x in value.flatten().tolist()[:8]])
