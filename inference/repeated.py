@@ -7,7 +7,7 @@ import pickle
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from multiprocessing import get_context
 from typing import Any
@@ -230,31 +230,25 @@ def _shared_out(run: Run, seeds: Sequence[int], processes: int) -> list[Populati
     return [found[k] for k in range(len(seeds))]
 
 
-Numbers = dict[str, np.ndarray]
+Numbers = dict[str, Any]
 
 
-def _numbers(run: Run, seed: int) -> tuple[Numbers, Numbers, Numbers, np.ndarray, float]:
+def _numbers(run: Run, seed: int) -> tuple[Numbers, Numbers]:
+    """What a run gave, as arrays: the trace's values, and what else the population holds."""
     population = _population(run, seed)
     trace = population.trace
-    parts = (trace.choices, trace.observations, trace.known)
-    choices, observations, known = ({a: v.numpy() for a, v in part.items()} for part in parts)
-    return choices, observations, known, population.log_weights.numpy(), population.log_evidence
-
-
-def _put_into(
-    first: Population,
-    choices: Numbers,
-    observations: Numbers,
-    known: Numbers,
-    log_weights: np.ndarray,
-    log_evidence: float,
-) -> Population:
-    trace = replace(
-        first.trace,
-        particles=len(log_weights),
-        choices={a: torch.from_numpy(v) for a, v in choices.items()},
-        observations={a: torch.from_numpy(np.asarray(v)) for a, v in observations.items()},
-        known={a: torch.from_numpy(v) for a, v in known.items()},
-        carried={},
+    values = {"choices": trace.choices, "observations": trace.observations, "known": trace.known}
+    rest = {f.name: getattr(population, f.name) for f in fields(population) if f.name != "trace"}
+    return (
+        {name: {a: v.numpy() for a, v in part.items()} for name, part in values.items()},
+        {name: v.numpy() if isinstance(v, Tensor) else v for name, v in rest.items()},
     )
-    return Population(trace, torch.from_numpy(log_weights), log_evidence)
+
+
+def _put_into(first: Population, values: Numbers, rest: Numbers) -> Population:
+    back: Numbers = {name: {a: torch.as_tensor(v) for a, v in part.items()} for name, part in values.items()}
+    other: Numbers = {
+        name: torch.as_tensor(v) if isinstance(v, np.ndarray) else v for name, v in rest.items()
+    }
+    trace = replace(first.trace, particles=len(other["log_weights"]), carried={}, **back)
+    return replace(first, trace=trace, **other)
