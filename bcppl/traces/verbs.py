@@ -14,15 +14,17 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.traces.run import Program, Run, run
+from bcppl.traces.series import Series, SeriesTrace, Stage
 from bcppl.traces.trace import Trace
 
 
 def trace_of(
-    program: Program, args: tuple[Any, ...], particles: int, ran: Run, observed: Mapping[str, Tensor]
+    program: Program | Series, args: tuple[Any, ...], particles: int, ran: Run, observed: Mapping[str, Tensor]
 ) -> Trace:
     """The trace of a run in which the addresses `observed` were constrained."""
     hidden = {a: v for a, v in ran.values.items() if a not in observed and a not in ran.fixed}
-    trace = Trace(program, args, particles, hidden, dict(observed))
+    kind = SeriesTrace if isinstance(program, Stage) else Trace
+    trace = kind(program, args, particles, hidden, dict(observed))
     trace._ran(ran)
     return trace
 
@@ -49,18 +51,19 @@ def _refuse_one_each(observations: Mapping[str, Tensor], ran: Run, particles: in
             )
 
 
-def simulate(program: Program, args: tuple[Any, ...] = (), particles: int = 1) -> Trace:
+def simulate(program: Program | Series, args: tuple[Any, ...] = (), particles: int = 1) -> Trace:
     """Run a program forward: every site is sampled, what would be observed included.
 
     Raises:
         InputError: see `bcppl.traces.run.run`.
     """
+    program = Stage(program) if isinstance(program, Series) else program
     ran = run(program, args, particles, {}, {})
     return trace_of(program, args, particles, ran, {})
 
 
 def generate(
-    program: Program, args: tuple[Any, ...], observations: Mapping[str, Tensor], particles: int
+    program: Program | Series, args: tuple[Any, ...], observations: Mapping[str, Tensor], particles: int
 ) -> tuple[Trace, Tensor]:
     """Run a program with some sites constrained, the others drawn from the program itself.
 
@@ -78,49 +81,78 @@ def generate(
         InputError: an observed address is never visited, or an observation has not its site's shape;
             see also `bcppl.traces.run.run`.
     """
+    program = Stage(program) if isinstance(program, Series) else program
     ran = run(program, args, particles, observations, {})
     refuse_unvisited(observations, ran)
     _refuse_one_each(observations, ran, particles)
     trace = trace_of(program, args, particles, ran, observations)
     constrained = [a for a in ran.distributions if a in observations or a in ran.fixed]
-    weight = trace.log_prob(*constrained) if constrained else torch.zeros(particles, dtype=torch.float64)
-    return trace, weight
+    return trace, _weight(trace, constrained)
 
 
-def extend(trace: Trace, args: tuple[Any, ...], observations: Mapping[str, Tensor]) -> tuple[Trace, Tensor]:
+def extend(
+    trace: Trace,
+    args: tuple[Any, ...],
+    observations: Mapping[str, Tensor],
+    choices: Mapping[str, Tensor] | None = None,
+) -> tuple[Trace, Tensor]:
     """Run the program on with new arguments (more measurements): only the new sites are evaluated.
 
     Values at the old addresses stay; new latent sites are drawn from the program. The old sites are taken to
     have the distributions they had.
 
+    A series (`bcppl.traces.Series`) is run on by one step, whose arguments and observations are given; then
+    it is the step's sites that are new.
+
     Args:
         trace: what is extended.
         args: the new arguments.
         observations: values of new addresses.
+        choices: values (N, ...) of new latent addresses, such as a proposal gave; those that are left out are
+            drawn from the program.
 
     Returns:
-        The longer trace and its log weight (N,): the log-probability of the new observations.
+        The longer trace and its log weight (N,): the log-probability of the new observations and of the
+        choices that were given.
 
     Raises:
-        InputError: an address vanishes, or an observation is of an old address, of one never visited, or
-            of the wrong shape.
+        InputError: an address vanishes, or an observation or a choice is of an old address, of one never
+            visited, or of the wrong shape.
     """
+    if isinstance(trace, SeriesTrace):
+        return _stepped(trace, args, observations)
     old = {**trace.choices, **trace.observations}
-    again = [a for a in observations if a in old]
+    choices = choices or {}
+    again = [a for a in (*observations, *choices) if a in old]
     if again:
         raise InputError(
             f"address {again[0]!r} was observed or sampled before; extend takes new addresses only."
         )
-    ran = run(trace.program, args, trace.particles, {**old, **observations}, trace.carried)
-    refuse_unvisited(observations, ran)
+    ran = run(trace.program, args, trace.particles, {**old, **observations, **choices}, trace.carried)
+    refuse_unvisited({**observations, **choices}, ran)
     _refuse_one_each(observations, ran, trace.particles)
     lost = [a for a in old if a not in ran.distributions]
     if lost:
         raise InputError(f"with the new arguments the program no longer visits address {lost[0]!r}.")
     longer = trace_of(trace.program, args, trace.particles, ran, {**trace.observations, **observations})
     longer.known.update(trace.known)
-    new = [
-        a for a in ran.distributions if a in observations or (a in ran.fixed and a not in trace.distributions)
-    ]
-    weight = longer.log_prob(*new) if new else torch.zeros(trace.particles, dtype=torch.float64)
-    return longer, weight
+    fixed = ran.fixed.difference(trace.distributions) if ran.fixed else ran.fixed
+    new = [a for a in ran.distributions if a in observations or a in choices or a in fixed]
+    return longer, _weight(longer, new)
+
+
+def _stepped(
+    trace: SeriesTrace, args: tuple[Any, ...], observations: Mapping[str, Tensor]
+) -> tuple[Trace, Tensor]:
+    """A series run on by one step."""
+    program = trace.next_stage()
+    ran = run(program, args, trace.particles, observations, trace.carried)
+    refuse_unvisited(observations, ran)
+    _refuse_one_each(observations, ran, trace.particles)
+    longer = trace_of(program, args, trace.particles, ran, observations)
+    return longer, _weight(longer, [a for a in ran.distributions if a in observations or a in ran.fixed])
+
+
+def _weight(trace: Trace, constrained: list[str]) -> Tensor:
+    """The log-probability (N,) of what was constrained; zeros where nothing was."""
+    return trace.log_prob(*constrained) if constrained else torch.zeros(trace.particles, dtype=torch.float64)
