@@ -24,7 +24,8 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.inference.kernels import Kernel, distinct
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import adaptive, systematic
-from bcppl.inference.smc import tempered
+from bcppl.inference.step import Observed
+from bcppl.inference.tempering import tempered
 from bcppl.traces import generate
 
 sys.path.insert(0, str(Path(__file__).parent / "peers"))
@@ -146,7 +147,7 @@ class Outcome(NamedTuple):
 def run(problem: Problem, method: Method, particles: int, seed: int) -> Outcome:
     """One run of tempered SMC, on one thread."""
     torch.manual_seed(seed)
-    assimilate = tempered(
+    step = tempered(
         method.kernel,
         sweeps=method.sweeps,
         resample=adaptive(systematic, method.threshold),
@@ -155,7 +156,7 @@ def run(problem: Problem, method: Method, particles: int, seed: int) -> Outcome:
     observed = {"y": torch.tensor(0.0, dtype=torch.float64)}
     Counted.calls, begun = 0, time.perf_counter()
     start, log_weights = generate(problem.program, (0,), {}, particles)
-    done = assimilate(Population(start, log_weights), (1,), observed)
+    done = step(Population(start, log_weights), Observed((1,), observed))
     seconds = time.perf_counter() - begun
     population = done.population
     mean = normalised(population.log_weights) @ population.trace["x"]

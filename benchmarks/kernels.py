@@ -222,9 +222,9 @@ def look(asked: tuple[str, int, int]) -> Posed:
 def posed(model: Any, recording: Any, kernel: Kernel, sweeps: int, share: float, seed: int) -> Posed:
     """One run of tempered SMC over a recording."""
     scene = model.prepare(recording)
-    assimilate = tempered(kernel, sweeps=sweeps, resample=adaptive(systematic, share), share=share)
+    step = tempered(kernel, sweeps=sweeps, resample=adaptive(systematic, share), share=share)
     begun = time.perf_counter()
-    steps = smc(model, recording, assimilate=assimilate, particles=PARTICLES, seed=seed, scene=scene)
+    steps = smc(model, recording, step=step, particles=PARTICLES, seed=seed, scene=scene)
     *_, last = steps
     seconds = time.perf_counter() - begun
     physics = scene.efforts.get("physics")

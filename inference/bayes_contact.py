@@ -9,17 +9,18 @@ tempering and no accept-reject step.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from bcppl.inference.kernels import replaced
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Proposal, drift, program_of
 from bcppl.inference.resampling import Resample, adaptive
-from bcppl.inference.smc import Assimilate, Assimilated, Step, smc
+from bcppl.inference.smc import Step, smc
+from bcppl.inference.step import Observed, StepFunction, StepInfo, Stepped
 from bcppl.traces import Model, assess, extend, propose, update
 
 
@@ -44,21 +45,25 @@ def drifted(population: Population, proposal: Proposal) -> Population:
     return population.reweighed(factor)
 
 
-def drift_and_weigh(proposal: Proposal, resample: Resample) -> Assimilate:
-    """Take a measurement in by drifting, weighing and, when needed, resampling."""
+def drift_and_weigh(proposal: Proposal, resample: Resample) -> StepFunction:
+    """A step that takes a measurement in by drifting, weighing and, when needed, resampling."""
 
-    def assimilate(
-        population: Population, args: tuple[Any, ...], observations: Mapping[str, Tensor]
-    ) -> Assimilated:
+    def step(population: Population, observed: Observed) -> Stepped:
+        start = population.log_evidence
         population = drifted(population, proposal)
-        longer, log_likelihood = extend(population.trace, args, observations)
-        population = Population(longer, population.log_weights, population.log_evidence).reweighed(
-            log_likelihood
+        longer, log_likelihood = extend(population.trace, *observed)
+        weighed = replace(population, trace=longer).reweighed(log_likelihood)
+        population, ancestors = resample(weighed)
+        info = StepInfo(
+            resampled=int(ancestors is not None),
+            effective_sample_size_before=weighed.effective_sample_size,
+            effective_sample_size=population.effective_sample_size,
+            log_evidence=population.log_evidence - start,
+            ancestors=ancestors,
         )
-        population, _ = resample(population)
-        return Assimilated(population, float("nan"), (1.0,))
+        return Stepped(population, info)
 
-    return assimilate
+    return step
 
 
 def infer(
@@ -74,5 +79,5 @@ def infer(
         scale: the drift, as a share of 2.38 / sqrt(d) times the particles' spread.
         scene: what `model.prepare(recording)` gives, if it is at hand.
     """
-    assimilate = drift_and_weigh(drift(model.pose, (scale, scale * 1.0001)), adaptive())
-    return smc(model, recording, assimilate=assimilate, particles=particles, seed=seed, scene=scene)
+    step = drift_and_weigh(drift(model.pose, (scale, scale * 1.0001)), adaptive())
+    return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene)

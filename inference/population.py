@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from bcppl.beliefs import Belief, effective_sample_size, normalised
+from bcppl.errors import InputError
 from bcppl.poses import FREE
 from bcppl.traces import Trace
 
@@ -16,23 +19,51 @@ from bcppl.traces import Trace
 class Population:
     """Weighted particles.
 
+    Raises:
+        InputError: there are founders, but not one for each particle.
+
     Attributes:
         trace: of N particles.
         log_weights: (N,) unnormalised, float64.
-        log_evidence: log of the estimated evidence of all measurements so far.
+        log_evidence: log of the estimated evidence of all measurements so far; by default the log of the mean
+            weight, which is right for what `generate` returns.
+        founders: (N,) int64, the particle of the first population that each descends from; by default
+            its own. What `bcppl.inference.variance` reads.
+        log_pairs: sum over the first population and every resampling since of log M / (M - 1), M the
+            particles that were then drawn independently of one another.
     """
 
     trace: Trace
     log_weights: Tensor
-    log_evidence: float = 0.0
+    log_evidence: float = math.nan
+    founders: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64), repr=False)
+    log_pairs: float = math.nan
+
+    def __post_init__(self) -> None:
+        if math.isnan(self.log_evidence):
+            object.__setattr__(self, "log_evidence", _log_mean(self.log_weights))
+        if len(self.founders) not in (0, len(self.log_weights)):
+            raise InputError(
+                f"a population of {len(self.log_weights)} particles is given {len(self.founders)} founders; "
+                "give one for each, or none."
+            )
+        if len(self.founders) == 0:
+            object.__setattr__(self, "founders", torch.arange(len(self.log_weights)))
+        if math.isnan(self.log_pairs):
+            object.__setattr__(self, "log_pairs", log_pair(len(self.log_weights)))
 
     def __len__(self) -> int:
         return self.trace.particles
 
-    @property
+    @cached_property
     def effective_sample_size(self) -> float:
         """1 / sum of squared normalised weights."""
         return effective_sample_size(self.log_weights)
+
+    @cached_property
+    def log_total(self) -> float:
+        """Log of the sum of the weights."""
+        return float(torch.logsumexp(self.log_weights, 0))
 
     def reweighed(self, log_factor: Tensor) -> Population:
         """Every weight times exp(log_factor) (N,), and the evidence times the weighted mean of the factors.
@@ -44,20 +75,47 @@ class Population:
             InferenceError: no particle has any weight left.
         """
         log_weights = self.log_weights + log_factor
-        normalised(log_weights)
-        gained = torch.logsumexp(log_weights, 0) - torch.logsumexp(self.log_weights, 0)
-        return replace(self, log_weights=log_weights, log_evidence=self.log_evidence + float(gained))
+        total = float(torch.logsumexp(log_weights, 0))
+        if not math.isfinite(total):
+            normalised(log_weights)
+        later = replace(
+            self, log_weights=log_weights, log_evidence=self.log_evidence + (total - self.log_total)
+        )
+        later.__dict__["log_total"] = total
+        return later
 
     def selected(self, ancestors: Tensor) -> Population:
-        """The particles at `ancestors` (N,), equally weighted."""
-        return replace(
-            self, trace=self.trace[ancestors], log_weights=torch.zeros(len(ancestors), dtype=torch.float64)
+        """The particles at `ancestors` (M,), equally weighted."""
+        return Population(
+            self.trace[ancestors],
+            torch.zeros(len(ancestors), dtype=torch.float64),
+            self.log_evidence,
+            self.founders[ancestors],
+            self.log_pairs + log_pair(len(ancestors)),
         )
 
     def __getitem__(self, index: Tensor) -> Population:
-        return replace(self, trace=self.trace[index], log_weights=self.log_weights[index])
+        return replace(
+            self,
+            trace=self.trace[index],
+            log_weights=self.log_weights[index],
+            founders=self.founders[index],
+        )
 
     def belief(self, address: str) -> Belief:
         """The particles read as a posterior over the pose at an address."""
         freedom = getattr(self.trace.distributions[address], "freedom", FREE)
         return Belief(self.trace[address], self.log_weights, freedom)
+
+
+def log_pair(count: int) -> float:
+    """Log of count / (count - 1): of all pairs over those of two different particles; 0 for one particle."""
+    return math.log(count / (count - 1)) if count > 1 else 0.0
+
+
+def _log_mean(log_weights: Tensor) -> float:
+    """Log of the mean weight; 0 to the bit for weights of 1."""
+    highest = float(log_weights.max())
+    if not math.isfinite(highest):
+        return highest
+    return highest + float(torch.log(torch.exp(log_weights - highest).mean()))

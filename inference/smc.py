@@ -1,19 +1,15 @@
-"""Sequential Monte Carlo over measurements, with tempering within a measurement and rejuvenation.
+"""Sequential Monte Carlo over a recording: an iterator that can be stopped, looked into and gone on with.
 
-`tempered` makes the step that takes one measurement in: extend the traces, let the new likelihood in by
-steps, resample and move the particles after each. `smc` is the loop over a recording, an iterator that can
-be stopped, looked into and gone on with. Del Moral, Doucet and Jasra, Sequential Monte Carlo samplers, JRSS
-B 68, 2006; Chopin and Papaspiliopoulos, An Introduction to Sequential Monte Carlo, 2020, chapter 17.
-
-With fixed exponents and fixed proposals the estimate of the evidence is unbiased; with adaptive tempering
-and fitted proposals it is consistent only. Evidence that contains a surrogate likelihood is a surrogate's.
+How one measurement is taken in is a step (`bcppl.inference.step`), such as `tempered(...)`. A program without
+a recording is run by `bcppl.inference.step.steps`.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -21,11 +17,9 @@ from torch import Tensor
 
 from bcppl.beliefs import Belief
 from bcppl.errors import InferenceError, InputError
-from bcppl.inference.kernels import Kernel, rejuvenate
 from bcppl.inference.population import Population
-from bcppl.inference.resampling import Resample, adaptive
-from bcppl.inference.targets import POSTERIOR, Target
-from bcppl.inference.tempering import next_exponent
+from bcppl.inference.step import Observed, StepFunction, StepInfo
+from bcppl.inference.tempering import tempered
 from bcppl.traces import Model, Trace, extend, generate
 
 
@@ -41,6 +35,7 @@ class Info(NamedTuple):
             NaN where the truth is not known.
         seconds: wall time.
         effort: by simulator's name, what it did for this measurement.
+        step: what else the step says about itself.
     """
 
     label: str
@@ -53,80 +48,10 @@ class Info(NamedTuple):
     truth_gap: float
     seconds: float
     effort: Mapping[str, Any]
+    step: StepInfo
 
 
-class Assimilated(NamedTuple):
-    """A population that has taken a measurement in, the acceptance rate and the exponents gone through."""
-
-    population: Population
-    acceptance: float
-    exponents: tuple[float, ...]
-
-
-Assimilate = Callable[[Population, tuple[Any, ...], Mapping[str, Tensor]], Assimilated]
-
-
-def tempered(
-    kernel: Kernel | None = None,
-    *,
-    sweeps: int | Callable[[Trace], int] = 3,
-    resample: Resample | None = None,
-    share: float | Callable[[Trace], float] = 0.5,
-) -> Assimilate:
-    """How to take a measurement in: let its likelihood in by steps, resample and move after each.
-
-    Args:
-        kernel: moves the particles after each resampling; None leaves them where they are.
-        sweeps: how many moves of every particle after each resampling, or a function of the trace.
-        resample: when and how; by default systematic below half the effective sample size.
-        share: tempering keeps the conditional effective sample size above this share of the particles;
-            0 lets a likelihood in at once. A number, or a function of the trace, as `sweeps`.
-
-    Returns:
-        `assimilate(population, args, observations)`, with the program's arguments up to and including the new
-        measurement, and the values of the new addresses. It raises InferenceError where no particle is left
-        with any weight.
-
-    Raises:
-        InputError: `share` is not in [0, 1).
-    """
-    if not callable(share) and not 0.0 <= share < 1.0:
-        raise InputError(
-            f"tempering is asked to keep a share of {share} of the particles; give 0 up to below 1."
-        )
-    resample = adaptive() if resample is None else resample
-
-    def assimilate(
-        population: Population, args: tuple[Any, ...], observations: Mapping[str, Tensor]
-    ) -> Assimilated:
-        before = set(population.trace.addresses)
-        longer, log_likelihood = extend(population.trace, args, observations)
-        # Sites that the program itself fixes (`obs=`, `pyro.factor`) are let in with the observations.
-        new = [a for a in longer.addresses if a not in before and a not in longer.choices]
-        population = Population(longer, population.log_weights, population.log_evidence)
-        exponent, exponents, acceptances = 0.0, [], []
-        while exponent < 1.0:
-            reached = exponent
-            exponent = 1.0
-            kept = share(population.trace) if callable(share) else share
-            if kept > 0.0:
-                exponent = next_exponent(population.log_weights, log_likelihood, reached, kept)
-            exponents.append(exponent)
-            # 0 times -inf is no number, so a particle that cannot be loses its weight here, once.
-            population = population.reweighed((exponent - reached) * log_likelihood)
-            population, resampled = resample(population)
-            if resampled and kernel is not None:
-                target = POSTERIOR if exponent == 1.0 else Target(dict.fromkeys(new, exponent))
-                population, acceptance = rejuvenate(
-                    population, kernel, target, sweeps(population.trace) if callable(sweeps) else sweeps
-                )
-                acceptances.append(acceptance)
-            log_likelihood = population.trace.log_prob(*new) if new else torch.zeros_like(log_likelihood)
-        acceptance = sum(acceptances) / len(acceptances) if acceptances else float("nan")
-        return Assimilated(population, acceptance, tuple(exponents))
-
-    return assimilate
-
+__all__ = ["Info", "Step", "smc", "tempered"]
 
 # Below this many particles, sharing a tensor out among threads takes longer than working on it.
 FEW_PARTICLES = 5000
@@ -147,104 +72,160 @@ def _own_state(box: list[Tensor], particles: int) -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-class Step(NamedTuple):
-    """What `smc` yields: the belief after a measurement, what happened, and the population to look into."""
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What `smc` yields: `for belief, info in smc(...)`, and the population to look into.
+
+    Attributes:
+        belief: over the sought pose.
+        info: what happened.
+        population: the particles.
+        random_state: of torch's generator; with the population it is all that a run goes on from.
+        taken: how many measurements were taken in.
+    """
 
     belief: Belief
     info: Info
     population: Population
     random_state: Tensor
+    taken: int = 0
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.belief, self.info))
 
 
 def smc(
     model: Model,
     recording: Any,
     *,
-    assimilate: Assimilate,
+    step: StepFunction,
     particles: int = 75,
     seed: int = 0,
     scene: Any = None,
+    start: Step | None = None,
 ) -> Iterator[Step]:
     """Run SMC over a recording: yields the prior's belief first, then one step for each measurement.
 
     Args:
         model: what explains the recording.
         recording: a `bcppl.recordings.Recording`.
-        assimilate: how one measurement is taken in, such as `tempered(...)`.
+        step: how one measurement is taken in, such as `tempered(...)`.
         particles: N.
         seed: same seed, same beliefs, bit for bit; torch's own generator is left as it was.
         scene: `model.prepare(recording)` unless given.
+        start: go on from this one, with its particles and its random state: what is yielded are the steps
+            after it, the same to the bit as those of the run that it was taken from.
 
     Raises:
         InferenceError: no particle is left with any weight; names the measurement.
+        InputError: the program samples no pose at `model.pose`, or `start` has taken more measurements in
+            than there are.
     """
     scene = model.prepare(recording) if scene is None else scene
-    state = [torch.Generator().manual_seed(seed).get_state()]
-    with _own_state(state, particles):
-        trace, log_weights = generate(model.program, (scene, []), {}, particles)
-    if model.pose not in trace:
-        raise InputError(
-            f"the model's pose is said to be at address {model.pose!r}, which its program never samples; "
-            f"it samples {', '.join(trace.choices) or 'nothing'} before any measurement."
-        )
-    population = Population(trace, log_weights)
-    # The truth draws from a generator of its own: a belief does not depend on whether it is known.
-    aside = [torch.Generator().manual_seed(seed).get_state()]
-    with _own_state(aside, 1):
-        truth = _truth(model, scene, recording, trace)
-    started = Info(
-        "prior", float("nan"), float(particles), 0.0, particles, float("nan"), (), float("nan"), 0.0, {}
-    )
-    yield Step(population.belief(model.pose), started, population, state[0])
-    for count, measurement in enumerate(recording.measurements, start=1):
+    if start is None:
+        state = [torch.Generator().manual_seed(seed).get_state()]
+        with _own_state(state, particles):
+            population = Population(*generate(model.program, (scene, []), {}, particles))
+        if model.pose not in population.trace:
+            raise InputError(
+                f"the model's pose is said to be at address {model.pose!r}, which its program never samples; "
+                f"it samples {', '.join(population.trace.choices) or 'nothing'} before any measurement."
+            )
+        start = _prior(model, population, state[0])
+        truth = _Truth(model, scene, recording, population, seed)
+        yield start
+    else:
+        if start.taken > len(recording.measurements):
+            raise InputError(
+                f"a run is to go on after {start.taken} measurements, but the recording has "
+                f"{len(recording.measurements)}; give the recording that it was run on."
+            )
+        state, population, particles = [start.random_state], start.population, len(start.population)
+        truth = _Truth(model, scene, recording, population, seed)
+        if start.taken:
+            truth.gap(_observed(model, scene, recording.measurements[: start.taken], {}), population)
+    for count in range(start.taken + 1, len(recording.measurements) + 1):
+        measurement = recording.measurements[count - 1]
         label = f"{measurement.kind} {count}"
         begun, before = time.perf_counter(), _effort(scene)
-        measurements = recording.measurements[:count]
-        new = _new(model.observe(scene, measurements), population.trace.observations)
-        args = (scene, [m.action for m in measurements])
+        observed = _observed(model, scene, recording.measurements[:count], population.trace.observations)
         try:
             with _own_state(state, particles):
-                population, acceptance, exponents = assimilate(population, args, new)
+                population, happened = step(population, observed)
         except InferenceError as error:
             raise InferenceError(f"{label}: {error}") from error
         belief = population.belief(model.pose)
         spent = {name: after.since(before[name]) for name, after in _effort(scene).items()}
         elapsed = time.perf_counter() - begun
-        gap = float("nan")
-        if set(population.trace.choices) != {model.pose}:
-            truth = None
-        if truth is not None:
-            with _own_state(aside, 1):
-                truth, _ = extend(truth, args, new)
-            observed = list(population.trace.observations)
-            best = population.trace.log_prob(*observed)[population.log_weights > -torch.inf].max()
-            gap = float(truth.log_prob(*observed) - best)
         info = Info(
             label,
             _time(measurement),
             belief.effective_sample_size,
             population.log_evidence,
             belief.distinct,
-            acceptance,
-            exponents,
-            gap,
+            happened.acceptance,
+            happened.exponents,
+            truth.gap(observed, population),
             elapsed,
             spent,
+            happened,
         )
-        yield Step(belief, info, population, state[0])
+        yield Step(belief, info, population, state[0], count)
 
 
-def _new(observations: Mapping[str, Tensor], known: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {a: v for a, v in observations.items() if a not in known}
+def _prior(model: Model, population: Population, random_state: Tensor) -> Step:
+    belief, nothing = population.belief(model.pose), float("nan")
+    size = belief.effective_sample_size
+    happened = StepInfo(exponents=(), effective_sample_size=size)
+    info = Info(
+        "prior",
+        nothing,
+        size,
+        population.log_evidence,
+        len(population),
+        nothing,
+        (),
+        nothing,
+        0.0,
+        {},
+        happened,
+    )
+    return Step(belief, info, population, random_state)
 
 
-def _truth(model: Model, scene: Any, recording: Any, trace: Any) -> Any:
-    """One particle at the true pose, if it is known and the pose is all that is latent."""
-    if recording.truth is None or set(trace.choices) != {model.pose}:
-        return None
-    pose = torch.as_tensor(recording.truth, dtype=torch.float64)[None]
-    one, _ = generate(model.program, (scene, []), {}, 1)
-    return one.at({model.pose: pose})
+def _observed(model: Model, scene: Any, measurements: Sequence[Any], known: Mapping[str, Tensor]) -> Observed:
+    """What a step takes in so that the measurements are all taken in."""
+    observations = model.observe(scene, measurements)
+    new = {a: v for a, v in observations.items() if a not in known}
+    return Observed((scene, [m.action for m in measurements]), new)
+
+
+class _Truth:
+    """One particle at the true pose, if that is known and the pose is all that is latent."""
+
+    def __init__(self, model: Model, scene: Any, recording: Any, population: Population, seed: int) -> None:
+        self.trace: Trace | None = None
+        # It draws from a generator of its own: a belief does not depend on whether the truth is known.
+        self.state = [torch.Generator().manual_seed(seed).get_state()]
+        self.latent = {model.pose}
+        if recording.truth is None or set(population.trace.choices) != self.latent:
+            return
+        pose = torch.as_tensor(recording.truth, dtype=torch.float64)[None]
+        with _own_state(self.state, 1):
+            one, _ = generate(model.program, (scene, []), {}, 1)
+            self.trace = one.at({model.pose: pose})
+
+    def gap(self, observed: Observed, population: Population) -> float:
+        """Log-likelihood of the truth minus that of the best particle, NaN where the truth is not known."""
+        if set(population.trace.choices) != self.latent:
+            self.trace = None
+        if self.trace is None:
+            return float("nan")
+        with _own_state(self.state, 1):
+            self.trace, _ = extend(self.trace, *observed)
+        addresses = list(population.trace.observations)
+        best = population.trace.log_prob(*addresses)[population.log_weights > -torch.inf].max()
+        return float(self.trace.log_prob(*addresses) - best)
 
 
 def _effort(scene: Any) -> dict[str, Any]:

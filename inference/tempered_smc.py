@@ -10,11 +10,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from torch import Tensor
+
 from bcppl.inference.kernels import Kernel, metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import adaptive, systematic
-from bcppl.inference.smc import Step, smc, tempered
+from bcppl.inference.smc import Step, smc
+from bcppl.inference.tempering import tempered
 from bcppl.traces import Model, Trace
 
 PHYSICS = 2  # the cost of a site that simulates contact (`bcppl.distributions.lazy`)
@@ -51,13 +54,13 @@ def infer(
     def by_physics(trace: Trace) -> int:
         return int(any(getattr(site, "cost", 0) >= PHYSICS for site in trace.distributions.values()))
 
-    def resample(population: Population) -> tuple[Population, bool]:
+    def resample(population: Population) -> tuple[Population, Tensor | None]:
         return adaptive(systematic, share[by_physics(population.trace)])(population)
 
-    assimilate = tempered(
+    step = tempered(
         kernel(model.pose),
         sweeps=lambda trace: sweeps[by_physics(trace)],
         resample=resample,
         share=lambda trace: share[by_physics(trace)],
     )
-    return smc(model, recording, assimilate=assimilate, particles=particles, seed=seed, scene=scene)
+    return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene)

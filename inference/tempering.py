@@ -1,16 +1,33 @@
-"""Tempering: letting a likelihood in by steps that the particles can follow.
+"""Tempering: a likelihood is let in by steps that the particles can follow, with moves after each.
 
 The next exponent is the largest whose conditional effective sample size stays above a share of N, found by
 bisection: Zhou, Johansen and Aston, Toward automatic model comparison: an adaptive sequential Monte Carlo
-approach, JCGS 25, 2016, section 3.3.2 (CESS, eq. 3.16).
+approach, JCGS 25, 2016, section 3.3.2 (CESS, eq. 3.16). The step is that of Del Moral, Doucet and Jasra,
+Sequential Monte Carlo samplers, JRSS B 68, 2006, and of Chopin and Papaspiliopoulos, An Introduction to
+Sequential Monte Carlo, 2020, chapter 17.
+
+With fixed exponents and fixed proposals the estimate of the evidence is unbiased; with adaptive tempering
+and fitted proposals it is consistent only. Evidence that contains a surrogate likelihood is a surrogate's.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from bcppl.beliefs import normalised
+from bcppl.errors import InputError
+from bcppl.inference.kernels import Kernel, Until, rejuvenate
+from bcppl.inference.population import Population
+from bcppl.inference.resampling import Resample, adaptive
+from bcppl.inference.step import Observed, StepFunction, StepInfo, Stepped
+from bcppl.inference.targets import POSTERIOR, Target, cost_of
+from bcppl.traces import Trace, extend
 
 SMALLEST_STEP = 1e-6
 
@@ -44,3 +61,148 @@ def next_exponent(log_weights: Tensor, log_likelihood: Tensor, exponent: float, 
         middle = 0.5 * (low + high)
         low, high = (middle, high) if enough(middle) else (low, middle)
     return min(1.0, exponent + max(low, SMALLEST_STEP))
+
+
+class Rejuvenated(NamedTuple):
+    """A population after resampling and moves; ancestors (N,) and acceptance are None where not done."""
+
+    population: Population
+    ancestors: Tensor | None
+    acceptance: float | None
+
+
+# Resamples if it sees need, and moves the particles towards a target that they are weighted for.
+Rejuvenation = Callable[[Population, Target], Rejuvenated]
+
+
+def resample_move(
+    kernel: Kernel | None, sweeps: int | Until | Callable[[Trace], int], resample: Resample
+) -> Rejuvenation:
+    """Resample when needed, then move every particle.
+
+    Gilks and Berzuini, Following a moving target: Monte Carlo inference for dynamic Bayesian models, JRSS B
+    63, 2001.
+    """
+
+    def rejuvenation(population: Population, target: Target) -> Rejuvenated:
+        population, ancestors = resample(population)
+        if ancestors is None or kernel is None:
+            return Rejuvenated(population, ancestors, None)
+        times = sweeps(population.trace) if callable(sweeps) else sweeps
+        moved, acceptance = rejuvenate(population, kernel, target, times)
+        return Rejuvenated(moved, ancestors, acceptance)
+
+    return rejuvenation
+
+
+def tempered(
+    kernel: Kernel | None = None,
+    *,
+    sweeps: int | Until | Callable[[Trace], int] = 3,
+    resample: Resample | None = None,
+    share: float | Callable[[Trace], float] = 0.5,
+    exponents: Sequence[float] | None = None,
+    by_site: bool = False,
+    rejuvenation: Rejuvenation | None = None,
+) -> StepFunction:
+    """A step that lets a measurement's likelihood in bit by bit, and resamples and moves after each.
+
+    Args:
+        kernel: moves the particles after each resampling; None leaves them where they are.
+        sweeps: how many moves of every particle after each resampling, `until(...)`, or a function of the
+            trace.
+        resample: when and how; by default systematic below half the effective sample size.
+        share: tempering keeps the conditional effective sample size above this share of the particles;
+            0 lets a likelihood in at once. A number, or a function of the trace, as `sweeps`.
+        exponents: fixed ones to let the likelihood in by, increasing, the last 1; then `share` counts for
+            nothing.
+        by_site: let the new sites in one after another, in the order of their cost and then of the program,
+            each by exponents of its own; otherwise all at once.
+        rejuvenation: in place of `kernel`, `sweeps` and `resample`, such as `waste_free(...)`.
+
+    Returns:
+        The step. It raises InferenceError where no particle is left with any weight.
+
+    Raises:
+        InputError: `share` is not in [0, 1), the exponents do not increase to 1, or a rejuvenation is given
+            beside a kernel or a resampling.
+    """
+    if not callable(share) and not 0.0 <= share < 1.0:
+        raise InputError(
+            f"tempering is asked to keep a share of {share} of the particles; give 0 up to below 1."
+        )
+    fixed = None if exponents is None else tuple(float(e) for e in exponents)
+    if fixed is not None and (fixed[-1:] != (1.0,) or any(b <= a for a, b in pairwise((0.0, *fixed)))):
+        raise InputError(
+            f"tempering is given the exponents {list(fixed)}; give increasing ones that end with 1."
+        )
+    if rejuvenation is None:
+        rejuvenation = resample_move(kernel, sweeps, adaptive() if resample is None else resample)
+    elif kernel is not None or resample is not None:
+        raise InputError(
+            "a step is given a rejuvenation beside a kernel or a resampling; give one or the other."
+        )
+    schedule = _Schedule(share, fixed)
+
+    def step(population: Population, observed: Observed) -> Stepped:
+        start = population.log_evidence
+        known = set(population.trace.addresses)
+        longer, log_likelihood = extend(population.trace, *observed)
+        # Sites that the program itself fixes (`obs=`, `pyro.factor`) are let in with the observations.
+        new = [a for a in longer.addresses if a not in known and a not in longer.choices]
+        population = replace(population, trace=longer)
+        groups = [[a] for a in _by_cost(longer, new)] if by_site and new else [new]
+        done, acceptances, ancestors, before, resampled = [], [], None, None, 0
+        for number, group in enumerate(groups):
+            later = {a: 0.0 for others in groups[number + 1 :] for a in others}
+            exponent = 0.0
+            if len(groups) > 1:
+                log_likelihood = population.trace.log_prob(*group)
+            while exponent < 1.0:
+                reached = exponent
+                exponent = schedule.after(reached, population, log_likelihood)
+                done.append(exponent)
+                # 0 times -inf is no number, so a particle that cannot be loses its weight here, once.
+                population = weighed = population.reweighed((exponent - reached) * log_likelihood)
+                partly = {**later, **(dict.fromkeys(group, exponent) if exponent < 1.0 else {})}
+                population, chosen, acceptance = rejuvenation(
+                    population, Target(partly) if partly else POSTERIOR
+                )
+                if chosen is not None:
+                    resampled += 1
+                    ancestors = chosen if ancestors is None else ancestors[chosen]
+                    before = weighed.effective_sample_size
+                if acceptance is not None:
+                    acceptances.append(acceptance)
+                if exponent < 1.0:
+                    log_likelihood = population.trace.log_prob(*group)
+        info = StepInfo(
+            sum(acceptances) / len(acceptances) if acceptances else float("nan"),
+            tuple(done),
+            resampled,
+            population.effective_sample_size if before is None else before,
+            population.effective_sample_size,
+            population.log_evidence - start,
+            ancestors,
+        )
+        return Stepped(population, info)
+
+    return step
+
+
+class _Schedule(NamedTuple):
+    share: float | Callable[[Trace], float]
+    fixed: tuple[float, ...] | None
+
+    def after(self, reached: float, population: Population, log_likelihood: Tensor) -> float:
+        """The exponent that follows `reached`."""
+        if self.fixed is not None:
+            return next(e for e in self.fixed if e > reached)
+        kept = self.share(population.trace) if callable(self.share) else self.share
+        if kept <= 0.0:
+            return 1.0
+        return next_exponent(population.log_weights, log_likelihood, reached, kept)
+
+
+def _by_cost(trace: Trace, addresses: Sequence[str]) -> list[str]:
+    return sorted(addresses, key=lambda address: cost_of(trace.distributions[address]))

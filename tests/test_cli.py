@@ -293,7 +293,7 @@ def test_a_users_own_files_are_taken_as_readily_as_names(bcppl: Callable[..., Ra
         "from bcppl.inference.smc import smc, tempered\n"
         "def infer(model, recording, *, particles, seed, scene):\n"
         "    options = {'particles': particles, 'seed': seed, 'scene': scene}\n"
-        "    yield from smc(model, recording, assimilate=tempered(), **options)\n"
+        "    yield from smc(model, recording, step=tempered(), **options)\n"
     )
     save(short(), tmp_path / "short.h5")
     words = ("--particles", 8, "--model", "my_probe.py", "--inference", tmp_path / "my_smc.py")

@@ -18,7 +18,8 @@ from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import adaptive, systematic
-from bcppl.inference.smc import tempered
+from bcppl.inference.step import Observed
+from bcppl.inference.tempering import tempered
 from bcppl.traces import generate
 
 RUNS, PARTICLES = 20, 2000
@@ -35,13 +36,13 @@ def evidence_errors(
     for seed in range(RUNS):
         torch.manual_seed(seed)
         trace, weights = generate(program, (0,), {}, PARTICLES)
-        assimilate = tempered(
+        step = tempered(
             metropolis_hastings(drift(address, (0.5, 1.0))),
             sweeps=sweeps,
             resample=adaptive(systematic, 0.75),
             share=0.7,
         )
-        done = assimilate(Population(trace, weights), (1,), values)
+        done = step(Population(trace, weights), Observed((1,), values))
         errors.append(done.population.log_evidence - exact)
         populations.append(done.population)
     return np.array(errors), populations
