@@ -1,0 +1,79 @@
+"""One step of SMC, a function (population, what was observed) -> (population, what happened), and its loop.
+
+Any program can be run so, without a recording:
+
+    population = importance_sampling(program, (0,), {}, particles=1000)
+    observed = [Observed((k + 1,), {f"y_{k}": y}) for k, y in enumerate(series)]
+    for population, info in steps(tempered(kernel), population, observed):
+        print(info.effective_sample_size, population.log_evidence)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from bcppl.inference.population import Population
+
+
+class Observed(NamedTuple):
+    """What one step takes in.
+
+    Attributes:
+        args: the program's arguments up to and including the new measurement.
+        observations: values of the new addresses, of the sites' event shape.
+    """
+
+    args: tuple[Any, ...]
+    observations: Mapping[str, Tensor]
+
+
+class StepInfo(NamedTuple):
+    """What happened in one step.
+
+    Attributes:
+        acceptance: the share of proposals accepted, NaN where nothing was moved.
+        exponents: the steps by which the likelihood was let in; the last is 1. Where sites are let in one
+            after another, those of each in turn, each ending with 1.
+        resampled: how many times.
+        effective_sample_size_before: just before the last resampling; where there was none, at the end.
+        effective_sample_size: at the end.
+        log_evidence: what the step added to the log of the evidence.
+        ancestors: (N,) int64, the particle before the step that each one descends from; None where
+            nothing was resampled, and each descends from itself.
+    """
+
+    acceptance: float = float("nan")
+    exponents: tuple[float, ...] = (1.0,)
+    resampled: int = 0
+    effective_sample_size_before: float = float("nan")
+    effective_sample_size: float = float("nan")
+    log_evidence: float = 0.0
+    ancestors: Tensor | None = None
+
+
+class Stepped(NamedTuple):
+    """A population that has taken something in, and what happened."""
+
+    population: Population
+    info: StepInfo
+
+
+StepFunction = Callable[[Population, Observed], Stepped]
+
+
+def steps(step: StepFunction, population: Population, observed: Iterable[Observed]) -> Iterator[Stepped]:
+    """The population after each step: an iterator that can be stopped, looked into and gone on with.
+
+    It draws from torch's own generator, so it goes on bit for bit from a population and torch's state.
+
+    Args:
+        step: such as `bcppl.inference.tempering.tempered(...)`.
+        population: before the first step, such as that of `importance_sampling(...)`.
+        observed: what each step takes in.
+    """
+    for each in observed:
+        population, info = step(population, each)
+        yield Stepped(population, info)
