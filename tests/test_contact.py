@@ -203,3 +203,21 @@ def test_the_normalised_contact_likelihood_samples_what_it_says() -> None:
     far = drawn[:, 1::2][felt[:, 1::2]].norm(dim=-1) > 0.005
     assert float(far.double().mean()) == pytest.approx(0.3, abs=0.015)
     assert float(drawn[:, ::2][felt[:, ::2]].std()) == pytest.approx(0.05, rel=0.03)
+
+
+def test_locations_anywhere_are_in_the_pegs_frame_wherever_the_peg_is() -> None:
+    contacts = torch.stack([points((0, 0, -50)), torch.full((1, 3), NAN, dtype=torch.float64)])
+    here, far = poses.identity(2, 1), poses.identity(2, 1)
+    far[..., 0] = 0.6
+    felt = points((3, 0, -50))
+    first, second = (ContactsInTime(Felt(contacts, pose), 0, 1, 0.001, every=1) for pose in (here, far))
+    assert torch.equal(first.log_prob(felt), second.log_prob(felt))
+    torch.manual_seed(5)
+    drawn = ContactsInTime(
+        Felt(torch.full((500, 1, 3), NAN, dtype=torch.float64), far[:1].expand(500, 1, 7)),
+        0,
+        1,
+        0.001,
+        invented=0.9,
+    ).sample()
+    assert float(drawn[..., 0].nanmean()) == pytest.approx(0.0, abs=0.01)

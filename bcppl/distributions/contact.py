@@ -137,7 +137,7 @@ class ContactsInTime(LazyDistribution):
     Where the simulated peg touches, nothing is felt with probability `missed`, else a location: Gaussian
     about the simulated one, or, with probability `outlier`, anywhere. Where it does not touch, a location
     anywhere is felt with probability `invented`, else none. Anywhere is a Gaussian of standard deviation
-    `reach` along each axis about the origin of the simulated peg. The density is with respect to counting
+    `reach` along each axis about the origin of the peg's frame. The density is with respect to counting
     measure on "none" plus Lebesgue measure on locations (cubic metres), at each stamp looked at.
 
     The event is (last - first, 3): locations in the peg's frame, a row of NaN where nothing was
@@ -183,13 +183,13 @@ class ContactsInTime(LazyDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-probability (N,) of locations (T, 3), or (N, T, 3)."""
-        contacts, pose = self.track.window(self.first, self.last)
+        contacts, _ = self.track.window(self.first, self.last)
         chosen = slice(-self.first % self.every, None, self.every)
-        contacts, pose = contacts[:, chosen], pose[:, chosen]
+        contacts = contacts[:, chosen]
         value = value.to(torch.float64)[..., chosen, :]
         touching, felt = torch.isfinite(contacts).all(dim=-1), torch.isfinite(value).all(dim=-1)
         value = torch.nan_to_num(value)
-        anywhere = _log_gaussian((value - pose[..., :3]).square().sum(dim=-1), self.reach)
+        anywhere = _log_gaussian(value.square().sum(dim=-1), self.reach)
         near = _log_gaussian((value - torch.nan_to_num(contacts)).square().sum(dim=-1), self.scale)
         here = torch.logaddexp(near + math.log1p(-self.outlier), anywhere + math.log(self.outlier))
         of_touch = torch.where(felt, here + math.log1p(-self.missed), math.log(self.missed))
@@ -199,7 +199,7 @@ class ContactsInTime(LazyDistribution):
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Locations (N, T, 3), NaN where none is felt; all stamps are drawn, independently."""
-        contacts, pose = self.track.window(self.first, self.last)
+        contacts, _ = self.track.window(self.first, self.last)
         shape = contacts.shape[:-1]
 
         def happens(probability: float) -> Tensor:
@@ -209,7 +209,7 @@ class ContactsInTime(LazyDistribution):
         felt = torch.where(touching, ~happens(self.missed), happens(self.invented))
         astray = (~touching | happens(self.outlier))[..., None]
         noise = torch.randn(*shape, 3, dtype=torch.float64)
-        location = torch.where(astray, pose[..., :3] + self.reach * noise, contacts + self.scale * noise)
+        location = torch.where(astray, self.reach * noise, contacts + self.scale * noise)
         return torch.where(felt[..., None], location, math.nan)
 
 
