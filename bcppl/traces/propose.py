@@ -10,6 +10,8 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.traces.run import Program, run
+from bcppl.traces.series import Series
+from bcppl.traces.trace import Trace
 from bcppl.traces.verbs import refuse_unvisited, simulate, trace_of
 
 
@@ -28,7 +30,7 @@ class Proposed:
     result: Any = field(default=None, repr=False)
 
 
-def propose(program: Program, args: tuple[Any, ...], particles: int) -> Proposed:
+def propose(program: Program | Series, args: tuple[Any, ...], particles: int) -> Proposed:
     """Run a proposal program forward: its choices and their log-density."""
     trace = simulate(program, args, particles)
     return Proposed(trace.choices, trace.log_prob(), trace.result)
@@ -40,6 +42,15 @@ def assess(program: Program, args: tuple[Any, ...], choices: Mapping[str, Tensor
     Raises:
         InputError: a choice is missing, or an address is never visited.
     """
+    return assessed(program, args, choices, particles).log_prob()
+
+
+def assessed(program: Program, args: tuple[Any, ...], choices: Mapping[str, Tensor], particles: int) -> Trace:
+    """The trace of a program at given values for all of its choices, which are its latent values.
+
+    Raises:
+        InputError: a choice is missing, or an address is never visited.
+    """
     ran = run(program, args, particles, choices, {})
     refuse_unvisited(choices, ran)
     missing = [a for a in ran.values if a not in choices and a not in ran.fixed]
@@ -47,4 +58,4 @@ def assess(program: Program, args: tuple[Any, ...], choices: Mapping[str, Tensor
         raise InputError(
             f"assess needs a value for address {missing[0]!r}; give one for every choice of the program."
         )
-    return trace_of(program, args, particles, ran, choices).log_prob()
+    return trace_of(program, args, particles, ran, {})
