@@ -47,7 +47,8 @@ def to_arviz(
           the mean's.
         - log_likelihood: of every observed address, (chain, draw).
         - sample_stats: (chain, draw) `lp`, the log-probability of all sites; `log_weight`, unnormalised, of
-          the particle that was drawn; `particle`, which one that was. (chain,) `log_evidence`,
+          the particle that was drawn; `particle`, which one that was; `founder`, which particle of the first
+          population it descends from. (chain,) `log_evidence`,
           `effective_sample_size` and `distinct_particles`, the last the number of different ones drawn.
         - observed_data: the observations.
 
@@ -77,6 +78,7 @@ def to_arviz(
         "lp": at_draws([chain.trace.log_prob() for chain in chains], chosen),
         "log_weight": at_draws([chain.log_weights for chain in chains], chosen),
         "particle": torch.stack(chosen),
+        "founder": at_draws([chain.founders for chain in chains], chosen),
     }
     data = arviz.from_dict(
         posterior=_numpy(posterior),
@@ -152,19 +154,8 @@ def draw(populations: Sequence[Population], draws: int | None, scheme: Scheme = 
     draws = min(map(len, populations)) if draws is None else draws
     if draws < 1:
         raise InputError(f"{draws} draws were asked for; give 1 or more.")
-    return [_ancestors(population.log_weights, draws, scheme) for population in populations]
-
-
-def _ancestors(log_weights: Tensor, draws: int, scheme: Scheme) -> Tensor:
-    """`draws` ancestors by a scheme that gives as many as it is given weights."""
-    # Weightless particles make up the number; of several ancestors for one draw, neighbours in the order of
-    # the scheme and so of one stratum, chance takes one.
-    each = -(-len(log_weights) // draws)
-    padded = torch.full((each * draws,), -torch.inf, dtype=torch.float64)
-    padded[: len(log_weights)] = log_weights
-    ancestors = scheme(padded).reshape(draws, each)
-    taken = ancestors.gather(1, torch.randint(each, (draws, 1)))[:, 0]
-    return taken[torch.randperm(draws)]
+    # A scheme gives ancestors in order; draws in order would look like a chain that does not mix.
+    return [scheme(population.log_weights, draws)[torch.randperm(draws)] for population in populations]
 
 
 def at_draws(values: Sequence[Tensor], chosen: Sequence[Tensor]) -> Tensor:

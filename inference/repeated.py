@@ -106,7 +106,10 @@ class Repeated:
 
     @cached_property
     def pooled(self) -> Population:
-        """All particles of all runs, each run with the weight of its evidence."""
+        """All particles of all runs, each run with the weight of its evidence.
+
+        How sure its evidence is, `standard_error` says: what one run knows of that is not put together.
+        """
         traces = [population.trace for population in self.populations]
         first = traces[0]
         shared = set.intersection(*(set(trace.known) for trace in traces))
@@ -118,7 +121,9 @@ class Repeated:
             carried={},
         )
         log_weights = [normalised(p.log_weights).log() + p.log_evidence for p in self.populations]
-        return Population(trace, torch.cat(log_weights), self.log_evidence)
+        before = np.cumsum([0, *(int(p.founders.max()) + 1 for p in self.populations)])
+        founders = [p.founders + int(b) for p, b in zip(self.populations, before, strict=False)]
+        return Population(trace, torch.cat(log_weights), self.log_evidence, torch.cat(founders))
 
     def r_hat(self, draws: int | None = None, seed: int = 0) -> dict[str, Tensor]:
         """Rank-normalised split R-hat (D,) of every latent address: near 1 where the runs agree.

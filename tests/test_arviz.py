@@ -45,7 +45,8 @@ SEEN = {"y": number(0.7)[0], "z": number(0.1, 0.2, 0.3)}
 def weighted(particles: int, seed: int) -> Population:
     torch.manual_seed(seed)
     trace, log_weights = generate(program, (), SEEN, particles)
-    return Population(trace, log_weights, float(torch.logsumexp(log_weights, 0)) - math.log(particles))
+    log_evidence = float(torch.logsumexp(log_weights, 0)) - math.log(particles)
+    return Population(trace, log_weights, log_evidence, torch.arange(particles) // 2)
 
 
 def test_groups_shapes_and_names() -> None:
@@ -65,6 +66,7 @@ def test_groups_shapes_and_names() -> None:
         np.testing.assert_array_equal(data.posterior.x.values[chain], trace["x"].numpy())
         np.testing.assert_array_equal(data.posterior.which.values[chain], trace["which"].numpy())
         np.testing.assert_array_equal(stats.lp.values[chain], trace.log_prob().numpy())
+        np.testing.assert_array_equal(stats.founder.values[chain], population.founders[particle].numpy())
         np.testing.assert_array_equal(data.log_likelihood.y.values[chain], trace.log_prob("y").numpy())
         np.testing.assert_array_equal(
             stats.log_weight.values[chain], population.log_weights[particle].numpy()

@@ -87,6 +87,7 @@ def test_pooled_runs_weigh_by_their_evidence() -> None:
     pooled = Repeated((few, many), (0, 1)).pooled
     assert len(pooled) == 16 and pooled.log_evidence == pytest.approx(math.log(2.0))
     assert float(mean(pooled, "x")) == pytest.approx(0.75)
+    assert pooled.founders.tolist() == list(range(16)), "nobody descends from another run"
     expected = torch.cat([few.trace.log_prob(), many.trace.log_prob()])
     torch.testing.assert_close(pooled.trace.log_prob(), expected)
     assert pooled.trace["hole"].shape == (16, 7) and pooled[torch.arange(3)].trace.particles == 3
