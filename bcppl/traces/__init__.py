@@ -3,6 +3,7 @@
 from bcppl.traces.carried import carried
 from bcppl.traces.model import Model
 from bcppl.traces.propose import Proposed, assess, propose
+from bcppl.traces.series import Series
 from bcppl.traces.trace import Trace
 from bcppl.traces.update import Regenerated, Update, regenerate, update
 from bcppl.traces.verbs import extend, generate, simulate
@@ -11,6 +12,7 @@ __all__ = [
     "Model",
     "Proposed",
     "Regenerated",
+    "Series",
     "Trace",
     "Update",
     "assess",

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.traces.run import Program, run
-from bcppl.traces.series import Series
+from bcppl.traces.series import Series, runnable
 from bcppl.traces.trace import Trace
 from bcppl.traces.verbs import refuse_unvisited, simulate, trace_of
 
@@ -36,7 +36,9 @@ def propose(program: Program | Series, args: tuple[Any, ...], particles: int) ->
     return Proposed(trace.choices, trace.log_prob(), trace.result)
 
 
-def assess(program: Program, args: tuple[Any, ...], choices: Mapping[str, Tensor], particles: int) -> Tensor:
+def assess(
+    program: Program | Series, args: tuple[Any, ...], choices: Mapping[str, Tensor], particles: int
+) -> Tensor:
     """Log-density (N,) of a program at given values for all of its choices.
 
     Raises:
@@ -45,12 +47,16 @@ def assess(program: Program, args: tuple[Any, ...], choices: Mapping[str, Tensor
     return assessed(program, args, choices, particles).log_prob()
 
 
-def assessed(program: Program, args: tuple[Any, ...], choices: Mapping[str, Tensor], particles: int) -> Trace:
+def assessed(
+    program: Program | Series, args: tuple[Any, ...], choices: Mapping[str, Tensor], particles: int
+) -> Trace:
     """The trace of a program at given values for all of its choices, which are its latent values.
 
     Raises:
         InputError: a choice is missing, or an address is never visited.
     """
+    program = runnable(program)
+    program = runnable(program)
     ran = run(program, args, particles, choices, {})
     refuse_unvisited(choices, ran)
     missing = [a for a in ran.values if a not in choices and a not in ran.fixed]

@@ -151,10 +151,15 @@ class Trace:
         )
 
     def _index(self, key: Index) -> Tensor:
-        if isinstance(key, slice):
-            return torch.arange(self.particles)[key]
-        index = torch.as_tensor(key).reshape(-1)
+        if not isinstance(key, Tensor):
+            key = key if isinstance(key, slice) else torch.as_tensor(key)
+            return torch.arange(self.particles)[key].reshape(-1)
+        index = key.reshape(-1)
         return index.nonzero().flatten() if index.dtype == torch.bool else index
+
+    def since(self, previous: Trace) -> list[str]:
+        """The addresses that `extend` added to `previous` to make this trace (or one moved since)."""
+        return [a for a in self.addresses if a not in previous._run.distributions]
 
     def __contains__(self, address: object) -> bool:
         return address in self.choices or address in self.observations

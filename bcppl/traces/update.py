@@ -33,7 +33,8 @@ class Update:
     @cached_property
     def log_ratio(self) -> Tensor:
         """Log p(new trace) - log p(old trace), (N,)."""
-        return self.trace.log_prob() - self.previous.log_prob()
+        named = self.trace.addresses
+        return self.trace.log_prob(*named) - self.previous.log_prob(*named)
 
 
 def update(trace: Trace, values: Mapping[str, Tensor]) -> Update:

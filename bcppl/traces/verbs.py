@@ -14,12 +14,12 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.traces.run import Program, Run, run
-from bcppl.traces.series import Series, SeriesTrace, Stage
+from bcppl.traces.series import Series, SeriesTrace, Stage, runnable
 from bcppl.traces.trace import Trace
 
 
 def trace_of(
-    program: Program | Series, args: tuple[Any, ...], particles: int, ran: Run, observed: Mapping[str, Tensor]
+    program: Program, args: tuple[Any, ...], particles: int, ran: Run, observed: Mapping[str, Tensor]
 ) -> Trace:
     """The trace of a run in which the addresses `observed` were constrained."""
     hidden = {a: v for a, v in ran.values.items() if a not in observed and a not in ran.fixed}
@@ -57,7 +57,7 @@ def simulate(program: Program | Series, args: tuple[Any, ...] = (), particles: i
     Raises:
         InputError: see `bcppl.traces.run.run`.
     """
-    program = Stage(program) if isinstance(program, Series) else program
+    program = runnable(program)
     ran = run(program, args, particles, {}, {})
     return trace_of(program, args, particles, ran, {})
 
@@ -81,7 +81,7 @@ def generate(
         InputError: an observed address is never visited, or an observation has not its site's shape;
             see also `bcppl.traces.run.run`.
     """
-    program = Stage(program) if isinstance(program, Series) else program
+    program = runnable(program)
     ran = run(program, args, particles, observations, {})
     refuse_unvisited(observations, ran)
     _refuse_one_each(observations, ran, particles)
@@ -119,10 +119,10 @@ def extend(
         InputError: an address vanishes, or an observation or a choice is of an old address, of one never
             visited, or of the wrong shape.
     """
-    if isinstance(trace, SeriesTrace):
-        return _stepped(trace, args, observations)
-    old = {**trace.choices, **trace.observations}
     choices = choices or {}
+    if isinstance(trace, SeriesTrace):
+        return _stepped(trace, args, observations, choices)
+    old = {**trace.choices, **trace.observations}
     again = [a for a in (*observations, *choices) if a in old]
     if again:
         raise InputError(
@@ -142,15 +142,18 @@ def extend(
 
 
 def _stepped(
-    trace: SeriesTrace, args: tuple[Any, ...], observations: Mapping[str, Tensor]
+    trace: SeriesTrace,
+    args: tuple[Any, ...],
+    observations: Mapping[str, Tensor],
+    choices: Mapping[str, Tensor],
 ) -> tuple[Trace, Tensor]:
     """A series run on by one step."""
-    program = trace.next_stage()
-    ran = run(program, args, trace.particles, observations, trace.carried)
-    refuse_unvisited(observations, ran)
+    program, given = trace.next_stage(), {**observations, **choices}
+    ran = run(program, args, trace.particles, given, trace.carried)
+    refuse_unvisited(given, ran)
     _refuse_one_each(observations, ran, trace.particles)
     longer = trace_of(program, args, trace.particles, ran, observations)
-    return longer, _weight(longer, [a for a in ran.distributions if a in observations or a in ran.fixed])
+    return longer, _weight(longer, [a for a in ran.distributions if a in given or a in ran.fixed])
 
 
 def _weight(trace: Trace, constrained: list[str]) -> Tensor:

@@ -1,0 +1,336 @@
+"""Long series: a model that is a pair (init, step), run step by step, its particles' ancestry as indices.
+
+    def init():
+        return pyro.sample("x", dist.Normal(0.0, 1.0))
+
+    def step(x):
+        x = pyro.sample("x", dist.Normal(x, 0.5))
+        pyro.sample("y", dist.Normal(x, 0.3))
+        return x
+
+    walk = Series(init, step)
+    trace, weight = generate(walk, (), {}, particles=100)
+    for y in observed:
+        trace, weight = extend(trace, (), {"y": y})
+    trace["x"], trace["x", 3]  # now, and what each particle's ancestor had after three steps
+
+The trace is that of the newest step, whose addresses are those that `step` visits; kernels move them. Earlier
+steps are behind it: they are reached by number, and are not moved any more. So T steps cost T, and choosing
+ancestors costs a single gather; paths are traced back when they are asked for (Murray, Bayesian state-space
+modelling on high-performance hardware using LibBi, JSS 67, 2015, section 3.3, stores ancestries so).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bcppl.errors import InputError
+from bcppl.traces.run import Program, Run
+from bcppl.traces.trace import Index, Trace
+
+
+@dataclass(frozen=True)
+class Series:
+    """A program in two parts, for `simulate` and `generate` (the first) and `extend` (the second, once each).
+
+    Attributes:
+        init: `init(*args) -> state`.
+        step: `step(state, *args) -> state`, with the arguments of that step alone.
+        history: whether earlier steps stay readable; without, memory does not grow with the steps.
+
+    A state is a tensor, or a dictionary, list, tuple or named tuple of such, the particle axis first;
+    numbers, None and tensors without axes are the same for all particles. What else it holds is indexed by
+    (K,) int64.
+    """
+
+    init: Callable[..., Any]
+    step: Callable[..., Any]
+    history: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One step of a series as a program: it knows the trace that it goes on from, and whose states."""
+
+    series: Series
+    number: int = 0
+    before: SeriesTrace | None = None
+    picks: tuple[Tensor, ...] = ()
+
+    def __call__(self, *args: Any) -> Any:
+        """Run the step from the states of the chosen particles."""
+        if self.before is None:
+            return self.series.init(*args)
+        return self.series.step(taken(self.before.state, self.chosen, self.before.particles), *args)
+
+    @cached_property
+    def chosen(self) -> Tensor | None:
+        """Which particles (N,) of the trace before go on; None if all of them do, in order."""
+        index = None
+        for pick in self.picks:
+            index = composed(index, pick)
+        return index
+
+    def take(self, index: Tensor) -> Stage:
+        """The same step for the particles at `index` (K,)."""
+        # Composed only when asked for: a filter that goes on from here never does.
+        return replace(self, picks=(*self.picks, index)) if self.before is not None else self
+
+    def where(self, mask: Tensor, other: Stage) -> Stage:
+        """The same step for this one's ancestors where `mask` (N,) is true, the other's elsewhere."""
+        if self.series is not other.series or self.before is not other.before:
+            raise InputError(
+                "two traces of a series were to be merged that do not go on from the same step; "
+                "merge traces of one population."
+            )
+        if self.before is None or self.chosen is other.chosen:
+            return self
+        own = torch.arange(len(mask))
+        first = own if self.chosen is None else self.chosen
+        second = own if other.chosen is None else other.chosen
+        return replace(self, picks=(torch.where(mask, first, second),))
+
+
+def runnable(program: Program | Series) -> Program:
+    """The program itself, or what begins a series."""
+    return Stage(program) if isinstance(program, Series) else program
+
+
+def composed(first: Tensor | None, then: Tensor | None) -> Tensor | None:
+    """Choosing by `first`, then by `then`, in one; None chooses all."""
+    return then if first is None else first if then is None else first.index_select(0, then)
+
+
+def taken(state: Any, index: Tensor | None, particles: int) -> Any:
+    """The states of the particles at `index` (K,), all of them if it is None.
+
+    Raises:
+        InputError: a tensor in the state has not the particle axis first.
+    """
+    if isinstance(state, Tensor):
+        if state.ndim == 0:
+            return state
+        if len(state) != particles:
+            raise InputError(
+                f"a series' state holds a tensor of shape {tuple(state.shape)} for {particles} particles; "
+                "put the particle axis first, and what is the same for all into the arguments."
+            )
+        return state if index is None else state.index_select(0, index)
+    if isinstance(state, Mapping):
+        return {key: taken(value, index, particles) for key, value in state.items()}
+    if isinstance(state, list | tuple):
+        parts = [taken(value, index, particles) for value in state]
+        return type(state)(*parts) if hasattr(state, "_fields") else type(state)(parts)
+    if index is None or state is None or isinstance(state, str | int | float):
+        return state
+    return state[index]
+
+
+class Chosen(Mapping[str, Tensor]):
+    """The choices of the particles at an index (K,), gathered when they are asked for."""
+
+    def __init__(self, whole: Mapping[str, Tensor], index: Tensor) -> None:
+        self._whole, self._index = whole, index
+        self._gathered: dict[str, Tensor] = {}
+
+    def __getitem__(self, address: str) -> Tensor:
+        if address not in self._gathered:
+            self._gathered[address] = self._whole[address].index_select(0, self._index)
+        return self._gathered[address]
+
+    def __contains__(self, address: object) -> bool:
+        return address in self._whole
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._whole)
+
+    def __len__(self) -> int:
+        return len(self._whole)
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesTrace(Trace):
+    """The newest step of a series for N particles, the earlier ones behind it.
+
+    `trace["x"]` is the newest value, `trace["x", t]` that of each particle's ancestor after t steps (0: what
+    `init` drew; -1: the newest). Choices, observations, addresses and distributions are the newest step's.
+
+    Attributes:
+        origin: the trace that this one's particles were chosen from, and which (N,); None if from none.
+    """
+
+    origin: tuple[SeriesTrace, Tensor] | None = None
+
+    @property
+    def stage(self) -> Stage:
+        """The step that the trace is of."""
+        assert isinstance(self.program, Stage)
+        return self.program
+
+    @property
+    def steps(self) -> int:
+        """How many steps were run after `init`."""
+        return self.stage.number
+
+    @cached_property
+    def _result(self) -> Any:
+        return self._run.result
+
+    @property
+    def state(self) -> Any:
+        """What the newest step returned, the particle axis first."""
+        if self.origin is None:
+            return self._result
+        whole, index = self.origin
+        return taken(whole.state, index, whole.particles)
+
+    def _ran(self, ran: Run) -> None:
+        taken(ran.result, None, self.particles)
+        super()._ran(ran)
+
+    def log_prob(self, *addresses: str | tuple[str, int]) -> Tensor:
+        """Log-probability (N,) of sites, summed; of all sites of all steps where none is named.
+
+        Args:
+            addresses: an address of the newest step, or one with the number of a step, ("x", 3).
+
+        Raises:
+            InputError: no site has that address, or the earlier steps were not kept.
+            InferenceError: a log-probability is NaN or +inf; names the site and the particles.
+        """
+        if not addresses:
+            return self._whole_path()
+        values = []
+        for address in addresses:
+            if isinstance(address, str):
+                values.append(self._site(address))
+            else:
+                then, index = self._after(address[1])
+                value = then._site(address[0])
+                values.append(value if index is None else value.index_select(0, index))
+        return sum(values[1:], values[0])
+
+    def _site(self, address: str) -> Tensor:
+        if self.origin is not None and address not in self.known and address not in self.hidden:
+            whole, index = self.origin
+            if address in whole.known:
+                self.known[address] = whole.known[address].index_select(0, index)
+        return super()._site(address)
+
+    def _whole_path(self) -> Tensor:
+        """The sum over all steps; each step's is kept, so that asking after every step costs no more."""
+        links: list[tuple[SeriesTrace, Tensor | None]] = []
+        node: SeriesTrace | None = self
+        while node is not None and "_total" not in node.__dict__:
+            links.append((node, node.stage.chosen))
+            if isinstance(node, Forgotten):
+                raise _forgotten(node.steps)
+            node = node.stage.before
+        total = None if node is None else node.__dict__["_total"]
+        for node, chosen in reversed(links):
+            own = node.log_prob(*node.addresses) if node.addresses else torch.zeros(node.particles)
+            if total is not None:
+                own = own + (total if chosen is None else total.index_select(0, chosen))
+            total = node.__dict__["_total"] = own.to(torch.float64)
+        assert total is not None
+        return total
+
+    def _after(self, number: int) -> tuple[SeriesTrace, Tensor | None]:
+        """The trace after so many steps, and which of its particles (N,) are ancestors of these."""
+        wanted = self.steps + 1 + number if number < 0 else number
+        if not 0 <= wanted <= self.steps:
+            raise InputError(
+                f"step {number} of a series was asked for, which has run {self.steps}; give 0 (what `init` "
+                f"drew) to {self.steps}."
+            )
+        node, index = self, None
+        while node.steps > wanted:
+            if isinstance(node, Forgotten) or node.stage.before is None:
+                raise _forgotten(wanted)
+            node, index = node.stage.before, composed(node.stage.chosen, index)
+        if isinstance(node, Forgotten):
+            raise _forgotten(wanted)
+        return node, index
+
+    def since(self, previous: Trace) -> list[str]:
+        """The addresses that `extend` added to `previous`: all of the newest step's, if it is another."""
+        same = isinstance(previous, SeriesTrace) and previous.steps == self.steps
+        return [] if same else self.addresses
+
+    def ancestors(self, number: int) -> Tensor:
+        """Which particle (N,) int64 each one descends from, of those that the step gave, not yet chosen from."""
+        then, index = self._after(number)
+        return torch.arange(then.particles) if index is None else index
+
+    def __getitem__(self, key: str | tuple[str, int] | Index) -> Any:
+        if isinstance(key, str):
+            return super().__getitem__(key)
+        if isinstance(key, tuple) and len(key) == 2 and isinstance(key[0], str):
+            then, chosen = self._after(int(key[1]))
+            value = then[key[0]]
+            return value if chosen is None or key[0] not in then.choices else value.index_select(0, chosen)
+        index = self._index(key)
+        whole, first = (self, None) if self.origin is None else self.origin
+        both = composed(first, index)
+        assert both is not None
+        return replace(
+            whole,
+            program=self.stage.take(index),
+            particles=len(index),
+            choices=Chosen(whole.choices, both),
+            carried={a: e.take(index) for a, e in self.carried.items()},
+            known={},
+            hidden=self.hidden,
+            origin=(whole, both),
+        )
+
+    def settled(self) -> SeriesTrace:
+        """The same trace, nothing of it left to be gathered."""
+        if self.origin is None:
+            return self
+        whole, index = self.origin
+        known = {a: v.index_select(0, index) for a, v in whole.known.items() if a not in self.known}
+        return replace(self, choices=dict(self.choices), known={**known, **self.known}, origin=None)
+
+    def where(self, mask: Tensor, other: Trace) -> SeriesTrace:
+        """This trace where `mask` (N,) is true, the other (of the same step and past) elsewhere.
+
+        Raises:
+            InputError: the two do not go on from the same step of one population.
+        """
+        assert isinstance(other, SeriesTrace)
+        first, second = self.settled(), other.settled()
+        merged = super(SeriesTrace, first).where(mask, second)
+        return replace(merged, program=first.stage.where(mask, second.stage))  # type: ignore[return-value]
+
+    def _moved(self, *args: Any) -> Trace:
+        return super(SeriesTrace, self.settled())._moved(*args)
+
+    def next_stage(self) -> Stage:
+        """The step that comes after this trace's, for its particles."""
+        whole, index = (self, None) if self.origin is None else self.origin
+        series = self.stage.series
+        if not series.history:
+            whole, index = Forgotten(Stage(series, self.steps), (), self.particles, {}, {}), None
+            whole.__dict__["_result"] = self.state
+        else:
+            # The state is all that the next step needs: the distributions of a past step are let go.
+            whole.__dict__["_result"] = whole._result
+            whole.__dict__.pop("_run", None)
+        return Stage(series, self.steps + 1, whole, () if index is None else (index,))
+
+
+class Forgotten(SeriesTrace):
+    """An earlier step of which only the state is kept."""
+
+
+def _forgotten(number: int) -> InputError:
+    return InputError(
+        f"step {number} of a series was asked for, which was not kept; make the series with `history=True`."
+    )
