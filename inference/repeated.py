@@ -22,6 +22,7 @@ from bcppl.errors import InputError
 from bcppl.inference.arviz import at_draws, check_alike, draw, import_arviz, seeded
 from bcppl.inference.population import Population
 from bcppl.inference.summaries import is_pose, mean
+from bcppl.traces import Trace
 
 Run = Callable[[int], Any]
 
@@ -105,11 +106,38 @@ class Repeated:
         return float(without.std(correction=0) * math.sqrt(count - 1))
 
     @cached_property
+    def log_weights(self) -> Tensor:
+        """Log weights of all particles of all runs, one run after another, each run with its evidence."""
+        return torch.cat([normalised(p.log_weights).log() + p.log_evidence for p in self.populations])
+
+    def belief(self, address: str) -> Belief:
+        """All particles of all runs read as a posterior over the pose at an address."""
+        each = torch.cat([p.trace.choices[address] for p in self.populations])
+        return replace(
+            self.populations[0].belief(address), world_from_part=each, log_weights=self.log_weights
+        )
+
+    def mean(self, address: str) -> Tensor:
+        """The weighted mean (*event) over all runs at a latent address, of poses the mean pose (7,).
+
+        Raises:
+            InputError: no latent site has that address.
+        """
+        if is_pose(self.populations[0], address):
+            return self.belief(address).mean
+        share = torch.softmax(self.log_evidences, 0)
+        return torch.einsum("r,r...->...", share, torch.stack([mean(p, address) for p in self.populations]))
+
+    @cached_property
     def pooled(self) -> Population:
         """All particles of all runs, each run with the weight of its evidence.
 
         How sure its evidence is, `standard_error` says: what one run knows of that is not put together.
+
+        Raises:
+            InputError: the runs are of a long series, whose traces hang on the steps before.
         """
+        _refuse_series(self.populations[0])
         traces = [population.trace for population in self.populations]
         first = traces[0]
         shared = set.intersection(*(set(trace.known) for trace in traces))
@@ -120,10 +148,9 @@ class Repeated:
             known={a: torch.cat([trace.known[a] for trace in traces]) for a in first.known if a in shared},
             carried={},
         )
-        log_weights = [normalised(p.log_weights).log() + p.log_evidence for p in self.populations]
         before = np.cumsum([0, *(int(p.founders.max()) + 1 for p in self.populations)])
         founders = [p.founders + int(b) for p, b in zip(self.populations, before, strict=False)]
-        return Population(trace, torch.cat(log_weights), self.log_evidence, torch.cat(founders))
+        return Population(trace, self.log_weights, self.log_evidence, torch.cat(founders))
 
     def r_hat(self, draws: int | None = None, seed: int = 0) -> dict[str, Tensor]:
         """Rank-normalised split R-hat (D,) of every latent address: near 1 where the runs agree.
@@ -151,17 +178,13 @@ class Repeated:
         for address in self.populations[0].trace.choices:
             values = at_draws([p.trace.choices[address] for p in self.populations], chosen)
             if is_pose(self.populations[0], address):
-                freedom = self._pooled_belief(address).freedom
-                center = self._pooled_belief(address).mean
-                values = freedom.coordinates(poses.local(center, values))
+                belief = self.belief(address)
+                values = belief.freedom.coordinates(poses.local(belief.mean, values))
             numbers = values.to(torch.float64).reshape(*values.shape[:2], -1).numpy()
             with np.errstate(invalid="ignore"):
                 each = [float(arviz.rhat(numbers[..., k])) for k in range(numbers.shape[-1])]
             found[address] = torch.tensor(each, dtype=torch.float64)
         return found
-
-    def _pooled_belief(self, address: str) -> Belief:
-        return self.pooled.belief(address)
 
     def table(self) -> str:
         """The runs, one to a line, their evidence together, and where ArviZ is installed their R-hat."""
@@ -187,7 +210,7 @@ class Repeated:
             return []
         lines = []
         for address, ratio in ratios.items():
-            numbers = " ".join(f"{value:.5g}" for value in mean(self.pooled, address).flatten().tolist()[:8])
+            numbers = " ".join(f"{value:.5g}" for value in self.mean(address).flatten().tolist()[:8])
             worst = max(ratio[~ratio.isnan()].tolist(), default=math.nan)
             lines.append(f"{address}: R-hat at most {worst:.3f}, mean {numbers}")
         return lines
@@ -231,6 +254,7 @@ def _shared_out(run: Run, seeds: Sequence[int], processes: int) -> list[Populati
     ) as pool:
         elsewhere = {k: pool.submit(_numbers, run, seeds[k]) for k in range(len(seeds)) if k not in here}
         found = {k: _population(run, seeds[k]) for k in here}
+        _refuse_series(found[0])
         found.update({k: _put_into(found[0], *sent.result()) for k, sent in elsewhere.items()})
     return [found[k] for k in range(len(seeds))]
 
@@ -248,6 +272,14 @@ def _numbers(run: Run, seed: int) -> tuple[Numbers, Numbers]:
         {name: {a: v.numpy() for a, v in part.items()} for name, part in values.items()},
         {name: v.numpy() if isinstance(v, Tensor) else v for name, v in rest.items()},
     )
+
+
+def _refuse_series(population: Population) -> None:
+    if type(population.trace) is not Trace:
+        raise InputError(
+            "runs of a long series cannot be pooled or shared out among processes; "
+            "run them here and read each by itself."
+        )
 
 
 def _put_into(first: Population, values: Numbers, rest: Numbers) -> Population:

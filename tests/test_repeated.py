@@ -87,6 +87,9 @@ def test_pooled_runs_weigh_by_their_evidence() -> None:
     pooled = Repeated((few, many), (0, 1)).pooled
     assert len(pooled) == 16 and pooled.log_evidence == pytest.approx(math.log(2.0))
     assert float(mean(pooled, "x")) == pytest.approx(0.75)
+    both = Repeated((few, many), (0, 1))
+    assert float(both.mean("x")) == pytest.approx(0.75)
+    assert torch.equal(both.mean("hole"), pooled.belief("hole").mean)
     assert pooled.founders.tolist() == list(range(16)), "nobody descends from another run"
     expected = torch.cat([few.trace.log_prob(), many.trace.log_prob()])
     torch.testing.assert_close(pooled.trace.log_prob(), expected)
