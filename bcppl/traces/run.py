@@ -8,7 +8,8 @@ particle axis comes first: (N, 5, *event), and what is observed of them is (5, *
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ import pyro
 import torch
 from pyro.poutine.indep_messenger import IndepMessenger
 from pyro.poutine.messenger import Messenger
+from pyro.poutine.runtime import _DIM_ALLOCATOR, _PYRO_STACK
 from pyro.poutine.subsample_messenger import _Subsample
 from torch import Tensor
 
@@ -69,11 +71,28 @@ def run(
     recorder = _Recorder(particles, given)
     with carrying(carried) as used, torch.no_grad(), pyro.validation_enabled(False):
         try:
-            with recorder, _Particles(PARTICLES, particles, dim=-1):
+            with _apart(), recorder, _Particles(PARTICLES, particles, dim=-1):
                 result = program(*args)
         except ValueError as error:
             raise _explained(error, particles) from error
     return Run(recorder.distributions, recorder.values, frozenset(recorder.fixed), used, result)
+
+
+@contextmanager
+def _apart() -> Iterator[None]:
+    """Within a run, another one that is no part of it: a proposal reads a trace that runs its own program."""
+    outermost = next((k for k, each in enumerate(_PYRO_STACK) if isinstance(each, _Recorder)), None)
+    if outermost is None:
+        yield
+        return
+    handlers, plates = _PYRO_STACK[outermost:], _DIM_ALLOCATOR._stack[:]
+    del _PYRO_STACK[outermost:]
+    _DIM_ALLOCATOR._stack[:] = []
+    try:
+        yield
+    finally:
+        _PYRO_STACK[outermost:] = handlers
+        _DIM_ALLOCATOR._stack[:] = plates
 
 
 def inward(value: Tensor, distribution: Any) -> Tensor:
