@@ -38,11 +38,13 @@ class Hits:
         particle: (M,) which particle.
         pixel: (M,) which pixel, v * width + u.
         depth: (M,) depth along the optical axis, metres.
+        face: (M,) which face of the part's mesh; None unless it was asked for.
     """
 
     particle: Indices
     pixel: Indices
     depth: Array
+    face: Indices | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +103,7 @@ class DepthRenderer:
         camera: Camera,
         world_from_part: Tensor | Array,
         counted: npt.NDArray[np.bool_] | None = None,
+        faces: bool = False,
     ) -> Hits:
         """What the camera sees of the part, as the pixels that see it.
 
@@ -108,6 +111,7 @@ class DepthRenderer:
             camera: the camera.
             world_from_part: (N, 7) the part's poses.
             counted: (H * W,) or (H, W) the pixels that matter; None for all.
+            faces: whether to say which face of the mesh is hit.
 
         Returns:
             The hits. A surface nearer than `camera.near` is a hit too; one behind the camera is none.
@@ -126,14 +130,18 @@ class DepthRenderer:
             ends = np.cumsum(spans.length)
             rays = int(ends[-1]) if len(ends) else 0
             particle, pixel, depth = np.empty(rays, np.int64), np.empty(rays, np.int64), np.empty(rays)
+            face = np.empty(rays, np.int64) if faces else None
             cuts = np.searchsorted(ends, np.arange(BATCH, rays, BATCH)).tolist()
             total = 0
             for first, last in zip([0, *cuts], [*cuts, len(ends)], strict=True):
-                free = Hits(particle[total:], pixel[total:], depth[total:])
+                ahead = None if face is None else face[total:]
+                free = Hits(particle[total:], pixel[total:], depth[total:], ahead)
                 hit, cast = self._cast(camera, rotation, offset, spans[first:last], counted, free)
                 total += hit
                 effort.amount += cast
-            return Hits(particle[:total], pixel[:total], depth[:total])
+            return Hits(
+                particle[:total], pixel[:total], depth[:total], None if face is None else face[:total]
+            )
 
     def images(self, camera: Camera, world_from_part: Tensor | Array) -> Array:
         """Depth images (N, H, W) in metres, +inf where a pixel does not see the part.
@@ -214,8 +222,15 @@ class DepthRenderer:
         directions = step.astype(np.float32).take(span, axis=0)
         directions *= along.astype(np.float32)[:, None]
         directions += first.astype(np.float32).take(span, axis=0)
-        depth = self._scene.run(origin.astype(np.float32).take(span, axis=0), directions, query="DISTANCE")
-        hit = np.flatnonzero(depth < MISS)
+        origins = origin.astype(np.float32).take(span, axis=0)
+        if free.face is None:
+            depth = self._scene.run(origins, directions, query="DISTANCE")
+            hit = np.flatnonzero(depth < MISS)
+        else:
+            found = self._scene.run(origins, directions, query="INTERSECT", output=1)
+            depth = found["tfar"]
+            hit = np.flatnonzero(depth < MISS)
+            free.face[: len(hit)] = found["primID"].take(hit)
         span = span.take(hit)
         spans.particle.take(span, out=free.particle[: len(hit)], mode="clip")
         np.add(first_pixel.take(span), along.take(hit), out=free.pixel[: len(hit)])
