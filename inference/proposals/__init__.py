@@ -1,6 +1,24 @@
 """Proposals: programs that choose new values at latent addresses."""
 
+from bcppl.inference.proposals.ancestral import prior
+from bcppl.inference.proposals.density import independent
+from bcppl.inference.proposals.differences import differential_evolution
 from bcppl.inference.proposals.proposal import Fitted, Program, Proposal, program_of
-from bcppl.inference.proposals.walk import drift, spread_of
+from bcppl.inference.proposals.spread import spread_of
+from bcppl.inference.proposals.symmetries import Continuous, rotations, symmetry
+from bcppl.inference.proposals.walk import drift
 
-__all__ = ["Fitted", "Program", "Proposal", "drift", "program_of", "spread_of"]
+__all__ = [
+    "Continuous",
+    "Fitted",
+    "Program",
+    "Proposal",
+    "differential_evolution",
+    "drift",
+    "independent",
+    "prior",
+    "program_of",
+    "rotations",
+    "spread_of",
+    "symmetry",
+]

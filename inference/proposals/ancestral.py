@@ -1,0 +1,56 @@
+"""Prior: latent values drawn anew from the program itself, discrete ones as well."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+import pyro
+from torch import Tensor
+
+from bcppl.errors import InputError
+from bcppl.traces import Trace
+
+
+def prior(*addresses: str) -> Callable[[Trace], None]:
+    """Some latent values drawn anew from the program, in its order, given the others' values.
+
+    Later ones are given the earlier ones' new values, as when the program is run. What it says of the other
+    sites decides: proposing from the prior is right for any value, and good for values of which the
+    observations say little.
+
+    Args:
+        addresses: latent addresses, in any order.
+
+    Raises:
+        InputError: no address is given; when it is run: one is not latent.
+    """
+    if not addresses:
+        raise InputError("prior is given no address; give one or more that are latent.")
+
+    def regenerated(trace: Trace) -> None:
+        for address in addresses:
+            if address not in trace.choices:
+                raise InputError(
+                    f"prior is to draw {address!r} anew, which is no latent address; "
+                    f"latent are {', '.join(trace.choices) or 'none'}."
+                )
+        fresh: dict[str, Tensor] = {}
+        for address in trace.addresses:
+            if address in addresses:
+                current = trace.at(fresh) if fresh else trace
+                fresh[address] = _sampled(address, current.distributions[address])
+
+    return regenerated
+
+
+def _sampled(address: str, distribution: Any) -> Tensor:
+    """A site's value, particle axis first, sampled in the plates that its distribution needs."""
+    sizes = distribution.batch_shape[:-1]
+    with ExitStack() as stack:
+        for k, size in enumerate(sizes):
+            dim = k - len(sizes) - 1
+            stack.enter_context(pyro.plate(f"{address} plate {dim}", size, dim=dim))
+        value: Tensor = pyro.sample(address, distribution)
+    return value.movedim(len(sizes), 0)

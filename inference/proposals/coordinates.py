@@ -1,0 +1,255 @@
+"""Coordinates in which a latent value is moved: a pose's tangent space, or the real line for any support.
+
+A value whose support is bounded (positive numbers, an interval, a simplex) is moved where it is not, by the
+transformation that Pyro has for its support, and densities take its Jacobian along.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+from torch.distributions import biject_to, constraints
+from torch.distributions.transforms import IndependentTransform, Transform, identity_transform
+
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.distributions.mixture import MixturePose
+from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.vectors import NormalStep
+from bcppl.errors import InputError
+from bcppl.poses import Freedom
+from bcppl.traces import Trace
+
+
+class Coordinates(Protocol):
+    """How proposals read and move one latent address.
+
+    A place is where a value is, in whatever form `normal` and `mixture` take as a centre: a pose (..., 7), or
+    a vector (..., d) in unbounded coordinates.
+
+    Attributes:
+        dimension: d.
+    """
+
+    dimension: int
+
+    def of(self, trace: Trace) -> Coordinates:
+        """The same for the particles of another trace, on whose other values a support may hang."""
+
+    def places(self, values: Tensor) -> Tensor:
+        """Where the values (N, *event) of the particles are, (N, 7) or (N, d)."""
+
+    def steps(self, start: Tensor, end: Tensor) -> Tensor:
+        """The coordinates (..., d) of the steps between places."""
+
+    def stepped(self, start: Tensor, step: Tensor) -> Tensor:
+        """The places that steps (..., d) lead to: the inverse of `steps`."""
+
+    def mean(self, places: Tensor, weights: Tensor) -> Tensor:
+        """The weighted mean, one place."""
+
+    def normal(self, center: Tensor, covariance: Tensor, size: Tensor) -> Any:
+        """The distribution of values, one for each particle, that is normal in these coordinates.
+
+        Args:
+            center: places of the N particles.
+            covariance: (d, d).
+            size: (N,) times which each particle's step is made.
+        """
+
+    def mixture(self, log_weights: Tensor, centers: Tensor, covariance: Tensor) -> Any:
+        """A mixture of K such normals.
+
+        Args:
+            log_weights: (K,) or (N, K).
+            centers: places (K, ...) or (N, K, ...).
+            covariance: (d, d), (K, d, d) or (N, K, d, d).
+        """
+
+
+class PoseCoordinates:
+    """A pose's free axes, in its tangent space: metres, then radians."""
+
+    def __init__(self, freedom: Freedom) -> None:
+        self.freedom = freedom
+        self.dimension = freedom.dimension
+
+    def of(self, trace: Trace) -> PoseCoordinates:
+        """These: free axes are the same for all."""
+        return self
+
+    def places(self, values: Tensor) -> Tensor:
+        """The poses themselves."""
+        return values
+
+    def steps(self, start: Tensor, end: Tensor) -> Tensor:
+        """Free coordinates of the tangents that lead from pose to pose."""
+        return self.freedom.coordinates(poses.local(start, end))
+
+    def stepped(self, start: Tensor, step: Tensor) -> Tensor:
+        """The poses that tangents lead to."""
+        return poses.retract(start, self.freedom.embed(step))
+
+    def mean(self, places: Tensor, weights: Tensor) -> Tensor:
+        """The belief's mean, reached from a pose along the free axes: the others stay as they are held."""
+        mean = Belief(places, weights.log(), self.freedom).mean
+        return self.stepped(places[0], self.steps(places[0], mean))
+
+    def normal(self, center: Tensor, covariance: Tensor, size: Tensor) -> Any:
+        """A `NormalPose`."""
+        return NormalPose(center, size[:, None, None] ** 2 * covariance, self.freedom)
+
+    def mixture(self, log_weights: Tensor, centers: Tensor, covariance: Tensor) -> Any:
+        """A `MixturePose`."""
+        return MixturePose(log_weights, centers, covariance, self.freedom)
+
+
+class VectorCoordinates:
+    """Any other continuous value, flattened and unbounded; its distribution's support says how."""
+
+    def __init__(self, address: str, transform: Unflattened) -> None:
+        self.address = address
+        self.transform = transform
+        self.dimension = transform.dimension
+
+    def of(self, trace: Trace) -> Coordinates:
+        """The same for other particles; a support may hang on their other values."""
+        if self.transform.unbounded:
+            return VectorCoordinates(self.address, self.transform.of(trace[self.address]))
+        return coordinates_of(trace, self.address)
+
+    def places(self, values: Tensor) -> Tensor:
+        """The values' unbounded coordinates (N, d)."""
+        return self.transform.inv(values)
+
+    def steps(self, start: Tensor, end: Tensor) -> Tensor:
+        """Differences."""
+        return end - start
+
+    def stepped(self, start: Tensor, step: Tensor) -> Tensor:
+        """Sums."""
+        return start + step
+
+    def mean(self, places: Tensor, weights: Tensor) -> Tensor:
+        """The weighted mean."""
+        return weights @ places
+
+    def normal(self, center: Tensor, covariance: Tensor, size: Tensor) -> Any:
+        """A multivariate normal, transformed to the support."""
+        return self._on_support(NormalStep(center, torch.linalg.cholesky(covariance), size))
+
+    def mixture(self, log_weights: Tensor, centers: Tensor, covariance: Tensor) -> Any:
+        """A mixture of multivariate normals, transformed to the support."""
+        particles, count = self.transform.particles, log_weights.shape[-1]
+        which = dist.Categorical(logits=log_weights.to(torch.float64), validate_args=False)
+        each = dist.MultivariateNormal(
+            centers.expand(particles, count, self.dimension), covariance, validate_args=False
+        )
+        return self._on_support(
+            dist.MixtureSameFamily(which.expand(torch.Size([particles])), each, validate_args=False)
+        )
+
+    def _on_support(self, base: Any) -> Any:
+        if self.transform.trivial:
+            return base
+        return dist.TransformedDistribution(base, [self.transform], validate_args=False)
+
+
+class Unflattened(Transform):
+    """From unbounded coordinates (N, d) in float64 to the values (N, *plates, *event) of a site.
+
+    Args:
+        distribution: of the site, (*plates, N) its batch shape.
+        values: (N, *plates, *event), for their shape and type.
+    """
+
+    bijective = True
+    domain = constraints.real_vector
+
+    def __init__(self, distribution: Any, values: Tensor) -> None:
+        super().__init__(cache_size=0)
+        self.to_support = biject_to(distribution.support)
+        self.plates = len(distribution.batch_shape) - 1
+        self.unbounded = _is_identity(self.to_support)
+        self._set(values)
+
+    def of(self, values: Tensor) -> Unflattened:
+        """The same for other particles; for a support that is the same for all."""
+        other = Unflattened.__new__(Unflattened)
+        other.__dict__.update(self.__dict__)
+        other._set(values)
+        return other
+
+    def _set(self, values: Tensor) -> None:
+        self.particles, self.event, self.dtype = len(values), values.shape[1:], values.dtype
+        self.codomain = constraints.independent(constraints.real, len(self.event))
+        self.free_event = self._free(values).shape[1 + self.plates :]
+        self.dimension = math.prod(self.event[: self.plates]) * math.prod(self.free_event)
+        self.trivial = self.unbounded and len(self.event) == 1 and self.dtype == torch.float64
+
+    def _free(self, values: Tensor) -> Tensor:
+        inside = values.to(torch.float64).movedim(0, self.plates)
+        return self.to_support.inv(inside).movedim(self.plates, 0)
+
+    def _inside(self, x: Tensor) -> Tensor:
+        free = x.reshape(self.particles, *self.event[: self.plates], *self.free_event)
+        return free.movedim(0, self.plates)
+
+    def _call(self, x: Tensor) -> Tensor:
+        return self.to_support(self._inside(x)).movedim(self.plates, 0).to(self.dtype)
+
+    def _inverse(self, y: Tensor) -> Tensor:
+        return self._free(y).reshape(self.particles, -1)
+
+    def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
+        """(N,) of all entries together."""
+        inside = self._inside(x)
+        each = self.to_support.log_abs_det_jacobian(inside, y.to(torch.float64).movedim(0, self.plates))
+        return each.movedim(self.plates, 0).reshape(self.particles, -1).sum(dim=1)
+
+    def forward_shape(self, shape: tuple[int, ...]) -> torch.Size:
+        """From (N, d) to (N, *plates, *event)."""
+        return torch.Size([*shape[:-1], *self.event])
+
+    def inverse_shape(self, shape: tuple[int, ...]) -> torch.Size:
+        """From (N, *plates, *event) to (N, d)."""
+        return torch.Size([*shape[: len(shape) - len(self.event)], self.dimension])
+
+
+def _is_identity(transform: Transform) -> bool:
+    while isinstance(transform, IndependentTransform):
+        transform = transform.base_transform
+    return transform == identity_transform
+
+
+def coordinates_of(trace: Trace, address: str) -> Coordinates:
+    """The coordinates in which proposals move a latent address of a trace.
+
+    Raises:
+        InputError: the address is not latent, is discrete, or its support has no unbounded coordinates.
+    """
+    if address not in trace.choices:
+        raise InputError(
+            f"a proposal is to move {address!r}, which is no latent address; "
+            f"latent are {', '.join(trace.choices) or 'none'}."
+        )
+    distribution = trace.distributions[address]
+    freedom = getattr(distribution, "freedom", None)
+    if freedom is not None:
+        return PoseCoordinates(freedom)
+    value = trace[address]
+    if distribution.support.is_discrete or not value.is_floating_point():
+        raise InputError(
+            f"address {address!r} is discrete and cannot be moved by small steps; use prior({address!r})."
+        )
+    try:
+        return VectorCoordinates(address, Unflattened(distribution, value))
+    except NotImplementedError as error:
+        raise InputError(
+            f"the support of address {address!r}, {distribution.support}, has no unbounded coordinates; "
+            f"use prior({address!r}) or a proposal of your own."
+        ) from error

@@ -1,0 +1,76 @@
+"""Differential evolution: steps along differences of particles, on SE(3) and in vectors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from bcppl.beliefs import normalised
+from bcppl.inference.population import Population
+from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
+from bcppl.inference.proposals.proposal import Fitted
+from bcppl.inference.proposals.spread import spread_of
+from bcppl.traces import Trace
+
+DIFFERENCES = 200  # how many are drawn when it is fitted
+
+
+def differential_evolution(
+    address: str, *, scale: float | None = None, jumps: float = 0.1, noise: float = 0.05
+) -> Fitted:
+    """A step along the difference of two other particles, up or down it, and some noise.
+
+    ter Braak, A Markov Chain Monte Carlo version of the genetic algorithm Differential Evolution, Statistics
+    and Computing 16, 2006, eq. 2. Some steps are whole differences: these lead from one mode to another. The
+    pairs are drawn by weight, from the particles that it is fitted to; of the two directions the mixture's
+    density is taken. For a pose a difference is the tangent from one pose to the other.
+
+    Args:
+        address: which latent value to move.
+        scale: what differences are multiplied by; by default ter Braak's 2.38 / sqrt(2 d).
+        jumps: how often the difference is taken whole, a share.
+        noise: standard deviation of the noise, in the particles' own spread.
+
+    Raises:
+        InputError: when it is fitted: the address is not latent, or is discrete.
+    """
+    spread = spread_of(address)
+
+    def fit(population: Population) -> Callable[[Trace], None]:
+        covariance = noise**2 * spread(population)
+        known = coordinates_of(population.trace, address)
+        drawn = _differences(known, known.places(population.trace[address]), population.log_weights)
+        usual = 2.38 / math.sqrt(2.0 * known.dimension) if scale is None else scale
+        sizes = torch.tensor([usual, 1.0], dtype=torch.float64)
+
+        def along(trace: Trace) -> None:
+            coordinates = known.of(trace)
+            which = pyro.sample("difference", dist.Categorical(torch.ones(len(drawn), dtype=torch.float64)))
+            whole = pyro.sample("whole", dist.Bernoulli(torch.tensor(jumps, dtype=torch.float64)))
+            step = sizes[whole.long()][:, None] * drawn[which]
+            place = coordinates.places(trace[address])
+            ends = coordinates.stepped(place[:, None], torch.stack([step, -step], dim=1))
+            pyro.sample(
+                address, coordinates.mixture(torch.zeros(len(step), 2, dtype=torch.float64), ends, covariance)
+            )
+
+        return along
+
+    return Fitted(fit)
+
+
+def _differences(coordinates: Coordinates, places: Tensor, log_weights: Tensor) -> Tensor:
+    """Steps (M, d) from particle to particle, both drawn by weight, no particle with itself."""
+    weights = normalised(log_weights)
+    if int((weights > 0).sum()) < 2:
+        return torch.zeros(1, coordinates.dimension, dtype=torch.float64)
+    first = torch.multinomial(weights, DIFFERENCES, replacement=True)
+    others = weights.expand(DIFFERENCES, -1).clone()
+    others[torch.arange(DIFFERENCES), first] = 0.0
+    second = torch.multinomial(others, 1)[:, 0]
+    return coordinates.steps(places[first], places[second])

@@ -1,0 +1,123 @@
+"""Symmetry: jumps between poses at which a part looks or feels alike, or nearly so."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.mixture import MixturePose
+from bcppl.distributions.poses import HELD
+from bcppl.errors import InputError
+from bcppl.poses import FREE, Freedom
+from bcppl.traces import Trace
+
+
+@dataclass(frozen=True)
+class Continuous:
+    """Turns about an axis of the part, or shifts along it, or both in step, by any amount up to a largest.
+
+    Attributes:
+        axis: (3,) direction, of any length.
+        point: (3,) a point on the axis, metres.
+        turn: the largest angle to either side, radians, at most pi.
+        slide: the largest shift to either side, metres.
+    """
+
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn: float = math.pi
+    slide: float = 0.0
+
+    def at(self, share: Tensor) -> Tensor:
+        """The motions (..., 7) `part_from_part` by a share (...,) of the largest amount, in [-1, 1]."""
+        axis = torch.tensor(self.axis, dtype=torch.float64)
+        axis = axis / axis.norm()
+        tangent = torch.cat([self.slide * axis, self.turn * axis])
+        turned = poses.retract(poses.identity(*share.shape), share[..., None] * tangent)
+        point = torch.tensor(self.point, dtype=torch.float64)
+        around = point - (poses.rotation_matrix(turned) @ point[:, None])[..., 0]
+        return torch.cat([turned[..., :3] + around, turned[..., 3:]], dim=-1)
+
+
+def rotations(
+    order: int,
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Tensor:
+    """The turns (order - 1, 7) about an axis of the part that an `order`-fold symmetry has, but for none.
+
+    Raises:
+        InputError: the order is below 2.
+    """
+    if order < 2:
+        raise InputError(f"a rotational symmetry is of order {order}; give 2 or more.")
+    shares = 2.0 * torch.arange(1, order, dtype=torch.float64) / order
+    return Continuous(axis, point).at(shares)
+
+
+def symmetry(
+    address: str, transforms: Any, *, spread: tuple[float, float] = (0.0005, 0.005)
+) -> Callable[[Trace], None]:
+    """A jump by one of the motions that leave the part as it is, or nearly so, and some noise.
+
+    The pose goes from `world_from_part` to `world_from_part part_from_part`. Every motion is as likely as
+    its inverse, and the density is that of the mixture over all of them.
+
+    Args:
+        address: of the pose.
+        transforms: motions (K, 7) `part_from_part`, such as `rotations(4)`; inverses that are missing are
+            added. Or a `Continuous` family.
+        spread: standard deviations of the noise, metres and radians: about those of a mode.
+
+    Raises:
+        InputError: the motions are no poses, or the spread is not positive; when it is run: the address is
+            no latent pose, or a motion would leave the pose's free axes.
+    """
+    if min(spread) <= 0.0:
+        raise InputError(f"symmetry is given a spread of {spread}; give positive metres and radians.")
+    family = transforms if isinstance(transforms, Continuous) else None
+    if family is not None and (not 0.0 <= family.turn <= math.pi or not any(family.axis)):
+        raise InputError(
+            f"a continuous symmetry has axis {family.axis} and turns up to {family.turn} rad; "
+            "give a direction, and an angle from 0 to pi."
+        )
+    listed = poses.identity(1) if family is not None else _with_inverses(transforms)
+
+    def alike(trace: Trace) -> None:
+        pose = trace[address]
+        freedom: Freedom = getattr(trace.distributions[address], "freedom", FREE)
+        if pose.ndim != 2 or pose.shape[-1] != 7 or address not in trace.choices:
+            raise InputError(f"symmetry is to move {address!r}, which is no latent pose; name one that is.")
+        motions = listed
+        if family is not None:
+            amount = pyro.sample("amount", dist.Uniform(*torch.tensor([0.0, 1.0], dtype=torch.float64)))
+            motions = family.at(torch.stack([amount, -amount], dim=-1))
+        ends = poses.compose(pose[:, None], motions)
+        if bool((freedom.off_axis(poses.local(pose[:, None], ends)) > HELD).any()):
+            raise InputError(
+                f"a symmetry moves the pose at {address!r} along an axis that is held; "
+                "leave that motion out, or free the axis."
+            )
+        deviations = torch.tensor([spread[0]] * 3 + [spread[1]] * 3, dtype=torch.float64)
+        equal = torch.zeros(ends.shape[:-1], dtype=torch.float64)
+        pyro.sample(address, MixturePose(equal, ends, freedom.coordinates(deviations), freedom))
+
+    return alike
+
+
+def _with_inverses(transforms: Any) -> Tensor:
+    """Motions (K, 7) and the inverses among which they are not."""
+    motions = poses.as_pose(transforms, "a symmetry").reshape(-1, 7)
+    if len(motions) == 0:
+        raise InputError("symmetry is given no motion; give one or more, such as rotations(2).")
+    back = poses.inverse(motions)
+    apart = poses.local(back[:, None], motions).abs().amax(dim=-1)
+    return torch.cat([motions, back[apart.amin(dim=1) > 1e-9]])
