@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyro
@@ -164,7 +164,7 @@ def run(problem: Problem, method: Method, particles: int, seed: int) -> Outcome:
         population.log_evidence - problem.log_evidence,
         Counted.calls,
         seconds,
-        len(done.exponents),
+        len(done.info.exponents),
         distinct(population),
         (mean / problem.spread).tolist(),
     )
@@ -187,19 +187,3 @@ def effective(deviations: Sequence[Sequence[float]]) -> float:
     effective sample size of the weights does not see.
     """
     return float(1.0 / np.mean(np.square(deviations)))
-
-
-def ratio(ours: Sequence[float], theirs: Sequence[float], draws: int = 10_000) -> tuple[float, float, float]:
-    """The ratio of two mean squared errors, and its 2.5 and 97.5 % bounds.
-
-    By the bootstrap: both sets of runs are drawn anew, each with replacement (percentile interval; Efron and
-    Tibshirani, An Introduction to the Bootstrap, 1993, section 13.3).
-    """
-    generator = np.random.default_rng(0)
-
-    def means(errors: Sequence[float]) -> np.ndarray[Any, Any]:
-        squared = np.square(errors)
-        return squared[generator.integers(len(squared), size=(draws, len(squared)))].mean(1)
-
-    low, high = np.quantile(means(ours) / means(theirs), (0.025, 0.975))
-    return float(np.mean(np.square(ours)) / np.mean(np.square(theirs))), float(low), float(high)

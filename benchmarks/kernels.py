@@ -12,19 +12,18 @@ scatter of several runs, so copies of a particle count once.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from evidence import PROBLEMS, Method, Outcome, effective, ratio, run, within
+from beside import beside, timed
+from evidence import PROBLEMS, Method, Outcome, effective, run
 from jobs import each
-from peer import ask
+from kernel_table import POSES, PROBES, VECTORS, walk
 from report import DATA, Row, finish, options, show
 
 from bcppl import poses
-from bcppl.inference.kernels import Kernel, cycle, delayed_acceptance, metropolis_hastings, mixture, repeat
-from bcppl.inference.proposals import drift
+from bcppl.inference.kernels import Kernel
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.inference.smc import smc, tempered
 from bcppl.models import part_in_view, peg_in_hole
@@ -35,29 +34,6 @@ SCENE = DATA / "lmo_scene2_frame3"
 OBJECT = 5
 PARTICLES = 75
 COUNTS = (75, 1000, 10_000)
-
-
-def walk(address: str) -> Kernel:
-    """The default program's random walk, some of its steps long ones."""
-    return metropolis_hastings(drift(address, (0.2, 2.0)))
-
-
-def even(address: str) -> Kernel:
-    """A random walk whose steps are between half of the best length for a normal posterior and all of it."""
-    return metropolis_hastings(drift(address, (0.5, 1.0)))
-
-
-# By name, what makes a kernel that moves the value at an address; the combinations make two moves a sweep.
-VECTORS: dict[str, Callable[[str], Kernel]] = {
-    "drift": even,
-    "drift, many scales": walk,
-    "repeat drift twice": lambda address: repeat(even(address), 2),
-    "mixture of two drifts": lambda address: mixture([even(address), walk(address)]),
-    "cycle of two drifts": lambda address: cycle(even(address), walk(address)),
-}
-POSES = VECTORS
-# What is compared with other packages: fixed before the comparison, and the same for both problems.
-COMPARED = Method(even("x"), sweeps=3, share=0.8)
 
 
 class Posed(NamedTuple):
@@ -94,8 +70,8 @@ def tables(seeds: range) -> list[Row]:
     rows: list[Row] = []
     for name, problem in PROBLEMS.items():
         lines: list[list[Any]] = []
-        for title, make in VECTORS.items():
-            outcomes = [run(problem, Method(make("x")), 1000, seed) for seed in seeds]
+        for title, (make, sweeps) in VECTORS.items():
+            outcomes = [run(problem, Method(make("x"), sweeps), 1000, seed) for seed in seeds]
             columns = Outcome(*map(np.array, zip(*outcomes, strict=True)))  # type: ignore[arg-type]
             seconds, calls = float(np.median(columns.seconds)), float(np.mean(columns.calls))
             draws = effective([outcome.deviation for outcome in outcomes])
@@ -146,77 +122,12 @@ def tables(seeds: range) -> list[Row]:
     return rows
 
 
-def beside(seed: int, runs: int, counts: tuple[int, ...]) -> list[Row]:
-    """Beside other packages: squared errors at the same number of likelihood calls, and times."""
-    asked = [*counts, "--runs", runs, "--seed", seed]
-    one_thread = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    theirs: list[dict[str, Any]] = []
-    for peer in ("particles", "blackjax"):
-        theirs += ask(peer, f"{peer}_tempering.py", *asked, environment=one_thread) or []
-    rows: list[Row] = []
-    lines: list[list[Any]] = []
-    for result in sorted(theirs, key=lambda r: (r["problem"], r["particles"])):
-        problem = PROBLEMS[result["problem"]]
-        allowed = float(np.mean(result["calls"]))
-        particles = within(problem, COMPARED, allowed, seed)
-        ours = [run(problem, COMPARED, particles, seed + k) for k in range(runs)]
-        errors, calls = [one.error for one in ours], float(np.mean([one.calls for one in ours]))
-        against, low, high = ratio(errors, result["errors"])
-        seconds = float(np.median([one.seconds for one in ours]))
-        slower = seconds / float(np.median(result["seconds"]))
-        who = f"{result['peer']} {result['variant']}"
-        lines.append(
-            [
-                result["problem"],
-                who,
-                result["particles"],
-                particles,
-                int(allowed),
-                f"{calls / allowed:.2f}",
-                f"{np.mean(np.square(result['errors'])):.2g}",
-                f"{np.mean(np.square(errors)):.2g}",
-                f"{against:.2f} [{low:.2f}, {high:.2f}]",
-                f"{np.median(result['seconds']):.3g}",
-                f"{seconds:.3g}",
-                slower,
-            ]
-        )
-        name = f"{result['problem']}, {who}, N {result['particles']}"
-        timed = result["peer"] == "particles" and result["particles"] == max(COUNTS)
-        rows += [
-            Row(f"{name}: squared error of log Z, ours over theirs", against, "ratio", 1.0),
-            Row(f"{name}: the same, 2.5 % bound", low, "ratio"),
-            Row(f"{name}: the same, 97.5 % bound", high, "ratio"),
-            Row(f"{name}: likelihood calls, ours over theirs", calls / allowed, "ratio", 1.02),
-            Row(f"{name}: time, ours over theirs", slower, "ratio", 2.0 if timed else None),
-        ]
-    if lines:
-        show(
-            f"beside other packages: {runs} runs each, ratios with 95 % bootstrap intervals, one thread",
-            [
-                "problem",
-                "peer",
-                "its N",
-                "our N",
-                "calls",
-                "ours",
-                "its error^2",
-                "ours",
-                "ratio",
-                "its s",
-                "ours",
-                "ratio",
-            ],
-            lines,
-        )
-    return rows
-
-
 def look(asked: tuple[str, int, int]) -> Posed:
     """One run of a kernel over the real depth image."""
     name, recording_seed, seed = asked
     recording = command(SCENE, object_id=OBJECT, seed=recording_seed)
-    return posed(part_in_view.model, recording, POSES[name]("part"), 3, 0.6, seed)
+    make, sweeps = POSES[name]
+    return posed(part_in_view.model, recording, make("part"), sweeps, 0.6, seed)
 
 
 def posed(model: Any, recording: Any, kernel: Kernel, sweeps: int, share: float, seed: int) -> Posed:
@@ -278,15 +189,6 @@ def images(seed: int, runs: int, jobs: int) -> list[Row]:
         lines,
     )
     return rows
-
-
-PROBES: dict[str, tuple[Callable[[str], Kernel], int]] = {
-    "drift, 3 sweeps": (walk, 3),
-    "drift, 6 sweeps": (walk, 6),
-    "delayed acceptance, 6 sweeps": (lambda a: delayed_acceptance(walk(a), first="depth_*"), 6),
-    "delayed acceptance, 12 sweeps": (lambda a: delayed_acceptance(walk(a), first="depth_*"), 12),
-    "by windows, 12 sweeps": (lambda a: delayed_acceptance(walk(a), first="depth_*", stages=4), 12),
-}
 
 
 def touch(asked: tuple[str, int, int]) -> Posed:
@@ -357,6 +259,7 @@ def main() -> None:
         rows += tables(range(seed, seed + (3 if quick else 50)))
     if "peers" in arguments.parts:
         rows += beside(seed, arguments.runs or (5 if quick else 100), COUNTS[:1] if quick else COUNTS)
+        rows += [] if quick else timed(seed)
     if "image" in arguments.parts:
         rows += images(seed, 2 if quick else 10, arguments.jobs)
     if "probe" in arguments.parts:
