@@ -264,7 +264,7 @@ class SeriesTrace(Trace):
         return [] if same else self.addresses
 
     def ancestors(self, number: int) -> Tensor:
-        """Which particle (N,) int64 each one descends from, of those that the step gave, not yet chosen from."""
+        """Which particle (N,) int64 of those that a step gave, before any were chosen, each descends from."""
         then, index = self._after(number)
         return torch.arange(then.particles) if index is None else index
 
