@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from bcppl.errors import InputError
 
 Array = npt.NDArray[np.float64]
 
@@ -39,3 +42,27 @@ class Camera:
         u, v = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
         x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
         return np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+
+
+def looking_at(eye: npt.ArrayLike, point: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+    """The pose (7,) `world_from_camera` of an optical frame at `eye` that sees `point` in its middle.
+
+    Args:
+        eye: (3,) where the camera stands, metres in the world.
+        point: (3,) what it looks at.
+        up: (3,) the direction that is upwards in the image.
+
+    Raises:
+        InputError: the camera would look at itself, or straight along `up`.
+    """
+    there = np.asarray(eye, dtype=np.float64)
+    forward = np.asarray(point, dtype=np.float64) - there
+    right = np.cross(forward, np.asarray(up, dtype=np.float64))
+    if not np.linalg.norm(right) > 1e-9 * max(float(np.linalg.norm(forward)), 1e-9):
+        raise InputError(
+            f"a camera at {there.tolist()} cannot look at {np.asarray(point).tolist()} with "
+            f"{np.asarray(up).tolist()} upwards; give another point, or another direction for up."
+        )
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    axes = np.stack([right, np.cross(forward, right), forward], axis=1)
+    return np.concatenate([there, Rotation.from_matrix(axes).as_quat()[[3, 0, 1, 2]]])
