@@ -6,13 +6,15 @@ from bcppl.inference.kernels.hastings import metropolis_hastings
 from bcppl.inference.kernels.involutions import involutive
 from bcppl.inference.kernels.kernel import Kernel, Move, put, replaced
 from bcppl.inference.kernels.rejuvenation import Moved, Until, displacement, distinct, rejuvenate, until
-from bcppl.inference.kernels.staged import Staged, delayed_acceptance
+from bcppl.inference.kernels.staged import Screened, Staged, Surrogate, delayed_acceptance, student_t
 
 __all__ = [
     "Kernel",
     "Move",
     "Moved",
+    "Screened",
     "Staged",
+    "Surrogate",
     "Until",
     "cycle",
     "delayed_acceptance",
@@ -27,5 +29,6 @@ __all__ = [
     "repeat",
     "replaced",
     "sequence",
+    "student_t",
     "until",
 ]

@@ -86,7 +86,7 @@ def displacement(start: Population, now: Population) -> Tensor:
     weights = normalised(now.log_weights)
     shares = [torch.empty(0, dtype=torch.float64)]
     for address in now.trace.choices:
-        if not now.trace[address].is_floating_point():
+        if now.trace.distributions[address].support.is_discrete:
             continue
         step, place = _coordinates(start, now, address)
         variance = weights @ (place - weights @ place).square()

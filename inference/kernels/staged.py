@@ -7,7 +7,7 @@ acceptance, Foundations of Data Science 1, 2019.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import pairwise
@@ -15,9 +15,12 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from bcppl.beliefs import normalised
 from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import Kernel, Move
 from bcppl.inference.population import Population
+from bcppl.inference.proposals import spread_of
+from bcppl.inference.proposals.coordinates import coordinates_of
 from bcppl.inference.targets import Target, cost_of
 from bcppl.traces import Trace
 
@@ -86,12 +89,91 @@ class Staged(Target):
         return trace.hiding([a for stage in self.stages(trace)[1:] for a in stage])
 
 
-def delayed_acceptance(
-    kernel: Kernel, first: Sequence[str] | str | None = None, *, stages: int = 2
-) -> Kernel:
-    """A kernel whose proposals are decided by cheap sites first; the target it leaves invariant is the same.
+Surrogate = Callable[[Population], Callable[[Trace], Tensor]]
 
-    It accepts less often than the kernel by itself, and pays for physics only where the cheap sites agree.
+
+def _unscreened(trace: Trace) -> Tensor:
+    return torch.zeros(trace.particles, dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Screened(Target):
+    """A target that accepts in two stages, the first decided by a surrogate of its log-density.
+
+    Christen and Fox, section 2: the surrogate and the proposal's ratio decide which proposals are evaluated;
+    the second stage undoes the surrogate.
+
+    Attributes:
+        surrogate: a log-density (N,) of a trace, up to a constant; it reads latent values.
+    """
+
+    surrogate: Callable[[Trace], Tensor] = _unscreened
+
+    def accept(self, old: Trace, new: Trace, log_ratio: Tensor) -> tuple[Tensor, Trace]:
+        """Which particles take their proposals: see `Target.accept`."""
+        before, guessed = self(old), self.surrogate(new) - self.surrogate(old)
+        possible = self.part(new, list(new.choices)) > -torch.inf
+        chance = torch.log(torch.rand(old.particles, dtype=torch.float64))
+        index = ((guessed + log_ratio > chance) & possible).nonzero().flatten()
+        if len(index) == 0:
+            return index, new[index]
+        chance = torch.log(torch.rand(len(index), dtype=torch.float64))
+        passed, survivors = self.above(new[index], chance + before[index] + guessed[index])
+        return index[passed], survivors
+
+    def visible(self, trace: Trace) -> Trace:
+        """The proposed trace without the sites that run physics, which would be evaluated for all."""
+        sites = trace.distributions
+        return trace.hiding([a for a in sites if a not in trace.choices and cost_of(sites[a]) >= PHYSICS])
+
+
+def student_t(address: str, degrees: float = 5.0, width: float = 1.3) -> Surrogate:
+    """A surrogate: the multivariate t about the particles' weighted mean at a latent address.
+
+    Its tails are heavy, for a particle where the surrogate is far too low would hardly ever leave.
+
+    Args:
+        address: of a pose or of another continuous value, taken in the coordinates that proposals move it in
+            (`bcppl.inference.proposals.coordinates`).
+        degrees: of freedom.
+        width: times the particles' weighted covariance.
+
+    Raises:
+        InputError: the degrees of freedom or the width are not greater than 0.
+    """
+    if not (degrees > 0.0 and width > 0.0):
+        raise InputError(
+            f"student_t is given {degrees} degrees of freedom and a width of {width}; give more than 0."
+        )
+
+    def fit(population: Population) -> Callable[[Trace], Tensor]:
+        coordinates = coordinates_of(population.trace, address)
+        places = coordinates.places(population.trace[address])
+        center = coordinates.mean(places, normalised(population.log_weights))
+        factor = torch.linalg.cholesky(width * spread_of(address)(population))
+
+        def log_density(trace: Trace) -> Tensor:
+            steps = coordinates.steps(center, coordinates_of(trace, address).places(trace[address]))
+            scaled = torch.linalg.solve_triangular(factor, steps.T, upper=False)
+            squared = scaled.square().sum(dim=0)
+            return -0.5 * (degrees + len(factor)) * torch.log1p(squared / degrees)
+
+        return log_density
+
+    return fit
+
+
+def delayed_acceptance(
+    kernel: Kernel,
+    first: Sequence[str] | str | None = None,
+    *,
+    stages: int = 2,
+    surrogate: Surrogate | None = None,
+) -> Kernel:
+    """A kernel whose proposals are decided by what is cheap first; the target stays exact.
+
+    It accepts less often than the kernel by itself, and pays for physics only where what is cheap agrees: so
+    longer steps and more of them are worth while, `repeat(delayed_acceptance(...), 4)`.
 
     Args:
         kernel: one whose decisions go through `Target.accept`, such as `metropolis_hastings(...)`.
@@ -99,24 +181,34 @@ def delayed_acceptance(
             ratio: "depth_*". By default all sites that cost less than physics.
         stages: how many, the first one included. The other sites are divided among the later ones evenly, in
             the order of cost and of the program, which for windows of a probe is that of time.
+        surrogate: decides first in place of any site, such as `student_t("hole")`; like what a proposal
+            learns, it is fitted to other particles than those that are moved. Two stages then.
 
     Raises:
-        InputError: fewer than two stages. When the kernel moves: a pattern fits no address, the target is a
-            plain function, or the way back of a proposal reads a site of a later stage.
+        InputError: fewer than two stages, or sites and a surrogate that are both to decide first. When the
+            kernel moves: a pattern fits no address, the target is a plain function, or the way back of a
+            proposal reads a site of a later stage.
     """
     if stages < 2:
         raise InputError(f"delayed acceptance is asked for {stages} stages; give 2 or more.")
+    if surrogate is not None and (first is not None or stages != 2):
+        raise InputError(
+            "delayed acceptance is given a surrogate and sites or stages besides; "
+            "a surrogate decides first by itself, and all sites after it."
+        )
     patterns = (first,) if isinstance(first, str) else None if first is None else tuple(first)
 
     def staged(population: Population) -> Move:
         move = kernel(population)
+        screen = surrogate(population) if surrogate is not None else None
 
         def in_stages(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
             if not isinstance(target, Target):
                 raise InputError(
                     "delayed acceptance cannot divide a target that is a plain function; give a Target."
                 )
-            return move(trace, Staged(target.exponents, patterns, stages - 1))
+            staged: Target = Staged(target.exponents, patterns, stages - 1)
+            return move(trace, staged if screen is None else Screened(target.exponents, screen))
 
         return in_stages
 

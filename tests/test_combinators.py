@@ -1,0 +1,309 @@
+"""Kernels put together, and sweeps of a population: invariance, bookkeeping, and when to stop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from torch import Tensor
+
+from bcppl.distributions.poses import NormalPose
+from bcppl.errors import InputError
+from bcppl.inference.kernels import (
+    Kernel,
+    Move,
+    cycle,
+    displacement,
+    distinct,
+    metropolis_hastings,
+    mixture,
+    put,
+    rejuvenate,
+    repeat,
+    sequence,
+    until,
+)
+from bcppl.inference.population import Population
+from bcppl.inference.proposals import drift
+from bcppl.inference.targets import POSTERIOR, Target
+from bcppl.poses import Freedom, identity
+from bcppl.traces import Trace, simulate
+
+DRAWS = 20_000
+SOUND, BROKEN = 4.5, 8.0  # |z| of the worst expectation: below if invariant, above if not
+
+
+def lopsided() -> None:
+    """A law on the half line: what favours one side shows at once."""
+    pyro.sample("x", dist.Gamma(torch.tensor(2.0, dtype=torch.float64), 1.0))
+
+
+def short(trace: Trace) -> None:
+    pyro.sample("x", dist.LogNormal(trace["x"].log(), 0.3))
+
+
+def fresh(trace: Trace) -> None:
+    pyro.sample("x", dist.Exponential(torch.full((len(trace),), 0.4, dtype=torch.float64)))
+
+
+def equal_weights(trace: Trace) -> Population:
+    return Population(trace, torch.zeros(len(trace), dtype=torch.float64))
+
+
+def worst_z(kernel: Kernel, times: int = 2) -> float:
+    """The largest |z| of the change in some expectations from exact draws."""
+    torch.manual_seed(1)
+    trace = simulate(lopsided, (), DRAWS)
+
+    def functions(trace: Trace) -> Tensor:
+        x = trace["x"]
+        return torch.stack([x, x**2, x.log(), (x > 2.0).double()], dim=1)
+
+    before = functions(trace)
+    move = kernel(equal_weights(trace[:500]))
+    for _ in range(times):
+        trace, _ = move(trace, POSTERIOR)
+    change = functions(trace) - before
+    z = change.mean(dim=0) / (change.std(dim=0) / math.sqrt(DRAWS))
+    return float(z.abs().max())
+
+
+SHORT, FRESH = metropolis_hastings(short), metropolis_hastings(fresh)
+
+COMBINED: dict[str, Kernel] = {
+    "sequence": sequence(SHORT, FRESH),
+    "cycle": cycle(SHORT, FRESH, SHORT),
+    "mixture": mixture([SHORT, FRESH], [1.0, 3.0]),
+    "repeat": repeat(SHORT, 3),
+    "nested": mixture([cycle(SHORT, repeat(FRESH, 2)), sequence(FRESH)]),
+}
+
+
+@pytest.mark.parametrize("name", COMBINED)
+def test_combinations_are_invariant(name: str) -> None:
+    assert worst_z(COMBINED[name]) < SOUND
+
+
+def test_mutant_mixture_that_chooses_by_where_a_particle_is() -> None:
+    def choosy(population: Population) -> Move:
+        moves = [SHORT(population), FRESH(population)]
+
+        def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
+            for k, each in enumerate(moves):
+                index = ((trace["x"] > 2.0) == bool(k)).nonzero().flatten()
+                moved, _ = each(trace[index], target)
+                trace = put(trace, index, moved)
+            return trace, torch.zeros(len(trace), dtype=torch.float64)
+
+        return move
+
+    assert worst_z(choosy) > BROKEN
+
+
+# ---- bookkeeping
+
+
+def adding(step: float, share: float, seen: list[Tensor]) -> Kernel:
+    """Not a kernel at all: adds a number to x, says which share it accepted, and keeps what it was given."""
+
+    def fitted(population: Population) -> Move:
+        def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
+            seen.append(trace["x"])
+            return trace.at({"x": trace["x"] + step}), torch.full((len(trace),), share, dtype=torch.float64)
+
+        return move
+
+    return fitted
+
+
+def moved_by(kernel: Kernel, count: int = 4000) -> tuple[Tensor, Tensor]:
+    torch.manual_seed(0)
+    trace = simulate(lopsided, (), count)
+    moved, accepted = kernel(equal_weights(trace))(trace, POSTERIOR)
+    return moved["x"] - trace["x"], accepted
+
+
+def test_sequence_keeps_its_order_and_cycle_draws_one_for_each_move() -> None:
+    trace = simulate(lopsided, (), 3)
+
+    def orders(combine: Callable[..., Kernel]) -> set[tuple[float, ...]]:
+        found = set()
+        seen: list[Tensor] = []
+        move = combine(*[adding(step, 1.0, seen) for step in (1.0, 10.0, 100.0)])(equal_weights(trace))
+        for _ in range(60):
+            seen.clear()
+            last = move(trace, POSTERIOR)[0]["x"]
+            path = [*seen, last]
+            found.add(tuple(round(float((b - a)[0])) for a, b in pairwise(path)))
+        return found
+
+    assert orders(sequence) == {(1, 10, 100)}
+    assert len(orders(cycle)) == 6
+
+
+def test_acceptance_is_the_mean_over_what_was_tried() -> None:
+    one, two = adding(1.0, 1.0, []), adding(2.0, 0.25, [])
+    for kernel in (sequence(one, two), cycle(one, two)):
+        difference, accepted = moved_by(kernel)
+        torch.testing.assert_close(difference, torch.full_like(difference, 3.0))
+        assert bool((accepted == 0.625).all())
+    difference, accepted = moved_by(repeat(two, 3))
+    torch.testing.assert_close(difference, torch.full_like(difference, 6.0))
+    assert bool((accepted == 0.25).all())
+
+
+def test_mixture_draws_for_each_particle_and_puts_it_back_in_its_place() -> None:
+    seen: list[Tensor] = []
+    difference, accepted = moved_by(mixture([adding(1.0, 1.0, seen), adding(2.0, 0.25, seen)], [1.0, 3.0]))
+    share = float((difference.round() == 1.0).double().mean())
+    assert share == pytest.approx(0.25, abs=0.03)
+    assert torch.equal(accepted, torch.where(difference.round() == 1.0, 1.0, 0.25).double())
+    assert sum(len(x) for x in seen) == 4000, "a kernel moves only the particles that drew it"
+    never, _ = moved_by(mixture([adding(1.0, 1.0, []), adding(2.0, 1.0, [])], [0.0, 5.0]))
+    assert bool((never.round() == 2.0).all())
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: repeat(SHORT, 0), "repeated 0 times"),
+        (lambda: repeat(SHORT, -2), "repeated -2 times"),
+        (lambda: mixture([SHORT, FRESH], [1.0]), "for 2 kernels"),
+        (lambda: mixture([SHORT, FRESH], [1.0, -1.0]), "0 or more"),
+        (lambda: mixture([SHORT], [0.0]), "not all of them 0"),
+        (lambda: mixture([]), "no kernel"),
+        (lambda: sequence(), "no kernel"),
+        (lambda: cycle(), "no kernel"),
+        (lambda: until(), "nothing to wait for"),
+        (lambda: until(distinct=0), "0 distinct"),
+        (lambda: until(displacement=2.5), "2.5 variances"),
+        (lambda: until(distinct=3, most=0), "0 sweeps"),
+    ],
+)
+def test_what_cannot_be_is_refused(make: Callable[[], object], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        make()
+
+
+# ---- sweeps
+
+
+def copies(count: int, ancestors: int) -> Population:
+    trace = simulate(lopsided, (), ancestors)
+    return equal_weights(trace[torch.arange(count) % ancestors])
+
+
+def counted(kernel: Kernel) -> tuple[Kernel, list[int]]:
+    calls: list[int] = []
+
+    def fitted(population: Population) -> Move:
+        calls.append(len(population))
+        return kernel(population)
+
+    return fitted, calls
+
+
+def test_sweeps_until_particles_differ() -> None:
+    torch.manual_seed(3)
+    population = copies(40, 4)
+    assert distinct(population) == 4
+    kernel, calls = counted(SHORT)
+    done = rejuvenate(population, kernel, POSTERIOR, until(distinct=30)).population
+    assert distinct(done) >= 30
+    assert 2 <= len(calls) <= 20
+    calls.clear()
+    assert rejuvenate(done, kernel, POSTERIOR, until(distinct=30)).population is done
+    assert not calls, "far enough already"
+
+
+def test_sweeps_until_the_start_is_left_behind_and_no_longer_than_allowed() -> None:
+    torch.manual_seed(4)
+    population = copies(200, 200)
+    kernel, calls = counted(SHORT)
+    done = rejuvenate(population, kernel, POSTERIOR, until(displacement=0.5)).population
+    assert float(displacement(population, done)) >= 0.5
+    x, y = population.trace["x"], done.trace["x"]
+    share = (y - x).square().mean() / y.var(correction=0)
+    assert float(displacement(population, done)) == pytest.approx(float(share))
+    calls.clear()
+    tiny = metropolis_hastings(drift("x", (1e-5, 1e-4)))
+    rejuvenate(population, counted(tiny)[0], POSTERIOR, until(displacement=0.5, most=2))
+    kernel, calls = counted(tiny)
+    rejuvenate(population, kernel, POSTERIOR, until(displacement=0.5, most=2))
+    assert len(calls) == 4, "two sweeps of two halves"
+
+
+def test_displacement_is_asked_for_on_every_free_axis() -> None:
+    def program() -> None:
+        pyro.sample("pose", NormalPose(identity(), torch.tensor([0.1, 0.2, 0.5]), Freedom("xy", "z")))
+        pyro.sample("which", dist.Bernoulli(torch.tensor(0.5)))
+
+    torch.manual_seed(5)
+    trace = simulate(program, (), 500)
+    shifted = trace["pose"].clone()
+    shifted[:, 1] += 0.2 * torch.randn(500, dtype=torch.float64)
+    share = displacement(equal_weights(trace), equal_weights(trace.at({"pose": shifted})))
+    assert share.shape == (3,)
+    assert float(share[0]) == 0.0
+    assert float(share[2]) == pytest.approx(0.0, abs=1e-12)
+    assert 0.3 < float(share[1]) < 0.7
+
+
+def particle_by_particle(population: Population, kernel: Kernel) -> Population:
+    """The mutant: each particle stops once it has come far enough itself."""
+    trace = population.trace
+    going = torch.arange(len(trace))
+    move = kernel(population)
+    for _ in range(30):
+        moved, _ = move(trace[going], POSTERIOR)
+        trace = put(trace, going, moved)
+        going = ((trace["x"] - population.trace["x"]).abs() < 1.0).nonzero().flatten()
+        if len(going) == 0:
+            break
+    return equal_weights(trace)
+
+
+def test_stopping_together_leaves_no_bias_that_shows_and_each_alone_does() -> None:
+    """75 exact draws, moved until they have come half a variance: over 60 runs the mean stays."""
+    torch.manual_seed(6)
+    together, alone = [], []
+    for _ in range(60):
+        population = equal_weights(simulate(lopsided, (), 75))
+        done = rejuvenate(population, SHORT, POSTERIOR, until(displacement=0.5)).population
+        together.append(done.trace["x"].mean() - 2.0)
+        alone.append(particle_by_particle(population, SHORT).trace["x"].mean() - 2.0)
+
+    def z(errors: list[Tensor]) -> float:
+        error = torch.stack(errors)
+        return float(error.mean() / error.std() * math.sqrt(len(error)))
+
+    assert abs(z(together)) < SOUND
+    assert abs(z(alone)) > BROKEN
+
+
+def test_no_sweeps_leave_a_population_as_it_is_and_fewer_are_refused() -> None:
+    population = copies(8, 8)
+    done = rejuvenate(population, SHORT, POSTERIOR, 0)
+    assert done.population is population
+    assert math.isnan(done.acceptance)
+    with pytest.raises(InputError, match="-1 times"):
+        rejuvenate(population, SHORT, POSTERIOR, -1)
+
+
+def test_a_half_without_weight_teaches_all_the_same() -> None:
+    torch.manual_seed(7)
+
+    def program() -> None:
+        pyro.sample("x", dist.Normal(torch.tensor(0.0, dtype=torch.float64), 1.0))
+
+    trace = simulate(program, (), 20)
+    log_weights = torch.full((20,), -torch.inf, dtype=torch.float64)
+    log_weights[3] = 0.0
+    done = rejuvenate(Population(trace, log_weights), metropolis_hastings(drift("x")), POSTERIOR, 5)
+    assert done.acceptance > 0.0
+    assert torch.equal(done.population.log_weights, log_weights)
