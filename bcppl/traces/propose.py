@@ -56,7 +56,6 @@ def assessed(
         InputError: a choice is missing, or an address is never visited.
     """
     program = runnable(program)
-    program = runnable(program)
     ran = run(program, args, particles, choices, {})
     refuse_unvisited(choices, ran)
     missing = [a for a in ran.values if a not in choices and a not in ran.fixed]

@@ -102,6 +102,13 @@ class Tangent(Chart):
         return poses.local(first, second).abs().reshape(len(first), -1).amax(dim=1)
 
 
+@dataclass(frozen=True)
+class Uncharted(Chart):
+    """Values on a surface whose volume is not taken here: they may be handed on, and nothing else."""
+
+    surface: str = ""
+
+
 # A density over these is not one over their entries.
 _UNCHARTED = (
     "CorrCholesky",
@@ -132,11 +139,7 @@ def support_of(distribution: Any) -> Any:
 
 
 def chart_of(address: str, distribution: Any, value: Tensor) -> Chart:
-    """The coordinates of values (N, *event) of a site.
-
-    Raises:
-        InputError: the values lie on a surface that has no chart here (matrices of a kind, a sphere).
-    """
+    """The coordinates of values (N, *event) of a site."""
     freedom = getattr(base(distribution), "freedom", None)
     if freedom is not None:
         return Tangent(math.prod(value.shape[1:-1]) * freedom.dimension, freedom)
@@ -145,10 +148,7 @@ def chart_of(address: str, distribution: Any, value: Tensor) -> Chart:
         return Chart()
     name = type(support).__name__.strip("_")
     if name in _UNCHARTED:
-        raise InputError(
-            f"address {address!r} has values in {name}, whose volume is not taken here; "
-            "leave it out of the map, or sample unconstrained values and build it from these."
-        )
+        return Uncharted(math.prod(value.shape[1:]), name)
     if name == "Simplex":
         return Simplex(math.prod(value.shape[1:-1]) * (value.shape[-1] - 1))
     return Real(math.prod(value.shape[1:]))
@@ -192,10 +192,18 @@ def log_abs_det_jacobian(
 
     Raises:
         InputError: there are more coordinates among the outputs than among the inputs or fewer, an output
-            hangs on no input or (checked) on those of other particles, or the map is nowhere one-to-one.
+            hangs on no input or (checked) on those of other particles, the map is nowhere one-to-one, or it
+            uses values on a surface (matrices of a kind, a sphere).
         InferenceError: the Jacobian is not finite.
     """
     columns, rows = _remaining(inputs, outputs)
+    for key in (*columns, *rows):
+        chart = (inputs if key in columns else outputs)[key].chart
+        if isinstance(chart, Uncharted):
+            raise InputError(
+                f"a map uses {key[1]!r} ({key[0]}), whose values in {chart.surface} have a volume that is "
+                "not taken here; hand them on as they are, or sample and move unconstrained values."
+            )
     wide = sum(inputs[k].chart.dimension for k in columns)
     high = sum(outputs[k].chart.dimension for k in rows)
     if wide != high:
