@@ -20,7 +20,7 @@ from bcppl.errors import InferenceError, InputError
 from bcppl.inference.population import Population
 from bcppl.inference.step import Observed, StepFunction, StepInfo
 from bcppl.inference.tempering import tempered
-from bcppl.traces import Model, Trace, extend, generate
+from bcppl.traces import Model, Series, Trace, extend, generate
 
 
 class Info(NamedTuple):
@@ -195,6 +195,9 @@ def _prior(model: Model, population: Population, random_state: Tensor) -> Step:
 
 def _observed(model: Model, scene: Any, measurements: Sequence[Any], known: Mapping[str, Tensor]) -> Observed:
     """What a step takes in so that the measurements are all taken in."""
+    if isinstance(model.program, Series):
+        # A step of a series is given what is new alone, under its own addresses.
+        measurements, known = measurements[-1:], {}
     observations = model.observe(scene, measurements)
     new = {a: v for a, v in observations.items() if a not in known}
     return Observed((scene, [m.action for m in measurements]), new)
@@ -208,7 +211,9 @@ class _Truth:
         # It draws from a generator of its own: a belief does not depend on whether the truth is known.
         self.state = [torch.Generator().manual_seed(seed).get_state()]
         self.latent = {model.pose}
-        if recording.truth is None or set(population.trace.choices) != self.latent:
+        # A series' pose moves: one true pose is not where it began.
+        moves = isinstance(model.program, Series)
+        if recording.truth is None or moves or set(population.trace.choices) != self.latent:
             return
         pose = torch.as_tensor(recording.truth, dtype=torch.float64)[None]
         with _own_state(self.state, 1):

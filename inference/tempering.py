@@ -146,10 +146,9 @@ def tempered(
 
     def step(population: Population, observed: Observed) -> Stepped:
         start = population.log_evidence
-        known = set(population.trace.addresses)
         longer, log_likelihood = extend(population.trace, *observed)
         # Sites that the program itself fixes (`obs=`, `pyro.factor`) are let in with the observations.
-        new = [a for a in longer.addresses if a not in known and a not in longer.choices]
+        new = [a for a in longer.since(population.trace) if a not in longer.choices]
         population = replace(population, trace=longer)
         groups = [[a] for a in _by_cost(longer, new)] if by_site and new else [new]
         done, acceptances, ancestors, before, resampled = [], [], None, None, 0

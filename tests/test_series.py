@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pyro
@@ -12,8 +13,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from bcppl import poses
+from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
-from bcppl.traces import Series, Trace, assess, extend, generate, regenerate, simulate, update
+from bcppl.inference.kernels import metropolis_hastings
+from bcppl.inference.proposals import drift
+from bcppl.inference.smc import smc
+from bcppl.inference.tempering import tempered
+from bcppl.traces import Model, Series, Trace, assess, extend, generate, regenerate, simulate, update
 from bcppl.traces.carried import carried
 
 N, STEPS = 6, 5
@@ -262,3 +269,35 @@ def test_refusals_say_what_to_do(case: str) -> None:
     trace, _ = filtered()
     with pytest.raises(InputError, match=says):
         act(trace)
+
+
+def test_smc_follows_a_pose_that_moves() -> None:
+    """A pose carried along the x axis by the robot and seen each time: the filter keeps up with it."""
+    spread = torch.tensor([0.01, 0.01, 0.01, 0.05, 0.05, 0.05], dtype=torch.float64)
+
+    def place(scene: None, actions: list[float]) -> Tensor:
+        return pyro.sample("pose", NormalPose(poses.identity(), spread))
+
+    def carry(pose: Tensor, scene: None, actions: list[float]) -> Tensor:
+        (moved,) = actions
+        ahead = pose + torch.tensor([moved, 0, 0, 0, 0, 0, 0], dtype=torch.float64)
+        pose = pyro.sample("pose", NormalPose(ahead, 0.1 * spread))
+        pyro.sample("seen", dist.Normal(pose[:, :3], 0.005).to_event(1))
+        return pose
+
+    measurements = [
+        SimpleNamespace(kind="look", action=0.1, observation=torch.tensor([0.1 * t, 0.0, 0.0]).double())
+        for t in range(1, 6)
+    ]
+    model = Model(
+        Series(place, carry),
+        prepare=lambda recording: None,
+        observe=lambda scene, taken: {"seen": taken[-1].observation},
+        pose="pose",
+    )
+    recording = SimpleNamespace(measurements=measurements, truth=None)
+    moved = tempered(metropolis_hastings(drift("pose")))
+    for taken, each in enumerate(smc(model, recording, step=moved, particles=300)):
+        mean = each.belief.mean[:3]
+        assert float((mean - torch.tensor([0.1 * taken, 0.0, 0.0])).abs().max()) < 0.004, taken
+    assert len(each.population.trace["pose", 0]) == 300 and each.population.trace.steps == 5

@@ -8,7 +8,8 @@ from typing import Any
 
 from torch import Tensor
 
-Program = Callable[..., Any]
+from bcppl.traces.run import Program
+from bcppl.traces.series import Series
 
 
 @dataclass(frozen=True)
@@ -17,15 +18,17 @@ class Model:
 
     Attributes:
         program: a Pyro program `program(scene, actions)`. Its arguments are what the robot did, never what
-            it saw.
+            it saw. Or a series, for a pose that moves: `init(scene, [])`, then `step(state, scene, [action])`
+            for each measurement, both with the pose at the same address.
         prepare: `prepare(recording) -> scene`, what stays the same over a run: the prior, simulators.
         observe: `observe(scene, measurements) -> {address: value}`, the constraints that the measurements put
             on `program(scene, [m.action for m in measurements])`: all, also those of earlier measurements.
+            For a series it is given the newest measurement alone, and names the step's own addresses.
         pose: address of the sought pose (`world_from_part`).
         invent: `invent(seed, **options) -> Recording`, a recording made up by the model; None if it has none.
     """
 
-    program: Program
+    program: Program | Series
     prepare: Callable[[Any], Any]
     observe: Callable[[Any, Sequence[Any]], Mapping[str, Tensor]]
     pose: str
