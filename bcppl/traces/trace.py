@@ -8,6 +8,7 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
+import pyro
 import torch
 from torch import Tensor
 
@@ -113,7 +114,8 @@ class Trace:
 
     def _evaluated(self, address: str) -> Tensor:
         distribution = self._run.distributions[address]
-        with torch.no_grad():
+        # A value that another one has moved out of the support is impossible, not a mistake.
+        with torch.no_grad(), pyro.validation_enabled(False):
             value = distribution.log_prob(inward(self._run.values[address], distribution))
         batch = distribution.batch_shape
         if value.shape not in ((), batch):
