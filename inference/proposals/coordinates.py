@@ -181,6 +181,7 @@ class Unflattened(Transform):
         """The same for other particles; for a support that is the same for all."""
         other = Unflattened.__new__(Unflattened)
         other.__dict__.update(self.__dict__)
+        other._inv = None  # torch keeps a transform's inverse, which would be that of the old one
         other._set(values)
         return other
 
