@@ -1,42 +1,33 @@
-"""Resampling: which particles go on, and when.
+"""Resampling: when particles are drawn anew by their weights, as decorators of a scheme.
 
-A scheme is `(log_weights (N,), count) -> ancestors (count,)`; `always` and `adaptive` make of it what SMC
-takes, a function of a population. Douc, Cappe and Moulines, Comparison of resampling schemes for particle
-filtering, ISPA 2005.
+Which ones go on is for the scheme to say (`bcppl.inference.schemes`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
-import torch
 from torch import Tensor
 
-from bcppl.beliefs import normalised
 from bcppl.inference.population import Population
+from bcppl.inference.schemes import Scheme, multinomial, residual, ssp, stratified, systematic
 
-
-class Scheme(Protocol):
-    """Ancestors (count,) int64 of particles with log weights (N,); as many as there are unless `count`."""
-
-    def __call__(self, log_weights: Tensor, count: int | None = None, /) -> Tensor:
-        """Draw them."""
-        ...
+__all__ = [
+    "Resample",
+    "Scheme",
+    "adaptive",
+    "always",
+    "multinomial",
+    "never",
+    "residual",
+    "ssp",
+    "stratified",
+    "systematic",
+]
 
 
 # The resampled population and its ancestors (N,), or None where all particles stay as they are.
 Resample = Callable[[Population], tuple[Population, Tensor | None]]
-
-
-def systematic(log_weights: Tensor, count: int | None = None) -> Tensor:
-    """Ancestors (count,) int64 by one uniform draw and equal steps: unbiased, of low variance."""
-    count = len(log_weights) if count is None else count
-    points = (torch.arange(count, dtype=torch.float64) + torch.rand((), dtype=torch.float64)) / count
-    weights = normalised(log_weights)
-    # Rounding may leave the last sum short of the last point: that falls to the last particle with weight.
-    last = int(weights.nonzero()[-1])
-    return torch.searchsorted(weights.cumsum(0), points, right=True).clamp_max(last)
 
 
 def always(scheme: Scheme = systematic) -> Resample:

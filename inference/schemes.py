@@ -1,0 +1,147 @@
+"""Resampling schemes: which particles go on, `(log_weights (N,), count) -> ancestors (count,)`.
+
+Each is unbiased, count times its normalised weight is the expected number of a particle's copies, and gives
+none to a particle without weight. Ancestors come in increasing order. All take time linear in N and count,
+save `multinomial` and the remainder of `residual`, which search. Douc, Cappe and Moulines, Comparison of
+resampling schemes for particle filtering, ISPA 2005; Gerber, Chopin and Whiteley, Negative association,
+ordering and convergence of resampling methods, Annals of Statistics 47, 2019.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from bcppl.beliefs import normalised
+from bcppl.errors import InputError
+
+# Below this many particles, searching for the points is faster than counting them.
+FEW = 5000
+
+
+class Scheme(Protocol):
+    """Ancestors (count,) int64 of particles with log weights (N,); N of them unless a count is given."""
+
+    def __call__(self, log_weights: Tensor, count: int | None = None, /) -> Tensor:
+        """Draw them.
+
+        Raises:
+            InferenceError: no particle has any weight, or a weight is not a number.
+            InputError: `count` is below 1.
+        """
+        ...
+
+
+def systematic(log_weights: Tensor, count: int | None = None) -> Tensor:
+    """One uniform draw and equal steps: a particle gets its expected number, rounded down or up."""
+    weights, count = _asked(log_weights, count)
+    offset = torch.rand((), dtype=torch.float64)
+    if count < FEW:
+        # Rounding may leave a point past the last sum: that falls to the last particle with weight.
+        points = (torch.arange(count, dtype=torch.float64) + offset) / count
+        return torch.searchsorted(weights.cumsum(0), points, right=True).clamp_max(_last(weights))
+    below = weights.cumsum(0).mul_(count).sub_(offset).ceil_()
+    return _ancestors(_closed(below, weights, count), count)
+
+
+def stratified(log_weights: Tensor, count: int | None = None) -> Tensor:
+    """One uniform draw in each of `count` equal strata."""
+    weights, count = _asked(log_weights, count)
+    draws = torch.rand(count, dtype=torch.float64)
+    place = weights.cumsum(0).mul_(count)
+    stratum = place.floor().clamp_(max=count - 1)
+    place -= stratum
+    below = stratum.add_(draws[stratum.long()] < place)
+    return _ancestors(_closed(below, weights, count), count)
+
+
+def multinomial(log_weights: Tensor, count: int | None = None) -> Tensor:
+    """Independent draws, each particle with the chance of its weight."""
+    weights, count = _asked(log_weights, count)
+    return _independent(weights, count)
+
+
+def residual(log_weights: Tensor, count: int | None = None) -> Tensor:
+    """Each particle's expected number rounded down, and independent draws for what is left."""
+    weights, count = _asked(log_weights, count)
+    copies, remainder = _parts(weights, count)
+    rest = count - int(copies.sum())
+    if rest:
+        copies += torch.bincount(_independent(remainder / remainder.sum(), rest), minlength=len(copies))
+    return torch.repeat_interleave(copies, output_size=count)
+
+
+def ssp(log_weights: Tensor, count: int | None = None) -> Tensor:
+    """Srinivasan sampling process: expected numbers rounded down or up, negatively associated.
+
+    Pairs of neighbours settle which of the two is rounded, and the other goes on to the next round
+    (Srinivasan, Distributions on level-sets with applications to approximation algorithms, FOCS 2001, section
+    2). Gerber, Chopin and Whiteley (algorithm 1) pair in a line, here it is a tree: any order of pairs has
+    the property that their theorem 1 asks for.
+    """
+    weights, count = _asked(log_weights, count)
+    copies, left = _parts(weights, count)
+    index = torch.arange(len(weights))
+    while len(index) > 1:
+        odd = index[-1:] if len(index) % 2 else index[:0]
+        first, second = index[: len(index) - len(odd)].reshape(-1, 2).T
+        p, q = left[first], left[second]
+        total = p + q
+        up = total >= 1.0
+        # Below 1 one of the two takes all of it and goes on; from 1 up one is rounded up, the other goes on.
+        chance = torch.where(up, (1.0 - q) / (2.0 - total), p / total)
+        wins = torch.rand(len(first), dtype=torch.float64) < chance
+        winner, loser = torch.where(wins, first, second), torch.where(wins, second, first)
+        copies[winner[up]] += 1
+        onward = torch.where(up, loser, winner)
+        left[onward] = torch.where(up, total - 1.0, total)
+        index = torch.cat([onward, odd])
+    # All that is left is whole, but for rounding.
+    copies[index] += count - copies.sum()
+    return torch.repeat_interleave(copies, output_size=count)
+
+
+def _asked(log_weights: Tensor, count: int | None) -> tuple[Tensor, int]:
+    weights = torch.softmax(log_weights, 0)
+    if not bool(torch.isfinite(weights.sum())):
+        normalised(log_weights)
+    count = len(log_weights) if count is None else count
+    if count < 1:
+        raise InputError(f"{count} particles are to be resampled; give 1 or more.")
+    return weights, count
+
+
+def _last(weights: Tensor) -> int:
+    """The last particle with any weight: to it falls what rounding leaves at the end of a cumulative sum."""
+    return int(weights.nonzero()[-1])
+
+
+def _closed(below: Tensor, weights: Tensor, count: int) -> Tensor:
+    """How many points lie below the end of each particle's stretch, whole numbers, the last one all."""
+    below.clamp_(max=count)
+    if float(below[-1]) < count:
+        below[_last(weights) :] = count
+    return below
+
+
+def _ancestors(below: Tensor, count: int) -> Tensor:
+    """The particle (count,) whose stretch each point lies in."""
+    copies = below.long()
+    copies[1:] -= below[:-1].long()
+    return torch.repeat_interleave(copies, output_size=count)
+
+
+def _independent(weights: Tensor, count: int) -> Tensor:
+    # Sums of exponential draws over their total are sorted uniform ones, without sorting.
+    sums = torch.empty(count + 1, dtype=torch.float64).exponential_().cumsum_(0)
+    points = sums[:-1] / sums[-1]
+    return torch.searchsorted(weights.cumsum(0), points, right=True).clamp_max(_last(weights))
+
+
+def _parts(weights: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Whole copies (N,) int64 of each particle, and the fractions that are left."""
+    expected = weights * count
+    whole = expected.floor()
+    return whole.long(), expected.sub_(whole)
