@@ -358,4 +358,6 @@ def test_maps_that_are_refused_name_the_address() -> None:
     def matrix() -> None:
         pyro.sample("L", dist.LKJCholesky(3, number(1.0)))
 
-    refused(r"'L' .latent., whose values in CorrCholesky", matrix, nothing, lambda v, a: ({"L": 1 * v["L"]}, {}))
+    refused(
+        r"'L' .latent., whose values in CorrCholesky", matrix, nothing, lambda v, a: ({"L": 1 * v["L"]}, {})
+    )

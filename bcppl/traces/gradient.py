@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from functools import partial, wraps
 from typing import Any
 
+import pyro
 import torch
 from torch import Tensor
 
@@ -55,7 +56,7 @@ def log_prob_with_grad(
     program = differentiable(trace.program)
     ran: Run = _refusing(partial(run, program, trace.args, trace.particles, given, trace.carried), "", values)
     total = torch.zeros(trace.particles, dtype=torch.float64, device=next(iter(values.values())).device)
-    with torch.enable_grad():
+    with torch.enable_grad(), pyro.validation_enabled(False):
         for address, distribution in ran.distributions.items():
             parameters = _parameters(distribution)
             if not parameters and not ran.values[address].requires_grad:
