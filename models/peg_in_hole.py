@@ -56,8 +56,8 @@ class Settings:
     depth_scale: float = 0.003
     outlier: float = 0.1
     effective_pixels: float = 50.0
-    contact_scale: float = 0.002
-    one_empty: float = 2.0 * 0.006**2
+    contact_scale: float = 0.003
+    one_empty: float = 2.0 * 0.005**2
     translation_scale: float = 0.0007
     rotation_scale: float = 0.005
     pose_every: int = 25
