@@ -41,17 +41,16 @@ REPEATS = {100: 21, 10_000: 11, 1_000_000: 5}
 Filter = Callable[[int, Tensor], float]
 
 
-def scalar(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
+ZERO, ONE, WALKED, NOISED = torch.tensor([0.0, 1.0, WALK, NOISE], dtype=torch.float64)
 
 
 def start() -> Tensor:
-    return pyro.sample("x", dist.Normal(scalar(0.0), scalar(1.0)))
+    return pyro.sample("x", dist.Normal(ZERO, ONE))
 
 
 def walk(x: Tensor) -> Tensor:
-    x = pyro.sample("x", dist.Normal(x, scalar(WALK)))
-    pyro.sample("y", dist.Normal(x, scalar(NOISE)))
+    x = pyro.sample("x", dist.Normal(x, WALKED))
+    pyro.sample("y", dist.Normal(x, NOISED))
     return x
 
 

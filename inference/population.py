@@ -86,13 +86,16 @@ class Population:
 
     def selected(self, ancestors: Tensor) -> Population:
         """The particles at `ancestors` (M,), equally weighted."""
-        return Population(
+        count = len(ancestors)
+        drawn = Population(
             self.trace[ancestors],
-            torch.zeros(len(ancestors), dtype=torch.float64),
+            torch.zeros(count, dtype=torch.float64),
             self.log_evidence,
-            self.founders[ancestors],
-            self.log_pairs + log_pair(len(ancestors)),
+            self.founders.index_select(0, ancestors),
+            self.log_pairs + log_pair(count),
         )
+        drawn.__dict__["log_total"] = math.log(count)
+        return drawn
 
     def __getitem__(self, index: Tensor) -> Population:
         return replace(

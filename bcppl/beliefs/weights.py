@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -26,7 +28,11 @@ def normalised(log_weights: Tensor) -> Tensor:
 
 def effective_sample_size(log_weights: Tensor) -> float:
     """1 / sum of squared normalised weights (Kong, Liu and Wong, JASA 89, 1994)."""
-    return float(1.0 / (normalised(log_weights) ** 2).sum())
+    weights = torch.softmax(log_weights, dim=0)
+    total = float(weights.dot(weights))
+    if math.isnan(total):
+        normalised(log_weights)  # says what is wrong with them
+    return 1.0 / total
 
 
 # What rounding leaves of a cumulative sum of weights.

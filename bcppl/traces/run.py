@@ -23,6 +23,7 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry, carrying
+from bcppl.traces.shortcuts import drawn
 
 Program = Callable[..., Any]
 PARTICLES = "particles"
@@ -160,6 +161,8 @@ class _Recorder(Messenger):
             self._has_shape(address, value, distribution)
             message["value"], message["is_observed"] = inward(value, distribution), True
             self.values[address] = value
+        elif message["value"] is None:
+            message["value"] = drawn(distribution)
 
     def _pyro_post_sample(self, message: Any) -> None:
         address = message["name"]

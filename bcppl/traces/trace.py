@@ -16,6 +16,7 @@ from bcppl.errors import InferenceError, InputError
 from bcppl.traces.carried import Entry, same_inputs
 from bcppl.traces.hiding import Hiding, refused
 from bcppl.traces.run import Program, Run, inward, run
+from bcppl.traces.shortcuts import narrowed
 
 Index = Tensor | Sequence[int] | slice | int
 
@@ -116,7 +117,7 @@ class Trace:
         distribution = self._run.distributions[address]
         # A value that another one has moved out of the support is impossible, not a mistake.
         with torch.no_grad(), pyro.validation_enabled(False):
-            value = distribution.log_prob(inward(self._run.values[address], distribution))
+            value = narrowed(distribution).log_prob(inward(self._run.values[address], distribution))
         batch = distribution.batch_shape
         if value.shape not in ((), batch):
             raise InputError(

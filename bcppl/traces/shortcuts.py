@@ -1,0 +1,41 @@
+"""The same densities and draws as Pyro's, for less work, where there are many particles."""
+
+from __future__ import annotations
+
+import math
+from copy import copy
+from typing import Any
+
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+# Below this many entries it is not worth the while.
+MANY = 1000
+
+
+def narrowed(distribution: Any) -> Any:
+    """The same densities: a scale that all particles share is squared and logged once, not once for each."""
+    if type(distribution) not in (dist.Normal, dist.Laplace):
+        return distribution
+    scale = distribution.scale
+    if scale.numel() < MANY or 0 not in scale.stride():
+        return distribution
+    once = copy(distribution)
+    once.scale = scale[tuple(slice(0, 1) if step == 0 else slice(None) for step in scale.stride())]
+    return once
+
+
+def drawn(distribution: Any) -> Tensor | None:
+    """A draw of many normals in double precision, by inversion; None leaves it to the distribution.
+
+    Torch draws these one by one (Box and Muller), which takes twice as long. The uniform numbers are odd
+    multiples of 2^-53 between -1 and 1, so the draws are symmetric and finite, up to 8.2 deviations.
+    """
+    if type(distribution) is not dist.Normal:
+        return None
+    mean = distribution.loc
+    if mean.numel() < MANY or mean.dtype != torch.float64 or mean.device.type != "cpu" or mean.requires_grad:
+        return None
+    uniform = torch.rand(distribution.batch_shape, dtype=torch.float64).mul_(2.0).sub_(1.0 - 2.0**-53)
+    return uniform.erfinv_().mul_(narrowed(distribution).scale * math.sqrt(2.0)).add_(mean)
