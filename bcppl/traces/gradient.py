@@ -72,7 +72,8 @@ def log_prob_with_grad(
             if parameters and not density.requires_grad:
                 _refuse(address, "passes no gradient on", parameters, values)
             # Plates lie to the left of the particles.
-            total = total + exponent * density.to(torch.float64).reshape(-1, trace.particles).sum(dim=0)
+            density = density.to(torch.float64).expand(distribution.batch_shape)
+            total = total + exponent * density.reshape(-1, trace.particles).sum(dim=0)
     return total
 
 

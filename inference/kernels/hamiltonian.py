@@ -183,7 +183,7 @@ class _Unconstrained:
                 )
 
     def slope(self, trace: Trace, position: Tensor, exponents: Mapping[str, float]) -> Tensor:
-        """Gradient (N, D) of the log-density of the position; 0 where it is no number."""
+        """Gradient (N, D) of the log-density of the position."""
         leaf = position.detach().requires_grad_()
         with torch.enable_grad():
             values, log_stretch = self.values(leaf)
@@ -191,8 +191,8 @@ class _Unconstrained:
         if not density.requires_grad:
             return torch.zeros_like(position)
         (slope,) = torch.autograd.grad(density.sum(), leaf)
-        # Any function of the position leaves the target invariant; one that is no number leaves none.
-        return torch.nan_to_num(slope, 0.0, 0.0, 0.0)
+        # Where it is no number, the momentum becomes none, and the trajectory counts as one that diverges.
+        return slope
 
 
 def _bounds(support: Any) -> list[Tensor]:
