@@ -1,9 +1,8 @@
-"""How well kernels move particles: exact problems beside other packages, a real image, a simulated probe.
+"""How well kernels move particles: exact problems beside other packages, and a real image.
 
 1. Two problems whose evidence is known, every kernel in tempered SMC: error of log Z and effective draws.
 2. The same problems beside `particles` and BlackJAX, at the same number of likelihood calls.
 3. A real depth image (a frame of LM-O), every kernel that can move a pose.
-4. A simulated probe: what delayed acceptance saves of the physics.
 
 "Effective" counts independent draws that would estimate the posterior mean as well as one run does, from the
 scatter of several runs, so copies of a particle count once.
@@ -16,18 +15,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from beside import beside, timed
+from beside import TIMED, beside, timed
 from evidence import PROBLEMS, Method, Outcome, effective, run
 from jobs import each
-from kernel_table import POSES, PROBES, VECTORS, walk
+from kernel_table import POSES, VECTORS
 from report import DATA, Row, finish, options, show
 
 from bcppl import poses
 from bcppl.inference.kernels import Kernel
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.inference.smc import smc, tempered
-from bcppl.models import part_in_view, peg_in_hole
-from bcppl.models.worlds.peg_in_hole import record
+from bcppl.models import part_in_view
 from bcppl.recordings.importers.bop import command
 
 SCENE = DATA / "lmo_scene2_frame3"
@@ -39,13 +37,12 @@ COUNTS = (75, 1000, 10_000)
 class Posed(NamedTuple):
     """One run over a recording: the belief in brief and what it cost.
 
-    `mean` (7,) and `spread` (6,) are the posterior's in metres and radians, `amount` seconds simulated.
+    `mean` (7,) and `spread` (6,) are the posterior's in metres and radians.
     """
 
     log_evidence: float
     distinct: int
     images: int
-    amount: float
     seconds: float
     mean: list[float]
     spread: list[float]
@@ -138,12 +135,10 @@ def posed(model: Any, recording: Any, kernel: Kernel, sweeps: int, share: float,
     steps = smc(model, recording, step=step, particles=PARTICLES, seed=seed, scene=scene)
     *_, last = steps
     seconds = time.perf_counter() - begun
-    physics = scene.efforts.get("physics")
     return Posed(
         last.info.log_evidence,
         last.belief.distinct,
         scene.efforts["rendering"].items,
-        physics.amount if physics else 0.0,
         seconds,
         last.belief.mean.tolist(),
         last.belief.spread.tolist(),
@@ -191,65 +186,16 @@ def images(seed: int, runs: int, jobs: int) -> list[Row]:
     return rows
 
 
-def touch(asked: tuple[str, int, int]) -> Posed:
-    """One run of a kernel over a simulated probe."""
-    name, recording_seed, seed = asked
-    make, sweeps = PROBES[name]
-    recording = record(recording_seed)
-    return posed(peg_in_hole.model, recording, make("hole"), sweeps, 0.6, seed)
-
-
-def probes(seed: int, runs: int, recordings: int, jobs: int) -> list[Row]:
-    """What delayed acceptance saves: seconds simulated for an effective draw, with and without."""
-    asked = [(n, seed + r, seed + k) for n in PROBES for r in range(recordings) for k in range(runs)]
-    results = iter(each(touch, asked, jobs))
-    rows: list[Row] = []
-    lines: list[list[Any]] = []
-    price: dict[str, float] = {}
-    for name in PROBES:
-        of_recordings = [[next(results) for _ in range(runs)] for _ in range(recordings)]
-        mine = [one for of_one in of_recordings for one in of_one]
-        draws = float(np.mean([scatter(of_one) for of_one in of_recordings]))
-        simulated = float(np.mean([one.amount for one in mine]))
-        price[name] = simulated / draws
-        kept = float(np.median([one.distinct for one in mine]))
-        evidences = [float(np.std([one.log_evidence for one in of_one])) for of_one in of_recordings]
-        lines.append(
-            [
-                name,
-                float(np.mean(evidences)),
-                draws,
-                simulated,
-                price[name],
-                kept,
-                float(np.median([one.seconds for one in mine])),
-            ]
-        )
-        rows += [
-            Row(f"probe, {name}: simulated for an effective draw", price[name], "s"),
-            Row(f"probe, {name}: effective", draws, "draws", direction="min"),
-            Row(f"probe, {name}: distinct, median", kept, "particles", direction="min"),
-        ]
-    show(
-        f"simulated probe: {PARTICLES} particles, {recordings} recordings, {runs} runs of each",
-        ["kernel", "sd of log Z", "effective", "simulated s", "per effective", "distinct", "s"],
-        lines,
-    )
-    staged = min(price[name] for name, (make, _) in PROBES.items() if make is not walk)
-    plain = min(price[name] for name, (make, _) in PROBES.items() if make is walk)
-    rows.append(Row("probe: simulated for an effective draw, delayed over not", staged / plain, "ratio", 0.5))
-    return rows
-
-
-PARTS = ("kernels", "peers", "image", "probe")
+PARTS = ("kernels", "peers", "image")
 
 
 def main() -> None:
     parser = options(__doc__ or "")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="only these")
     parser.add_argument("--runs", type=int, help="beside other packages; 100 unless told")
+    parser.add_argument("--counts", type=int, nargs="+", metavar="N", help="of the other packages' particles")
     parser.add_argument(
-        "--jobs", type=int, default=1, help="runs at a time, of image and probe; times then mean little"
+        "--jobs", type=int, default=1, help="runs over the image at a time; times then mean little"
     )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -258,12 +204,11 @@ def main() -> None:
     if "kernels" in arguments.parts:
         rows += tables(range(seed, seed + (3 if quick else 50)))
     if "peers" in arguments.parts:
-        rows += beside(seed, arguments.runs or (5 if quick else 100), COUNTS[:1] if quick else COUNTS)
-        rows += [] if quick else timed(seed)
+        counts = tuple(arguments.counts or (COUNTS[:1] if quick else COUNTS))
+        rows += beside(seed, arguments.runs or (5 if quick else 100), counts)
+        rows += timed(seed) if TIMED in counts else []
     if "image" in arguments.parts:
         rows += images(seed, 2 if quick else 10, arguments.jobs)
-    if "probe" in arguments.parts:
-        rows += probes(seed, 2 if quick else 6, 1 if quick else 3, arguments.jobs)
     finish(rows, arguments.json)
 
 
