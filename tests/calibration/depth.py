@@ -1,0 +1,76 @@
+"""Depth-only cases: a box before a coarse camera."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pyro
+import torch
+import trimesh
+
+from bcppl import poses
+from bcppl.distributions.depth import RobustDepth
+from bcppl.distributions.poses import NormalPose
+from bcppl.inference.kernels import cycle, metropolis_hastings
+from bcppl.inference.proposals import independent
+from bcppl.inference.tempered_smc import kernel as shipped
+from bcppl.parts import Part
+from bcppl.poses import FREE, Freedom
+from bcppl.simulators.camera import Camera
+from bcppl.simulators.renderer import DepthRenderer
+from bcppl.traces import Trace
+from tests.calibration.case import Case
+
+CAMERA = Camera("coarse", 16, 12, 16.0, 16.0, 7.5, 5.5, np.array([0.0, 0, 0, 1, 0, 0, 0]), near=0.05, far=1.5)
+CENTER = poses.as_pose([0.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0])
+
+
+def box() -> Part:
+    """A box of 12 x 8 x 5 cm, its frame in its middle: a half turn about any of its axes changes nothing."""
+    mesh = trimesh.creation.box((0.12, 0.08, 0.05))
+    return Part("box", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+RENDERER = DepthRenderer(box())
+
+
+class Seen:
+    """The program: a pose from a normal prior, and a depth image of the box."""
+
+    def __init__(self, spread: tuple[float, ...], freedom: Freedom, scale: float, outlier: float) -> None:
+        self.spread, self.freedom = torch.tensor(spread, dtype=torch.float64), freedom
+        self.scale, self.outlier = scale, outlier
+
+    def __call__(self, count: int) -> None:
+        pose = pyro.sample("pose", NormalPose(CENTER, self.spread, self.freedom))
+        if count:
+            seen = RobustDepth(RENDERER, CAMERA, pose, self.scale, outlier=self.outlier)
+            pyro.sample("seen", seen)
+
+
+OVER = poses.retract(CENTER, torch.tensor([0.0, 0.0, 0.0, math.pi, 0.0, 0.0], dtype=torch.float64))
+OVER_SPREAD = torch.tensor([0.02, 0.02, 0.02, 1.2, 1.2, 1.2], dtype=torch.float64)
+
+
+def turned_over(trace: Trace) -> None:
+    """A pose drawn anew about the box lying on its other side, wherever the particle is."""
+    pyro.sample("pose", NormalPose(OVER.expand(len(trace), 7), OVER_SPREAD))
+
+
+def six_axes(scale: float = 0.04, believed: float | None = None) -> Case:
+    """Wide rotations, weakly seen: there their measure counts; a box turned over looks alike."""
+    spread, outlier = (0.02, 0.02, 0.02, 1.3, 1.3, 1.3), 0.4
+    program = Seen(spread, FREE, scale, outlier)
+    inferred = Seen(spread, FREE, believed or scale, outlier)
+    kernel = cycle(shipped("pose"), metropolis_hastings(turned_over))
+    return Case(program, CENTER, FREE, kernel, inferred, sweeps=6)
+
+
+def planar(scale: float = 0.015, believed: float | None = None) -> Case:
+    """On a table: two translations and a turn, well seen."""
+    spread, freedom, outlier = (0.03, 0.03, 0.4), Freedom("xy", "z"), 0.1
+    program = Seen(spread, freedom, scale, outlier)
+    inferred = Seen(spread, freedom, believed or scale, outlier)
+    kernel = cycle(shipped("pose"), metropolis_hastings(independent("pose", components=None)))
+    return Case(program, CENTER, freedom, kernel, inferred, sweeps=6)
