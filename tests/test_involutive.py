@@ -23,7 +23,7 @@ from bcppl.inference.targets import POSTERIOR
 from bcppl.poses import FREE, Freedom
 from bcppl.traces import Trace, simulate
 
-DRAWS = 20_000
+DRAWS = 10_000
 SOUND, BROKEN = 4.5, 8.0
 
 Values = Mapping[str, Tensor]

@@ -261,7 +261,7 @@ def test_a_particle_without_weight_does_not_come_back_as_not_a_number() -> None:
     torch.manual_seed(0)
     trace, weights = generate(bounded, (0,), {}, 400)
     population = Population(trace, weights)
-    take = drift_and_weigh(drift("x", (0.2, 0.21)), never)
+    take = drift_and_weigh(fixed_drift, never)
     for k in range(4):
         population, *_ = take(population, Observed((k + 1,), {f"y_{k}": number(0.0)}))
         assert not bool(torch.isnan(population.log_weights).any())

@@ -99,7 +99,7 @@ def switch(trace: Trace) -> Any:
     """A discrete value turned over, or not, by chance; the size follows, and a little more."""
     kind, size = trace["kind"], trace["size"]
     change = pyro.sample("change", dist.Bernoulli(torch.where(kind == 1, number(0.7), number(0.3))))
-    factor = pyro.sample("factor", dist.LogNormal(number(0.1), 0.2))
+    factor = pyro.sample("factor", dist.LogNormal(number(0.35), 0.2))
     new = torch.where(change == 1, 1 - kind, kind)
     grown = size * factor * torch.exp(0.7 * (new - kind))
     return {"kind": new, "size": grown}, {"changed": change, "divisor": factor}
@@ -108,7 +108,7 @@ def switch(trace: Trace) -> Any:
 def switch_back(trace: Trace) -> Any:
     kind, size = trace["kind"], trace["size"]
     change = pyro.sample("changed", dist.Bernoulli(torch.where(kind == 1, number(0.6), number(0.4))))
-    factor = pyro.sample("divisor", dist.LogNormal(number(0.0), 0.3))
+    factor = pyro.sample("divisor", dist.LogNormal(number(0.3), 0.25))
     old = torch.where(change == 1, 1 - kind, kind)
     return {"kind": old, "size": size / factor * torch.exp(0.7 * (old - kind))}, {
         "change": change,
@@ -149,22 +149,22 @@ def further(pose: Tensor, amount: Tensor) -> Tensor:
 
 
 def turn_on(trace: Trace) -> Any:
-    u = pyro.sample("u", dist.Normal(number(0.1), 0.1))
+    u = pyro.sample("u", dist.Normal(number(0.2), 0.1))
     return {"pose": further(trace["pose"], u)}, {"v": u}
 
 
 def turn_off(trace: Trace) -> Any:
-    v = pyro.sample("v", dist.Normal(number(0.05), 0.12))
+    v = pyro.sample("v", dist.Normal(number(0.17), 0.12))
     return {"pose": further(trace["pose"], -v)}, {"u": v}
 
 
 def spread_out(trace: Trace) -> Any:
-    u = pyro.sample("u", dist.Normal(number(0.1), 0.1))
+    u = pyro.sample("u", dist.Normal(number(0.2), 0.1))
     return {"pose": plane_scaled(trace["pose"], u)}, {"v": u}
 
 
 def draw_in(trace: Trace) -> Any:
-    v = pyro.sample("v", dist.Normal(number(0.05), 0.12))
+    v = pyro.sample("v", dist.Normal(number(0.17), 0.12))
     return {"pose": plane_scaled(trace["pose"], -v)}, {"u": v}
 
 
