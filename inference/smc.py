@@ -17,7 +17,9 @@ from torch import Tensor
 
 from bcppl.beliefs import Belief
 from bcppl.errors import InferenceError, InputError
+from bcppl.inference.importance import importance_sampling
 from bcppl.inference.population import Population
+from bcppl.inference.progress import watched
 from bcppl.inference.step import Observed, StepFunction, StepInfo
 from bcppl.inference.tempering import tempered
 from bcppl.traces import Model, Series, Trace, extend, generate
@@ -103,6 +105,7 @@ def smc(
     seed: int = 0,
     scene: Any = None,
     start: Step | None = None,
+    progress: bool = True,
 ) -> Iterator[Step]:
     """Run SMC over a recording: yields the prior's belief first, then one step for each measurement.
 
@@ -115,17 +118,32 @@ def smc(
         scene: `model.prepare(recording)` unless given.
         start: go on from this one, with its particles and its random state: what is yielded are the steps
             after it, the same to the bit as those of the run that it was taken from.
+        progress: show a bar, on a terminal or in a notebook.
 
     Raises:
         InferenceError: no particle is left with any weight; names the measurement.
         InputError: the program samples no pose at `model.pose`, or `start` has taken more measurements in
             than there are.
     """
+    steps = _steps(model, recording, step, particles, seed, scene, start)
+    left = len(recording.measurements) + (1 if start is None else -start.taken)
+    return watched(steps, total=left, describe=lambda each: each.info.label, progress=progress)
+
+
+def _steps(
+    model: Model,
+    recording: Any,
+    step: StepFunction,
+    particles: int,
+    seed: int,
+    scene: Any,
+    start: Step | None,
+) -> Iterator[Step]:
     scene = model.prepare(recording) if scene is None else scene
     if start is None:
         state = [torch.Generator().manual_seed(seed).get_state()]
         with _own_state(state, particles):
-            population = Population(*generate(model.program, (scene, []), {}, particles))
+            population = importance_sampling(model.program, (scene, []), {}, particles)
         if model.pose not in population.trace:
             raise InputError(
                 f"the model's pose is said to be at address {model.pose!r}, which its program never samples; "

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from bcppl import poses
@@ -22,6 +21,7 @@ from bcppl.beliefs import average_distance, average_nearest_distance
 from bcppl.cli import loading
 from bcppl.errors import InputError
 from bcppl.figures import add_over_time, belief_in_3d
+from bcppl.inference.progress import sole_bar
 from bcppl.recordings import Recording
 from bcppl.recordings.beliefs import save_belief
 
@@ -92,7 +92,7 @@ def run(
             style="yellow",
         )
     try:
-        with _progress(console) as progress:
+        with sole_bar(console) as progress:
             task = progress.add_task("prior", total=len(found.measurements))
             for step in infer(chosen, found, particles=particles, seed=seed, scene=scene):
                 if not steps:
@@ -115,11 +115,6 @@ def run(
             _report(console, found, steps)
             _draw(folder, found, steps)
             console.print(f"beliefs and figures are in {folder}")
-
-
-def _progress(console: Console) -> Progress:
-    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 def _start(folder: Path) -> None:

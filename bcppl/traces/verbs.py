@@ -63,7 +63,11 @@ def simulate(program: Program | Series, args: tuple[Any, ...] = (), particles: i
 
 
 def generate(
-    program: Program | Series, args: tuple[Any, ...], observations: Mapping[str, Tensor], particles: int
+    program: Program | Series,
+    args: tuple[Any, ...],
+    observations: Mapping[str, Tensor],
+    particles: int,
+    choices: Mapping[str, Tensor] | None = None,
 ) -> tuple[Trace, Tensor]:
     """Run a program with some sites constrained, the others drawn from the program itself.
 
@@ -73,20 +77,27 @@ def generate(
         particles: N.
         observations: values by address, of the shape of the site's plates and event: the same for all
             particles.
+        choices: values (N, ...) of latent addresses, such as a proposal gave; the others are drawn.
 
     Returns:
-        The trace and the log weight (N,): the summed log-probability of what was constrained.
+        The trace and the log weight (N,): the summed log-probability of what was constrained and of the
+        choices that were given.
 
     Raises:
-        InputError: an observed address is never visited, or an observation has not its site's shape;
+        InputError: an observed address is never visited, an observation has not its site's shape, or a
+            choice is of an observed address or one never visited;
             see also `bcppl.traces.run.run`.
     """
-    program = runnable(program)
-    ran = run(program, args, particles, observations, {})
-    refuse_unvisited(observations, ran)
+    program, choices = runnable(program), choices or {}
+    again = [a for a in choices if a in observations]
+    if again:
+        raise InputError(f"address {again[0]!r} is observed and given a value for each particle; give one.")
+    given = {**observations, **choices}
+    ran = run(program, args, particles, given, {})
+    refuse_unvisited(given, ran)
     _refuse_one_each(observations, ran, particles)
     trace = trace_of(program, args, particles, ran, observations)
-    constrained = [a for a in ran.distributions if a in observations or a in ran.fixed]
+    constrained = [a for a in ran.distributions if a in given or a in ran.fixed]
     return trace, _weight(trace, constrained)
 
 

@@ -1,0 +1,96 @@
+"""Markov chains, one for each particle, all moved at once: the kernels of SMC by themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from bcppl.errors import InputError
+from bcppl.inference.kernels import Kernel, put
+from bcppl.inference.population import Population
+from bcppl.inference.progress import watched
+from bcppl.inference.targets import POSTERIOR, Target
+from bcppl.traces import Trace
+
+
+class Chains(NamedTuple):
+    """Where chains went.
+
+    Attributes:
+        draws: (S, N, *event) by address, the state of each of N chains after each recorded move.
+        acceptance: (N,) share of its proposals that each chain took.
+        trace: the last states.
+    """
+
+    draws: Mapping[str, Tensor]
+    acceptance: Tensor
+    trace: Trace
+
+
+def markov_chains(
+    kernel: Kernel,
+    start: Population | Trace,
+    moves: int,
+    target: Target = POSTERIOR,
+    *,
+    addresses: Collection[str] | None = None,
+    every: int = 1,
+    progress: bool = True,
+) -> Chains:
+    """Run a chain from each particle.
+
+    The kernel is fitted once, each half of the chains learning from where the other half starts, and then
+    stays as it is: so the target is left invariant however long the chains are.
+
+    Args:
+        kernel: what moves.
+        start: where the chains start, and what is learned from, by weight if it is a population. Chains from
+            resampled particles of a population start where they should end.
+        moves: how many.
+        target: what the chains leave invariant.
+        addresses: the latent addresses to record; by default all.
+        every: record after each so many moves.
+        progress: show a bar, on a terminal or in a notebook.
+
+    Raises:
+        InputError: no moves, or an address is not latent.
+    """
+    population = start if isinstance(start, Population) else _equal(start)
+    trace, count = population.trace, len(population)
+    if moves < 1 or every < 1:
+        raise InputError(f"chains are to make {moves} moves, recorded every {every}; give 1 or more of each.")
+    recorded = list(trace.choices if addresses is None else addresses)
+    for address in recorded:
+        if address not in trace.choices:
+            raise InputError(
+                f"chains are to record {address!r}, which is no latent address; "
+                f"latent are {', '.join(trace.choices) or 'none'}."
+            )
+    order = torch.randperm(count)
+    halves = [h for h in (order[: count // 2], order[count // 2 :]) if len(h)]
+    fitted = [kernel(_teachers(population[other])) for other in halves[::-1]]
+    taken = torch.zeros(count, dtype=torch.float64)
+    draws: dict[str, list[Tensor]] = {address: [] for address in recorded}
+    for number in watched(range(1, moves + 1), description="chains", progress=progress):
+        for mine, move in zip(halves, fitted, strict=True):
+            moved, accepted = move(trace[mine], target)
+            trace = put(trace, mine, moved)
+            taken[mine] += accepted.to(torch.float64)
+        if number % every == 0:
+            for address, states in draws.items():
+                states.append(trace[address])
+    # Values of a trace are never written to, so they are kept as they are until here.
+    stacked = {a: torch.stack(s) if s else trace[a][None][:0] for a, s in draws.items()}
+    return Chains(stacked, taken / moves, trace)
+
+
+def _equal(trace: Trace) -> Population:
+    return Population(trace, torch.zeros(trace.particles, dtype=torch.float64))
+
+
+def _teachers(population: Population) -> Population:
+    some = bool((population.log_weights > -torch.inf).any())
+    return population if some else _equal(population.trace)

@@ -1,0 +1,112 @@
+"""Collectors: functions that watch a run as it goes by, and leave it as it was.
+
+    watched = collect(smc(model, recording, step=step), size=effective_sample_size, hole=mean("hole"))
+    for belief, info in watched:
+        ...
+    watched["size"]                                         # (steps,)
+
+As in `particles` (Chopin and Papaspiliopoulos, 2020), whose collectors they are named after.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from bcppl.beliefs import normalised
+from bcppl.errors import InputError
+from bcppl.inference import kernels
+
+S = TypeVar("S")
+
+
+class Collected(Generic[S]):
+    """The steps of a run, handed on one by one, and a column for each function of what went by."""
+
+    def __init__(self, steps: Iterable[S], functions: dict[str, Callable[[S], Any]]) -> None:
+        self._steps = iter(steps)
+        self._functions = functions
+        self._columns: dict[str, list[Any]] = {name: [] for name in functions}
+
+    def __iter__(self) -> Iterator[S]:
+        return self
+
+    def __next__(self) -> S:
+        step = next(self._steps)
+        # What a function draws is not taken from the run.
+        with torch.random.fork_rng(devices=[]):
+            row = {name: function(step) for name, function in self._functions.items()}
+        for name, value in row.items():
+            self._columns[name].append(value)
+        return step
+
+    def to_end(self) -> Collected[S]:
+        """Let the run go on to its end."""
+        for _ in self:
+            pass
+        return self
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """By name, (steps, ...) tensors where all values are numbers or tensors of one shape, else lists."""
+        return {name: self[name] for name in self._columns}
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._columns:
+            raise InputError(
+                f"nothing was collected as {name!r}; there are {', '.join(self._columns) or 'no columns'}."
+            )
+        column = self._columns[name]
+        if not column or not all(isinstance(v, Tensor | float | int) for v in column):
+            return list(column)
+        values = [torch.as_tensor(v, dtype=None if isinstance(v, Tensor) else torch.float64) for v in column]
+        return torch.stack(values) if len({v.shape for v in values}) == 1 else list(column)
+
+
+def collect(steps: Iterable[S], **functions: Callable[[S], Any]) -> Collected[S]:
+    """Watch a run: `name=function(step)` for each column.
+
+    Args:
+        steps: an iterator such as `smc(...)` or `bcppl.inference.step.steps(...)`; it is not run ahead.
+        functions: what is read of each step; see the ones below.
+
+    Returns:
+        An iterator over the same steps, whose `[name]` and `.columns` hold what was collected so far.
+    """
+    return Collected(steps, functions)
+
+
+def effective_sample_size(step: Any) -> float:
+    """Of the population after the step."""
+    return float(step.population.effective_sample_size)
+
+
+def log_evidence(step: Any) -> float:
+    """Of all measurements so far."""
+    return float(step.population.log_evidence)
+
+
+def acceptance(step: Any) -> float:
+    """The share of proposals accepted, NaN where nothing was moved."""
+    return float(step.info.acceptance)
+
+
+def distinct(step: Any) -> int:
+    """How many particles differ in some latent value."""
+    return kernels.distinct(step.population)
+
+
+def mean(address: str) -> Callable[[Any], Tensor]:
+    """The weighted mean of a latent address: of a pose (7,), of another value the shape of its event."""
+
+    def weighted(step: Any) -> Tensor:
+        population = step.population
+        if getattr(population.trace.distributions[address], "freedom", None) is not None:
+            return population.belief(address).mean
+        value = population.trace[address].to(torch.float64)
+        return torch.tensordot(normalised(population.log_weights), value, dims=1)
+
+    return weighted

@@ -1,0 +1,59 @@
+"""Progress bars: on a terminal and in a notebook, and nothing elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sized
+from contextlib import contextmanager
+from typing import TypeVar
+
+from rich import get_console
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+T = TypeVar("T")
+
+# The bar on show: one is enough, so what runs within what is watched shows none of its own.
+_shown: list[Progress] = []
+
+
+@contextmanager
+def sole_bar(console: Console | None = None) -> Iterator[Progress]:
+    """A bar that is the only one until it is gone; it shows nothing where there is no one to see it."""
+    console = get_console() if console is None else console
+    seen = (console.is_terminal or console.is_jupyter) and not _shown
+    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    bar = Progress(*columns, console=console, transient=True, disable=not seen)
+    _shown.append(bar)
+    try:
+        with bar:
+            yield bar
+    finally:
+        _shown.remove(bar)
+
+
+def watched(
+    items: Iterable[T],
+    *,
+    total: int | None = None,
+    description: str = "",
+    describe: Callable[[T], str] | None = None,
+    progress: bool = True,
+) -> Iterator[T]:
+    """The same items, with a bar that says how many of them have come.
+
+    Args:
+        items: anything to iterate over: moves, runs, steps of `smc`.
+        total: how many there will be; by default the length, where there is one.
+        description: what stands beside the bar.
+        describe: what stands there after an item, in its place.
+        progress: False for no bar.
+    """
+    if not progress:
+        yield from items
+        return
+    expected = len(items) if total is None and isinstance(items, Sized) else total
+    with sole_bar() as bar:
+        task = bar.add_task(description, total=expected)
+        for item in items:
+            bar.update(task, advance=1, description=describe(item) if describe else description)
+            yield item

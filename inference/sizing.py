@@ -1,0 +1,66 @@
+"""Verbs that change how many particles a population has; each leaves what it estimates unbiased.
+
+GenParticleFilters.jl (`pf_resize!`, `pf_replicate!`, `pf_coalesce!`) has the same verbs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+
+from bcppl.beliefs import normalised
+from bcppl.errors import InputError
+from bcppl.inference.population import Population
+from bcppl.inference.schemes import Scheme, systematic
+
+
+def resized(population: Population, count: int, scheme: Scheme = systematic) -> Population:
+    """A population grown or shrunk to `count` particles by resampling, equally weighted.
+
+    Raises:
+        InferenceError: no particle has any weight.
+        InputError: `count` is below 1.
+    """
+    return population.selected(scheme(population.log_weights, count))
+
+
+def replicated(population: Population, times: int) -> Population:
+    """Every particle `times` times, side by side, each copy with the same weight; nothing is drawn.
+
+    Raises:
+        InputError: `times` is below 1.
+    """
+    if times < 1:
+        raise InputError(f"particles are to be replicated {times} times; give 1 or more.")
+    return population[torch.arange(len(population)).repeat_interleave(times)]
+
+
+def merged(population: Population) -> Population:
+    """Particles that agree in every latent value made one, with the sum of their weights.
+
+    The first of each keeps its place. Of copies that descend from different founders the variance of the
+    evidence can no longer be told (`bcppl.inference.variance`).
+
+    Raises:
+        InferenceError: no particle has any weight.
+    """
+    count = len(population)
+    weights = normalised(population.log_weights)
+    numbers = [v.reshape(count, -1).to(torch.float64) for v in population.trace.choices.values()]
+    together = torch.cat([torch.zeros(count, 1, dtype=torch.float64), *numbers], dim=1)
+    _, group = torch.unique(together, dim=0, return_inverse=True)
+    groups = int(group.max()) + 1
+    first = torch.full((groups,), count).scatter_reduce(0, group, torch.arange(count), "amin")
+    total = torch.zeros(groups, dtype=torch.float64).index_add_(0, group, weights)
+    order = first.argsort()
+    kept = first[order]
+    # The mean weight stays what it was, so a merged population goes on as the whole would have.
+    log_weights = total.log()[order] + population.log_total + math.log(groups / count)
+    mixed = bool((population.founders[first][group] != population.founders).any())
+    return replace(
+        population[kept],
+        log_weights=log_weights,
+        log_pairs=math.inf if mixed else population.log_pairs,
+    )

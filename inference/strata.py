@@ -1,0 +1,138 @@
+"""Stratified starts: the first latent choice is drawn stratum by stratum, so that none is left out.
+
+Cochran, Sampling Techniques, 1977, chapter 5; as in GenParticleFilters.jl's `pf_initialize` with strata.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bcppl.errors import InputError
+from bcppl.inference.population import Population
+from bcppl.traces import Series, Trace, generate
+
+Program = Callable[..., Any]
+
+
+def generate_stratified(
+    program: Program | Series,
+    args: tuple[Any, ...],
+    observations: Mapping[str, Tensor],
+    particles: int,
+    strata: int | Callable[[Tensor], Tensor] | None = None,
+    *,
+    candidates: int = 10,
+) -> Population:
+    """Generate, with the first latent choice of the program drawn by stratum.
+
+    A discrete choice takes each of its values with equally many particles, weighed by the value's chance. A
+    real one with an inverse distribution function is drawn within `strata` stretches of equal chance. For any
+    other, such as a pose, `strata` says which stratum a value lies in; then `candidates` times as many
+    particles are drawn from the program, and from each stratum equally many go on, weighed by the share of
+    the candidates that fell there. The estimate of the evidence is unbiased in all three.
+
+    Args:
+        program: a Pyro program.
+        args: its arguments.
+        observations: values by address, as for `generate`.
+        particles: N.
+        strata: how many stretches, by default N; or a function of values (M, *event) that gives the number of
+            each one's stratum, (M,) int64.
+        candidates: how many for each particle, where `strata` is a function.
+
+    Returns:
+        The population. The variance of its evidence cannot be told from its founders.
+
+    Raises:
+        InputError: there is no latent choice, fewer particles than strata, or no inverse distribution
+            function and no function given.
+    """
+    trace, _ = generate(program, args, observations, particles)
+    if not trace.choices:
+        raise InputError("a start is to be stratified, but the program has no latent choice; use generate.")
+    address = next(a for a in trace.addresses if a in trace.choices)
+    if callable(strata):
+        wide = generate(program, args, observations, particles * candidates)
+        return _chosen(*wide, strata(wide[0][address]), particles)
+    if trace.distributions[address].has_enumerate_support:
+        return _enumerated(program, args, observations, trace, address)
+    return _stretched(program, args, observations, trace, address, particles if strata is None else strata)
+
+
+def _start(trace: Trace, log_weights: Tensor) -> Population:
+    return Population(trace, log_weights, log_pairs=math.inf)
+
+
+def _refuse_more(strata: int, particles: int) -> None:
+    if not 0 < strata <= particles:
+        raise InputError(
+            f"{particles} particles are to represent {strata} strata; give at least one for each stratum."
+        )
+
+
+def _enumerated(
+    program: Program | Series,
+    args: tuple[Any, ...],
+    observations: Mapping[str, Tensor],
+    trace: Trace,
+    address: str,
+) -> Population:
+    site, particles = trace.distributions[address], trace.particles
+    values = site.enumerate_support(expand=False)
+    values = values.reshape(len(values), *site.event_shape)
+    _refuse_more(len(values), particles)
+    stratum = torch.arange(particles) % len(values)
+    chosen = values[stratum].to(trace[address])
+    started, log_weights = generate(program, args, observations, particles, {address: chosen})
+    share = torch.bincount(stratum).to(torch.float64) / particles
+    return _start(started, log_weights - share.log()[stratum])
+
+
+def _stretched(
+    program: Program | Series,
+    args: tuple[Any, ...],
+    observations: Mapping[str, Tensor],
+    trace: Trace,
+    address: str,
+    strata: int,
+) -> Population:
+    site, particles = trace.distributions[address], trace.particles
+    _refuse_more(strata, particles)
+    # Of strata that do not divide N, chance says which get one more: each draw is then the program's own.
+    stratum = (torch.arange(particles) + int(torch.randint(strata, ()))) % strata
+    quantile = (stratum + torch.rand(particles, dtype=torch.float64)) / strata
+    try:
+        if site.event_shape:
+            raise NotImplementedError
+        chosen = site.icdf(quantile).to(trace[address])
+    except NotImplementedError:
+        raise InputError(
+            f"the first latent choice {address!r} has no inverse distribution function; "
+            "give strata as a function that says which stratum a value lies in."
+        ) from None
+    started, log_weights = generate(program, args, observations, particles, {address: chosen})
+    # The values are the program's own draws: it is only together that they are spread more evenly.
+    return _start(started, log_weights - started.log_prob(address))
+
+
+def _chosen(trace: Trace, log_weights: Tensor, stratum: Tensor, particles: int) -> Population:
+    _, stratum, found = torch.unique(stratum, return_inverse=True, return_counts=True)
+    _refuse_more(len(found), particles)
+    wanted = torch.full_like(found, particles // len(found))
+    wanted[: particles % len(found)] += 1
+    # Candidates are exchangeable within a stratum, so the first of each are as good as any. A stratum with
+    # fewer than are wanted gives some of them more than once, each with its share of the weight.
+    kept, log_factors = [], []
+    for number, (count, want) in enumerate(zip(found.tolist(), wanted.tolist(), strict=True)):
+        members = (stratum == number).nonzero().flatten()
+        kept.append(members[torch.arange(want) % count])
+        each = torch.bincount(torch.arange(want) % count).to(torch.float64)
+        weight = count / len(stratum) * particles / min(count, want) / each
+        log_factors.append(weight.log()[torch.arange(want) % count])
+    index = torch.cat(kept)
+    return _start(trace[index], log_weights[index] + torch.cat(log_factors))

@@ -1,0 +1,39 @@
+"""The variance of a run's evidence, from that run alone: how many founders the particles still descend from.
+
+Lee and Whiteley, Variance estimation in the particle filter, Biometrika 105, 2018, eq. 8.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from bcppl.beliefs import normalised
+from bcppl.inference.population import Population
+
+
+def evidence_variance(population: Population) -> float:
+    """Relative variance of a run's estimate of the evidence: about the variance of its log.
+
+    With multinomial resampling, at fixed times, and fixed exponents and proposals, this times the squared
+    estimate is unbiased for the estimate's variance; when to resample may hang on the particles (Du and
+    Guyader, Variance estimation in adaptive sequential Monte Carlo, Annals of Applied Probability 31, 2021:
+    consistent). Other schemes vary less than it says, for what it counts is independent draws. It may
+    come out negative where the variance is small, and says little once few founders are left.
+
+    Returns:
+        NaN where all particles with weight share one founder, where founders were merged, or where the
+        start was stratified.
+
+    Raises:
+        InferenceError: no particle has any weight.
+    """
+    weights = normalised(population.log_weights)
+    if math.isinf(population.log_pairs):
+        return math.nan
+    _, founder = torch.unique(population.founders, return_inverse=True)
+    shares = torch.zeros(int(founder.max()) + 1, dtype=torch.float64).index_add_(0, founder, weights)
+    if int((shares > 0).sum()) < 2:
+        return math.nan
+    return 1.0 - math.exp(population.log_pairs) * (1.0 - float(shares @ shares))
