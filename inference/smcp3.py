@@ -3,9 +3,9 @@
 Lew, Matheos, Zhi-Xuan, Ghavamizadeh, Gothoskar, Russell and Mansinghka, SMCP3: Sequential Monte Carlo with
 probabilistic program proposals, AISTATS 2023. The forward program chooses at random what to do with a
 particle, the backward program what was done; each says what the other has to choose to undo it. The weight of
-a move is p(new) L(backward choices | new) |det J| / (p(old) K(forward choices | old)), eq. 3 and theorem 2
-of the paper, J that of the map from (old values, forward choices) to (new values, backward choices), taken in
-the coordinates of the densities' base measures (`bcppl.inference.kernels.jacobian`). With fixed programs the
+a move is p(new) L(backward choices | new) |det J| / (p(old) K(forward choices | old)), J that of the map from
+(old values, forward choices) to (new values, backward choices) (theorem 2 of the paper), taken in the
+coordinates of the densities' base measures (`bcppl.inference.kernels.jacobian`). With fixed programs the
 estimate of the evidence stays unbiased.
 
     def forward(trace):

@@ -27,7 +27,7 @@ FLOOR = 1e-6
 def hmc(*addresses: str, step_size: float = 0.5, steps: int = 8, jitter: float = 0.3) -> Kernel:
     """Hamiltonian Monte Carlo with the leapfrog integrator.
 
-    Neal, MCMC using Hamiltonian dynamics, Handbook of Markov Chain Monte Carlo, 2011, section 5.3.2.1. The
+    Neal, MCMC using Hamiltonian dynamics, Handbook of Markov Chain Monte Carlo, 2011, section 5.3. The
     inverse mass matrix is the weighted covariance of the particles it learns from (not of those it moves),
     so a step of 1 is about one standard deviation whatever the units. Constrained values (positive, in an
     interval, on a simplex) move in unconstrained coordinates, the Jacobian included.

@@ -31,8 +31,8 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
     """Involutive MCMC: auxiliary choices, and a map of them and the latent values that is its own inverse.
 
     Green's reversible jump (Biometrika 82, 1995) with everything but the map derived: Cusumano-Towner, Lew
-    and Mansinghka, Automating involutive MCMC using probabilistic and differentiable programming, 2020,
-    algorithm 1. The log-ratio of acceptance is log p(new) q(new choices | new) - log p(old) q(choices | old)
+    and Mansinghka, Automating involutive MCMC using probabilistic and differentiable programming, 2020.
+    The log-ratio of acceptance is log p(new) q(new choices | new) - log p(old) q(choices | old)
     + log|det J|; J is found by autograd in the coordinates of the densities' base measures
     (`bcppl.inference.kernels.jacobian`).
 

@@ -7,7 +7,7 @@ its density is with respect to Lebesgue x Haar (`bcppl.poses`), and Haar measure
 up to a constant, the same at every rotation.
 
 Cusumano-Towner, Lew and Mansinghka, Automating involutive MCMC using probabilistic and differentiable
-programming, 2020, section 4: an output that is an input is found first, which takes its row and its column
+programming, 2020: an output that is an input is found first, which takes its row and its column
 out of the determinant; only the rest is differentiated.
 """
 
