@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -25,22 +26,35 @@ def test_notebook_is_kept_without_outputs(path: Path) -> None:
     assert set(notebook.metadata) == {"kernelspec", "language_info"}
 
 
-def test_first_belief_runs_and_finds_the_part(tmp_path: Path) -> None:
-    notebook = nbformat.read(NOTEBOOKS / "first_belief.ipynb", as_version=4)
+class Ran(NamedTuple):
+    """What the cells of a notebook printed, and which of them drew a picture."""
+
+    said: dict[str, str]
+    drawn: set[str]
+
+
+def run(name: str, folder: Path) -> Ran:
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
     # The kernel starts in an empty folder: only what is installed can be read.
     client = nbclient.NotebookClient(
-        notebook, timeout=480, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+        notebook, timeout=480, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
     )
     client.execute()
     outputs = {cell.id: cell.outputs for cell in notebook.cells if cell.cell_type == "code"}
     said = {
-        name: "".join(o.text for o in all_of if o.output_type == "stream") for name, all_of in outputs.items()
+        name: "".join(o.text for o in all_of if o.output_type == "stream" and o.name == "stdout")
+        for name, all_of in outputs.items()
     }
     drawn = {
         name for name, all_of in outputs.items() if any("image/png" in o.get("data", {}) for o in all_of)
     }
-    assert drawn == {"views", "wrench", "prior", "forward", "vision-figure", "felt", "add", "final"}
     assert "Traceback" not in "".join(said.values())
+    return Ran(said, drawn)
+
+
+def test_first_belief_runs_and_finds_the_part(tmp_path: Path) -> None:
+    said, drawn = run("first_belief", tmp_path)
+    assert drawn == {"views", "wrench", "prior", "forward", "vision-figure", "felt", "add", "final"}
 
     # A row for the prior and one for each of the fourteen measurements, ADD in its column.
     rows = re.findall(
@@ -54,3 +68,36 @@ def test_first_belief_runs_and_finds_the_part(tmp_path: Path) -> None:
     assert adds["window 14"] < 2.0
     (final,) = re.findall(r"^ADD ([\d.]+) mm$", said["answer"], flags=re.MULTILINE)
     assert float(final) == adds["window 14"]
+
+
+def test_own_model_names_the_part_and_its_proposal_earns_its_place(tmp_path: Path) -> None:
+    said, drawn = run("own_model", tmp_path)
+    assert drawn == {"look", "figure"}
+    truth = re.search(r"^truth: (.+) at", said["infer"], flags=re.MULTILINE)
+    assert truth
+    above = said["infer"].split("after the view from above")[1]
+    named = re.search(rf"^  {truth[1]}: ([\d.]+)$", above, flags=re.MULTILINE)
+    assert named and float(named[1]) > 0.8
+    (alone,), (helped,) = (
+        re.findall(rf"^{label}: .* deviation ([\d.]+)$", said["without"], flags=re.MULTILINE)
+        for label in ("random walk alone", "with our proposal")
+    )
+    assert float(helped) < 0.5 * float(alone)
+
+
+def test_own_model_and_its_proposal_are_short() -> None:
+    notebook = nbformat.read(NOTEBOOKS / "own_model.ipynb", as_version=4)
+    sources = {cell.id: cell.source for cell in notebook.cells}
+    assert len((sources["model"] + "\n" + sources["proposal"]).splitlines()) < 60
+
+
+def test_swap_kernels_puts_four_programs_side_by_side(tmp_path: Path) -> None:
+    said, drawn = run("swap_kernels", tmp_path)
+    assert drawn == {"figure"}
+    rows = re.findall(
+        r"^(\S.*?) +([\d.]+) +(\d+) +(-?[\d.]+) +([\d.]+) mm ", said["table"], flags=re.MULTILINE
+    )
+    table = {name: [float(v) for v in values] for name, *values in rows}
+    assert len(table) == 4
+    assert all(1 <= ess <= 60 and 1 <= distinct <= 60 for ess, distinct, *_ in table.values())
+    assert table["random walk"][3] < 3.0 < table["BayesContact"][3]
