@@ -53,7 +53,7 @@ class RendersDepth(Protocol):
         """Depth images (N, H, W) in metres, +inf where a pixel does not see the part."""
 
 
-class _Observed(NamedTuple):
+class Observed(NamedTuple):
     """What an observation alone says, computed once for all particles.
 
     Attributes:
@@ -157,7 +157,7 @@ class _Depth(LazyDistribution):
             InputError: a pose is not finite, or the image has another shape.
         """
         self._check_pose()
-        seen = self._observe(value)
+        seen = self.observed(value)
         hits = self.renderer.hits(self.camera, self.pose.detach(), counted=np.asarray(seen.valid.any(axis=0)))
         pixel = hits.pixel
         rendered = np.minimum(hits.depth, seen.behind.take(pixel))
@@ -195,8 +195,13 @@ class _Depth(LazyDistribution):
     def _uniform(self, like: Tensor) -> Tensor:
         return self.camera.near + (self.camera.far - self.camera.near) * torch.rand_like(like)
 
-    def _observe(self, value: Tensor) -> _Observed:
-        cached: _Observed | None = _OBSERVED.get(value)
+    def observed(self, value: Tensor) -> Observed:
+        """What a depth image (H, W), or one for each particle (N, H, W), says without any pose.
+
+        Raises:
+            InputError: the image has another shape.
+        """
+        cached: Observed | None = _OBSERVED.get(value)
         if (
             cached is not None
             and cached.version == value._version
@@ -222,7 +227,7 @@ class _Depth(LazyDistribution):
         if self.effective_pixels is not None:
             power = np.minimum(1.0, self.effective_pixels / np.maximum(valid.sum(axis=1), 1))
         read = (self._parameters, self.background, self.region)
-        observed = _Observed(value._version, *read, self._behind, depth, valid, empty, power)
+        observed = Observed(value._version, *read, self._behind, depth, valid, empty, power)
         _OBSERVED[value] = observed
         return observed
 

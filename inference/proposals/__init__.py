@@ -2,6 +2,7 @@
 
 from bcppl.inference.proposals.ancestral import prior
 from bcppl.inference.proposals.density import independent
+from bcppl.inference.proposals.depth_points import depth_alignment
 from bcppl.inference.proposals.differences import differential_evolution
 from bcppl.inference.proposals.proposal import Fitted, Program, Proposal, program_of
 from bcppl.inference.proposals.spread import spread_of
@@ -13,6 +14,7 @@ __all__ = [
     "Fitted",
     "Program",
     "Proposal",
+    "depth_alignment",
     "differential_evolution",
     "drift",
     "independent",

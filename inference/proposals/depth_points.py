@@ -1,0 +1,149 @@
+"""Depth alignment: a part moved so that its rendered points come onto the measured depth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fnmatch import fnmatchcase
+from functools import reduce
+from operator import add
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyro
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.depth import LaplaceDepth, RobustDepth
+from bcppl.errors import InputError
+from bcppl.inference.population import Population
+from bcppl.inference.proposals.least_squares import Equations, aligned
+from bcppl.inference.proposals.proposal import Fitted
+from bcppl.inference.proposals.spread import spread_of
+from bcppl.poses import FREE, Freedom
+from bcppl.simulators.renderer import DepthRenderer, Hits
+from bcppl.traces import Trace
+
+Array = npt.NDArray[np.float64]
+Ids = npt.NDArray[np.int64]
+
+FARTHEST = 10.0  # scales of the depth's noise: what is farther off than this is not reached for
+ENOUGH = 200  # pixels of an image, for each particle: more say hardly more about where to move
+GRAZING = 0.3  # the cosine below which a surface's depth is trusted no less than at that cosine
+
+
+def depth_alignment(address: str, sites: str = "depth_*", *, steps: int = 1, reach: float = 1.0) -> Fitted:
+    """Moves a part so that the points rendered of it meet the measured depth, and proposes around that.
+
+    Gauss-Newton on point to plane distances along the pixels' rays, the planes those of the faces that are
+    hit, each pixel weighed by how far it is off (Geman and McClure's weights, their scale the particle's own
+    median error): what another thing shows is left out. What is proposed is a mixture of normals around the
+    answer, of the fit's covariance and of some times that. It renders once for each step, there and back.
+
+    Args:
+        address: of the pose.
+        sites: a pattern of the addresses of its depth images, `LaplaceDepth` or `RobustDepth`.
+        steps: of Gauss-Newton.
+        reach: the steps are damped towards staying, with a covariance that is the particles' own times this
+            squared.
+
+    Raises:
+        InputError: fewer than one step; when it is run: no depth image is at such an address, or one is of
+            another pose than that at `address`.
+    """
+    if steps < 1 or not reach > 0.0:
+        raise InputError(
+            f"depth_alignment is given {steps} steps and reach {reach}; give 1 or more, and more than 0."
+        )
+    spread = spread_of(address)
+
+    def fit(population: Population) -> Callable[[Trace], None]:
+        damping = torch.linalg.inv(reach**2 * spread(population))
+
+        def towards_depth(trace: Trace) -> None:
+            images = [a for a in trace.addresses if fnmatchcase(a, sites)]
+            if not images:
+                raise InputError(
+                    f"depth_alignment is to read {sites!r}, which fits no address; "
+                    f"the program visits {', '.join(trace.addresses)}."
+                )
+            freedom: Freedom = getattr(trace.distributions[address], "freedom", FREE)
+            pose = trace[address]
+            for _ in range(steps):
+                each = [_equations(trace, address, image, pose) for image in images]
+                equations = reduce(add, (said for said, _ in each))
+                answer = aligned(pose, equations, damping, freedom, reduce(add, (sure for _, sure in each)))
+                pose = answer.pose
+            pyro.sample(address, answer.around(freedom))
+
+        return towards_depth
+
+    return Fitted(fit)
+
+
+def _equations(trace: Trace, address: str, image: str, pose: Tensor) -> tuple[Equations, Tensor]:
+    """What one depth image says of poses (N, 7), and how sure its likelihood is of that, (N, 6, 6)."""
+    site: Any = trace.distributions[image]
+    renderer = getattr(site, "renderer", None)
+    if not isinstance(site, LaplaceDepth | RobustDepth) or not isinstance(renderer, DepthRenderer):
+        raise InputError(
+            f"depth_alignment reads site {image!r}, which is a {type(site).__name__} and no depth image; "
+            "name those that are with `sites`."
+        )
+    if not torch.equal(site.pose, trace[address]):
+        raise InputError(
+            f"depth_alignment moves {address!r}, but site {image!r} renders another pose; "
+            "name the images of that part with `sites`."
+        )
+    seen, camera = site.observed(trace[image]), site.camera
+    hits = renderer.hits(camera, pose, counted=np.asarray(seen.valid.any(axis=0)), faces=True)
+    hits, stood_for = _thinned(hits, len(pose))
+    assert hits.face is not None
+    own = hits.pixel + hits.particle * seen.depth.shape[1] if len(seen.depth) > 1 else hits.pixel
+    error = seen.depth.take(own) - hits.depth
+    told = seen.valid.take(own) & (hits.depth < seen.behind.take(hits.pixel))
+
+    camera_from_part = poses.compose(poses.inverse(torch.as_tensor(camera.world_from_camera)), pose)
+    turn = poses.rotation_matrix(camera_from_part).numpy()
+    row, column = np.divmod(hits.pixel, camera.width)
+    ray = np.stack(
+        [(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(len(row))], axis=1
+    )
+    normal = np.asarray(renderer.part.mesh.face_normals).take(hits.face, axis=0)
+    at = ray * hits.depth[:, None] - camera_from_part[:, :3].numpy().take(hits.particle, axis=0)
+    turned = turn.take(hits.particle, axis=0)
+    point = np.einsum("mji,mj->mi", turned, at)
+    # How far along the normal the plane moves when its depth along the ray grows by one.
+    slope = np.einsum("mji,mj,mi->m", turned, ray, normal)
+    scale = _scales(error, told, hits.particle, len(pose), site.scale).take(hits.particle)
+    weight = np.where(told, (1.0 + (0.5 * error / scale) ** 2) ** -2, 0.0)
+    weight *= stood_for.take(hits.particle) / (scale * np.maximum(np.abs(slope), GRAZING)) ** 2
+    equations = Equations.of_planes(
+        pose,
+        *(torch.from_numpy(np.asarray(x)) for x in (hits.particle, point, normal, error * slope, weight)),
+    )
+    return equations, torch.from_numpy(seen.power)[:, None, None] * equations.precision
+
+
+def _thinned(hits: Hits, particles: int) -> tuple[Hits, Array]:
+    """Every so many hits of each particle, no more than are enough, and how many (N,) each stands for."""
+    count = np.bincount(hits.particle, minlength=particles)
+    rank = np.arange(len(hits.particle)) - (np.cumsum(count) - count).take(hits.particle)
+    stride = np.maximum(-(-count // ENOUGH), 1)
+    kept = np.flatnonzero(rank % stride.take(hits.particle) == 0)
+    face = None if hits.face is None else hits.face.take(kept)
+    thinned = Hits(hits.particle.take(kept), hits.pixel.take(kept), hits.depth.take(kept), face)
+    return thinned, stride.astype(np.float64)
+
+
+def _scales(error: Array, told: npt.NDArray[np.bool_], particle: Ids, particles: int, noise: float) -> Array:
+    """Each particle's scale of the errors (N,): by their median size, between noise and farthest."""
+    size = np.where(told, np.abs(error), np.inf)
+    order = np.lexsort((size, particle))
+    first = np.searchsorted(particle, np.arange(particles))
+    count = np.bincount(particle, weights=told, minlength=particles).astype(np.int64)
+    middle = size[order].take(np.minimum(first + count // 2, len(order) - 1)) if len(order) else size
+    middle = np.where(count > 0, middle, 0.0) if len(order) else np.zeros(particles)
+    # A normal's median size is 0.674 standard deviations; a Laplace's standard deviation is sqrt 2 scales.
+    return np.asarray(np.clip(1.483 * middle, np.sqrt(2.0) * noise, FARTHEST * noise))

@@ -1,0 +1,186 @@
+"""Alignments: they find where a part is, they leave the posterior invariant, and their mutants do not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyro
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.depth import LaplaceDepth, RobustDepth
+from bcppl.distributions.poses import NormalPose, UniformPose
+from bcppl.errors import InputError
+from bcppl.inference.kernels import metropolis_hastings
+from bcppl.inference.population import Population
+from bcppl.inference.proposals import depth_alignment, program_of
+from bcppl.inference.proposals.proposal import Proposal
+from bcppl.inference.targets import POSTERIOR
+from bcppl.parts import Part
+from bcppl.poses import Freedom
+from bcppl.simulators.camera import Camera, looking_at
+from bcppl.simulators.renderer import DepthRenderer
+from bcppl.traces import Proposed, Trace, assess, propose, simulate
+
+DRAWS, TIMES = 2000, 4
+SOUND, BROKEN = 4.5, 8.0  # |z| of the worst of a few dozen expectations: below if invariant, above if not
+
+
+def matrix(rows: object) -> Tensor:
+    return torch.as_tensor(rows, dtype=torch.float64)
+
+
+def equal_weights(trace: Trace) -> Population:
+    return Population(trace, torch.zeros(len(trace), dtype=torch.float64))
+
+
+# A corner of a box, at its frame's origin, fills the view with three faces: a coarse image's outline
+# would say more than planes do.
+BOX = trimesh.creation.box((0.3, 0.3, 0.3), trimesh.transformations.translation_matrix((-0.15, -0.15, -0.15)))
+RENDERER = DepthRenderer(Part("box", np.asarray(BOX.vertices), np.asarray(BOX.faces, dtype=np.int64)))
+CAMERA = Camera(
+    "above", 16, 12, 22.0, 22.0, 7.5, 5.5, looking_at((0.1, 0.1, 0.12), (0.0, 0.0, 0.0)), near=0.05, far=0.6
+)
+TABLE = np.full((12, 16), 0.4)
+CENTER = poses.identity()
+SPREAD = matrix([0.01, 0.01, 0.006, 0.1, 0.1, 0.2])
+NOISE = 0.01
+PLANAR = Freedom("xy", "z")
+
+
+def seen(freedom: Freedom = poses.FREE, robust: bool = True) -> None:
+    """A box near where it is thought to be, and one coarse depth image of it."""
+    part = pyro.sample("part", NormalPose(CENTER, freedom.coordinates(SPREAD), freedom))
+    depth = RobustDepth if robust else LaplaceDepth
+    pyro.sample("depth_0", depth(RENDERER, CAMERA, part, NOISE, background=TABLE))
+
+
+def edged() -> None:
+    part = pyro.sample("part", UniformPose(CENTER, (0.02, 0.02, 0.0), 0.3, rotation="z"))
+    pyro.sample("depth_0", LaplaceDepth(RENDERER, CAMERA, part, NOISE))
+
+
+def of_poses(pose: Tensor) -> Tensor:
+    tangent = poses.local(CENTER, pose)
+    tangent = torch.cat([100.0 * tangent[:, :3], 10.0 * tangent[:, 3:]], dim=1)
+    return torch.cat(
+        [tangent, (tangent[:, :, None] * tangent[:, None, :]).flatten(1), torch.sin(2 * tangent)], 1
+    )
+
+
+def worst_z(
+    program: Callable[[], None], proposal: Proposal, functions: Callable[[Trace], Tensor], times: int = TIMES
+) -> float:
+    """The largest |z| of the change in expectations over exact draws of a pose with its own image."""
+    torch.manual_seed(1)
+    move = metropolis_hastings(proposal)(equal_weights(simulate(program, (), 60)))
+    trace = simulate(program, (), DRAWS)
+    before = functions(trace)
+    for _ in range(times):
+        trace, accepted = move(trace, POSTERIOR)
+        assert float(accepted.mean()) > 0.1, "hardly anything moved"
+    change = functions(trace) - before
+    moving = change.std(dim=0) > 1e-9
+    z = change.mean(dim=0)[moving] / (change.std(dim=0)[moving] / math.sqrt(DRAWS))
+    return float(z.abs().max())
+
+
+def of_both(trace: Trace) -> Tensor:
+    """Of the pose, and of how well it goes with the image: what is drawn towards the data goes too well."""
+    image = trace["depth_0"].flatten(1)
+    image = image.clamp(0.05, 0.3) - 0.18
+    tangent = poses.local(CENTER, trace["part"])
+    fit = trace.log_prob("depth_0")[:, None] / 100.0
+    return torch.cat(
+        [of_poses(trace["part"]), fit, fit**2, (image[:, ::17, None] * tangent[:, None]).flatten(1)], dim=1
+    )
+
+
+DEPTH_CASES: dict[str, Callable[[], None]] = {
+    "robust": seen,
+    "Laplace": lambda: seen(robust=False),
+    "planar": lambda: seen(PLANAR),
+    "edged": edged,
+}
+
+
+@pytest.mark.parametrize("case", DEPTH_CASES)
+def test_depth_alignment_leaves_pose_and_image_invariant(case: str) -> None:
+    assert worst_z(DEPTH_CASES[case], depth_alignment("part"), of_both) < SOUND
+
+
+def test_two_steps_of_depth_alignment() -> None:
+    assert worst_z(seen, depth_alignment("part", steps=2), of_both, times=1) < SOUND
+
+
+@pytest.mark.parametrize("case", ["robust", "planar"])
+def test_mutant_recentred_on_the_data_without_its_way_back(
+    case: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The way back taken to be as likely as the way there, as if a particle stepped out from where it was."""
+    there: list[Tensor] = []
+
+    def spied(*args: Any) -> Proposed:
+        proposed = propose(*args)
+        there.append(proposed.log_prob)
+        return proposed
+
+    monkeypatch.setattr("bcppl.inference.kernels.hastings.propose", spied)
+    monkeypatch.setattr("bcppl.inference.kernels.hastings.assess", lambda *args: there[-1])
+    assert worst_z(DEPTH_CASES[case], depth_alignment("part"), of_both) > BROKEN
+
+
+@pytest.mark.parametrize("case", DEPTH_CASES)
+def test_a_way_there_has_the_density_that_assess_gives_it(case: str) -> None:
+    torch.manual_seed(0)
+    trace = simulate(DEPTH_CASES[case], (), 40)
+    program = program_of(depth_alignment("part"), (), equal_weights(trace))
+    there = propose(program, (trace,), 40)
+    torch.testing.assert_close(assess(program, (trace,), there.choices, 40), there.log_prob)
+    back = assess(program, (trace.at(there.choices),), {"part": trace["part"]}, 40)
+    assert bool(torch.isfinite(back).all())
+
+
+def test_depth_alignment_finds_the_part() -> None:
+    """Off by a spread, five moves that are all taken bring it to where the image says."""
+    torch.manual_seed(0)
+    trace = simulate(seen, (), 200)
+    truth = trace["part"]
+    trace = trace.at({"part": simulate(seen, (), 200)["part"]})
+    points = 0.05 * torch.eye(3, dtype=torch.float64)
+
+    def off(trace: Trace) -> float:
+        apart = poses.transform(trace["part"], points) - poses.transform(truth, points)
+        return float(apart.norm(dim=-1).mean(dim=-1).median())
+
+    begun = off(trace)
+    move = metropolis_hastings(depth_alignment("part"))(equal_weights(trace))
+    for _ in range(6):
+        trace, _ = move(trace, POSTERIOR)
+    assert off(trace) < 0.4 * begun
+
+
+def test_depth_alignment_refuses_what_is_no_image_of_the_part() -> None:
+    def beside() -> None:
+        part = pyro.sample("part", NormalPose(CENTER, SPREAD))
+        other = pyro.sample("other", NormalPose(CENTER, SPREAD))
+        pyro.sample("depth_0", LaplaceDepth(RENDERER, CAMERA, other, NOISE))
+        pyro.sample("felt", NormalPose(part, SPREAD))
+
+    trace = simulate(beside, (), 3)
+    for sites, message in (
+        ("depth_*", "renders another pose"),
+        ("felt", "no depth image"),
+        ("touch_*", "fits no address"),
+    ):
+        program = program_of(depth_alignment("part", sites), (), equal_weights(trace))
+        with pytest.raises(InputError, match=message):
+            propose(program, (trace,), 3)
+    with pytest.raises(InputError, match="steps"):
+        depth_alignment("part", steps=0)
