@@ -137,9 +137,9 @@ def test_bars_are_for_terminals_and_only_one_at_a_time(monkeypatch: pytest.Monke
     assert list(progress.watched(range(4), description="moves")) == [0, 1, 2, 3]
     assert quiet.getvalue() == ""
     seen = shown(monkeypatch, True)
-    for outer in progress.watched(["a", "b"], describe=lambda item: f"item {item}"):
+    for _ in progress.watched(["a", "b"], describe=lambda item: f"item {item}"):
         assert list(progress.watched(range(3), description="inner")) == [0, 1, 2]
-    assert outer == "b" and "item b" in seen.getvalue() and "inner" not in seen.getvalue()
+    assert "item b" in seen.getvalue() and "inner" not in seen.getvalue()
     off = shown(monkeypatch, True)
     assert list(progress.watched(range(2), progress=False)) == [0, 1] and off.getvalue() == ""
     # A run that is left half way takes its bar along.

@@ -48,11 +48,10 @@ def exact() -> float:
 
 def filtered(resample: Resample, seed: int, particles: int) -> Population:
     torch.manual_seed(seed)
-    population = importance_sampling(walk, (0,), {}, particles)
+    start = importance_sampling(walk, (0,), {}, particles)
     observed = [Observed((k + 1,), {f"y_{k}": y}) for k, y in enumerate(SEEN)]
-    for population, _ in steps(tempered(resample=resample, share=0.0), population, observed):
-        pass
-    return population
+    *_, last = steps(tempered(resample=resample, share=0.0), start, observed)
+    return last.population
 
 
 def compared(resample: Resample, runs: int = 300, particles: int = 100) -> tuple[float, float, float]:
