@@ -14,17 +14,21 @@ import trimesh
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.distributions.contact import ContactsInTime, PegPose
 from bcppl.distributions.depth import LaplaceDepth, RobustDepth
+from bcppl.distributions.path import Path
 from bcppl.distributions.poses import NormalPose, UniformPose
+from bcppl.distributions.touch import OnsetLocation
 from bcppl.errors import InputError
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import depth_alignment, program_of
+from bcppl.inference.proposals import contact_alignment, depth_alignment, program_of
 from bcppl.inference.proposals.proposal import Proposal
 from bcppl.inference.targets import POSTERIOR
 from bcppl.parts import Part
 from bcppl.poses import Freedom
 from bcppl.simulators.camera import Camera, looking_at
+from bcppl.simulators.distance import SignedDistance
 from bcppl.simulators.renderer import DepthRenderer
 from bcppl.traces import Proposed, Trace, assess, propose, simulate
 
@@ -44,6 +48,7 @@ def equal_weights(trace: Trace) -> Population:
 # would say more than planes do.
 BOX = trimesh.creation.box((0.3, 0.3, 0.3), trimesh.transformations.translation_matrix((-0.15, -0.15, -0.15)))
 RENDERER = DepthRenderer(Part("box", np.asarray(BOX.vertices), np.asarray(BOX.faces, dtype=np.int64)))
+DISTANCE = SignedDistance(RENDERER.part)
 CAMERA = Camera(
     "above", 16, 12, 22.0, 22.0, 7.5, 5.5, looking_at((0.1, 0.1, 0.12), (0.0, 0.0, 0.0)), near=0.05, far=0.6
 )
@@ -119,7 +124,7 @@ def test_two_steps_of_depth_alignment() -> None:
     assert worst_z(seen, depth_alignment("part", steps=2), of_both, times=1) < SOUND
 
 
-@pytest.mark.parametrize("case", ["robust", "planar"])
+@pytest.mark.parametrize("case", ["robust", "planar", "finger"])
 def test_mutant_recentred_on_the_data_without_its_way_back(
     case: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -133,7 +138,8 @@ def test_mutant_recentred_on_the_data_without_its_way_back(
 
     monkeypatch.setattr("bcppl.inference.kernels.hastings.propose", spied)
     monkeypatch.setattr("bcppl.inference.kernels.hastings.assess", lambda *args: there[-1])
-    assert worst_z(DEPTH_CASES[case], depth_alignment("part"), of_both) > BROKEN
+    program, proposal, functions = MUTANTS[case]
+    assert worst_z(program, proposal, functions) > BROKEN
 
 
 @pytest.mark.parametrize("case", DEPTH_CASES)
@@ -184,3 +190,113 @@ def test_depth_alignment_refuses_what_is_no_image_of_the_part() -> None:
             propose(program, (trace,), 3)
     with pytest.raises(InputError, match="steps"):
         depth_alignment("part", steps=0)
+
+
+# ---- contacts: a finger's tip, held by a spring, comes to rest on one of three faces of a corner
+
+FACES = torch.eye(3, dtype=torch.float64).repeat(2, 1)  # outward normals in the part's frame
+TIPS = matrix([[-0.04, -0.02, -0.01], [-0.03, -0.01, -0.03], [-0.04, -0.03, -0.01]])
+AIMS = torch.cat([TIPS * (1 - torch.eye(3)), TIPS.flip(0) * (1 - torch.eye(3))]) - 0.004 * FACES
+
+
+class Spring:
+    """What `ContactTrack` answers, of a tip that would go to AIMS[k] at stamp k and is kept outside."""
+
+    def __init__(self, world_from_part: Tensor) -> None:
+        self.inputs = (world_from_part,)
+        self.diverged = torch.zeros(len(world_from_part), dtype=torch.bool)
+        upward = FACES @ poses.rotation_matrix(world_from_part).mT
+        depth = ((world_from_part[:, None, :3] - AIMS) * upward).sum(dim=-1)
+        # The tip lies 10 mm below the peg's origin.
+        self.peg = poses.identity(len(world_from_part), len(AIMS))
+        self.peg[..., :3] = AIMS + depth.clamp(min=0.0)[..., None] * upward + 0.01 * FACES
+        touching = (depth > 0.0)[..., None]
+        self.contacts = torch.where(touching, -0.01 * FACES, torch.nan)
+        self.upward = torch.where(touching, upward, torch.nan)
+
+    def __len__(self) -> int:
+        return len(self.diverged)
+
+    def window(self, first: int, last: int) -> tuple[Tensor, Tensor]:
+        return self.contacts[:, first:last], self.peg[:, first:last]
+
+    def pushes(self, first: int, last: int) -> Tensor:
+        return self.upward[:, first:last]
+
+
+def touched(freedom: Freedom = poses.FREE) -> None:
+    part = pyro.sample("part", NormalPose(CENTER, freedom.coordinates(0.5 * SPREAD), freedom))
+    track = Spring(part)
+    pyro.sample("contacts_0", ContactsInTime(track, 0, 3, scale=0.002, every=1))
+    pyro.sample("contacts_1", ContactsInTime(track, 3, 6, scale=0.002, every=1))
+    pyro.sample("peg_1", PegPose(track, 0, 6, 0.002, 0.01, every=1))
+
+
+def pushed() -> None:
+    """Onsets of a finger that comes from outside, along lines through AIMS."""
+    part = pyro.sample("part", NormalPose(CENTER, 0.5 * SPREAD))
+    for k, (aim, face) in enumerate(zip(AIMS, FACES, strict=True)):
+        path = Path(aim + face * torch.linspace(0.02, -0.02, 21, dtype=torch.float64)[:, None])
+        pyro.sample(f"onset_{k}", OnsetLocation(DISTANCE, part, path, 0.0, 0.001, 0.01))
+
+
+def of_touch(trace: Trace) -> Tensor:
+    fits = [trace.log_prob(a) for a in trace.addresses if a != "part"]
+    fit = (torch.stack(fits).sum(0) / 10.0).clamp(min=-20.0)[:, None]
+    return torch.cat([of_poses(trace["part"]), fit, fit**2], dim=1)
+
+
+CONTACT_CASES: dict[str, Callable[[], None]] = {
+    "peg": touched,
+    "peg in the plane": lambda: touched(PLANAR),
+    "finger": pushed,
+}
+
+
+@pytest.mark.parametrize("case", CONTACT_CASES)
+def test_contact_alignment_leaves_pose_and_touch_invariant(case: str) -> None:
+    assert worst_z(CONTACT_CASES[case], contact_alignment("part"), of_touch) < SOUND
+
+
+@pytest.mark.parametrize(("case", "gain"), [("peg", 0.2), ("peg in the plane", 0.2), ("finger", 0.8)])
+def test_contact_alignment_brings_the_part_to_what_was_felt(
+    case: str, gain: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One step gains so much of how well the truth fits; stamps at which nothing touches tell it nothing."""
+    monkeypatch.setattr("bcppl.inference.proposals.least_squares.WIDTHS", (1e-3, 1e-3, 1e-3))
+    torch.manual_seed(0)
+    program = CONTACT_CASES[case]
+    trace = simulate(program, (), 300)
+    off = trace.at({"part": simulate(program, (), 300)["part"]})
+    step = program_of(contact_alignment("part"), (), equal_weights(off))
+    there = off.at({"part": propose(step, (off,), 300).choices["part"]})
+    best, begun, reached = (float(of_touch(each)[:, -2].median()) for each in (trace, off, there))
+    assert reached > begun + gain * (best - begun)
+
+
+@pytest.mark.parametrize("case", CONTACT_CASES)
+def test_contact_alignment_is_assessed_as_it_is_proposed(case: str) -> None:
+    torch.manual_seed(0)
+    trace = simulate(CONTACT_CASES[case], (), 40)
+    program = program_of(contact_alignment("part"), (), equal_weights(trace))
+    there = propose(program, (trace,), 40)
+    torch.testing.assert_close(assess(program, (trace,), there.choices, 40), there.log_prob)
+    back = assess(program, (trace.at(there.choices),), {"part": trace["part"]}, 40)
+    assert bool(torch.isfinite(back).all())
+
+
+def test_contact_alignment_refuses_what_was_not_felt_of_the_part() -> None:
+    trace = simulate(seen, (), 3)
+    for sites, message in ((("depth_*",), "is a RobustDepth"), (("touch_*",), "fit no address")):
+        program = program_of(contact_alignment("part", sites), (), equal_weights(trace))
+        with pytest.raises(InputError, match=message):
+            propose(program, (trace,), 3)
+    with pytest.raises(InputError, match="reach"):
+        contact_alignment("part", reach=0.0)
+
+
+MUTANTS: dict[str, tuple[Callable[[], None], Proposal, Callable[[Trace], Tensor]]] = {
+    "robust": (seen, depth_alignment("part"), of_both),
+    "planar": (DEPTH_CASES["planar"], depth_alignment("part"), of_both),
+    "finger": (pushed, contact_alignment("part"), of_touch),
+}

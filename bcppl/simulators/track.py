@@ -7,6 +7,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from bcppl import poses
 from bcppl.recordings.measurements import Probe
 from bcppl.simulators.physics import PegPhysics, Rollout, Selection, rows_of
 from bcppl.simulators.wrench import Sensing, SensingState
@@ -83,6 +84,20 @@ class ContactTrack:
         self.advance(last)
         pose = torch.from_numpy(self.rollout.world_from_peg[:, first:last].copy())
         return torch.from_numpy(self._contacts[:, first:last].copy()), pose
+
+    def pushes(self, first: int, last: int) -> Tensor:
+        """Unit directions (N, last-first, 3), in the world, of the force that the part exerts on the peg.
+
+        NaN where there is none, or the physics diverged.
+        """
+        self.advance(last)
+        pose = torch.from_numpy(self.rollout.world_from_peg[:, first:last].copy())
+        force = torch.from_numpy(self.rollout.wrench[:, first:last, :3].copy())
+        size = force.norm(dim=-1, keepdim=True)
+        lost = torch.isnan(pose).any(dim=-1, keepdim=True)
+        turn = poses.rotation_matrix(torch.where(lost, poses.identity(), pose))
+        pushed = (turn @ force[..., None])[..., 0] / size
+        return torch.where(lost | (size == 0.0), torch.nan, pushed)
 
     def __getitem__(self, index: Selection) -> ContactTrack:
         """The tracks of some particles, in the order of an index tensor, a mask or a slice."""

@@ -1,6 +1,7 @@
 """Proposals: programs that choose new values at latent addresses."""
 
 from bcppl.inference.proposals.ancestral import prior
+from bcppl.inference.proposals.contact_points import contact_alignment
 from bcppl.inference.proposals.density import independent
 from bcppl.inference.proposals.depth_points import depth_alignment
 from bcppl.inference.proposals.differences import differential_evolution
@@ -14,6 +15,7 @@ __all__ = [
     "Fitted",
     "Program",
     "Proposal",
+    "contact_alignment",
     "depth_alignment",
     "differential_evolution",
     "drift",

@@ -1,0 +1,155 @@
+"""Contact alignment: a part moved so that what is felt of it in simulation meets what was felt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from fnmatch import fnmatchcase
+from functools import reduce
+from operator import add
+from typing import Any
+
+import pyro
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose
+from bcppl.distributions.touch import OnsetLocation
+from bcppl.errors import InputError
+from bcppl.inference.population import Population
+from bcppl.inference.proposals.least_squares import Equations, aligned
+from bcppl.inference.proposals.proposal import Fitted
+from bcppl.inference.proposals.spread import spread_of
+from bcppl.poses import FREE, Freedom
+from bcppl.traces import Trace
+
+SITES = ("contacts_*", "peg_*", "onset_*")
+
+
+def contact_alignment(address: str, sites: Sequence[str] = SITES, *, reach: float = 1.0) -> Fitted:
+    """Moves a part so that contacts felt in simulation meet those that were felt, and proposes around that.
+
+    Along the direction in which the part pushes, it is moved as far as a felt contact lies from the simulated
+    one at the same stamp, and as far as the peg was measured to stand from where it stands in simulation; of
+    a finger's onset, as far as the surface lies from it. What is off by more than most counts less (Geman
+    and McClure's weights). One Gauss-Newton step; what is proposed is a mixture of normals around it, of the
+    fit's covariance and of some times that.
+
+    The way back reads the contacts at the new pose, so physics is run for every proposal:
+    `delayed_acceptance` refuses it.
+
+    Args:
+        address: of the pose.
+        sites: patterns of the addresses of what was felt: `ChamferContacts`, `ContactsInTime`, `PegPose`,
+            `OnsetLocation`.
+        reach: the step is damped towards staying, with a covariance that is the particles' own times this
+            squared.
+
+    Raises:
+        InputError: the reach is not positive; when it is run: no site fits, or one is of another kind or of
+            another pose than that at `address`.
+    """
+    if not reach > 0.0:
+        raise InputError(f"contact_alignment is given reach {reach}; give more than 0.")
+    spread = spread_of(address)
+
+    def fit(population: Population) -> Callable[[Trace], None]:
+        damping = torch.linalg.inv(reach**2 * spread(population))
+
+        def towards_contacts(trace: Trace) -> None:
+            felt = [a for a in trace.addresses if any(fnmatchcase(a, pattern) for pattern in sites)]
+            if not felt:
+                raise InputError(
+                    f"contact_alignment is to read {', '.join(sites)}, which fit no address; "
+                    f"the program visits {', '.join(trace.addresses)}."
+                )
+            freedom: Freedom = getattr(trace.distributions[address], "freedom", FREE)
+            pose = trace[address]
+            said, sure = zip(*(_equations(trace, address, site) for site in felt), strict=True)
+            answer = aligned(pose, reduce(add, said), damping, freedom, reduce(add, sure))
+            pyro.sample(address, answer.around(freedom))
+
+        return towards_contacts
+
+    return Fitted(fit)
+
+
+def _equations(trace: Trace, address: str, felt: str) -> tuple[Equations, Tensor]:
+    """What one site says of the poses (N, 7), and how sure it is of where that leads, (N, 6, 6)."""
+    site: Any = trace.distributions[felt]
+    pose, value = trace[address], trace[felt].to(torch.float64)
+    if isinstance(site, OnsetLocation):
+        _refuse_other(torch.equal(site.pose, pose), address, felt)
+        place = value.expand(len(pose), 3)[:, None]
+        known = torch.isfinite(place).all(dim=-1)
+        inside = poses.transform(poses.inverse(pose), torch.nan_to_num(place))
+        near = site.distance(inside)
+        gap = near.distance + torch.as_tensor(site.offset, dtype=torch.float64).reshape(-1, 1)
+        spread = torch.as_tensor(site.spread, dtype=torch.float64).reshape(-1, 1)
+        precision = torch.where(known, 1.0 / spread**2, 0.0)
+        return _robust(pose, near.closest, near.normal, gap, precision)
+    if not isinstance(site, ChamferContacts | ContactsInTime | PegPose):
+        raise InputError(
+            f"contact_alignment reads site {felt!r}, which is a {type(site).__name__}; "
+            "name contacts, peg poses or onsets with `sites`."
+        )
+    track: Any = site.track
+    _refuse_other(torch.equal(track.inputs[0], pose), address, felt)
+    contacts, world_from_peg = track.window(site.first, site.last)
+    every = getattr(site, "every", 1)
+    chosen = slice(-site.first % every, None, every)
+    contacts, world_from_peg = contacts[:, chosen], world_from_peg[:, chosen]
+    push, value = track.pushes(site.first, site.last)[:, chosen], value[..., chosen, :]
+    known = torch.isfinite(torch.cat([contacts, push, value.expand(len(pose), -1, -1)], dim=-1)).all(dim=-1)
+    contacts, push, value = (torch.nan_to_num(x) for x in (contacts, push, value))
+    world_from_peg = torch.where(known[..., None], world_from_peg, poses.identity())
+    here = _moved(world_from_peg, contacts)
+    if isinstance(site, PegPose):
+        there = _moved(value, contacts)
+        precision = torch.full_like(known, 1.0 / site.translation_scale**2, dtype=torch.float64)
+    else:
+        there = _moved(world_from_peg, value)
+        # The Chamfer distance takes means over both sets, so that a window counts as two contacts.
+        share = (
+            2.0 / known.sum(dim=1, keepdim=True).clamp(min=1) if isinstance(site, ChamferContacts) else 1.0
+        )
+        precision = (share / site.scale**2) * torch.ones_like(known, dtype=torch.float64)
+    part_from_world = poses.inverse(pose)
+    point = poses.transform(part_from_world, here)
+    normal = push @ poses.rotation_matrix(part_from_world).mT
+    return _robust(
+        pose, point, normal, ((there - here) * push).sum(dim=-1), torch.where(known, precision, 0.0)
+    )
+
+
+def _moved(world_from_peg: Tensor, points: Tensor) -> Tensor:
+    """One point for each pose: (..., 7) and (..., 3)."""
+    return poses.transform(world_from_peg, points[..., None, :])[..., 0, :]
+
+
+def _robust(
+    pose: Tensor, point: Tensor, normal: Tensor, gap: Tensor, precision: Tensor
+) -> tuple[Equations, Tensor]:
+    """The equations of T points (N, T, 3) of each particle, with less of what is off by more than most.
+
+    The step trusts what was felt; how sure its end is, (N, 6, 6), goes by how far the particle is off.
+    """
+    counted = precision > 0.0
+    middle = torch.where(counted, gap.abs(), torch.nan).nanmedian(dim=1, keepdim=True).values
+    scale = torch.maximum(precision.rsqrt(), 1.483 * torch.nan_to_num(middle))
+    weight = torch.where(counted, (1.0 + (0.5 * gap / scale) ** 2) ** -2, 0.0)
+    particle, stamp = counted.nonzero().unbind(dim=1)
+
+    def of(precision: Tensor) -> Equations:
+        rows = (x[particle, stamp] for x in (point, normal, gap, weight * precision))
+        return Equations.of_planes(pose, particle, *rows)
+
+    return of(precision), of(scale**-2).precision
+
+
+def _refuse_other(same: bool, address: str, felt: str) -> None:
+    if not same:
+        raise InputError(
+            f"contact_alignment moves {address!r}, but what is felt at site {felt!r} is of another pose; "
+            "name that part's sites with `sites`."
+        )
