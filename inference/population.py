@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from bcppl.beliefs import Belief, effective_sample_size, normalised
+from bcppl.beliefs import Belief, normalised
 from bcppl.errors import InputError
 from bcppl.poses import FREE
 from bcppl.traces import Trace
@@ -57,8 +57,14 @@ class Population:
 
     @cached_property
     def effective_sample_size(self) -> float:
-        """1 / sum of squared normalised weights."""
-        return effective_sample_size(self.log_weights)
+        """1 / sum of squared normalised weights (Kong, Liu and Wong, JASA 89, 1994).
+
+        Raises:
+            InferenceError: no particle has any weight, or a weight is not a number.
+        """
+        if not math.isfinite(self.log_total):
+            normalised(self.log_weights)
+        return float(1.0 / torch.softmax(self.log_weights, 0).square_().sum())
 
     @cached_property
     def log_total(self) -> float:
