@@ -32,7 +32,7 @@ from bcppl.simulators.distance import SignedDistance
 from bcppl.simulators.renderer import DepthRenderer
 from bcppl.traces import Proposed, Trace, assess, propose, simulate
 
-DRAWS, TIMES = 2000, 4
+DRAWS = 2000
 SOUND, BROKEN = 4.5, 8.0  # |z| of the worst of a few dozen expectations: below if invariant, above if not
 
 
@@ -80,7 +80,7 @@ def of_poses(pose: Tensor) -> Tensor:
 
 
 def worst_z(
-    program: Callable[[], None], proposal: Proposal, functions: Callable[[Trace], Tensor], times: int = TIMES
+    program: Callable[[], None], proposal: Proposal, functions: Callable[[Trace], Tensor], times: int = 2
 ) -> float:
     """The largest |z| of the change in expectations over exact draws of a pose with its own image."""
     torch.manual_seed(1)
@@ -124,7 +124,7 @@ def test_two_steps_of_depth_alignment() -> None:
     assert worst_z(seen, depth_alignment("part", steps=2), of_both, times=1) < SOUND
 
 
-@pytest.mark.parametrize("case", ["robust", "planar", "finger"])
+@pytest.mark.parametrize("case", ["robust", "finger"])
 def test_mutant_recentred_on_the_data_without_its_way_back(
     case: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,7 +139,7 @@ def test_mutant_recentred_on_the_data_without_its_way_back(
     monkeypatch.setattr("bcppl.inference.kernels.hastings.propose", spied)
     monkeypatch.setattr("bcppl.inference.kernels.hastings.assess", lambda *args: there[-1])
     program, proposal, functions = MUTANTS[case]
-    assert worst_z(program, proposal, functions) > BROKEN
+    assert worst_z(program, proposal, functions, times=4) > BROKEN
 
 
 @pytest.mark.parametrize("case", DEPTH_CASES)
@@ -297,6 +297,5 @@ def test_contact_alignment_refuses_what_was_not_felt_of_the_part() -> None:
 
 MUTANTS: dict[str, tuple[Callable[[], None], Proposal, Callable[[Trace], Tensor]]] = {
     "robust": (seen, depth_alignment("part"), of_both),
-    "planar": (DEPTH_CASES["planar"], depth_alignment("part"), of_both),
     "finger": (pushed, contact_alignment("part"), of_touch),
 }
