@@ -100,3 +100,9 @@ def test_sites_that_the_program_fixes_are_let_in_like_observations() -> None:
         done = take(Population(trace, weights), Observed((1,), {"seen": number(0.0)}))
         estimates.append(done.population.log_evidence)
     assert abs(sum(estimates) / len(estimates) - exact) < 0.1
+
+
+@pytest.mark.parametrize("exponents", [(), (0.5,), (0.5, 0.5, 1.0), (0.0, 1.0), (0.5, 1.0, 2.0)])
+def test_exponents_that_do_not_lead_to_one(exponents: tuple[float, ...]) -> None:
+    with pytest.raises(InputError, match="give increasing ones that end with 1"):
+        tempered(exponents=exponents)
