@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bcppl.errors import InferenceError
+from bcppl.errors import InferenceError, InputError
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
