@@ -36,7 +36,7 @@ from bcppl.inference.targets import POSTERIOR
 from bcppl.poses import Freedom
 from bcppl.traces import Trace, assess, generate, propose, simulate
 
-DRAWS = 10_000
+DRAWS = 7_000
 SOUND, BROKEN = 4.5, 8.0  # |z| of the worst of a few dozen expectations: below if invariant, above if not
 
 
