@@ -230,9 +230,6 @@ def test_prior_is_always_accepted_where_nothing_else_hangs_on_it() -> None:
     assert bool((accepted == 1.0).all())
 
 
-# ---- mutants
-
-
 def test_mutant_without_the_jacobian_of_a_bounded_value(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "bcppl.inference.proposals.coordinates.Unflattened.log_abs_det_jacobian",
@@ -303,8 +300,6 @@ def test_mutant_that_is_fitted_to_the_particles_it_moves() -> None:
     assert abs(change(own=True)) > BROKEN
 
 
-# ---- densities
-
 ROUND_TRIPS: dict[str, tuple[Proposal, str]] = {
     **{name: (make("pose"), "two modes") for name, make in LEARNING.items()},
     **{f"{name} in the plane": (make("pose"), "planar") for name, make in LEARNING.items()},
@@ -364,9 +359,6 @@ def test_whole_differences_lead_from_mode_to_mode() -> None:
         return float((turned(move(trace, POSTERIOR)[0]) != turned(trace)).double().mean())
 
     assert changed(1.0) > 0.01 > changed(0.0)
-
-
-# ---- refusals
 
 
 @pytest.mark.parametrize(
