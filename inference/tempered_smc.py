@@ -1,8 +1,10 @@
-"""The default inference program: SMC with tempering and random walks shaped by the particles' own spread.
+"""The default inference program: SMC with tempering, its moves shaped by the other particles.
 
-Where a move costs little (pushes, depth images), a measurement is let in by small steps, with many moves of
-every particle after each; once moves cost simulations, by larger steps with fewer moves. Copy this file to
-write your own: `bcppl run RECORDING --inference FILE.py` takes any file that defines `infer`.
+Half of the moves are random walks, half are drawn from a normal that is fitted to the other half of the
+particles. Where a move costs little (pushes, depth images), a measurement is let in by small steps, with many
+moves of every particle after each. Once moves cost simulations it is let in by larger steps, and the
+particles are moved until they have left where they were resampled. Copy this file to write your own:
+`bcppl run RECORDING --inference FILE.py` takes any file that defines `infer`.
 """
 
 from __future__ import annotations
@@ -12,9 +14,9 @@ from typing import Any
 
 from torch import Tensor
 
-from bcppl.inference.kernels import Kernel, metropolis_hastings
+from bcppl.inference.kernels import Kernel, Until, metropolis_hastings, mixture, until
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import drift
+from bcppl.inference.proposals import drift, independent
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.inference.smc import Step, smc
 from bcppl.inference.tempering import tempered
@@ -24,8 +26,8 @@ PHYSICS = 2  # the cost of a site that simulates contact (`bcppl.distributions.l
 
 
 def kernel(pose: str) -> Kernel:
-    """How particles are moved: a random walk on the pose at an address, some of its steps long ones."""
-    return metropolis_hastings(drift(pose, (0.2, 2.0)))
+    """How a pose is moved: by a random walk, some of its steps long ones, or to wherever the others are."""
+    return mixture([metropolis_hastings(drift(pose, (0.2, 2.0))), metropolis_hastings(independent(pose, 1))])
 
 
 def infer(
@@ -34,7 +36,7 @@ def infer(
     *,
     particles: int = 75,
     seed: int = 0,
-    sweeps: tuple[int, int] = (12, 6),
+    sweeps: tuple[int | Until, int | Until] | None = None,
     share: tuple[float, float] = (0.8, 0.6),
     scene: Any = None,
 ) -> Iterator[Step]:
@@ -45,11 +47,15 @@ def infer(
         recording: a `bcppl.recordings.Recording`.
         particles: how many.
         seed: same seed, same beliefs.
-        sweeps: moves of every particle after each resampling: without, and with physics in the program.
+        sweeps: moves of every particle after each resampling: without, and with physics in the program. By
+            default 12, and until the particles' mean squared displacement is half their variance on every
+            axis and four of five differ, at most 12.
         share: particles are resampled below this effective sample size, and a likelihood is let in by steps
             that keep this conditional one, as shares of N: without, and with physics.
         scene: what `model.prepare(recording)` gives, if it is at hand.
     """
+    enough = until(displacement=0.5, distinct=max(1, round(0.8 * particles)), most=12)
+    moves = (12, enough) if sweeps is None else sweeps
 
     def by_physics(trace: Trace) -> int:
         return int(any(getattr(site, "cost", 0) >= PHYSICS for site in trace.distributions.values()))
@@ -59,7 +65,7 @@ def infer(
 
     step = tempered(
         kernel(model.pose),
-        sweeps=lambda trace: sweeps[by_physics(trace)],
+        sweeps=lambda trace: moves[by_physics(trace)],
         resample=resample,
         share=lambda trace: share[by_physics(trace)],
     )

@@ -76,7 +76,7 @@ Rejuvenation = Callable[[Population, Target], Rejuvenated]
 
 
 def resample_move(
-    kernel: Kernel | None, sweeps: int | Until | Callable[[Trace], int], resample: Resample
+    kernel: Kernel | None, sweeps: int | Until | Callable[[Trace], int | Until], resample: Resample
 ) -> Rejuvenation:
     """Resample when needed, then move every particle.
 
@@ -98,7 +98,7 @@ def resample_move(
 def tempered(
     kernel: Kernel | None = None,
     *,
-    sweeps: int | Until | Callable[[Trace], int] = 3,
+    sweeps: int | Until | Callable[[Trace], int | Until] = 3,
     resample: Resample | None = None,
     share: float | Callable[[Trace], float] = 0.5,
     exponents: Sequence[float] | None = None,
@@ -110,7 +110,7 @@ def tempered(
     Args:
         kernel: moves the particles after each resampling; None leaves them where they are.
         sweeps: how many moves of every particle after each resampling, `until(...)`, or a function of the
-            trace.
+            trace that gives either.
         resample: when and how; by default systematic below half the effective sample size.
         share: tempering keeps the conditional effective sample size above this share of the particles;
             0 lets a likelihood in at once. A number, or a function of the trace, as `sweeps`.

@@ -24,8 +24,8 @@ def independent(
     address: str,
     components: int | None = 2,
     *,
-    inflation: float = 1.2,
-    wide: tuple[float, float] = (0.2, 3.0),
+    inflation: float = 1.05,
+    wide: tuple[float, float] = (0.05, 2.0),
 ) -> Fitted:
     """A value drawn from a mixture of normals that is fitted to the particles, wherever the particle was.
 
