@@ -22,10 +22,11 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.inference.kernels import Kernel
+from bcppl.inference.kernels import Kernel, rejuvenate
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.inference.step import Observed
+from bcppl.inference.targets import POSTERIOR
 from bcppl.inference.tempering import tempered
 from bcppl.poses import Freedom
 from bcppl.traces import extend, generate, simulate
@@ -46,6 +47,7 @@ class Case:
         kernel: moves the particles.
         believed: the program that inference runs; the same as `program` in all but mutants.
         sweeps, share, particles: as in `tempered`.
+        settling: moves of every particle at the end, until it is far from the one that it was copied from.
         patched: what is in force while inference runs; nothing in all but mutants.
     """
 
@@ -57,6 +59,7 @@ class Case:
     sweeps: int = 10
     share: float = 0.7
     particles: int = 100
+    settling: int = 0
     patched: Callable[[], AbstractContextManager[Any]] = nullcontext
 
     @property
@@ -80,7 +83,10 @@ class Case:
         resample = adaptive(systematic, self.share)
         step = tempered(self.kernel, sweeps=self.sweeps, resample=resample, share=self.share)
         trace, log_weights = generate(self.believed, (0,), {}, self.particles)
-        return step(Population(trace, log_weights), Observed((1,), {"seen": seen})).population
+        population = step(Population(trace, log_weights), Observed((1,), {"seen": seen})).population
+        if self.kernel is None or self.settling == 0:
+            return population
+        return rejuvenate(population, self.kernel, POSTERIOR, self.settling).population
 
     def invent(self) -> tuple[Tensor, Tensor]:
         """A pose (7,) from the prior, and data drawn there."""

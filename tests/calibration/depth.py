@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pyro
@@ -13,7 +14,7 @@ from bcppl import poses
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import NormalPose
 from bcppl.inference.kernels import cycle, metropolis_hastings
-from bcppl.inference.proposals import independent
+from bcppl.inference.proposals import depth_alignment, independent
 from bcppl.inference.tempered_smc import kernel as shipped
 from bcppl.parts import Part
 from bcppl.poses import FREE, Freedom
@@ -73,4 +74,9 @@ def planar(scale: float = 0.015, believed: float | None = None) -> Case:
     program = Seen(spread, freedom, scale, outlier)
     inferred = Seen(spread, freedom, believed or scale, outlier)
     kernel = cycle(shipped("pose"), metropolis_hastings(independent("pose", components=None)))
-    return Case(program, CENTER, freedom, kernel, inferred, sweeps=6)
+    return Case(program, CENTER, freedom, kernel, inferred, sweeps=6, settling=10)
+
+
+def aligned() -> Case:
+    """As `planar`, moved only by what brings the rendered points onto the measured depth."""
+    return replace(planar(), kernel=metropolis_hastings(depth_alignment("pose", "seen")))

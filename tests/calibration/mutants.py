@@ -27,6 +27,7 @@ from tests.calibration.case import Case, Drawn, draw
 CASES: dict[str, Callable[..., Case]] = {
     "depth, six axes": depth.six_axes,
     "depth, planar": depth.planar,
+    "depth, aligned": depth.aligned,
     "touch": touch.touched,
 }
 NOISE = {"depth, six axes": 0.04, "depth, planar": 0.015, "touch": 0.001}

@@ -2,8 +2,9 @@
 
 A failure says which quantity and how its ranks lie. Ranks heaped at both ends (`spread` above 1): particles
 are too few, too alike, or too sure; heaped in the middle (below 1): they are not sure enough; to one side
-(`mean` off 0.5): they lie beside the truth. Poor sampling fails like a bug: "never moved" is the proof, and
-the cases have so many moves that a right implementation passes with room to spare.
+(`mean` off 0.5): they lie beside the truth. Poor sampling fails like a bug ("never moved"), and also where it
+shows in nothing else: a six-axis touch with 8 moves after each resampling kept 75 distinct particles of 75,
+and failed by spreads of 1.05 to 1.12 on every axis, for they were still near the ones they were copied from.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ def test_a_few_rounds_are_calibrated_and_a_flipped_sign_is_not() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 def test_the_truth_ranks_like_a_draw(name: str) -> None:
-    found = ranked(name, None, ROUNDS)
+    found = ranked(name, None, 60 if name == "depth, aligned" else ROUNDS)
     print(f"\n{found.table}")
     assert found.corrected > SOUND, found.table
 
@@ -99,12 +100,13 @@ def test_the_truth_ranks_like_a_draw(name: str) -> None:
 # The draws are the first ones of the sound runs: so many suffice.
 FAILING = [
     ("depth, planar", "sign flipped", 30),
-    ("touch", "sign flipped", 30),
+    ("touch", "sign flipped", 16),
     ("depth, six axes", "Jacobian of rotations dropped", ROUNDS),
-    ("touch", "noise 1.5 times as wide", ROUNDS),
-    ("depth, six axes", "way back forgotten", 30),
+    ("touch", "noise 1.5 times as wide", 150),
+    ("depth, aligned", "way back forgotten", 16),
+    ("depth, planar", "way back forgotten", 20),
     ("depth, planar", "fitted on the particle it moves", 100),
-    ("depth, planar", "never moved", 30),
+    ("depth, planar", "never moved", 20),
 ]
 
 

@@ -38,7 +38,9 @@ def pressed() -> Probe:
 PROBE = pressed()
 PHYSICS = PegPhysics(BLOCK, PEG, ContactParameters(time_step=0.005))
 SENSING = Sensing(PEG, rate=RATE, tare=4)
-PRIOR = UniformPose(CENTER, (0.004, 0.004, 0.003), 0.15)
+# The block may be beside where it is thought to be, above it, and tilted about the edge that is pressed.
+PRIOR = UniformPose(CENTER, (0.004, 0.0, 0.003), 0.15, rotation="y")
+EFFORT: dict[str, Any] = {"sweeps": 8, "share": 0.6, "particles": 75, "settling": 24}
 
 
 class Felt:
@@ -63,10 +65,10 @@ class Felt:
 def touched(scale: float = 0.001, believed: float | None = None) -> Case:
     """One press, by the normalised contact likelihood."""
     program, inferred = Felt(scale), Felt(believed or scale)
-    return Case(program, CENTER, PRIOR.freedom, shipped("pose"), inferred, sweeps=8, share=0.6, particles=75)
+    return Case(program, CENTER, PRIOR.freedom, shipped("pose"), inferred, **EFFORT)
 
 
 def surrogate() -> Case:
     """The same press by the Chamfer surrogate, whose `sample` is a model of its own: coverage only."""
     program = Felt(0.002, surrogate=True)
-    return Case(program, CENTER, PRIOR.freedom, shipped("pose"), program, sweeps=8, share=0.6, particles=75)
+    return Case(program, CENTER, PRIOR.freedom, shipped("pose"), program, **EFFORT)
