@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import TypeVar
 
 from rich import get_console
@@ -20,9 +21,19 @@ _shown: list[Progress] = []
 def sole_bar(console: Console | None = None) -> Iterator[Progress]:
     """A bar that is the only one until it is gone; it shows nothing where there is no one to see it."""
     console = get_console() if console is None else console
-    seen = (console.is_terminal or console.is_jupyter) and not _shown
+    # Without ipywidgets rich warns at every turn and leaves a bar behind for each.
+    notebook = console.is_jupyter and find_spec("ipywidgets") is not None
+    seen = (console.is_terminal or notebook) and not _shown
     columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = Progress(*columns, console=console, transient=True, disable=not seen)
+    # Between two steps the caller prints: in a notebook that shall stay ordinary output.
+    bar = Progress(
+        *columns,
+        console=console,
+        transient=True,
+        disable=not seen,
+        redirect_stdout=not console.is_jupyter,
+        redirect_stderr=not console.is_jupyter,
+    )
     _shown.append(bar)
     try:
         with bar:

@@ -105,7 +105,7 @@ def smc(
     seed: int = 0,
     scene: Any = None,
     start: Step | None = None,
-    progress: bool = True,
+    progress: bool = False,
 ) -> Iterator[Step]:
     """Run SMC over a recording: yields the prior's belief first, then one step for each measurement.
 
@@ -118,7 +118,8 @@ def smc(
         scene: `model.prepare(recording)` unless given.
         start: go on from this one, with its particles and its random state: what is yielded are the steps
             after it, the same to the bit as those of the run that it was taken from.
-        progress: show a bar, on a terminal or in a notebook.
+        progress: show a bar, on a terminal or in a notebook, until the last step is taken. For a loop that
+            runs through: a bar would stay while you stop and look.
 
     Raises:
         InferenceError: no particle is left with any weight; names the measurement.
