@@ -28,6 +28,7 @@ CASES: dict[str, Callable[..., Case]] = {
     "depth, six axes": depth.six_axes,
     "depth, planar": depth.planar,
     "depth, aligned": depth.aligned,
+    "depth, quick": depth.quick,
     "touch": touch.touched,
 }
 NOISE = {"depth, six axes": 0.04, "depth, planar": 0.015, "touch": 0.001}

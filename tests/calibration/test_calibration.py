@@ -61,9 +61,9 @@ def ranked(name: str, mutant: str | None, rounds: int, processes: int = 2) -> Ra
 
 def test_p_values_of_uniform_ranks_are_uniform_and_of_others_small() -> None:
     generator = np.random.default_rng(1)
-    uniform = [p_value(generator.integers(0, DRAWS + 1, 100), DRAWS) for _ in range(400)]
-    assert 0.02 < np.mean(np.array(uniform) < 0.05) < 0.09
-    assert np.quantile(uniform, 0.5) == pytest.approx(0.5, abs=0.08)
+    uniform = [p_value(generator.integers(0, DRAWS + 1, 100), DRAWS) for _ in range(200)]
+    assert 0.01 < np.mean(np.array(uniform) < 0.05) < 0.1
+    assert np.quantile(uniform, 0.5) == pytest.approx(0.5, abs=0.11)
     for shape in ((1.0, 2.0), (0.5, 0.5), (2.0, 2.0)):
         others = np.floor(generator.beta(*shape, 300) * (DRAWS + 1)).astype(np.int64)
         assert p_value(others, DRAWS) < 1e-3
@@ -82,15 +82,15 @@ def test_ranks_count_what_lies_below_and_break_ties_at_random() -> None:
 
 
 def test_a_few_rounds_are_calibrated_and_a_flipped_sign_is_not() -> None:
-    assert ranked("depth, planar", None, 6, processes=1).corrected > BROKEN
-    assert ranked("depth, planar", "sign flipped", 6, processes=1).corrected < BROKEN
+    assert ranked("depth, quick", None, 6, processes=1).corrected > BROKEN
+    assert ranked("depth, quick", "sign flipped", 6, processes=1).corrected < BROKEN
 
 
 # ---- the long tests
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", sorted(set(CASES) - {"depth, quick"}))
 def test_the_truth_ranks_like_a_draw(name: str) -> None:
     found = ranked(name, None, 60 if name == "depth, aligned" else ROUNDS)
     print(f"\n{found.table}")
