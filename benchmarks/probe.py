@@ -20,6 +20,8 @@ PARTICLES = 75
 class Result(NamedTuple):
     """One run: weighted ADD (mm) at three times, the belief at the end, and what it cost (s).
 
+    `moved` is the smallest displacement after a resampling once there is contact, in variances on the axis on
+    which the particles came least.
     `simulated` counts seconds of the rollouts' own clocks, `wall` is from the prior to the last belief.
     """
 
@@ -29,6 +31,7 @@ class Result(NamedTuple):
     truth_gap: float
     effective: float
     distinct: int
+    moved: float
     wall: float
     rendering: float
     physics: float
@@ -42,6 +45,7 @@ COLUMNS = (
     "truth gap",
     "ESS",
     "distinct",
+    "moved",
     "wall s",
     "rendering s",
     "physics s",
@@ -67,6 +71,7 @@ def run(seed: int) -> Result:
         last.truth_gap,
         last.effective_sample_size,
         last.distinct,
+        min(step.info.step.displacement for step in steps[1:] if step.info.step.displacement >= 0),
         wall,
         sum(e["rendering"].seconds for e in efforts),
         sum(e["physics"].seconds for e in efforts),
@@ -110,9 +115,10 @@ def main() -> None:
             Row("weighted ADD at the end, median", median("end"), "mm", 3.0),
             Row("weighted ADD at the end, 90 %", float(np.quantile(columns["end"], 0.9)), "mm"),
             Row("truth gap at the end, median", median("truth_gap"), "nats", -5.0, "min"),
-            Row("truth gap at the end, worst", float(columns["truth_gap"].min()), "nats", direction="min"),
+            Row("truth gap at the end, worst", float(columns["truth_gap"].min()), "nats", -5.0, "min"),
             Row("ESS at the end, median", median("effective"), "particles", direction="min"),
-            Row("distinct particles at the end, median", median("distinct"), "particles", direction="min"),
+            Row("distinct at the end, fewest", float(columns["distinct"].min()), "particles", 60.0, "min"),
+            Row("moved since a resampling, least", float(columns["moved"].min()), "variances", 0.5, "min"),
             Row("wall, median", median("wall"), "s", 20.0 if alone else None),
             Row("rendering, median", median("rendering"), "s"),
             Row("physics, median", median("physics"), "s"),

@@ -43,6 +43,8 @@ class StepInfo(NamedTuple):
         log_evidence: what the step added to the log of the evidence.
         ancestors: (N,) int64, the particle before the step that each one descends from; None where
             nothing was resampled, and each descends from itself.
+        displacement: how far the particles came since the last resampling, in variances, on the axis on which
+            they came least; NaN where none was made, or where sweeps were not `until(displacement=...)`.
     """
 
     acceptance: float = float("nan")
@@ -52,6 +54,7 @@ class StepInfo(NamedTuple):
     effective_sample_size: float = float("nan")
     log_evidence: float = 0.0
     ancestors: Tensor | None = None
+    displacement: float = float("nan")
 
 
 class Stepped(NamedTuple):

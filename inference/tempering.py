@@ -69,6 +69,7 @@ class Rejuvenated(NamedTuple):
     population: Population
     ancestors: Tensor | None
     acceptance: float | None
+    displacement: float = float("nan")
 
 
 # Resamples if it sees need, and moves the particles towards a target that they are weighted for.
@@ -89,8 +90,8 @@ def resample_move(
         if ancestors is None or kernel is None:
             return Rejuvenated(population, ancestors, None)
         times = sweeps(population.trace) if callable(sweeps) else sweeps
-        moved, acceptance = rejuvenate(population, kernel, target, times)
-        return Rejuvenated(moved, ancestors, acceptance)
+        moved = rejuvenate(population, kernel, target, times)
+        return Rejuvenated(moved.population, ancestors, moved.acceptance, moved.displacement)
 
     return rejuvenation
 
@@ -152,6 +153,7 @@ def tempered(
         population = replace(population, trace=longer)
         groups = [[a] for a in _by_cost(longer, new)] if by_site and new else [new]
         done, acceptances, ancestors, before, resampled = [], [], None, None, 0
+        displacement = float("nan")
         for number, group in enumerate(groups):
             later = {a: 0.0 for others in groups[number + 1 :] for a in others}
             exponent = 0.0
@@ -164,10 +166,11 @@ def tempered(
                 # 0 times -inf is no number, so a particle that cannot be loses its weight here, once.
                 population = weighed = population.reweighed((exponent - reached) * log_likelihood)
                 partly = {**later, **(dict.fromkeys(group, exponent) if exponent < 1.0 else {})}
-                population, chosen, acceptance = rejuvenation(
+                population, chosen, acceptance, come = rejuvenation(
                     population, Target(partly) if partly else POSTERIOR
                 )
                 if chosen is not None:
+                    displacement = come
                     resampled += 1
                     ancestors = chosen if ancestors is None else ancestors[chosen]
                     before = weighed.effective_sample_size
@@ -183,6 +186,7 @@ def tempered(
             population.effective_sample_size,
             population.log_evidence - start,
             ancestors,
+            displacement,
         )
         return Stepped(population, info)
 

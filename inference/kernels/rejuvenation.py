@@ -17,10 +17,18 @@ from bcppl.inference.targets import Target
 
 
 class Moved(NamedTuple):
-    """A rejuvenated population, and the share of proposals that were accepted, NaN without sweeps."""
+    """A rejuvenated population, and what it took.
+
+    Attributes:
+        population: after the last sweep.
+        acceptance: the share of proposals that were accepted, NaN without sweeps.
+        displacement: how far the particles came, in variances, on the axis on which they came least; NaN
+            unless `until(displacement=...)` asked.
+    """
 
     population: Population
     acceptance: float
+    displacement: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -131,7 +139,9 @@ def rejuvenate(population: Population, kernel: Kernel, target: Target, sweeps: i
         shares.append(accepted)
         made += 1
     acceptance = float(torch.cat(shares).mean()) if shares else float("nan")
-    return Moved(population, acceptance)
+    if not isinstance(sweeps, Until) or sweeps.displacement is None:
+        return Moved(population, acceptance)
+    return Moved(population, acceptance, float(displacement(start, population).min()))
 
 
 def _sweep(population: Population, kernel: Kernel, target: Target) -> tuple[Population, Tensor]:
