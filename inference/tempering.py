@@ -34,9 +34,13 @@ SMALLEST_STEP = 1e-6
 
 def conditional_effective_sample_size(log_weights: Tensor, log_factor: Tensor) -> float:
     """N (sum W w)^2 / sum W w^2 for weights W and incremental weights w = exp(log_factor), each (N,)."""
+    return _conditional(normalised(log_weights), log_factor)
+
+
+def _conditional(weights: Tensor, log_factor: Tensor) -> float:
     factor = torch.exp(log_factor - log_factor.max())
-    weights = normalised(log_weights)
-    return float(len(log_weights) * (weights @ factor) ** 2 / (weights @ factor**2))
+    weighted = weights * factor
+    return float(len(weights) * weighted.sum() ** 2 / (weighted @ factor))
 
 
 def next_exponent(log_weights: Tensor, log_likelihood: Tensor, exponent: float, share: float = 0.5) -> float:
@@ -47,19 +51,18 @@ def next_exponent(log_weights: Tensor, log_likelihood: Tensor, exponent: float, 
     finite = torch.isfinite(log_likelihood) & (log_weights > -torch.inf)
     if not bool(finite.any()):
         return 1.0
-    weights, likelihood = log_weights[finite], log_likelihood[finite]
+    weights, likelihood = normalised(log_weights[finite]), log_likelihood[finite]
     target = share * len(weights)
-
-    def enough(step: float) -> bool:
-        return conditional_effective_sample_size(weights, step * likelihood) >= target
-
     low, high = 0.0, 1.0 - exponent
-    if enough(high):
+    if _conditional(weights, high * likelihood) >= target:
         return 1.0
-    # Fifty halvings: the sharpest likelihoods need steps of 1e-5 and less.
-    for _ in range(50):
+    # The sharpest likelihoods need steps of 1e-5 and less; one part in ten thousand of a step is nothing.
+    while high - low > 1e-4 * high and high > SMALLEST_STEP:
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if enough(middle) else (low, middle)
+        if _conditional(weights, middle * likelihood) >= target:
+            low = middle
+        else:
+            high = middle
     return min(1.0, exponent + max(low, SMALLEST_STEP))
 
 
