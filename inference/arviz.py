@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
+from bcppl.inference.chains import Chains
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.summaries import is_pose
@@ -22,7 +23,7 @@ POSE_COORDINATES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 def to_arviz(
-    populations: Population | Sequence[Population],
+    found: Any,
     *,
     draws: int | None = None,
     seed: int = 0,
@@ -34,8 +35,12 @@ def to_arviz(
     many of them are worth something is in `sample_stats`.
 
     Args:
-        populations: one, or those of independent runs of one program on the same measurements: the chains.
-        draws: how many of each; by default as many as the smallest population has particles.
+        found: a population, or something that has one, such as a step of SMC; an iterator over steps, of
+            which the last counts; or several populations, those of independent runs of one program on the
+            same measurements (`repeated(...)`, or a list): the chains. Or `Chains`, whose states are draws
+            already: then there is no log_likelihood, and sample_stats has each chain's `acceptance`.
+        draws: how many of each; by default as many as the smallest population has particles. Of `Chains` the
+            last so many, by default all.
         seed: same seed, same draws; torch's own generator is left as it was.
         scheme: resamples (`bcppl.inference.resampling`).
 
@@ -58,7 +63,9 @@ def to_arviz(
         InferenceError: no particle of a population has any weight.
     """
     arviz = import_arviz()
-    chains = [populations] if isinstance(populations, Population) else list(populations)
+    if isinstance(found, Chains):
+        return _of_chains(arviz, found, draws)
+    chains = _populations(found)
     check_alike(chains)
     with seeded(seed):
         chosen = draw(chains, draws, scheme)
@@ -67,9 +74,7 @@ def to_arviz(
         address: at_draws([chain.trace.choices[address] for chain in chains], chosen)
         for address in first.choices
     }
-    posed = [address for address in posterior if is_pose(chains[0], address)]
-    for address in posed:
-        posterior[address] = _one_sign(posterior[address])
+    posed = _posed(chains[0], posterior)
     observed = [address for address in first.addresses if address not in first.choices]
     log_likelihood = {
         address: at_draws([chain.trace.log_prob(address) for chain in chains], chosen) for address in observed
@@ -92,6 +97,59 @@ def to_arviz(
     sizes = [chain.effective_sample_size for chain in chains]
     data.sample_stats["effective_sample_size"] = ("chain", sizes)
     data.sample_stats["distinct_particles"] = ("chain", [len(torch.unique(index)) for index in chosen])
+    return data
+
+
+def _populations(found: Any) -> list[Population]:
+    """The populations of runs, of whatever form."""
+    found = getattr(found, "populations", getattr(found, "population", found))
+    if isinstance(found, Population):
+        return [found]
+    if not isinstance(found, Iterable):
+        raise InputError(
+            f"a {type(found).__name__} was given; give a population, a step of SMC, runs or chains."
+        )
+    given = list(found)
+    each: list[Population] = []
+    for one in given:
+        population = getattr(one, "population", one)
+        if not isinstance(population, Population):
+            raise InputError(
+                f"a {type(one).__name__} was given in place of a population; "
+                "give populations, steps of SMC, runs or chains."
+            )
+        each.append(population)
+    # An iterator over the steps of one run; populations are those of several.
+    of_one = isinstance(found, Iterator) and not any(isinstance(one, Population) for one in given)
+    return each[-1:] if of_one else each
+
+
+def _posed(population: Population, posterior: dict[str, Tensor]) -> list[str]:
+    """Which addresses hold poses; their quaternions are given one sign."""
+    posed = [address for address in posterior if is_pose(population, address)]
+    for address in posed:
+        posterior[address] = _one_sign(posterior[address])
+    return posed
+
+
+def _of_chains(arviz: Any, chains: Chains, draws: int | None) -> Any:
+    recorded = min((len(states) for states in chains.draws.values()), default=0)
+    draws = recorded if draws is None else draws
+    if not 1 <= draws <= recorded:
+        raise InputError(
+            f"{draws} draws were asked for of chains with {recorded} states; give 1 to that many."
+        )
+    last = Population(chains.trace, torch.zeros(len(chains.trace), dtype=torch.float64))
+    # Chains are recorded move by move.
+    posterior = {address: states[-draws:].movedim(1, 0) for address, states in chains.draws.items()}
+    posed = _posed(last, posterior)
+    data = arviz.from_dict(
+        posterior=_numpy(posterior),
+        observed_data=_numpy(dict(chains.trace.observations)) or None,
+        coords={"pose": list(POSE_COORDINATES)} if posed else None,
+        dims={address: ["pose"] for address in posed},
+    )
+    data.add_groups(sample_stats={"acceptance": ("chain", chains.acceptance.numpy())})
     return data
 
 

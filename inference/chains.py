@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.inference.kernels import Kernel, put
+from bcppl.inference.kernels import Kernel, fitted, put, refuse_other
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
+from bcppl.inference.schemes import Scheme, systematic
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace
 
@@ -36,8 +37,9 @@ def markov_chains(
     moves: int,
     target: Target = POSTERIOR,
     *,
-    addresses: Collection[str] | None = None,
+    addresses: Collection[str] | str | None = None,
     every: int = 1,
+    scheme: Scheme | None = systematic,
     progress: bool = True,
 ) -> Chains:
     """Run a chain from each particle.
@@ -47,21 +49,27 @@ def markov_chains(
 
     Args:
         kernel: what moves.
-        start: where the chains start, and what is learned from, by weight if it is a population. Chains from
-            resampled particles of a population start where they should end.
+        start: where the chains start, and what is learned from. A population whose weights are not equal is
+            resampled first, to as many particles, so that the chains start where they should end.
         moves: how many.
         target: what the chains leave invariant.
-        addresses: the latent addresses to record; by default all.
+        addresses: the latent addresses to record, or one; by default all.
         every: record after each so many moves.
+        scheme: resamples; None starts a chain at every particle, whatever its weight.
         progress: show a bar, on a terminal or in a notebook.
 
     Raises:
-        InputError: no moves, or an address is not latent.
+        InputError: what is given is no kernel, no moves, or an address is not latent.
     """
+    refuse_other("markov_chains", kernel)
     population = start if isinstance(start, Population) else _equal(start)
+    weights = population.log_weights
+    if scheme is not None and bool((weights != weights[0]).any()):
+        population = population.selected(scheme(weights))
     trace, count = population.trace, len(population)
     if moves < 1 or every < 1:
         raise InputError(f"chains are to make {moves} moves, recorded every {every}; give 1 or more of each.")
+    addresses = [addresses] if isinstance(addresses, str) else addresses
     recorded = list(trace.choices if addresses is None else addresses)
     for address in recorded:
         if address not in trace.choices:
@@ -71,11 +79,11 @@ def markov_chains(
             )
     order = torch.randperm(count)
     halves = [h for h in (order[: count // 2], order[count // 2 :]) if len(h)]
-    fitted = [kernel(_teachers(population[other])) for other in halves[::-1]]
+    moves_of = [fitted(kernel, _teachers(population[other])) for other in halves[::-1]]
     taken = torch.zeros(count, dtype=torch.float64)
     draws: dict[str, list[Tensor]] = {address: [] for address in recorded}
     for number in watched(range(1, moves + 1), description="chains", progress=progress):
-        for mine, move in zip(halves, fitted, strict=True):
+        for mine, move in zip(halves, moves_of, strict=True):
             moved, accepted = move(trace[mine], target)
             trace = put(trace, mine, moved)
             taken[mine] += accepted.to(torch.float64)

@@ -16,9 +16,8 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from bcppl.beliefs import normalised
 from bcppl.errors import InputError
-from bcppl.inference import kernels
+from bcppl.inference import kernels, summaries
 
 S = TypeVar("S")
 
@@ -100,13 +99,9 @@ def distinct(step: Any) -> int:
 
 
 def mean(address: str) -> Callable[[Any], Tensor]:
-    """The weighted mean of a latent address: of a pose (7,), of another value the shape of its event."""
+    """The weighted mean of a latent address: of a pose (7,), of another value the shape of its event.
 
-    def weighted(step: Any) -> Tensor:
-        population = step.population
-        if getattr(population.trace.distributions[address], "freedom", None) is not None:
-            return population.belief(address).mean
-        value = population.trace[address].to(torch.float64)
-        return torch.tensordot(normalised(population.log_weights), value, dims=1)
-
-    return weighted
+    Returns:
+        A function of a step. It raises InputError where no latent site has that address.
+    """
+    return lambda step: summaries.mean(step.population, address)

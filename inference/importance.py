@@ -1,5 +1,7 @@
 """Importance sampling: the start of SMC, and by itself an estimate of evidence and posterior.
 
+Plain, or tempered: from the prior to the posterior of a program whose data come all at once.
+
 Robert and Casella, Monte Carlo Statistical Methods, 2004, section 3.3.
 """
 
@@ -8,10 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
+from bcppl.inference.step import Stepped
+from bcppl.inference.tempering import Tempered
 from bcppl.traces import Series, generate, propose
 
 Program = Callable[..., Any]
@@ -45,3 +50,39 @@ def importance_sampling(
         raise InputError("a proposal for importance sampling chooses nothing; leave it out.")
     trace, log_weights = generate(program, args, observations, particles, proposed.choices)
     return Population(trace, log_weights - proposed.log_prob)
+
+
+def tempered_importance_sampling(
+    program: Program | Series,
+    args: tuple[Any, ...],
+    observations: Mapping[str, Tensor],
+    particles: int,
+    step: Tempered,
+) -> Stepped:
+    """From the prior to the posterior, all observations let in together, bit by bit.
+
+    The SMC sampler of Del Moral, Doucet and Jasra, JRSS B 68, 2006, section 3.3.2. Where data come one after
+    another, start with `importance_sampling` and go on with `bcppl.inference.step.steps`.
+
+    Args:
+        program: a Pyro program.
+        args: its arguments.
+        observations: values by address, of the shape of the sites' plates and events.
+        particles: N.
+        step: how the likelihood is let in, `tempered(kernel)`; what the program itself fixes (`obs=`,
+            `pyro.factor`) is let in with it.
+
+    Returns:
+        The population, with the evidence of all observations, and what happened.
+
+    Raises:
+        InputError: an observed address is never visited, or `step` is no `tempered(...)`.
+        InferenceError: no particle is left with any weight.
+    """
+    if not isinstance(step, Tempered):
+        raise InputError(
+            "tempered_importance_sampling is given something else than a step; give tempered(kernel)."
+        )
+    trace, log_likelihood = generate(program, args, observations, particles)
+    prior = Population(trace, torch.zeros_like(log_likelihood))
+    return step.let_in(prior, [a for a in trace.addresses if a not in trace.choices], log_likelihood)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any, overload
 
 import torch
 from torch import Tensor
 
 from bcppl.beliefs import Belief, normalised
-from bcppl.errors import InputError
+from bcppl.errors import InferenceError, InputError
 from bcppl.poses import FREE
 from bcppl.traces import Trace
 
@@ -18,6 +19,9 @@ from bcppl.traces import Trace
 @dataclass(frozen=True, eq=False)
 class Population:
     """Weighted particles.
+
+    `population["x"]` is a value (N, *event) of the trace, `population[index]` the particles at an index, with
+    their weights.
 
     Raises:
         InputError: there are founders, but not one for each particle.
@@ -103,7 +107,20 @@ class Population:
         drawn.__dict__["log_total"] = math.log(count)
         return drawn
 
-    def __getitem__(self, index: Tensor) -> Population:
+    @overload
+    def __getitem__(self, index: str) -> Tensor: ...
+
+    @overload
+    def __getitem__(self, index: Tensor) -> Population: ...
+
+    def __getitem__(self, index: str | Tensor) -> Any:
+        if isinstance(index, str):
+            if index in self.trace:
+                return self.trace[index]
+            raise InputError(
+                f"a population has no value at address {index!r}; it has "
+                f"{', '.join([*self.trace.choices, *self.trace.observations]) or 'none'}."
+            )
         return replace(
             self,
             trace=self.trace[index],
@@ -112,9 +129,35 @@ class Population:
         )
 
     def belief(self, address: str) -> Belief:
-        """The particles read as a posterior over the pose at an address."""
-        freedom = getattr(self.trace.distributions[address], "freedom", FREE)
-        return Belief(self.trace[address], self.log_weights, freedom)
+        """The particles read as a posterior over the pose at an address.
+
+        Raises:
+            InputError: no latent site has that address, or no pose is there.
+        """
+        if address not in self.trace.choices:
+            raise InputError(
+                f"a belief over {address!r} was asked for, which is no latent address; "
+                f"latent are {', '.join(self.trace.choices) or 'none'}."
+            )
+        poses = self.trace[address]
+        freedom = getattr(self.trace.distributions[address], "freedom", None)
+        if poses.shape != (len(self), 7):
+            raise InputError(
+                f"a belief over {address!r} was asked for, which is no pose: its values have shape "
+                f"{tuple(poses.shape[1:])}; use bcppl.inference.summaries."
+            )
+        return Belief(poses, self.log_weights, FREE if freedom is None else freedom)
+
+    def __repr__(self) -> str:
+        try:
+            size = f"{self.effective_sample_size:.1f}"
+        except InferenceError:
+            size = "none"
+        return (
+            f"Population({len(self)} particles, effective sample size {size}, "
+            f"log evidence {self.log_evidence:.4f}, latent: {', '.join(self.trace.choices) or 'none'}, "
+            f"observed: {', '.join(self.trace.observations) or 'none'})"
+        )
 
 
 def log_pair(count: int) -> float:

@@ -21,13 +21,14 @@ from bcppl.beliefs import Belief, normalised
 from bcppl.errors import InputError
 from bcppl.inference.arviz import at_draws, check_alike, draw, import_arviz, seeded
 from bcppl.inference.population import Population
+from bcppl.inference.progress import watched
 from bcppl.inference.summaries import is_pose, mean
 from bcppl.traces import Trace
 
 Run = Callable[[int], Any]
 
 
-def repeated(run: Run, times: int, seed: int = 0, *, processes: int = 1) -> Repeated:
+def repeated(run: Run, times: int, seed: int = 0, *, processes: int = 1, progress: bool = True) -> Repeated:
     """Run the same inference several times, independently.
 
     Args:
@@ -38,6 +39,7 @@ def repeated(run: Run, times: int, seed: int = 0, *, processes: int = 1) -> Repe
         processes: above 1, runs are shared out among processes, this one and fresh ones. Then `run` must be
             something that can be imported there (a function of a module, or a `functools.partial` of one),
             and a script must keep its own work behind `if __name__ == "__main__":`.
+        progress: show a bar, on a terminal or in a notebook.
 
     Raises:
         InputError: `times` or `processes` is below 1, `run` gives no population, it cannot be sent to
@@ -48,9 +50,9 @@ def repeated(run: Run, times: int, seed: int = 0, *, processes: int = 1) -> Repe
     seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(times)]
     processes = min(processes, times)
     if processes == 1:
-        found = [_population(run, each) for each in seeds]
+        found = [_population(run, each) for each in watched(seeds, description="runs", progress=progress)]
     else:
-        found = _shared_out(run, seeds, processes)
+        found = _shared_out(run, seeds, processes, progress)
     check_alike(found)
     return Repeated(tuple(found), tuple(seeds))
 
@@ -211,8 +213,9 @@ class Repeated:
         lines = []
         for address, ratio in ratios.items():
             numbers = " ".join(f"{value:.5g}" for value in self.mean(address).flatten().tolist()[:8])
-            worst = max(ratio[~ratio.isnan()].tolist(), default=math.nan)
-            lines.append(f"{address}: R-hat at most {worst:.3f}, mean {numbers}")
+            told = ratio[~ratio.isnan()].tolist()
+            agreed = f"R-hat at most {max(told):.3f}" if told else "the same in all draws"
+            lines.append(f"{address}: {agreed}, mean {numbers}")
         return lines
 
     def __str__(self) -> str:
@@ -234,7 +237,7 @@ def _population(run: Run, seed: int) -> Population:
     return found
 
 
-def _shared_out(run: Run, seeds: Sequence[int], processes: int) -> list[Population]:
+def _shared_out(run: Run, seeds: Sequence[int], processes: int, progress: bool) -> list[Population]:
     """The runs in several processes, this one doing its share.
 
     A program and its simulators stay where they are: another process sends numbers only, and they are put
@@ -253,9 +256,13 @@ def _shared_out(run: Run, seeds: Sequence[int], processes: int) -> list[Populati
         processes - 1, get_context("spawn"), initializer=torch.set_num_threads, initargs=(threads,)
     ) as pool:
         elsewhere = {k: pool.submit(_numbers, run, seeds[k]) for k in range(len(seeds)) if k not in here}
-        found = {k: _population(run, seeds[k]) for k in here}
-        _refuse_series(found[0])
-        found.update({k: _put_into(found[0], *sent.result()) for k, sent in elsewhere.items()})
+        found: dict[int, Population] = {}
+        for k in watched([*here, *elsewhere], description="runs", progress=progress):
+            if k in here:
+                found[k] = _population(run, seeds[k])
+                _refuse_series(found[k])
+            else:
+                found[k] = _put_into(found[0], *elsewhere[k].result())
     return [found[k] for k in range(len(seeds))]
 
 

@@ -78,16 +78,24 @@ class Pair:
     check: bool = False
 
 
+def _refuse_no_pair(pair: object) -> None:
+    if not isinstance(pair, Pair):
+        raise InputError(
+            f"SMCP3 is given a {type(pair).__name__} in place of a pair; give Pair(forward, backward)."
+        )
+
+
 def moved(population: Population, pair: Pair) -> Population:
     """Every particle moved by a pair and weighed for it; the target stays.
 
     Where a program learns, each half of the population learns from the other.
 
     Raises:
-        InputError: a program gives an address that the other has not, more coordinates than it takes, or
-            (checked) no way back.
+        InputError: no `Pair` is given, a program gives an address that the other has not, more coordinates
+            than it takes, or (checked) no way back.
         InferenceError: no particle has any weight left.
     """
+    _refuse_no_pair(pair)
     return _by_halves(population, pair, None)
 
 
@@ -100,7 +108,11 @@ def smcp3(pair: Pair, *, resample: Resample | None = None) -> StepFunction:
 
     Returns:
         The step. It raises what `moved` raises.
+
+    Raises:
+        InputError: no `Pair` is given.
     """
+    _refuse_no_pair(pair)
     resample = adaptive() if resample is None else resample
 
     def step(population: Population, observed: Observed) -> Stepped:

@@ -10,24 +10,47 @@ Any program can be run so, without a recording:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from typing import Any, NamedTuple
 
 from torch import Tensor
 
+from bcppl.errors import InputError
+from bcppl.inference.kernels.kernel import takes
 from bcppl.inference.population import Population
+from bcppl.inference.progress import watched
 
 
-class Observed(NamedTuple):
+class _Observed(NamedTuple):
+    args: tuple[Any, ...]
+    observations: Mapping[str, Tensor]
+
+
+class Observed(_Observed):
     """What one step takes in.
 
     Attributes:
-        args: the program's arguments up to and including the new measurement.
+        args: the program's arguments up to and including the new measurement, as a tuple.
         observations: values of the new addresses, of the sites' event shape.
+
+    Raises:
+        InputError: the arguments are no tuple, or the observations no mapping.
     """
 
-    args: tuple[Any, ...]
-    observations: Mapping[str, Tensor]
+    __slots__ = ()
+
+    def __new__(cls, args: tuple[Any, ...], observations: Mapping[str, Tensor]) -> Observed:  # noqa: D102
+        if not isinstance(args, tuple):
+            raise InputError(
+                f"Observed is given a {type(args).__name__} as the program's arguments; "
+                "give a tuple, (5,) for one argument."
+            )
+        if not isinstance(observations, Mapping):
+            raise InputError(
+                f"Observed is given a {type(observations).__name__} as observations; "
+                "give values by address, {'y': value}."
+            )
+        return super().__new__(cls, args, observations)
 
 
 class StepInfo(NamedTuple):
@@ -67,7 +90,9 @@ class Stepped(NamedTuple):
 StepFunction = Callable[[Population, Observed], Stepped]
 
 
-def steps(step: StepFunction, population: Population, observed: Iterable[Observed]) -> Iterator[Stepped]:
+def steps(
+    step: StepFunction, population: Population, observed: Iterable[Observed], *, progress: bool = False
+) -> Iterator[Stepped]:
     """The population after each step: an iterator that can be stopped, looked into and gone on with.
 
     It draws from torch's own generator, so it goes on bit for bit from a population and torch's state.
@@ -76,7 +101,33 @@ def steps(step: StepFunction, population: Population, observed: Iterable[Observe
         step: such as `bcppl.inference.tempering.tempered(...)`.
         population: before the first step, such as that of `importance_sampling(...)`.
         observed: what each step takes in.
+        progress: show a bar, on a terminal or in a notebook, until the last step is taken. For a loop that
+            runs through: a bar would stay while you stop and look.
+
+    Raises:
+        InputError: what is given is no step (a kernel, say), no population, or no list of `Observed`.
     """
+    if not callable(step) or not takes(step, 2):
+        raise InputError(
+            "steps is given something else than a step; if it is a kernel, give tempered(kernel) from "
+            "bcppl.inference.tempering."
+        )
+    if not isinstance(population, Population):
+        hint = "Population(*...)" if isinstance(population, tuple) else "Population(trace, log_weights)"
+        raise InputError(
+            f"steps is given a {type(population).__name__} in place of a population; make it one, {hint}."
+        )
+    if isinstance(observed, Observed):
+        raise InputError("steps is given one Observed; give a list of them, one for each step.")
+    total = len(observed) if isinstance(observed, Sized) else None
+    return watched(_stepping(step, population, observed), total=total, description="steps", progress=progress)
+
+
+def _stepping(step: StepFunction, population: Population, observed: Iterable[Observed]) -> Iterator[Stepped]:
     for each in observed:
+        if not isinstance(each, Observed):
+            raise InputError(
+                f"steps is to take in a {type(each).__name__}; give a list of Observed(args, observations)."
+            )
         population, info = step(population, each)
         yield Stepped(population, info)

@@ -2,6 +2,9 @@
 
 At the address of a pose (its distribution has a `freedom`) these are the belief's: a mean pose (7,), and six
 tangent coordinates at it, metres and radians, 0 along held axes (`bcppl.beliefs`).
+
+Of a long series (`bcppl.traces.Series`) an address may be one with the number of a step, `("x", 3)`: what
+each particle's ancestor had then, weighed as the particle is now.
 """
 
 from __future__ import annotations
@@ -11,32 +14,58 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bcppl.beliefs import normalised, weighted_quantiles
+from bcppl.beliefs import Belief, normalised, weighted_quantiles
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
+from bcppl.poses import FREE, Freedom
+from bcppl.traces.series import SeriesTrace
+
+Address = str | tuple[str, int]
 
 
-def values_at(population: Population, address: str) -> Tensor:
+def values_at(population: Population, address: Address) -> Tensor:
     """The values (N, *event) at a latent address.
 
     Raises:
         InputError: no latent site has that address.
     """
-    if address not in population.trace.choices:
+    trace = population.trace
+    name = address if isinstance(address, str) else address[0]
+    if name not in trace.choices:
         raise InputError(
-            f"a summary of {address!r} was asked for, which is no latent address; "
-            f"latent are {', '.join(population.trace.choices) or 'none'}."
+            f"a summary of {name!r} was asked for, which is no latent address; "
+            f"latent are {', '.join(trace.choices) or 'none'}."
         )
-    return population.trace.choices[address]
+    if isinstance(address, str):
+        return trace.choices[address]
+    if not isinstance(trace, SeriesTrace):
+        raise InputError(
+            f"a summary of {name!r} after step {address[1]} was asked for, but the program is no Series; "
+            "give the address alone."
+        )
+    return trace[address]
 
 
-def is_pose(population: Population, address: str) -> bool:
+def is_pose(population: Population, address: Address) -> bool:
     """Whether a latent address holds poses (N, 7): its distribution says which of their axes are free."""
     values_at(population, address)
-    return hasattr(population.trace.distributions[address], "freedom")
+    return _freedom(population, address) is not None
 
 
-def mean(population: Population, address: str) -> Tensor:
+def _freedom(population: Population, address: Address) -> Freedom | None:
+    # What is a pose now was one at every step.
+    name = address if isinstance(address, str) else address[0]
+    return getattr(population.trace.distributions[name], "freedom", None)
+
+
+def _belief(population: Population, address: Address) -> Belief:
+    freedom = _freedom(population, address)
+    return Belief(
+        values_at(population, address), population.log_weights, FREE if freedom is None else freedom
+    )
+
+
+def mean(population: Population, address: Address) -> Tensor:
     """The weighted mean (*event) at an address, in its own units; of a discrete one that of its numbers.
 
     Raises:
@@ -44,12 +73,12 @@ def mean(population: Population, address: str) -> Tensor:
         InferenceError: no particle has any weight.
     """
     if is_pose(population, address):
-        return population.belief(address).mean
+        return _belief(population, address).mean
     values = values_at(population, address).to(torch.float64)
     return torch.einsum("n,n...->...", normalised(population.log_weights), values)
 
 
-def covariance(population: Population, address: str) -> Tensor:
+def covariance(population: Population, address: Address) -> Tensor:
     """The weighted covariance (D, D) of the D numbers of a value, in reading order; (6, 6) of a pose.
 
     Raises:
@@ -57,19 +86,19 @@ def covariance(population: Population, address: str) -> Tensor:
         InferenceError: no particle has any weight.
     """
     if is_pose(population, address):
-        return population.belief(address).covariance
+        return _belief(population, address).covariance
     weights = normalised(population.log_weights)
     values = values_at(population, address).to(torch.float64).reshape(len(weights), -1)
     centred = values - weights @ values
     return (weights[:, None] * centred).T @ centred
 
 
-def quantiles(population: Population, address: str, probabilities: object) -> Tensor:
+def quantiles(population: Population, address: Address, probabilities: object) -> Tensor:
     """Weighted quantiles (Q, *event) of each number of a value by itself, (Q, 6) of a pose.
 
     Args:
         population: weighted particles.
-        address: a latent one.
+        address: a latent one, or with the number of a step.
         probabilities: one (then there is no first axis) or several in [0, 1]; see `weighted_quantiles`.
 
     Raises:
@@ -77,7 +106,7 @@ def quantiles(population: Population, address: str, probabilities: object) -> Te
         InferenceError: no particle has any weight.
     """
     if is_pose(population, address):
-        return population.belief(address).quantiles(probabilities)
+        return _belief(population, address).quantiles(probabilities)
     return weighted_quantiles(
         values_at(population, address), normalised(population.log_weights), probabilities
     )
@@ -90,7 +119,7 @@ class Probabilities(NamedTuple):
     probabilities: Tensor
 
 
-def probabilities(population: Population, address: str) -> Probabilities:
+def probabilities(population: Population, address: Address) -> Probabilities:
     """The probability of each value at a discrete address.
 
     Raises:

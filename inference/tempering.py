@@ -13,7 +13,7 @@ and fitted proposals it is consistent only. Evidence that contains a surrogate l
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -22,10 +22,10 @@ from torch import Tensor
 
 from bcppl.beliefs import normalised
 from bcppl.errors import InputError
-from bcppl.inference.kernels import Kernel, Until, rejuvenate
+from bcppl.inference.kernels import Kernel, Until, refuse_other, rejuvenate, takes
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Resample, adaptive
-from bcppl.inference.step import Observed, StepFunction, StepInfo, Stepped
+from bcppl.inference.step import Observed, StepInfo, Stepped
 from bcppl.inference.targets import POSTERIOR, Target, cost_of
 from bcppl.traces import Trace, extend
 
@@ -99,6 +99,85 @@ def resample_move(
     return rejuvenation
 
 
+class _Schedule(NamedTuple):
+    share: float | Callable[[Trace], float]
+    fixed: tuple[float, ...] | None
+
+    def after(self, reached: float, population: Population, log_likelihood: Tensor) -> float:
+        """The exponent that follows `reached`."""
+        if self.fixed is not None:
+            return next(e for e in self.fixed if e > reached)
+        kept = self.share(population.trace) if callable(self.share) else self.share
+        if kept <= 0.0:
+            return 1.0
+        return next_exponent(population.log_weights, log_likelihood, reached, kept)
+
+
+@dataclass(frozen=True, eq=False)
+class Tempered:
+    """A step that tempers: see `tempered`, which makes it."""
+
+    rejuvenation: Rejuvenation
+    schedule: _Schedule
+    by_site: bool = False
+
+    def __call__(self, population: Population, observed: Observed) -> Stepped:
+        """Take in what was observed, at new addresses."""
+        longer, log_likelihood = extend(population.trace, *observed)
+        # Sites that the program itself fixes (`obs=`, `pyro.factor`) are let in with the observations.
+        new = [a for a in longer.since(population.trace) if a not in longer.choices]
+        return self.let_in(replace(population, trace=longer), new, log_likelihood)
+
+    def let_in(self, population: Population, new: Sequence[str], log_likelihood: Tensor) -> Stepped:
+        """Let sites in that the trace has and the weights do not yet count.
+
+        Args:
+            population: weighed for all other sites.
+            new: addresses of the sites; none of them is latent.
+            log_likelihood: their log-probability (N,).
+        """
+        start = population.log_evidence
+        groups = [[a] for a in _by_cost(population.trace, new)] if self.by_site and new else [list(new)]
+        done, acceptances, ancestors, before, resampled = [], [], None, None, 0
+        displacement = float("nan")
+        for number, group in enumerate(groups):
+            later = {a: 0.0 for others in groups[number + 1 :] for a in others}
+            exponent = 0.0
+            if len(groups) > 1:
+                log_likelihood = population.trace.log_prob(*group)
+            while exponent < 1.0:
+                reached = exponent
+                exponent = self.schedule.after(reached, population, log_likelihood)
+                done.append(exponent)
+                # 0 times -inf is no number, so a particle that cannot be loses its weight here, once.
+                population = weighed = population.reweighed((exponent - reached) * log_likelihood)
+                partly = {**later, **(dict.fromkeys(group, exponent) if exponent < 1.0 else {})}
+                population, chosen, acceptance, come = self.rejuvenation(
+                    population, Target(partly) if partly else POSTERIOR
+                )
+                if chosen is not None:
+                    displacement = come
+                    resampled += 1
+                    ancestors = chosen if ancestors is None else ancestors[chosen]
+                    before = weighed.effective_sample_size
+                if acceptance is not None:
+                    acceptances.append(acceptance)
+                # Of no address at all, `log_prob` would give all sites.
+                if exponent < 1.0 and group:
+                    log_likelihood = population.trace.log_prob(*group)
+        info = StepInfo(
+            sum(acceptances) / len(acceptances) if acceptances else float("nan"),
+            tuple(done),
+            resampled,
+            population.effective_sample_size if before is None else before,
+            population.effective_sample_size,
+            population.log_evidence - start,
+            ancestors,
+            displacement,
+        )
+        return Stepped(population, info)
+
+
 def tempered(
     kernel: Kernel | None = None,
     *,
@@ -108,7 +187,7 @@ def tempered(
     exponents: Sequence[float] | None = None,
     by_site: bool = False,
     rejuvenation: Rejuvenation | None = None,
-) -> StepFunction:
+) -> Tempered:
     """A step that lets a measurement's likelihood in bit by bit, and resamples and moves after each.
 
     Args:
@@ -128,9 +207,16 @@ def tempered(
         The step. It raises InferenceError where no particle is left with any weight.
 
     Raises:
-        InputError: `share` is not in [0, 1), the exponents do not increase to 1, or a rejuvenation is given
-            beside a kernel or a resampling.
+        InputError: what is given is no kernel, `share` is not in [0, 1), the exponents do not increase to 1,
+            or a rejuvenation is given beside a kernel or a resampling.
     """
+    if kernel is not None:
+        if callable(kernel) and takes(kernel, 2) and not takes(kernel, 1):
+            raise InputError(
+                "tempered is given a function of two arguments in place of a kernel; "
+                "if it is a rejuvenation such as waste_free_moves(...), give it as rejuvenation=..."
+            )
+        refuse_other("tempered", kernel)
     if not callable(share) and not 0.0 <= share < 1.0:
         raise InputError(
             f"tempering is asked to keep a share of {share} of the particles; give 0 up to below 1."
@@ -146,68 +232,7 @@ def tempered(
         raise InputError(
             "a step is given a rejuvenation beside a kernel or a resampling; give one or the other."
         )
-    schedule = _Schedule(share, fixed)
-
-    def step(population: Population, observed: Observed) -> Stepped:
-        start = population.log_evidence
-        longer, log_likelihood = extend(population.trace, *observed)
-        # Sites that the program itself fixes (`obs=`, `pyro.factor`) are let in with the observations.
-        new = [a for a in longer.since(population.trace) if a not in longer.choices]
-        population = replace(population, trace=longer)
-        groups = [[a] for a in _by_cost(longer, new)] if by_site and new else [new]
-        done, acceptances, ancestors, before, resampled = [], [], None, None, 0
-        displacement = float("nan")
-        for number, group in enumerate(groups):
-            later = {a: 0.0 for others in groups[number + 1 :] for a in others}
-            exponent = 0.0
-            if len(groups) > 1:
-                log_likelihood = population.trace.log_prob(*group)
-            while exponent < 1.0:
-                reached = exponent
-                exponent = schedule.after(reached, population, log_likelihood)
-                done.append(exponent)
-                # 0 times -inf is no number, so a particle that cannot be loses its weight here, once.
-                population = weighed = population.reweighed((exponent - reached) * log_likelihood)
-                partly = {**later, **(dict.fromkeys(group, exponent) if exponent < 1.0 else {})}
-                population, chosen, acceptance, come = rejuvenation(
-                    population, Target(partly) if partly else POSTERIOR
-                )
-                if chosen is not None:
-                    displacement = come
-                    resampled += 1
-                    ancestors = chosen if ancestors is None else ancestors[chosen]
-                    before = weighed.effective_sample_size
-                if acceptance is not None:
-                    acceptances.append(acceptance)
-                if exponent < 1.0:
-                    log_likelihood = population.trace.log_prob(*group)
-        info = StepInfo(
-            sum(acceptances) / len(acceptances) if acceptances else float("nan"),
-            tuple(done),
-            resampled,
-            population.effective_sample_size if before is None else before,
-            population.effective_sample_size,
-            population.log_evidence - start,
-            ancestors,
-            displacement,
-        )
-        return Stepped(population, info)
-
-    return step
-
-
-class _Schedule(NamedTuple):
-    share: float | Callable[[Trace], float]
-    fixed: tuple[float, ...] | None
-
-    def after(self, reached: float, population: Population, log_likelihood: Tensor) -> float:
-        """The exponent that follows `reached`."""
-        if self.fixed is not None:
-            return next(e for e in self.fixed if e > reached)
-        kept = self.share(population.trace) if callable(self.share) else self.share
-        if kept <= 0.0:
-            return 1.0
-        return next_exponent(population.log_weights, log_likelihood, reached, kept)
+    return Tempered(rejuvenation, _Schedule(share, fixed), by_site)
 
 
 def _by_cost(trace: Trace, addresses: Sequence[str]) -> list[str]:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 
 from bcppl.errors import InputError
-from bcppl.inference.kernels import Kernel, put
+from bcppl.inference.kernels import Kernel, fitted, put, refuse_other
 from bcppl.inference.population import Population, log_pair
 from bcppl.inference.schemes import Scheme, systematic
 from bcppl.inference.targets import Target
@@ -32,8 +32,9 @@ def waste_free_moves(
         threshold: resample when the effective sample size is below this share of N; 1 is always.
 
     Raises:
-        InputError: there are no chains. When it runs: M does not divide N.
+        InputError: what is given is no kernel, or there are no chains. When it runs: M does not divide N.
     """
+    refuse_other("waste_free_moves", kernel)
     if chains < 1:
         raise InputError(f"waste-free SMC is asked for {chains} chains; give 1 or more.")
 
@@ -51,7 +52,7 @@ def waste_free_moves(
         side = (torch.randperm(chains) % 2)[torch.arange(count) % chains]
         sides = [s for s in (0, 1) if bool((side[ancestors] == s).any())]
         halves = [(side[ancestors] == s).nonzero().flatten() for s in sides]
-        moves = [kernel(_teachers(population, side == 1 - s)) for s in sides]
+        moves = [fitted(kernel, _teachers(population, side == 1 - s)) for s in sides]
         current, acceptances = population.trace[ancestors], []
         whole = population.trace[ancestors.repeat(count // chains)]
         for state in range(1, count // chains):

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.poses import NormalPose, UniformPose
-from bcppl.errors import InferenceError
+from bcppl.errors import InputError
 from bcppl.inference.kernels import Kernel, cycle, metropolis_hastings, rejuvenate, repeat
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Fitted, drift
@@ -216,7 +216,7 @@ def test_a_proposal_that_moves_nothing_latent_is_refused() -> None:
         pyro.sample("elsewhere", dist.Normal(trace["x"], 1.0).to_event(1))
 
     trace = correlated_draws(4)
-    with pytest.raises(InferenceError, match=r"elsewhere.* latent are x"):
+    with pytest.raises(InputError, match=r"elsewhere.* latent are x"):
         metropolis_hastings(elsewhere)(equal_weights(trace))(trace, POSTERIOR)
 
 

@@ -4,7 +4,7 @@ from bcppl.inference.kernels.combinators import cycle, mixture, repeat, sequence
 from bcppl.inference.kernels.hamiltonian import hmc
 from bcppl.inference.kernels.hastings import metropolis_hastings
 from bcppl.inference.kernels.involutions import involutive
-from bcppl.inference.kernels.kernel import Kernel, Move, put, replaced
+from bcppl.inference.kernels.kernel import Kernel, Move, fitted, put, refuse_other, replaced, takes
 from bcppl.inference.kernels.rejuvenation import Moved, Until, displacement, distinct, rejuvenate, until
 from bcppl.inference.kernels.staged import Screened, Staged, Surrogate, delayed_acceptance, student_t
 
@@ -20,15 +20,18 @@ __all__ = [
     "delayed_acceptance",
     "displacement",
     "distinct",
+    "fitted",
     "hmc",
     "involutive",
     "metropolis_hastings",
     "mixture",
     "put",
+    "refuse_other",
     "rejuvenate",
     "repeat",
     "replaced",
     "sequence",
     "student_t",
+    "takes",
     "until",
 ]

@@ -7,12 +7,13 @@ choice of what comes next hangs on where the particles are. The acceptance is th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, Move, put
+from bcppl.inference.kernels.kernel import Kernel, Move, fitted, put, refuse_other
 from bcppl.inference.population import Population
 from bcppl.inference.targets import Target
 from bcppl.traces import Trace
@@ -26,38 +27,44 @@ def _one_after_another(moves: Sequence[Move], trace: Trace, target: Target) -> t
     return trace, total / len(moves)
 
 
-def _refuse_none(name: str, kernels: Sequence[Kernel]) -> None:
-    if not kernels:
+def _listed(name: str, kernels: Sequence[Kernel | Sequence[Kernel]]) -> list[Kernel]:
+    """Kernels that were given one by one, or as one list."""
+    one = kernels[0] if len(kernels) == 1 else None
+    listed: list[Any] = list(one) if isinstance(one, Sequence) and not isinstance(one, str) else list(kernels)
+    if not listed:
         raise InputError(f"{name} is given no kernel; give one or more.")
+    for each in listed:
+        refuse_other(name, each)
+    return listed
 
 
-def sequence(*kernels: Kernel) -> Kernel:
-    """One kernel after another, in the order given.
+def sequence(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
+    """One kernel after another, in the order given, one by one or as a list.
 
     Raises:
-        InputError: no kernel is given.
+        InputError: no kernel is given, or something else, such as a proposal.
     """
-    _refuse_none("sequence", kernels)
+    listed = _listed("sequence", kernels)
 
     def together(population: Population) -> Move:
-        moves = [kernel(population) for kernel in kernels]
+        moves = [fitted(kernel, population) for kernel in listed]
         return lambda trace, target: _one_after_another(moves, trace, target)
 
     return together
 
 
-def cycle(*kernels: Kernel) -> Kernel:
+def cycle(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
     """Each kernel once, in an order that is drawn anew for each move: Tierney's random permutation scan.
 
     Of reversible kernels a fixed order is not reversible; a random one is.
 
     Raises:
-        InputError: no kernel is given.
+        InputError: no kernel is given, or something else, such as a proposal.
     """
-    _refuse_none("cycle", kernels)
+    listed = _listed("cycle", kernels)
 
     def together(population: Population) -> Move:
-        moves = [kernel(population) for kernel in kernels]
+        moves = [fitted(kernel, population) for kernel in listed]
 
         def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
             order = torch.randperm(len(moves)).tolist()
@@ -68,30 +75,34 @@ def cycle(*kernels: Kernel) -> Kernel:
     return together
 
 
-def mixture(kernels: Sequence[Kernel], weights: Sequence[float] | None = None) -> Kernel:
+def mixture(kernels: Sequence[Kernel] | Kernel, *more: Any, weights: Sequence[float] | None = None) -> Kernel:
     """One of several kernels, drawn anew for each particle and each move.
 
     Drawn for each particle, so that particles stay independent of one another and a small population sees
     every kernel; each kernel then moves only the particles that drew it.
 
     Args:
-        kernels: what is drawn from.
+        kernels: what is drawn from, as a list, or the first of them.
+        more: the others; after a list, the weights.
         weights: their chances, not negative, up to a factor; equal by default.
 
     Raises:
-        InputError: no kernel is given, or the weights are not one for each, finite, and not negative.
+        InputError: no kernel is given, or something else, such as a proposal; or the weights are not one for
+            each, finite, and not negative.
     """
-    _refuse_none("mixture", kernels)
-    chances = torch.as_tensor([1.0] * len(kernels) if weights is None else weights, dtype=torch.float64)
-    sound = chances.shape == (len(kernels),) and bool((torch.isfinite(chances) & (chances >= 0.0)).all())
+    if isinstance(kernels, Sequence) and len(more) == 1 and weights is None and not callable(more[0]):
+        weights, more = more[0], ()
+    listed = _listed("mixture", (kernels, *more))
+    chances = torch.as_tensor([1.0] * len(listed) if weights is None else weights, dtype=torch.float64)
+    sound = chances.shape == (len(listed),) and bool((torch.isfinite(chances) & (chances >= 0.0)).all())
     if not sound or not bool(chances.sum() > 0.0):
         raise InputError(
-            f"mixture is given weights {chances.tolist()} for {len(kernels)} kernels; "
+            f"mixture is given weights {chances.tolist()} for {len(listed)} kernels; "
             "give one for each, 0 or more, not all of them 0."
         )
 
     def together(population: Population) -> Move:
-        moves = [kernel(population) for kernel in kernels]
+        moves = [fitted(kernel, population) for kernel in listed]
 
         def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
             drawn = torch.multinomial(chances, trace.particles, replacement=True)
@@ -117,13 +128,14 @@ def repeat(kernel: Kernel, times: int) -> Kernel:
     whole population: `bcppl.inference.kernels.until`.
 
     Raises:
-        InputError: fewer than one time.
+        InputError: what is given is no kernel, or the times are no whole number, 1 or more.
     """
-    if times < 1:
-        raise InputError(f"a kernel is to be repeated {times} times; give 1 or more.")
+    refuse_other("repeat", kernel)
+    if not isinstance(times, int) or times < 1:
+        raise InputError(f"a kernel is to be repeated {times} times; give a whole number, 1 or more.")
 
     def together(population: Population) -> Move:
-        moves = [kernel(population)] * times
+        moves = [fitted(kernel, population)] * times
         return lambda trace, target: _one_after_another(moves, trace, target)
 
     return together

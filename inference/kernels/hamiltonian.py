@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -24,7 +24,9 @@ from bcppl.traces.run import inward
 FLOOR = 1e-6
 
 
-def hmc(*addresses: str, step_size: float = 0.5, steps: int = 8, jitter: float = 0.3) -> Kernel:
+def hmc(
+    *addresses: str | Sequence[str], step_size: float = 0.5, steps: int = 8, jitter: float = 0.3
+) -> Kernel:
     """Hamiltonian Monte Carlo with the leapfrog integrator.
 
     Neal, MCMC using Hamiltonian dynamics, Handbook of Markov Chain Monte Carlo, 2011, section 5.3. The
@@ -33,7 +35,7 @@ def hmc(*addresses: str, step_size: float = 0.5, steps: int = 8, jitter: float =
     interval, on a simplex) move in unconstrained coordinates, the Jacobian included.
 
     Args:
-        addresses: latent addresses, moved together; the other latent values stay.
+        addresses: latent addresses, one by one or as a list, moved together; the other latent values stay.
         step_size: of the leapfrog, in standard deviations.
         steps: leapfrog steps of a trajectory, each one gradient for all particles.
         jitter: each trajectory's step size is uniform within this share of `step_size`, so that none runs in
@@ -44,7 +46,8 @@ def hmc(*addresses: str, step_size: float = 0.5, steps: int = 8, jitter: float =
         support without unconstrained coordinates; moving raises it where a site that hangs on the addresses
         runs a simulator or passes no gradient on. A trajectory that diverges is rejected.
     """
-    if not addresses:
+    named = tuple(a for each in addresses for a in ([each] if isinstance(each, str) else each))
+    if not named:
         raise InputError("hmc was given no address to move; name at least one.")
     if not step_size > 0 or steps < 1 or not 0 <= jitter < 1:
         raise InputError(
@@ -53,10 +56,10 @@ def hmc(*addresses: str, step_size: float = 0.5, steps: int = 8, jitter: float =
         )
 
     def kernel(population: Population) -> Move:
-        factor = _factor(_Unconstrained(addresses, population.trace), population)
+        factor = _factor(_Unconstrained(named, population.trace), population)
 
         def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-            space = _Unconstrained(addresses, trace)
+            space = _Unconstrained(named, trace)
             exponents = target.exponents if isinstance(target, Target) else {}
             start = space.read(trace)
             scale = 1.0 + jitter * (2.0 * torch.rand(len(trace), 1, dtype=torch.float64) - 1.0)

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bcppl.errors import InferenceError
+from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import Kernel, Move, put
 from bcppl.inference.population import Population
-from bcppl.inference.proposals.proposal import Proposal, program_of
+from bcppl.inference.proposals.proposal import Fitted, Proposal, program_of
 from bcppl.inference.targets import Target, accept, visible
 from bcppl.traces import Trace, assess, propose, update
 
@@ -21,14 +21,24 @@ def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any
 
     Args:
         proposal: a Pyro program `proposal(trace, *values)`, or a shipped one such as `drift("hole")`. Its
-            choices at latent addresses of the trace are new values; its other choices are auxiliary and keep
-            their values on the way back (so their distribution must not depend on what is moved in a way
-            that forbids that).
+            choices at latent addresses of the trace are new values, each particle's from its own old values
+            only; its other choices are auxiliary and keep their values on the way back (so their distribution
+            must not depend on what is moved in a way that forbids that).
         learned: functions of a population, such as `spread_of("hole")`; what they give is handed to the
-            program as `values`. They see other particles than those that are moved.
+            program as `values`. They see other particles than those that are moved: a program that itself
+            reads `trace["mu"].mean()` learns from the very particles that it moves, and is not right.
 
     The acceptance ratio is that of Hastings, Biometrika 57, 1970, on the pair (trace, auxiliary choices).
+
+    Raises:
+        InputError: what is given is no proposal. When the kernel moves: the proposal makes no choice at a
+            latent address.
     """
+    if not isinstance(proposal, Fitted) and not callable(proposal):
+        raise InputError(
+            f"metropolis_hastings is given a {type(proposal).__name__} in place of a proposal; "
+            "give a program, or one such as drift(...)."
+        )
 
     def kernel(population: Population) -> Move:
         program = program_of(proposal, learned, population)
@@ -37,10 +47,15 @@ def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any
             forward = propose(program, (trace,), trace.particles)
             new = {a: v for a, v in forward.choices.items() if a in trace.choices}
             if not new:
+                if callable(forward.result):
+                    raise InputError(
+                        "a proposal returns a function and samples nothing; if it learns from a population, "
+                        "wrap it in Fitted(...), and if it is a kernel, use it as it is."
+                    )
                 chosen = ", ".join(forward.choices) or "nothing"
-                raise InferenceError(
+                raise InputError(
                     f"a proposal has no choice at a latent address: it chooses {chosen}, "
-                    f"latent are {', '.join(trace.choices)}."
+                    f"latent are {', '.join(trace.choices) or 'none'}; sample at one of these."
                 )
             updated = update(trace, new)
             back = {**forward.choices, **updated.discarded}

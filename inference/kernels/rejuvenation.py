@@ -11,7 +11,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.beliefs import normalised
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, replaced
+from bcppl.inference.kernels.kernel import Kernel, fitted, replaced
 from bcppl.inference.population import Population
 from bcppl.inference.targets import Target
 
@@ -151,7 +151,7 @@ def _sweep(population: Population, kernel: Kernel, target: Target) -> tuple[Popu
     for mine, others in (halves, halves[::-1]):
         if len(mine) == 0:
             continue
-        move = kernel(_teachers(population[others] if len(others) else population))
+        move = fitted(kernel, _teachers(population[others] if len(others) else population))
         moved, share = move(population.trace[mine], target)
         shares.append(share.to(torch.float64))
         population = replaced(population, mine, moved)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bcppl.beliefs import normalised
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, Move
+from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_other
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import spread_of
 from bcppl.inference.proposals.coordinates import coordinates_of
@@ -185,10 +185,16 @@ def delayed_acceptance(
             learns, it is fitted to other particles than those that are moved. Two stages then.
 
     Raises:
-        InputError: fewer than two stages, or sites and a surrogate that are both to decide first. When the
+        InputError: what is given is no kernel, fewer than two stages, a surrogate in the place of `first`, or
+            sites and a surrogate that are both to decide first. When the
             kernel moves: a pattern fits no address, the target is a plain function, or the way back of a
             proposal reads a site of a later stage.
     """
+    refuse_other("delayed_acceptance", kernel)
+    if callable(first):
+        raise InputError(
+            "delayed acceptance is to decide first by a function; give a surrogate as surrogate=..."
+        )
     if stages < 2:
         raise InputError(f"delayed acceptance is asked for {stages} stages; give 2 or more.")
     if surrogate is not None and (first is not None or stages != 2):
@@ -199,7 +205,7 @@ def delayed_acceptance(
     patterns = (first,) if isinstance(first, str) else None if first is None else tuple(first)
 
     def staged(population: Population) -> Move:
-        move = kernel(population)
+        move = fitted(kernel, population)
         screen = surrogate(population) if surrogate is not None else None
 
         def in_stages(trace: Trace, target: Target) -> tuple[Trace, Tensor]:

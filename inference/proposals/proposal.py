@@ -1,7 +1,9 @@
 """What a proposal is: a Pyro program that, given a trace, chooses new values at latent addresses.
 
-What it learns from a population is fixed before it runs, is the same on the way back, and comes from other
-particles than those that it moves (`bcppl.inference.kernels.rejuvenate`).
+Each particle's new value hangs on its own old values only. What a proposal learns from a population is fixed
+before it runs, is the same on the way back, and comes from other particles than those that it moves
+(`bcppl.inference.kernels.rejuvenate`): so `trace["mu"].mean()` is not for a program to read, but for `Fitted`
+or for what `metropolis_hastings(proposal, *learned)` is told to learn.
 """
 
 from __future__ import annotations
