@@ -127,7 +127,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "batch (3, N)": (lambda: simulate(stacked, (), N), r"'x' has batch shape \(3, 5\)"),
     "batch (3,)": (
         lambda: simulate(beside_the_plate, (), N),
-        "'x' has 3 entries at dimension -1 where .* has 5",
+        "'x' has 3 entries where there are 5 particles; .*k.*to_event",
     ),
     "stacked in a plate": (
         lambda: simulate(plated, (torch.zeros(2, 3, 1),), N),

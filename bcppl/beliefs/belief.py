@@ -17,6 +17,7 @@ from bcppl.beliefs.distances import average_distance
 from bcppl.beliefs.merged import merged
 from bcppl.beliefs.regions import Measure, Region, pose_deviation, region
 from bcppl.beliefs.weights import effective_sample_size, normalised, weighted_quantiles
+from bcppl.errors import InputError
 from bcppl.poses import FREE, Freedom
 
 
@@ -28,11 +29,25 @@ class Belief:
         world_from_part: (N, 7) poses.
         log_weights: (N,) unnormalised.
         freedom: which axes of the pose are free.
+
+    Raises:
+        InputError: the poses are not (N, 7), or the weights not (N,).
     """
 
     world_from_part: Tensor
     log_weights: Tensor
     freedom: Freedom = FREE
+
+    def __post_init__(self) -> None:
+        given, weights = tuple(self.world_from_part.shape), tuple(self.log_weights.shape)
+        if len(given) != 2 or given[1] != 7:
+            raise InputError(
+                f"a belief is given poses of shape {given}; give (N, 7), each [x y z qw qx qy qz]."
+            )
+        if weights != given[:1]:
+            raise InputError(
+                f"a belief of {given[0]} poses is given log weights of shape {weights}; give one for each."
+            )
 
     def __len__(self) -> int:
         return len(self.log_weights)

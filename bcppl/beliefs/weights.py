@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -10,8 +11,12 @@ from torch import Tensor
 from bcppl.errors import InferenceError, InputError
 
 
-def normalised(log_weights: Tensor) -> Tensor:
+def normalised(log_weights: Tensor, impossible: Sequence[str] = ()) -> Tensor:
     """Weights (N,) that sum to 1, from log weights (N,).
+
+    Args:
+        log_weights: unnormalised.
+        impossible: addresses that no particle can explain (`bcppl.traces.Trace.impossible`), for the error.
 
     Raises:
         InferenceError: no particle has any weight.
@@ -19,8 +24,9 @@ def normalised(log_weights: Tensor) -> Tensor:
     if bool((torch.isnan(log_weights) | (log_weights == torch.inf)).any()):
         raise InferenceError("a particle's weight is not a number; a kernel or a resampler gave NaN or +inf.")
     if not bool((log_weights > -torch.inf).any()):
+        where = f" at {', '.join(map(repr, impossible))}" if impossible else ""
         raise InferenceError(
-            "no particle has any weight left: every particle says that what was measured cannot be; "
+            f"no particle has any weight left: every particle says that what was measured{where} cannot be; "
             "widen the prior, use more particles, or check the recording with `bcppl check`."
         )
     return torch.softmax(log_weights, dim=0)

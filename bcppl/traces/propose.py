@@ -9,6 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from bcppl.errors import InputError
+from bcppl.traces.coincidence import refuse_coincidence
 from bcppl.traces.run import Program, run
 from bcppl.traces.series import Series, runnable
 from bcppl.traces.trace import Trace
@@ -58,6 +59,7 @@ def assessed(
     program = runnable(program)
     ran = run(program, args, particles, choices, {})
     refuse_unvisited(choices, ran)
+    refuse_coincidence(program, args, particles, ran)
     missing = [a for a in ran.values if a not in choices and a not in ran.fixed]
     if missing:
         raise InputError(

@@ -7,14 +7,15 @@ particle axis comes first: (N, 5, *event), and what is observed of them is (5, *
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import pyro
 import torch
+from pyro.distributions.torch_distribution import TorchDistributionMixin
 from pyro.poutine.indep_messenger import IndepMessenger
 from pyro.poutine.messenger import Messenger
 from pyro.poutine.runtime import _DIM_ALLOCATOR, _PYRO_STACK
@@ -23,6 +24,7 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry, carrying
+from bcppl.traces.explained import explained, unfit, unfit_particles
 from bcppl.traces.shortcuts import drawn
 
 Program = Callable[..., Any]
@@ -39,6 +41,8 @@ class Run:
         fixed: addresses that the program observes itself (`obs=`, `pyro.factor`).
         carried: simulator states that it used or started.
         result: what it returned.
+        coincident: addresses in a plate of N entries (`bcppl.traces.coincidence`).
+        whole: the first address, if its distribution had N entries before it was spread over the particles.
     """
 
     distributions: dict[str, Any]
@@ -46,6 +50,8 @@ class Run:
     fixed: frozenset[str]
     carried: dict[str, Entry]
     result: Any
+    coincident: frozenset[str]
+    whole: frozenset[str]
 
 
 def run(
@@ -58,25 +64,42 @@ def run(
     """Run a program under a plate of `particles`, its sites set to `given` and the others sampled.
 
     Raises:
-        InputError: no particles, a duplicate address, an enumerated site, a subsampled plate, a site that
-            does not fit the particles and the plates around it, or a value that is no tensor or has the
-            wrong shape; the sentence names the address.
+        InputError: no particles, arguments that are no tuple, a duplicate address, an enumerated site, a
+            subsampled plate, a site that does not fit the particles and the plates around it, a value that is
+            no tensor or has the wrong shape, tensors in the program that do not fit the particles, or one
+            that is asked for a single number; the sentence names the address.
     """
-    if particles < 1:
-        raise InputError(f"a program was to be run for {particles} particles; give 1 or more.")
+    if not isinstance(args, tuple | list):
+        raise InputError(
+            f"a program's arguments are of type {type(args).__name__}; give a tuple of them, `(x,)` for one."
+        )
+    if not isinstance(particles, Integral) or particles < 1:
+        raise InputError(
+            f"a program was to be run for {particles} particles; give 1 or more, a whole number."
+        )
+    refuse_other_than_tensors(given)
+    recorder = _Recorder(particles, given)
+    with carrying(carried) as used, torch.no_grad(), pyro.validation_enabled(False):
+        try:
+            with _apart(), recorder, _Particles(PARTICLES, particles, dim=-1) as plate:
+                result = program(*args)
+        except (RuntimeError, TypeError, ValueError) as error:
+            said = explained(error, particles, next(reversed(recorder.distributions), None))
+            if said is error:
+                raise
+            raise said from error
+    values, fixed = recorder.values, frozenset(recorder.fixed)
+    coincident, whole = frozenset(recorder.coincident), frozenset(plate.whole)
+    return Run(recorder.distributions, values, fixed, used, result, coincident, whole)
+
+
+def refuse_other_than_tensors(given: Mapping[str, Any]) -> None:
+    """An error that names an address that something else than a tensor was given for."""
     for address, value in given.items():
         if not isinstance(value, Tensor):
             raise InputError(
                 f"the value given for address {address!r} is a {type(value).__name__}; give a tensor."
             )
-    recorder = _Recorder(particles, given)
-    with carrying(carried) as used, torch.no_grad(), pyro.validation_enabled(False):
-        try:
-            with _apart(), recorder, _Particles(PARTICLES, particles, dim=-1):
-                result = program(*args)
-        except ValueError as error:
-            raise _explained(error, particles) from error
-    return Run(recorder.distributions, recorder.values, frozenset(recorder.fixed), used, result)
 
 
 @contextmanager
@@ -108,6 +131,11 @@ def inward(value: Tensor, distribution: Any) -> Tensor:
 class _Particles(IndepMessenger):
     """The plate of the particles: `pyro.plate`, for less where a site has its shape already."""
 
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.first: str | None = None
+        self.whole: set[str] = set()
+
     def _pyro_sample(self, message: Any) -> None:
         batch = message["fn"].batch_shape if hasattr(message["fn"], "batch_shape") else None
         if batch is None or isinstance(message["fn"], _Subsample) or message["infer"].get("_deterministic"):
@@ -115,7 +143,15 @@ class _Particles(IndepMessenger):
         if not batch or batch[-1] == 1 != self.size:
             message["fn"] = message["fn"].expand(torch.Size([*batch[:-1], self.size]))
         elif batch[-1] != self.size:
-            raise ValueError(_MISMATCH.format(PARTICLES, message["name"], -1, self.size, batch[-1]))
+            alone = len(message["cond_indep_stack"]) == 1
+            raise (
+                unfit_particles(message["name"], self.size, batch[-1])
+                if alone
+                else unfit(message["name"], -1, PARTICLES, self.size, batch[-1])
+            )
+        elif self.first is None and self.size > 1:
+            self.whole.add(message["name"])
+        self.first = self.first or message["name"]
 
     def _process_message(self, message: Any) -> None:
         super()._process_message(message)
@@ -133,6 +169,7 @@ class _Recorder(Messenger):
         self.distributions: dict[str, Any] = {}
         self.values: dict[str, Tensor] = {}
         self.fixed: set[str] = set()
+        self.coincident: set[str] = set()
 
     def _pyro_sample(self, message: Any) -> None:
         if _is_no_choice(message):
@@ -153,6 +190,11 @@ class _Recorder(Messenger):
             raise InputError(
                 f"site {address!r} is sampled from a {type(distribution).__name__}, which has no "
                 "log-probability; give a distribution of `pyro.distributions`."
+            )
+        if not isinstance(distribution, TorchDistributionMixin):
+            raise InputError(
+                f"site {address!r} is sampled from {type(distribution).__module__}."
+                f"{type(distribution).__name__}, which Pyro cannot use; take it from `pyro.distributions`."
             )
         self._fits(address, tuple(distribution.batch_shape), message["cond_indep_stack"])
         self.distributions[address] = distribution
@@ -198,6 +240,8 @@ class _Recorder(Messenger):
                 f"and of the {self.particles} particles; put further dimensions into the event with "
                 "`.to_event()`, or open a plate for them."
             )
+        if self.particles > 1 and self.particles in expected[:-1]:
+            self.coincident.add(address)
 
     def _has_shape(self, address: str, value: Tensor, distribution: Any) -> None:
         batch, event = tuple(distribution.batch_shape), tuple(distribution.event_shape)
@@ -215,30 +259,3 @@ def _is_no_choice(message: Any) -> bool:
 
 def _scaled(scale: Any) -> bool:
     return not isinstance(scale, int | float) or scale != 1
-
-
-_MISMATCH = "Shape mismatch inside plate('{}') at site {} dim {}, {} vs {}"
-_MISMATCHED = re.compile(r"Shape mismatch inside plate\('(.+)'\) at site (.+) dim (-?\d+), (\d+) vs (\d+)")
-_COLLIDING = re.compile(r'at plates "(.+)" and "(.+)", collide at dim=(-?\d+)')
-
-
-def _explained(error: ValueError, particles: int) -> ValueError:
-    """What Pyro says of plates, in a sentence that names the site and says what to do."""
-    said = str(error).partition("\n")[0]
-    if found := _MISMATCHED.match(said):
-        plate, site, dim, size, given = found.groups()
-        return InputError(
-            f"site {site!r} has {given} entries at dimension {dim} where plate {plate!r} has {size}; inside "
-            "a program the particles are the last batch dimension and plates lie to the left of it, so give "
-            "what hangs on a plate a last axis of 1 (`[:, None]`), and put other dimensions into the event "
-            "with `.to_event()`."
-        )
-    if found := _COLLIDING.match(said):
-        plate, other, dim = found.groups()
-        return InputError(
-            f"plate {plate!r} is put at dimension {dim}, which is that of plate {other!r}"
-            "; leave its `dim` out, or take one further to the left (the particles have -1, so -2)."
-        )
-    if said.startswith("duplicate plate"):
-        return InputError(f"two plates, one within the other, have the same name ({said}); rename one.")
-    return error

@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from inspect import signature
 from typing import Any
 
 import torch
@@ -47,11 +48,22 @@ class Series:
     A state is a tensor, or a dictionary, list, tuple or named tuple of such, the particle axis first;
     numbers, None and tensors without axes are the same for all particles. What else it holds is indexed by
     (K,) int64.
+
+    Raises:
+        InputError: a part is no function.
     """
 
     init: Callable[..., Any]
     step: Callable[..., Any]
     history: bool = True
+
+    def __post_init__(self) -> None:
+        for name, part in (("init", self.init), ("step", self.step)):
+            if not callable(part):
+                raise InputError(
+                    f"the {name} of a series is of type {type(part).__name__}; "
+                    "give two functions, Series(init, step)."
+                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +78,16 @@ class Stage:
     def __call__(self, *args: Any) -> Any:
         """Run the step from the states of the chosen particles."""
         if self.before is None:
+            _refuse_arguments("init", self.series.init, args)
             return self.series.init(*args)
-        return self.series.step(taken(self.before.state, self.chosen, self.before.particles), *args)
+        state = taken(self.before.state, self.chosen, self.before.particles)
+        _refuse_arguments("step", self.series.step, (state, *args))
+        after = self.series.step(state, *args)
+        if after is None and state is not None:
+            raise InputError(
+                "a series' step returned nothing, but it was given a state; return the next state from it."
+            )
+        return after
 
     @cached_property
     def chosen(self) -> Tensor | None:
@@ -97,6 +117,20 @@ class Stage:
         return replace(self, picks=(torch.where(mask, first, second),))
 
 
+def _refuse_arguments(name: str, part: Callable[..., Any], args: tuple[Any, ...]) -> None:
+    """An error where a part of a series cannot be called with what it is given."""
+    try:
+        signature(part).bind(*args)
+    except TypeError as error:
+        raise InputError(
+            f"the {name} of a series, {getattr(part, '__name__', part)!r}, does not take the arguments it is "
+            f"given ({error}); write Series(init, step) with init(*args) and step(state, *args)."
+        ) from error
+    except ValueError:
+        # Some callables have no signature to be read.
+        return
+
+
 def runnable(program: Program | Series) -> Program:
     """The program itself, or what begins a series."""
     return Stage(program) if isinstance(program, Series) else program
@@ -119,7 +153,8 @@ def taken(state: Any, index: Tensor | None, particles: int) -> Any:
         if len(state) != particles:
             raise InputError(
                 f"a series' state holds a tensor of shape {tuple(state.shape)} for {particles} particles; "
-                "put the particle axis first, and what is the same for all into the arguments."
+                "put the particle axis first (sample a vector with `.to_event(1)`, or `.movedim(-1, 0)` what is "
+                "sampled in a plate), and what is the same for all into the arguments."
             )
         return state if index is None else state.index_select(0, index)
     if isinstance(state, Mapping):

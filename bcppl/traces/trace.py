@@ -15,7 +15,7 @@ from torch import Tensor
 from bcppl.errors import InferenceError, InputError
 from bcppl.traces.carried import Entry, same_inputs
 from bcppl.traces.hiding import Hiding, refused
-from bcppl.traces.run import Program, Run, inward, run
+from bcppl.traces.run import Program, Run, inward, refuse_other_than_tensors, run
 from bcppl.traces.shortcuts import narrowed
 
 Index = Tensor | Sequence[int] | slice | int
@@ -130,6 +130,12 @@ class Trace:
         # The maximum is NaN where any is.
         if not bool(value.max() < torch.inf):
             which = (torch.isnan(value) | (value == torch.inf)).nonzero().flatten().tolist()
+            if address in self.observations and bool(torch.isnan(self.observations[address]).any()):
+                seen = torch.isnan(self.observations[address])
+                raise InferenceError(
+                    f"the observation at site {address!r} is NaN in {int(seen.sum())} of {seen.numel()} "
+                    "entries; leave out what was not measured, or mask it in the site's distribution."
+                )
             raise InferenceError(
                 f"site {address!r} has a log-probability of {float(value[which[0]])} for "
                 f"{len(which)} of {self.particles} particles (first: {', '.join(map(str, which[:5]))}); "
@@ -143,7 +149,10 @@ class Trace:
                 return self.choices[key]
             if key in self.observations:
                 return self.observations[key]
-            raise KeyError(f"the trace has no value at address {key!r}")
+            held = [*self.choices, *self.observations]
+            raise InputError(
+                f"the trace has no value at address {key!r}; it has {', '.join(held) or 'none'}."
+            )
         index = self._index(key)
         return replace(
             self,
@@ -159,6 +168,10 @@ class Trace:
             return torch.arange(self.particles)[key].reshape(-1)
         index = key.reshape(-1)
         return index.nonzero().flatten() if index.dtype == torch.bool else index
+
+    def impossible(self) -> list[str]:
+        """The addresses, of those that are not latent, that every particle is known to say cannot be."""
+        return [a for a, v in self.known.items() if a not in self.choices and bool((v == -torch.inf).all())]
 
     def since(self, previous: Trace) -> list[str]:
         """The addresses that `extend` added to `previous` to make this trace (or one moved since)."""
@@ -209,16 +222,24 @@ class Trace:
         """The same run with other values at some latent addresses; what cannot have changed is kept.
 
         Raises:
-            InputError: an address is not latent, or a value has the wrong shape.
+            InputError: an address is not latent, or a value is no tensor or has the wrong shape, or reals are
+                given for whole numbers.
         """
         self._refuse_other_than_latent(values)
+        refuse_other_than_tensors(values)
         for address, value in values.items():
+            if not torch.can_cast(value.dtype, self.choices[address].dtype):
+                raise InputError(
+                    f"the new value of {address!r} is of {value.dtype}, the old one of "
+                    f"{self.choices[address].dtype}; give one of the same kind."
+                )
             if value.shape != self.choices[address].shape:
                 raise InputError(
                     f"the new value of {address!r} has shape {tuple(value.shape)}, "
                     f"the old one {tuple(self.choices[address].shape)}; give one for each particle."
                 )
-        return self._moved({**self.choices, **values}, frozenset(values))
+        new = {a: value.to(self.choices[a].dtype) for a, value in values.items()}
+        return self._moved({**self.choices, **new}, frozenset(new))
 
     def regenerated(self, addresses: Collection[str]) -> Trace:
         """The same run with some latent addresses drawn anew from the program, in its order.

@@ -7,12 +7,14 @@ PLDI 2019, section 4 (the generative function interface). All of them act on N p
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
+from bcppl.traces.coincidence import refuse_coincidence
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.series import Series, SeriesTrace, Stage, runnable
 from bcppl.traces.trace import Trace
@@ -22,11 +24,30 @@ def trace_of(
     program: Program, args: tuple[Any, ...], particles: int, ran: Run, observed: Mapping[str, Tensor]
 ) -> Trace:
     """The trace of a run in which the addresses `observed` were constrained."""
-    hidden = {a: v for a, v in ran.values.items() if a not in observed and a not in ran.fixed}
+    hidden = {
+        a: _one_each(v, ran.distributions[a], particles)
+        for a, v in ran.values.items()
+        if a not in observed and a not in ran.fixed
+    }
     kind = SeriesTrace if isinstance(program, Stage) else Trace
     trace = kind(program, args, particles, hidden, dict(observed))
     trace._ran(ran)
     return trace
+
+
+def _one_each(value: Tensor, site: Any, particles: int) -> Tensor:
+    """A latent value as a trace holds it: one for each particle."""
+    if value.ndim == len(site.batch_shape) - 1 + len(site.event_shape):
+        value = value.expand(particles, *value.shape).clone()
+    return value
+
+
+def _real(choices: Mapping[str, Tensor], ran: Run) -> None:
+    """Whole numbers given for a real site are made real: kernels would round what they move."""
+    for address, value in choices.items():
+        with suppress(NotImplementedError):
+            if not value.is_floating_point() and not ran.distributions[address].support.is_discrete:
+                ran.values[address] = value.to(torch.float64)
 
 
 def refuse_unvisited(observations: Mapping[str, Tensor], ran: Run) -> None:
@@ -59,6 +80,7 @@ def simulate(program: Program | Series, args: tuple[Any, ...] = (), particles: i
     """
     program = runnable(program)
     ran = run(program, args, particles, {}, {})
+    refuse_coincidence(program, args, particles, ran)
     return trace_of(program, args, particles, ran, {})
 
 
@@ -77,7 +99,8 @@ def generate(
         particles: N.
         observations: values by address, of the shape of the site's plates and event: the same for all
             particles.
-        choices: values (N, ...) of latent addresses, such as a proposal gave; the others are drawn.
+        choices: values (N, ...) of latent addresses, such as a proposal gave; the others are drawn. One value
+            without the particle axis is that of all particles.
 
     Returns:
         The trace and the log weight (N,): the summed log-probability of what was constrained and of the
@@ -95,6 +118,8 @@ def generate(
     given = {**observations, **choices}
     ran = run(program, args, particles, given, {})
     refuse_unvisited(given, ran)
+    refuse_coincidence(program, args, particles, ran)
+    _real(choices, ran)
     _refuse_one_each(observations, ran, particles)
     trace = trace_of(program, args, particles, ran, observations)
     constrained = [a for a in ran.distributions if a in given or a in ran.fixed]
@@ -141,6 +166,8 @@ def extend(
         )
     ran = run(trace.program, args, trace.particles, {**old, **observations, **choices}, trace.carried)
     refuse_unvisited({**observations, **choices}, ran)
+    refuse_coincidence(trace.program, args, trace.particles, ran, old)
+    _real(choices, ran)
     _refuse_one_each(observations, ran, trace.particles)
     lost = [a for a in old if a not in ran.distributions]
     if lost:
@@ -162,6 +189,9 @@ def _stepped(
     program, given = trace.next_stage(), {**observations, **choices}
     ran = run(program, args, trace.particles, given, trace.carried)
     refuse_unvisited(given, ran)
+    _real(choices, ran)
+    if program.number == 1:
+        refuse_coincidence(program, args, trace.particles, ran)
     _refuse_one_each(observations, ran, trace.particles)
     longer = trace_of(program, args, trace.particles, ran, observations)
     return longer, _weight(longer, [a for a in ran.distributions if a in given or a in ran.fixed])

@@ -1,0 +1,69 @@
+"""A plate as large as the population could hide data without its last axis: one more particle shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bcppl.errors import InputError
+from bcppl.traces.run import Program, Run, run
+from bcppl.traces.series import Stage, taken
+from bcppl.traces.trace import Trace
+
+
+def refuse_coincidence(
+    program: Program, args: tuple[Any, ...], particles: int, ran: Run, old: Collection[str] = ()
+) -> None:
+    """Run a program once more, for N + 1 particles, if N is what makes its shapes fit.
+
+    It is done only where a plate has N entries, or the first site has N before it is spread over the
+    particles. All sites are set, the last particle to the first one's values: nothing is drawn and no
+    simulator is asked. A proposal that reads a trace is let through: it is made for the particles of that.
+
+    Args:
+        program: what was run.
+        args: its arguments.
+        particles: N.
+        ran: what the run for N particles left.
+        old: addresses that were looked at before.
+
+    Raises:
+        InputError: the program fits N particles and no other number of them.
+    """
+    # A program's first site hangs on no sampled value, so it has nothing to have N entries from. A later step
+    # of a series goes on from the state, which has.
+    begins = not isinstance(program, Stage) or program.before is None
+    suspects = ran.coincident | ran.whole if begins else ran.coincident
+    if not suspects.difference(old) or any(isinstance(arg, Trace) for arg in args):
+        return
+    index = torch.cat([torch.arange(particles), torch.tensor([0])])
+    given = {
+        a: _one_more(v, ran.distributions[a], index) for a, v in ran.values.items() if a not in ran.fixed
+    }
+    carried = {name: entry.take(index) for name, entry in ran.carried.items()}
+    state = torch.get_rng_state()
+    try:
+        again = run(
+            program.take(index) if isinstance(program, Stage) else program,
+            args,
+            particles + 1,
+            given,
+            carried,
+        )
+        if isinstance(program, Stage):
+            taken(again.result, None, particles + 1)
+    except InputError as error:
+        raise InputError(
+            f"with {particles} particles the shapes fit by coincidence alone; with one more, "
+            f"{str(error).removesuffix('.')}."
+        ) from error
+    finally:
+        torch.set_rng_state(state)
+
+
+def _one_more(value: Tensor, distribution: Any, index: Tensor) -> Tensor:
+    shared = value.ndim == len(distribution.batch_shape) - 1 + len(distribution.event_shape)
+    return value if shared else value[index]
