@@ -1,0 +1,173 @@
+"""What a newcomer hands to the wrong place is refused in one sentence that says what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from torch import Tensor
+
+from bcppl.errors import InputError
+from bcppl.inference import collect
+from bcppl.inference.arviz import to_arviz
+from bcppl.inference.chains import markov_chains
+from bcppl.inference.importance import importance_sampling, tempered_importance_sampling
+from bcppl.inference.kernels import (
+    cycle,
+    delayed_acceptance,
+    hmc,
+    metropolis_hastings,
+    mixture,
+    rejuvenate,
+    repeat,
+    sequence,
+    student_t,
+)
+from bcppl.inference.population import Population
+from bcppl.inference.proposals import drift
+from bcppl.inference.smcp3 import moved, smcp3
+from bcppl.inference.step import Observed, steps
+from bcppl.inference.summaries import mean
+from bcppl.inference.targets import POSTERIOR
+from bcppl.inference.tempering import tempered
+from bcppl.inference.waste_free import waste_free_moves
+from bcppl.traces import Trace, generate
+
+
+def number(value: float) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def program(count: int) -> None:
+    mu = pyro.sample("mu", dist.Normal(number(0.0), 1.0))
+    for k in range(count):
+        pyro.sample(f"y_{k}", dist.Normal(mu, 0.5))
+
+
+def start() -> Population:
+    return importance_sampling(program, (0,), {}, 20)
+
+
+def nudge(trace: Trace) -> None:
+    pyro.sample("mu", dist.Normal(trace["mu"], 0.2))
+
+
+def bold(trace: Trace) -> None:
+    pyro.sample("mu", dist.Normal(trace["mu"], trace.distributions["mu"].scale))
+
+
+def learning(population: Population) -> Callable[[Trace], None]:
+    return nudge
+
+
+def steadily(trace: Trace, size: float) -> None:
+    pyro.sample("mu", dist.Normal(trace["mu"], size))
+
+
+walk = metropolis_hastings(nudge)
+SEEN = Observed((1,), {"y_0": number(0.4)})
+WRAP = r"wrap it in metropolis_hastings"
+anything: Any = None
+
+MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
+    "chains of a shipped proposal": (lambda: markov_chains(drift("mu"), start(), 2), WRAP),  # type: ignore[arg-type]
+    "chains of a program": (lambda: markov_chains(nudge, start(), 2), rf"nudge gives no move.* {WRAP}"),  # type: ignore[arg-type]
+    "chains of a program that reads more": (lambda: markov_chains(bold, start(), 2), rf"bold .* {WRAP}"),  # type: ignore[arg-type]
+    "chains of a name": (lambda: markov_chains("mu", start(), 2), "given a str in place of a kernel"),  # type: ignore[arg-type]
+    "chains of a program that learns": (lambda: markov_chains(steadily, start(), 2), rf"steadily.* {WRAP}"),  # type: ignore[arg-type]
+    "sequence": (lambda: sequence(drift("mu")), rf"sequence is given a proposal.* {WRAP}"),  # type: ignore[arg-type]
+    "cycle": (lambda: cycle([walk, drift("mu")]), rf"cycle is given a proposal.* {WRAP}"),  # type: ignore[list-item]
+    "mixture": (lambda: mixture(walk, drift("mu")), rf"mixture is given a proposal.* {WRAP}"),
+    "repeat": (lambda: repeat(drift("mu"), 2), rf"repeat is given a proposal.* {WRAP}"),  # type: ignore[arg-type]
+    "tempered": (lambda: tempered(drift("mu")), rf"tempered is given a proposal.* {WRAP}"),  # type: ignore[arg-type]
+    "rejuvenate": (lambda: rejuvenate(start(), drift("mu"), POSTERIOR), WRAP),  # type: ignore[arg-type]
+    "waste free": (lambda: waste_free_moves(drift("mu"), 5), WRAP),  # type: ignore[arg-type]
+    "no proposal": (lambda: metropolis_hastings("mu"), r"a str in place of a proposal.* drift"),  # type: ignore[arg-type]
+    "a proposal that learns": (
+        lambda: markov_chains(metropolis_hastings(learning), start(), 2),
+        r"returns a function .* wrap it in Fitted",
+    ),
+    "a kernel twice": (
+        lambda: markov_chains(metropolis_hastings(metropolis_hastings(nudge)), start(), 2),
+        "if it is a kernel, use it as it is",
+    ),
+    "a surrogate in the place of sites": (
+        lambda: delayed_acceptance(walk, student_t("mu")),  # type: ignore[arg-type]
+        "give a surrogate as surrogate=",
+    ),
+    "a rejuvenation": (lambda: tempered(waste_free_moves(walk, 20)), "give it as rejuvenation="),  # type: ignore[arg-type]
+    "half a time": (lambda: repeat(walk, 3.0), "give a whole number"),  # type: ignore[arg-type]
+    "a kernel as a step": (lambda: steps(walk, start(), [SEEN]), r"if it is a kernel, give tempered"),  # type: ignore[arg-type]
+    "a tuple as a population": (
+        lambda: steps(tempered(), generate(program, (0,), {}, 5), [SEEN]),  # type: ignore[arg-type]
+        r"given a tuple .* Population\(\*\.\.\.\)",
+    ),
+    "one Observed": (lambda: steps(tempered(), start(), SEEN), "give a list of them"),  # type: ignore[arg-type]
+    "an address instead of Observed": (lambda: list(steps(tempered(), start(), ["y_0"])), "take in a str"),  # type: ignore[list-item]
+    "arguments that are no tuple": (lambda: Observed(1, {}), r"given a int .* \(5,\)"),  # type: ignore[arg-type]
+    "observations without addresses": (lambda: Observed((1,), number(0.4)), "a Tensor as observations"),  # type: ignore[arg-type]
+    "a kernel to temper with": (
+        lambda: tempered_importance_sampling(program, (1,), SEEN.observations, 5, walk),  # type: ignore[arg-type]
+        r"give tempered\(kernel\)",
+    ),
+    "a column of nothing": (
+        lambda: list(collect.collect(steps(tempered(), start(), [SEEN]), x=collect.mean("nope"))),
+        "'nope' was asked for, which is no latent address; latent are mu",
+    ),
+    "a belief over nothing": (lambda: start().belief("nope"), "'nope' .* no latent address; latent are mu"),
+    "a belief over a number": (lambda: start().belief("mu"), r"'mu' .* no pose.* bcppl.inference.summaries"),
+    "a value of nothing": (lambda: start()["nope"], "no value at address 'nope'; it has mu"),
+    "two programs": (lambda: smcp3((nudge, nudge)), r"given a tuple .* Pair\(forward, backward\)"),  # type: ignore[arg-type]
+    "two programs at once": (lambda: moved(start(), (nudge, nudge)), "given a tuple"),  # type: ignore[arg-type]
+    "a number for ArviZ": (lambda: to_arviz(3), "a int was given"),
+    "names for ArviZ": (lambda: to_arviz(["mu"]), "a str was given in place of a population"),
+    "a step of what is no series": (lambda: mean(start(), ("mu", 1)), "the program is no Series"),
+}
+
+
+@pytest.mark.parametrize("misuse", MISUSES)
+def test_it_is_refused_in_one_sentence(misuse: str) -> None:
+    call, said = MISUSES[misuse]
+    with pytest.raises(InputError, match=said) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+def test_an_error_of_the_kernel_itself_is_left_alone() -> None:
+    def broken(population: Population) -> Any:
+        return number(0.0).nothing  # type: ignore[attr-defined]
+
+    with pytest.raises(AttributeError, match="nothing"):
+        markov_chains(broken, start(), 2)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (mixture([walk, walk], [0.3, 0.7]), mixture(walk, walk, weights=[0.3, 0.7])),
+        (sequence([walk, walk]), sequence(walk, walk)),
+        (cycle([walk, walk]), cycle(walk, walk)),
+        (hmc(["mu"]), hmc("mu")),
+    ],
+    ids=["mixture", "sequence", "cycle", "hmc"],
+)
+def test_a_list_says_the_same_as_one_by_one(one: Any, other: Any) -> None:
+    found = []
+    for kernel in (one, other):
+        torch.manual_seed(1)
+        found.append(markov_chains(kernel, start(), 5, addresses="mu").draws["mu"])
+    assert torch.equal(*found) and bool((found[0][0] != found[0][-1]).any())
+
+
+def test_a_population_is_told_in_a_line_and_read_by_address() -> None:
+    (population, _) = next(steps(tempered(walk), start(), [SEEN]))
+    assert torch.equal(population["mu"], population.trace["mu"]) and float(population["y_0"]) == 0.4
+    told = repr(population)
+    assert told.startswith("Population(20 particles, effective sample size ") and "tensor" not in told
+    assert told.endswith("latent: mu, observed: y_0)") and f"{population.log_evidence:.4f}" in told
+    dead = Population(population.trace, torch.full((20,), -torch.inf, dtype=torch.float64))
+    assert "effective sample size none" in repr(dead)
