@@ -145,11 +145,13 @@ def _of_chains(arviz: Any, chains: Chains, draws: int | None) -> Any:
     posed = _posed(last, posterior)
     data = arviz.from_dict(
         posterior=_numpy(posterior),
+        sample_stats=_numpy({"acceptance": chains.acceptance[:, None].expand(-1, draws)}),
         observed_data=_numpy(dict(chains.trace.observations)) or None,
         coords={"pose": list(POSE_COORDINATES)} if posed else None,
         dims={address: ["pose"] for address in posed},
     )
-    data.add_groups(sample_stats={"acceptance": ("chain", chains.acceptance.numpy())})
+    # A group is begun with what hangs on chains and draws.
+    data.sample_stats["acceptance"] = ("chain", chains.acceptance.numpy())
     return data
 
 

@@ -20,7 +20,12 @@ from bcppl.distributions.poses import UniformPose
 from bcppl.errors import InputError
 from bcppl.inference import arviz as export
 from bcppl.inference.arviz import to_arviz
+from bcppl.inference.chains import markov_chains
+from bcppl.inference.kernels import cycle, metropolis_hastings
 from bcppl.inference.population import Population
+from bcppl.inference.proposals import drift
+from bcppl.inference.repeated import Repeated
+from bcppl.inference.step import StepInfo, Stepped
 from bcppl.traces import generate
 
 arviz = export.import_arviz()
@@ -125,6 +130,37 @@ def test_opposite_quaternions_do_not_part_the_chains() -> None:
     found = to_arviz([mixed, populations[1]]).posterior.hole.values
     assert (np.abs(found[..., 6]) > 0.9).all() and len(np.unique(np.sign(found[..., 6]))) == 1
     assert float(arviz.rhat(found[..., 6])) < 1.1
+
+
+def test_runs_steps_and_populations_say_the_same() -> None:
+    one, two = weighted(40, 1), weighted(40, 2)
+    step = [Stepped(p, StepInfo()) for p in (one, two)]
+    for given, meant in (
+        (Repeated((one, two), (1, 2)), [one, two]),
+        ((p for p in (one, two)), [one, two]),
+        (step, [one, two]),
+        (step[1], two),
+        (iter(step), two),
+    ):
+        found, expected = to_arviz(given), to_arviz(meant)
+        np.testing.assert_array_equal(found.posterior.x.values, expected.posterior.x.values)
+
+
+def test_chains_come_with_their_moves_as_draws() -> None:
+    torch.manual_seed(0)
+    kernel = cycle(metropolis_hastings(drift("x")), metropolis_hastings(drift("hole")))
+    chains = markov_chains(kernel, weighted(6, 1), 10)
+    data = to_arviz(chains)
+    assert data.posterior.x.shape == (6, 10) and data.posterior.hole.shape == (6, 10, 7)
+    assert data.posterior.hole.dims == ("chain", "draw", "pose")
+    np.testing.assert_array_equal(data.posterior.x.values, chains.draws["x"].numpy().T)
+    np.testing.assert_array_equal(data.sample_stats.acceptance.values, chains.acceptance.numpy())
+    np.testing.assert_array_equal(
+        to_arviz(chains, draws=4).posterior.x.values, chains.draws["x"][6:].numpy().T
+    )
+    assert np.isfinite(arviz.summary(data, var_names=["x"], kind="stats")["mean"].to_numpy()).all()
+    with pytest.raises(InputError, match="11 draws were asked for of chains with 10 states"):
+        to_arviz(chains, draws=11)
 
 
 def test_it_can_be_saved_and_read(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from bcppl.inference.collect import acceptance, collect, distinct, effective_sam
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.proposals import drift
+from bcppl.inference.repeated import repeated
 from bcppl.inference.resampling import always
 from bcppl.inference.smc import Step, smc
 from bcppl.inference.step import Observed, Stepped, steps
@@ -142,6 +143,18 @@ def test_bars_are_for_terminals_and_only_one_at_a_time(monkeypatch: pytest.Monke
     assert "item b" in seen.getvalue() and "inner" not in seen.getvalue()
     off = shown(monkeypatch, True)
     assert list(progress.watched(range(2), progress=False)) == [0, 1] and off.getvalue() == ""
+    bar = shown(monkeypatch, True)
+    torch.manual_seed(3)
+    start = importance_sampling(static, (0,), {}, 20)
+    observed = [Observed((1,), {"y_0": SEEN[0]})]
+    assert len(list(steps(tempered(), start, observed, progress=True))) == 1
+    assert "steps" in bar.getvalue() and "1/1" in bar.getvalue()
+    repeated(lambda seed: start, 3)
+    assert "runs" in bar.getvalue() and "3/3" in bar.getvalue()
+    none = shown(monkeypatch, True)
+    list(steps(tempered(), start, observed))
+    repeated(lambda seed: start, 3, progress=False)
+    assert none.getvalue() == ""
     # A run that is left half way takes its bar along.
     left = progress.watched(range(3))
     next(left)

@@ -13,14 +13,15 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.inference.chains import markov_chains
-from bcppl.inference.importance import importance_sampling
+from bcppl.inference.importance import importance_sampling, tempered_importance_sampling
 from bcppl.inference.kernels import Move, metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
+from bcppl.inference.resampling import never
 from bcppl.inference.step import Observed
 from bcppl.inference.targets import Target
 from bcppl.inference.tempering import tempered
-from bcppl.traces import Trace, simulate
+from bcppl.traces import Trace, generate, simulate
 
 SEEN = torch.tensor(1.7, dtype=torch.float64)
 NOISE = 0.3
@@ -96,6 +97,67 @@ def test_factors_at_the_start_count_in_the_evidence() -> None:
     assert Population(trace, torch.zeros(75, dtype=torch.float64)).log_evidence == 0.0
     nothing = Population(trace, torch.full((75,), -torch.inf, dtype=torch.float64))
     assert nothing.log_evidence == -math.inf
+
+
+def plate(y_size: int) -> None:
+    mu = pyro.sample("mu", dist.Normal(torch.tensor(0.0, dtype=torch.float64), 5.0))
+    with pyro.plate("readings", y_size):
+        pyro.sample("y", dist.Normal(mu.expand(y_size, -1), NOISE))
+    pyro.sample("fixed", dist.Normal(mu, NOISE), obs=SEEN)
+
+
+def walk(trace: Trace) -> None:
+    pyro.sample("mu", dist.Normal(trace["mu"], 0.3))
+
+
+def test_tempering_from_prior_to_posterior_finds_the_exact_evidence() -> None:
+    """With fixed exponents and moves it is unbiased; with data counted twice it would be far off."""
+    y = SEEN + torch.tensor([0.2, -0.3, 0.1, 0.4], dtype=torch.float64)
+    every = torch.cat([y, SEEN[None]])
+    covariance = 25.0 * torch.ones(5, 5).double() + NOISE**2 * torch.eye(5).double()
+    exact = float(dist.MultivariateNormal(torch.zeros(5).double(), covariance).log_prob(every))
+    step = tempered(metropolis_hastings(walk), sweeps=2, exponents=(0.002, 0.02, 0.2, 1.0))
+    tempering, plain, means = [], [], []
+    for seed in range(60):
+        torch.manual_seed(seed)
+        population, info = tempered_importance_sampling(plate, (4,), {"y": y}, 60, step)
+        assert info.exponents == (0.002, 0.02, 0.2, 1.0) and info.log_evidence == population.log_evidence
+        tempering.append(math.exp(population.log_evidence - exact))
+        means.append(float(torch.softmax(population.log_weights, 0) @ population["mu"]))
+        plain.append(math.exp(importance_sampling(plate, (4,), {"y": y}, 60).log_evidence - exact))
+    assert abs(np.mean(tempering) - 1) < 4 * np.std(tempering, ddof=1) / math.sqrt(60)
+    assert np.std(tempering) < 0.8 * np.std(plain)
+    mean = float(every.sum()) / (5 + NOISE**2 / 25.0)
+    assert abs(np.mean(means) - mean) < 4 * np.std(means, ddof=1) / math.sqrt(60)
+    trace, log_likelihood = generate(plate, (4,), {"y": y}, 60)
+    twice, _ = step.let_in(Population(trace, log_likelihood), ["y", "fixed"], log_likelihood)
+    assert abs(twice.log_evidence - exact) > 3
+
+
+def test_fixed_exponents_and_nothing_observed_leave_the_weights() -> None:
+    torch.manual_seed(0)
+    step = tempered(exponents=(0.5, 1.0), resample=never)
+    population, _ = step(importance_sampling(program, (0,), {}, 10), Observed((0,), {}))
+    assert population.log_evidence == 0.0 and not bool(population.log_weights.any())
+
+
+def test_chains_start_by_weight() -> None:
+    """Of a population with weight on one side, half of the chains would start on the other."""
+
+    def stay(_: Population) -> Move:
+        return lambda trace, target: (trace, torch.ones(len(trace), dtype=torch.float64))
+
+    trace = simulate(program, (0,), 40)
+    weights = torch.where(trace["x"] > 0, 0.0, -torch.inf).double()
+    population = Population(trace, weights)
+    assert float(markov_chains(stay, population, 1).draws["x"].min()) > 0
+    assert torch.equal(markov_chains(stay, population, 1, scheme=None).draws["x"][0], trace["x"])
+    even = Population(trace, torch.full((40,), -3.0, dtype=torch.float64))
+    before = torch.get_rng_state()
+    assert torch.equal(markov_chains(stay, even, 1, addresses="x").draws["x"][0], trace["x"])
+    torch.set_rng_state(before)
+    markov_chains(stay, trace, 1)
+    torch.testing.assert_close(markov_chains(stay, population, 1).acceptance, torch.ones(40).double())
 
 
 def test_chains_reach_the_posterior_and_keep_it() -> None:

@@ -119,6 +119,7 @@ def test_the_table_says_all_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     said = str(runs)
     assert len(said.splitlines()) == 1 + 3 + 1 + 3
     assert f"log of the mean evidence {runs.log_evidence:.4f}" in said and "hole: R-hat at most 1.0" in said
+    assert "same: the same in all draws, mean 2" in said and "nan" not in said
     assert all(str(seed) in said for seed in runs.seeds)
     monkeypatch.setitem(sys.modules, "arviz", None)
     assert "R-hat" not in str(runs)

@@ -14,7 +14,7 @@ from bcppl.distributions.poses import UniformPose
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.summaries import covariance, mean, probabilities, quantiles
-from bcppl.traces import generate
+from bcppl.traces import Series, extend, generate
 
 
 def number(*values: float) -> torch.Tensor:
@@ -75,3 +75,28 @@ def test_an_address_that_is_not_latent_is_refused() -> None:
         with pytest.raises(InputError, match=f"{address}' was asked for, which is no latent address"):
             mean(population(), address)
     assert math.isfinite(float(mean(population(), "which")))
+
+
+def test_an_earlier_step_of_a_series_is_weighed_by_where_it_led() -> None:
+    def init() -> torch.Tensor:
+        return pyro.sample("x", dist.Normal(number(0.0)[0], 1.0))
+
+    def step(x: torch.Tensor) -> torch.Tensor:
+        x = pyro.sample("x", dist.Normal(x, 0.5))
+        pyro.sample("hole", UniformPose(poses.identity(), (0.02, 0.01, 0.0), 0.5, "z"))
+        return x
+
+    torch.manual_seed(0)
+    first, _ = generate(Series(init, step), (), {}, 4)
+    second, _ = extend(first[torch.tensor([3, 1, 1, 0])], (), {})
+    third, _ = extend(second, (), {})
+    found = Population(third, number(0.5, 0.25, 0.25, 0.0).log())
+    began = first["x"]
+    torch.testing.assert_close(mean(found, ("x", 0)), 0.5 * began[3] + 0.5 * began[1])
+    assert float(quantiles(found, ("x", 0), 0.99)) == max(float(began[3]), float(began[1]))
+    torch.testing.assert_close(mean(found, ("x", 2)), mean(found, "x"))
+    torch.testing.assert_close(
+        mean(found, ("hole", 1)), Population(second, found.log_weights).belief("hole").mean
+    )
+    with pytest.raises(InputError, match="step 3 of a series"):
+        mean(found, ("x", 3))
