@@ -123,7 +123,7 @@ def test_every_state_is_kept_in_its_place() -> None:
 
     torch.manual_seed(0)
     start = importance_sampling(program, (0,), {}, 12)
-    done, ancestors, acceptance = waste_free_moves(counting, 3)(start, POSTERIOR)
+    done, ancestors, acceptance, _ = waste_free_moves(counting, 3)(start, POSTERIOR)
     assert acceptance == 1.0 and ancestors is not None
     steps = torch.arange(4).repeat_interleave(3)
     assert torch.equal(done.trace["x"], start.trace["x"][ancestors] + steps)
