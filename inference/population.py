@@ -67,7 +67,7 @@ class Population:
             InferenceError: no particle has any weight, or a weight is not a number.
         """
         if not math.isfinite(self.log_total):
-            normalised(self.log_weights)
+            normalised(self.log_weights, self.trace.impossible())
         return float(1.0 / torch.softmax(self.log_weights, 0).square_().sum())
 
     @cached_property
@@ -87,7 +87,7 @@ class Population:
         log_weights = self.log_weights + log_factor
         total = float(torch.logsumexp(log_weights, 0))
         if not math.isfinite(total):
-            normalised(log_weights)
+            normalised(log_weights, self.trace.impossible())
         later = replace(
             self, log_weights=log_weights, log_evidence=self.log_evidence + (total - self.log_total)
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from bcppl.beliefs import (
     effective_sample_size,
     normalised,
 )
-from bcppl.errors import InferenceError
+from bcppl.errors import InferenceError, InputError
 from bcppl.poses import identity
 
 
@@ -111,3 +112,17 @@ def test_weights_of_any_size_are_normalised_and_none_is_an_error() -> None:
     assert effective_sample_size(far) == pytest.approx(1.6)
     with pytest.raises(InferenceError, match="no particle has any weight left"):
         normalised(torch.full((3,), -torch.inf, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("poses_given", "weights_given", "says"),
+    [
+        ((4, 7), (3,), r"4 poses is given log weights of shape \(3,\)"),
+        ((4, 7), (4, 1), r"log weights of shape \(4, 1\)"),
+        ((4, 3), (4,), r"poses of shape \(4, 3\); give \(N, 7\)"),
+        ((7,), (1,), r"poses of shape \(7,\); give \(N, 7\)"),
+    ],
+)
+def test_poses_and_weights_that_do_not_fit(poses_given: Any, weights_given: Any, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        Belief(torch.zeros(poses_given), torch.zeros(weights_given))

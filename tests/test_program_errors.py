@@ -14,6 +14,7 @@ from torch import Tensor
 
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InferenceError, InputError
+from bcppl.inference.population import Population
 from bcppl.traces import assess, extend, generate, simulate, update
 
 N = 5
@@ -93,6 +94,29 @@ def branching() -> None:
     x = pyro.sample("x", dist.Bernoulli(number(0.5)))
     if bool((x == 1).all()):
         pyro.sample("only then", dist.Normal(number(0.0), 1.0))
+
+
+def of_one_number(take: Callable[[Tensor], Any]) -> None:
+    take(pyro.sample("x", dist.Normal(number(0.0), 1.0)))
+
+
+def of_torch() -> None:
+    pyro.sample("x", torch.distributions.Normal(number(0.0), 1.0))
+
+
+def sampled_whole() -> None:
+    pyro.sample("x", dist.Categorical(torch.tensor([0.5, 0.5])))
+
+
+def first_entry() -> None:
+    part = pyro.sample("part", dist.Normal(torch.zeros(3), 1.0).to_event(1))
+    pyro.sample("x", dist.Normal(part[0], 1.0))
+
+
+def line(data: Tensor, dim: int | None = None) -> None:
+    slope = pyro.sample("slope", dist.Normal(number(0.0), 1.0))
+    with pyro.plate("points", len(data), dim=dim):
+        pyro.sample("y", dist.Normal(slope * data, 1.0))
 
 
 def updated(values: dict[str, Tensor]) -> Any:
@@ -188,6 +212,23 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
         r"'x' has shape \(3,\); .* particles \(5,\)",
     ),
     "no particles": (lambda: simulate(latent_and_seen, (), 0), "for 0 particles; give 1 or more"),
+    "arguments that are no tuple": (lambda: simulate(growing, 5, 4), "of type int; give a tuple"),  # type: ignore[arg-type]
+    "particles that are no number": (
+        lambda: simulate(latent_and_seen, (), 2.5),  # type: ignore[arg-type]
+        "for 2.5 particles; .* a whole number",
+    ),
+    "distribution of torch": (lambda: simulate(of_torch, (), N), "'x' .* torch.*; take it from `pyro.distri"),
+    "data without a last axis": (
+        lambda: simulate(line, (torch.zeros(3),), N),
+        r"after site 'slope' .* tensor a \(5\) .* tensor b \(3\).*5 particles; .*`\[:, None\]`",
+    ),
+    "entry of a vector": (lambda: simulate(first_entry, (), N), r"'x' has 3 .* 5 particles; .*`\[:, k\]`"),
+    "no such value": (lambda: simulate(latent_and_seen, (), N)["q"], "no value at address 'q'; it has x, y"),
+    "update by a number": (lambda: updated({"x": 1.0}), "'x' is a float; give a tensor"),  # type: ignore[dict-item]
+    "update of whole numbers by reals": (
+        lambda: update(simulate(sampled_whole, (), N), {"x": ones}),
+        "'x' is of torch.float64, the old one of torch.int64",
+    ),
     "an error of the program itself": (
         lambda: simulate(refusing, (), N),
         "^the scene has no part; give one.$",
@@ -216,6 +257,105 @@ def test_a_log_probability_that_is_no_number_names_site_and_particles(bad: float
 
     with pytest.raises(InferenceError, match=rf"'felt' .* {said} for 2 of 5 particles \(first: 1, 3\)"):
         generate(program, (), {"felt": number(0.0)}, N)
+
+
+@pytest.mark.parametrize(
+    "take", [bool, float, int, math.sqrt, range, lambda x: x.item(), lambda x: 1 if x > 0 else 2]
+)
+def test_particles_are_no_single_number(take: Callable[[Tensor], Any]) -> None:
+    with pytest.raises(InputError, match=r"after site 'x' .* 5 particles .*`torch.where`"):
+        simulate(of_one_number, (take,), N)
+
+
+def test_errors_of_the_program_that_particles_do_not_bring_about_stay_as_they_are() -> None:
+    with pytest.raises(RuntimeError, match=r"tensor a \(3\) must match the size of tensor b \(2\)"):
+        simulate(of_one_number, (lambda x: torch.zeros(3) + torch.zeros(2),), N)
+    with pytest.raises(TypeError, match="unsupported operand"):
+        simulate(of_one_number, (lambda x: x + "a",), N)  # type: ignore[operator]
+
+
+DATA = torch.linspace(-1, 1, N, dtype=torch.float64)
+BY_COINCIDENCE: dict[str, Callable[[], Any]] = {
+    "simulate": lambda: simulate(line, (DATA,), N),
+    "generate": lambda: generate(line, (DATA,), {"y": DATA}, N),
+    "assess": lambda: assess(line, (DATA,), {"slope": DATA, "y": DATA}, N),
+    "extend": lambda: extend(simulate(lengthened, (False,), N), (True,), {"y": DATA}),
+    "first site": lambda: simulate(beside_the_plate, (), 3),
+    "entry of a vector": lambda: simulate(first_entry, (), 3),
+}
+
+
+def lengthened(on: bool) -> None:
+    if on:
+        line(DATA)
+    else:
+        pyro.sample("slope", dist.Normal(number(0.0), 1.0))
+
+
+@pytest.mark.parametrize("case", BY_COINCIDENCE)
+def test_shapes_that_fit_by_coincidence_are_refused(case: str) -> None:
+    with pytest.raises(InputError, match=r"coincidence alone; with one more, .*`\[:, ") as caught:
+        BY_COINCIDENCE[case]()
+    assert ". " not in str(caught.value)
+
+
+def test_one_more_particle_runs_no_simulator_and_draws_nothing() -> None:
+    sampled, ran = [], []
+
+    class Counted(Felt):
+        cost = 2
+
+        def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+            sampled.append(len(self.inputs[0]))
+            return super().sample(sample_shape)
+
+    def program(data: Tensor) -> None:
+        ran.append(1)
+        line(data)
+        pyro.sample("felt", Counted(pyro.sample("x", dist.Normal(number(0.0), 1.0))))
+
+    states = []
+    for count, runs in ((N, 2), (N + 1, 1)):
+        ran.clear(), sampled.clear(), torch.manual_seed(3)  # type: ignore[func-returns-value]
+        trace = simulate(program, (DATA[:, None],), count)
+        assert len(ran) == runs and sampled == [count] and trace["y"].shape == (count, N)
+        torch.manual_seed(3)
+        torch.randn(count, dtype=torch.float64), torch.randn(N, count, dtype=torch.float64)
+        torch.randn(count, dtype=torch.float64)
+        states.append(torch.rand(1))
+        torch.manual_seed(3)
+        simulate(program, (DATA[:, None],), count)
+        assert torch.equal(torch.rand(1), states[-1]), "the generator stands where one run left it"
+
+
+@pytest.mark.parametrize("value", [number(0.7), torch.tensor(1)])
+def test_a_choice_without_the_particle_axis_is_that_of_all_particles(value: Tensor) -> None:
+    trace, weight = generate(latent_and_seen, (), {"y": number(0.5)}, N, {"x": value})
+    whole, expected = generate(latent_and_seen, (), {"y": number(0.5)}, N, {"x": value * ones})
+    torch.testing.assert_close(weight, expected)
+    assert trace["x"].shape == (N,) and trace["x"].dtype == torch.float64
+    torch.testing.assert_close(trace[[1, 3]].log_prob(), whole[[1, 3]].log_prob())
+    longer, _ = extend(simulate(growing, (0,), N), (1,), {}, {"a_0": value})
+    assert longer["a_0"].shape == (N,) and longer["a_0"].dtype == torch.float64
+    moved = update(trace, {"x": torch.full((N,), 2)}).trace
+    assert moved["x"].dtype == torch.float64
+
+
+def test_an_observation_that_is_no_number_is_named() -> None:
+    with pytest.raises(InferenceError, match="observation at site 'y' is NaN in 1 of 1 entries"):
+        generate(latent_and_seen, (), {"y": number(math.nan)}, N)
+
+
+def test_what_no_particle_can_explain_is_named() -> None:
+    def program() -> None:
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        pyro.sample("near", dist.Normal(x, 1.0))
+        pyro.sample("far", dist.Uniform(x, x + 1.0))
+
+    trace, weights = generate(program, (), {"near": number(0.0), "far": number(99.0)}, N)
+    assert trace.impossible() == trace[[0, 1]].impossible() == ["far"]
+    with pytest.raises(InferenceError, match="measured at 'far' cannot be; widen the prior"):
+        _ = Population(trace, weights).effective_sample_size
 
 
 def test_a_scaled_or_masked_site_is_refused_by_name() -> None:

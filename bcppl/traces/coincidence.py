@@ -13,15 +13,19 @@ from bcppl.traces.run import Program, Run, run
 from bcppl.traces.series import Stage, taken
 from bcppl.traces.trace import Trace
 
+# More particles than a vector that was meant as one event is likely to have entries.
+FEW = 20
+
 
 def refuse_coincidence(
     program: Program, args: tuple[Any, ...], particles: int, ran: Run, old: Collection[str] = ()
 ) -> None:
     """Run a program once more, for N + 1 particles, if N is what makes its shapes fit.
 
-    It is done only where a plate has N entries, or the first site has N before it is spread over the
-    particles. All sites are set, the last particle to the first one's values: nothing is drawn and no
-    simulator is asked. A proposal that reads a trace is let through: it is made for the particles of that.
+    It is done only where a plate or an event's axis has N entries, or the first site, of few particles, has N
+    before it is spread over them. All sites are set, the last particle to the first one's values: nothing is
+    drawn and no simulator is asked. A proposal that reads a trace is let through: it is made for the
+    particles of that.
 
     Args:
         program: what was run.
@@ -33,9 +37,9 @@ def refuse_coincidence(
     Raises:
         InputError: the program fits N particles and no other number of them.
     """
-    # A program's first site hangs on no sampled value, so it has nothing to have N entries from. A later step
-    # of a series goes on from the state, which has.
-    begins = not isinstance(program, Stage) or program.before is None
+    # A program's first site hangs on no sampled value, so that N entries are a coincidence where N is small
+    # and meant where it is large. A later step of a series goes on from the state, which has N.
+    begins = particles <= FEW and (not isinstance(program, Stage) or program.before is None)
     suspects = ran.coincident | ran.whole if begins else ran.coincident
     if not suspects.difference(old) or any(isinstance(arg, Trace) for arg in args):
         return

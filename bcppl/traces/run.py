@@ -41,7 +41,7 @@ class Run:
         fixed: addresses that the program observes itself (`obs=`, `pyro.factor`).
         carried: simulator states that it used or started.
         result: what it returned.
-        coincident: addresses in a plate of N entries (`bcppl.traces.coincidence`).
+        coincident: addresses with a plate or an event axis of N entries (`bcppl.traces.coincidence`).
         whole: the first address, if its distribution had N entries before it was spread over the particles.
     """
 
@@ -198,6 +198,8 @@ class _Recorder(Messenger):
             )
         self._fits(address, tuple(distribution.batch_shape), message["cond_indep_stack"])
         self.distributions[address] = distribution
+        if self.particles > 1 and self._coincides(distribution):
+            self.coincident.add(address)
         if address in self.given:
             value = self.given[address]
             self._has_shape(address, value, distribution)
@@ -240,8 +242,13 @@ class _Recorder(Messenger):
                 f"and of the {self.particles} particles; put further dimensions into the event with "
                 "`.to_event()`, or open a plate for them."
             )
-        if self.particles > 1 and self.particles in expected[:-1]:
-            self.coincident.add(address)
+
+    def _coincides(self, distribution: Any) -> bool:
+        """Whether another axis has as many entries as there are particles; what is lazy checks its own."""
+        axes = distribution.batch_shape[:-1]
+        if not hasattr(distribution, "inputs"):
+            axes = axes + distribution.event_shape
+        return self.particles in axes
 
     def _has_shape(self, address: str, value: Tensor, distribution: Any) -> None:
         batch, event = tuple(distribution.batch_shape), tuple(distribution.event_shape)

@@ -153,8 +153,8 @@ def taken(state: Any, index: Tensor | None, particles: int) -> Any:
         if len(state) != particles:
             raise InputError(
                 f"a series' state holds a tensor of shape {tuple(state.shape)} for {particles} particles; "
-                "put the particle axis first (sample a vector with `.to_event(1)`, or `.movedim(-1, 0)` what is "
-                "sampled in a plate), and what is the same for all into the arguments."
+                "put the particle axis first (sample a vector with `.to_event(1)`, or return "
+                "`.movedim(-1, 0)` of what lies in a plate), and what is the same for all into the arguments."
             )
         return state if index is None else state.index_select(0, index)
     if isinstance(state, Mapping):
