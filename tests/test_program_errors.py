@@ -311,6 +311,7 @@ def test_one_more_particle_runs_no_simulator_and_draws_nothing() -> None:
 
     def program(data: Tensor) -> None:
         ran.append(1)
+        torch.rand(1)
         line(data)
         pyro.sample("felt", Counted(pyro.sample("x", dist.Normal(number(0.0), 1.0))))
 
@@ -320,7 +321,7 @@ def test_one_more_particle_runs_no_simulator_and_draws_nothing() -> None:
         trace = simulate(program, (DATA[:, None],), count)
         assert len(ran) == runs and sampled == [count] and trace["y"].shape == (count, N)
         torch.manual_seed(3)
-        torch.randn(count, dtype=torch.float64), torch.randn(N, count, dtype=torch.float64)
+        torch.rand(1), torch.randn(count, dtype=torch.float64), torch.randn(N, count, dtype=torch.float64)
         torch.randn(count, dtype=torch.float64)
         states.append(torch.rand(1))
         torch.manual_seed(3)

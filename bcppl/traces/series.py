@@ -78,11 +78,9 @@ class Stage:
     def __call__(self, *args: Any) -> Any:
         """Run the step from the states of the chosen particles."""
         if self.before is None:
-            _refuse_arguments("init", self.series.init, args)
-            return self.series.init(*args)
+            return _called("init", self.series.init, args)
         state = taken(self.before.state, self.chosen, self.before.particles)
-        _refuse_arguments("step", self.series.step, (state, *args))
-        after = self.series.step(state, *args)
+        after = _called("step", self.series.step, (state, *args))
         if after is None and state is not None:
             raise InputError(
                 "a series' step returned nothing, but it was given a state; return the next state from it."
@@ -117,8 +115,16 @@ class Stage:
         return replace(self, picks=(torch.where(mask, first, second),))
 
 
+def _called(name: str, part: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+    """What a part of a series returns, or an error where it does not take what it is given."""
+    try:
+        return part(*args)
+    except TypeError:
+        _refuse_arguments(name, part, args)
+        raise
+
+
 def _refuse_arguments(name: str, part: Callable[..., Any], args: tuple[Any, ...]) -> None:
-    """An error where a part of a series cannot be called with what it is given."""
     try:
         signature(part).bind(*args)
     except TypeError as error:
