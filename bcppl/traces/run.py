@@ -245,10 +245,10 @@ class _Recorder(Messenger):
 
     def _coincides(self, distribution: Any) -> bool:
         """Whether another axis has as many entries as there are particles; what is lazy checks its own."""
-        axes = distribution.batch_shape[:-1]
-        if not hasattr(distribution, "inputs"):
-            axes = axes + distribution.event_shape
-        return self.particles in axes
+        batch, event = distribution.batch_shape, distribution.event_shape
+        return (len(batch) > 1 and self.particles in batch[:-1]) or (
+            len(event) > 0 and self.particles in event and not hasattr(distribution, "inputs")
+        )
 
     def _has_shape(self, address: str, value: Tensor, distribution: Any) -> None:
         batch, event = tuple(distribution.batch_shape), tuple(distribution.event_shape)
