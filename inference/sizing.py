@@ -14,6 +14,7 @@ from bcppl.beliefs import normalised
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.schemes import Scheme, systematic
+from bcppl.traces.series import SeriesTrace
 
 
 def resized(population: Population, count: int, scheme: Scheme = systematic) -> Population:
@@ -45,7 +46,13 @@ def merged(population: Population) -> Population:
 
     Raises:
         InferenceError: no particle has any weight.
+        InputError: the population is of a series.
     """
+    if isinstance(population.trace, SeriesTrace):
+        raise InputError(
+            "the particles of a series cannot be merged: those that agree in the newest step may have "
+            "different pasts; resample instead (`resized`)."
+        )
     count = len(population)
     weights = normalised(population.log_weights)
     numbers = [v.reshape(count, -1).to(torch.float64) for v in population.trace.choices.values()]

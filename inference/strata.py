@@ -83,6 +83,11 @@ def _enumerated(
     address: str,
 ) -> Population:
     site, particles = trace.distributions[address], trace.particles
+    if len(site.batch_shape) > 1:
+        raise InputError(
+            f"the first latent choice {address!r} stands in a plate; "
+            "give strata as a function that says which stratum a value lies in."
+        )
     values = site.enumerate_support(expand=False)
     values = values.reshape(len(values), *site.event_shape)
     _refuse_more(len(values), particles)
@@ -107,7 +112,7 @@ def _stretched(
     stratum = (torch.arange(particles) + int(torch.randint(strata, ()))) % strata
     quantile = (stratum + torch.rand(particles, dtype=torch.float64)) / strata
     try:
-        if site.event_shape:
+        if site.event_shape or len(site.batch_shape) > 1:
             raise NotImplementedError
         chosen = site.icdf(quantile).to(trace[address])
     except NotImplementedError:

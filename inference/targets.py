@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bcppl.errors import InputError
 from bcppl.traces import Trace
 
 
@@ -26,6 +28,11 @@ class Target:
     """
 
     exponents: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for address, exponent in self.exponents.items():
+            if not 0.0 <= exponent < math.inf:
+                raise InputError(f"site {address!r} is given the exponent {exponent}; give 0 or more.")
 
     def exponent(self, address: str) -> float:
         """How much of a site is let in."""
@@ -67,6 +74,9 @@ class Target:
         bounds = [self.exponent(a) * float(getattr(s, "log_prob_bound", torch.inf)) for a, s in sites]
         index = torch.arange(trace.particles)
         total = torch.zeros(trace.particles, dtype=torch.float64)
+        if not sites:
+            index = (needed < 0.0).nonzero().flatten()
+            return index, trace[index]
         for k, (address, _) in enumerate(sites):
             total = total + self.exponent(address) * trace.log_prob(address)
             last = k + 1 == len(sites)

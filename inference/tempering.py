@@ -6,8 +6,8 @@ approach, JCGS 25, 2016, section 3.3.2 (CESS, eq. 3.16). The step is that of Del
 Sequential Monte Carlo samplers, JRSS B 68, 2006, and of Chopin and Papaspiliopoulos, An Introduction to
 Sequential Monte Carlo, 2020, chapter 17.
 
-With fixed exponents and fixed proposals the estimate of the evidence is unbiased; with adaptive tempering
-and fitted proposals it is consistent only. Evidence that contains a surrogate likelihood is a surrogate's.
+With fixed exponents, fixed proposals, and moves whose number does not hang on the particles (`always_move`, or
+resampling always), the estimate of the evidence is unbiased; otherwise it is consistent only. Evidence that contains a surrogate likelihood is a surrogate's.
 """
 
 from __future__ import annotations
@@ -80,9 +80,12 @@ Rejuvenation = Callable[[Population, Target], Rejuvenated]
 
 
 def resample_move(
-    kernel: Kernel | None, sweeps: int | Until | Callable[[Trace], int | Until], resample: Resample
+    kernel: Kernel | None,
+    sweeps: int | Until | Callable[[Trace], int | Until],
+    resample: Resample,
+    always_move: bool = False,
 ) -> Rejuvenation:
-    """Resample when needed, then move every particle.
+    """Resample when needed, then move every particle: after a resampling, or always.
 
     Gilks and Berzuini, Following a moving target: Monte Carlo inference for dynamic Bayesian models, JRSS B
     63, 2001.
@@ -90,7 +93,7 @@ def resample_move(
 
     def rejuvenation(population: Population, target: Target) -> Rejuvenated:
         population, ancestors = resample(population)
-        if ancestors is None or kernel is None:
+        if kernel is None or (ancestors is None and not always_move):
             return Rejuvenated(population, ancestors, None)
         times = sweeps(population.trace) if callable(sweeps) else sweeps
         moved = rejuvenate(population, kernel, target, times)
@@ -187,6 +190,7 @@ def tempered(
     exponents: Sequence[float] | None = None,
     by_site: bool = False,
     rejuvenation: Rejuvenation | None = None,
+    always_move: bool = False,
 ) -> Tempered:
     """A step that lets a measurement's likelihood in bit by bit, and resamples and moves after each.
 
@@ -201,6 +205,10 @@ def tempered(
             nothing.
         by_site: let the new sites in one after another, in the order of their cost and then of the program,
             each by exponents of its own; otherwise all at once.
+        always_move: move after each exponent, whether or not that resampled. Whether particles resample hangs
+            on where they are, so moves that are made only then leave a bias of order 1/N in the evidence (one
+            of 2 % with three particles). With it, or resampling always, and with fixed exponents and
+            proposals, the estimate of the evidence is unbiased.
         rejuvenation: in place of `kernel`, `sweeps` and `resample`, such as `waste_free(...)`.
 
     Returns:
@@ -227,7 +235,9 @@ def tempered(
             f"tempering is given the exponents {list(fixed)}; give increasing ones that end with 1."
         )
     if rejuvenation is None:
-        rejuvenation = resample_move(kernel, sweeps, adaptive() if resample is None else resample)
+        rejuvenation = resample_move(
+            kernel, sweeps, adaptive() if resample is None else resample, always_move
+        )
     elif kernel is not None or resample is not None:
         raise InputError(
             "a step is given a rejuvenation beside a kernel or a resampling; give one or the other."

@@ -111,7 +111,11 @@ SCHEMES = {"never": never, "always": always(), "adaptive": adaptive(systematic, 
 def test_evidence_is_unbiased_with_fixed_exponents(scheme: str) -> None:
     values = [number(y) for y in OBSERVED]
     take = tempered(
-        metropolis_hastings(fixed_drift), sweeps=1, resample=SCHEMES[scheme], exponents=(0.5, 1.0)
+        metropolis_hastings(fixed_drift),
+        sweeps=1,
+        resample=SCHEMES[scheme],
+        exponents=(0.5, 1.0),
+        always_move=True,
     )
     found = ratios(static, values, static_evidence(), take, 150, 60)
     assert standard_errors(found) < 4

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.traces.coincidence import refuse_coincidence
-from bcppl.traces.run import Program, run
+from bcppl.traces.run import Program, Run, run
 from bcppl.traces.series import Series, runnable
 from bcppl.traces.trace import Trace
 from bcppl.traces.verbs import refuse_unvisited, simulate, trace_of
@@ -32,9 +32,23 @@ class Proposed:
 
 
 def propose(program: Program | Series, args: tuple[Any, ...], particles: int) -> Proposed:
-    """Run a proposal program forward: its choices and their log-density."""
+    """Run a proposal program forward: its choices and their log-density.
+
+    Raises:
+        InputError: the program observes something itself (`obs=`, `pyro.factor`).
+    """
     trace = simulate(program, args, particles)
+    _refuse_fixed(trace._run)
     return Proposed(trace.choices, trace.log_prob(), trace.result)
+
+
+def _refuse_fixed(ran: Run) -> None:
+    """What a program observes itself has no density of being chosen."""
+    if ran.fixed:
+        raise InputError(
+            f"a program that is to propose or to be assessed observes {min(ran.fixed)!r} itself (`obs=` or "
+            "`pyro.factor`); take that out, and give values as observations."
+        )
 
 
 def assess(
@@ -58,6 +72,7 @@ def assessed(
     """
     program = runnable(program)
     ran = run(program, args, particles, choices, {})
+    _refuse_fixed(ran)
     refuse_unvisited(choices, ran)
     refuse_coincidence(program, args, particles, ran)
     missing = [a for a in ran.values if a not in choices and a not in ran.fixed]

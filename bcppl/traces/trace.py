@@ -279,4 +279,8 @@ class Trace:
 def unchanged(first: Trace, second: Trace, address: str) -> bool:
     """Whether a site of the same value in two traces hangs on the same inputs, so that it says the same."""
     then, now = first._run.distributions[address], second._run.distributions[address]
-    return hasattr(now, "inputs") and same_inputs(then.inputs, now.inputs)
+    if not (hasattr(then, "inputs") and hasattr(now, "inputs") and same_inputs(then.inputs, now.inputs)):
+        return False
+    # What a program observes itself (`obs=`) may hang on a latent value.
+    fixed = address in second._run.fixed
+    return not fixed or same_inputs((first._run.values[address],), (second._run.values[address],))

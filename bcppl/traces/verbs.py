@@ -199,4 +199,7 @@ def _stepped(
 
 def _weight(trace: Trace, constrained: list[str]) -> Tensor:
     """The log-probability (N,) of what was constrained; zeros where nothing was."""
-    return trace.log_prob(*constrained) if constrained else torch.zeros(trace.particles, dtype=torch.float64)
+    if not constrained:
+        return torch.zeros(trace.particles, dtype=torch.float64)
+    # A caller may go on with the weights in place: what the trace knows is not theirs.
+    return trace.log_prob(*constrained).clone()
