@@ -49,7 +49,7 @@ def by_hand(trace: Trace, address: str) -> Tensor:
     if address == "x":
         return normal_log(trace["x"], trace["mean"][:, None], WIDTHS).sum(1)
     if address == "label":
-        return torch.where(trace["label"] == 1, math.log(0.8), math.log(0.2)).to(torch.float64).sum(1)
+        return torch.tensor([0.2, 0.8], dtype=torch.float64).log()[trace["label"]].sum(1)
     centre = torch.stack([trace["x"], trace["x"] + trace["label"]], -1)
     return normal_log(trace[address], centre, 1.0).sum((1, 2))
 
