@@ -6,8 +6,9 @@ approach, JCGS 25, 2016, section 3.3.2 (CESS, eq. 3.16). The step is that of Del
 Sequential Monte Carlo samplers, JRSS B 68, 2006, and of Chopin and Papaspiliopoulos, An Introduction to
 Sequential Monte Carlo, 2020, chapter 17.
 
-With fixed exponents, fixed proposals, and moves whose number does not hang on the particles (`always_move`, or
-resampling always), the estimate of the evidence is unbiased; otherwise it is consistent only. Evidence that contains a surrogate likelihood is a surrogate's.
+With fixed exponents, fixed proposals, and moves whose number does not hang on the particles (`always_move`,
+or resampling always), the estimate of the evidence is unbiased; otherwise it is consistent only. Evidence
+that contains a surrogate likelihood is a surrogate's.
 """
 
 from __future__ import annotations
