@@ -12,7 +12,6 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import peer
@@ -64,7 +63,7 @@ def language(history: bool) -> Filter:
         population = Population(trace, log_weights)
         for y in observed:
             trace, log_factor = extend(population.trace, (), {"y": y})
-            population = replace(population, trace=trace).reweighed(log_factor)
+            population = population.with_trace(trace).reweighed(log_factor)
             population, _ = resample(population)
         return population.log_evidence
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from bcppl.beliefs import Belief, normalised
+from bcppl.distributions.support import freedom_of
 from bcppl.errors import InferenceError, InputError
 from bcppl.poses import FREE
 from bcppl.traces import Trace
@@ -74,6 +75,13 @@ class Population:
     def log_total(self) -> float:
         """Log of the sum of the weights."""
         return float(torch.logsumexp(self.log_weights, 0))
+
+    def with_trace(self, trace: Trace) -> Population:
+        """The same weights for another trace of as many particles: extended, or moved."""
+        later = replace(self, trace=trace)
+        if "log_total" in self.__dict__:
+            later.__dict__["log_total"] = self.log_total
+        return later
 
     def reweighed(self, log_factor: Tensor) -> Population:
         """Every weight times exp(log_factor) (N,), and the evidence times the weighted mean of the factors.
@@ -140,7 +148,7 @@ class Population:
                 f"latent are {', '.join(self.trace.choices) or 'none'}."
             )
         poses = self.trace[address]
-        freedom = getattr(self.trace.distributions[address], "freedom", None)
+        freedom = freedom_of(self.trace.distributions[address])
         if poses.shape != (len(self), 7):
             raise InputError(
                 f"a belief over {address!r} was asked for, which is no pose: its values have shape "

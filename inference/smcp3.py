@@ -152,7 +152,7 @@ def _by_halves(population: Population, pair: Pair, observed: Observed | None) ->
     assert whole is not None
     # A particle without weight stays without: it is not brought back by moving where it could be.
     factor = torch.where(population.log_weights == -torch.inf, 0.0, factor)
-    return replace(population, trace=whole).reweighed(factor)
+    return population.with_trace(whole).reweighed(factor)
 
 
 def _fitted(pair: Pair, others: Population) -> tuple[Program, Program]:

@@ -14,7 +14,7 @@ that contains a surrogate likelihood is a surrogate's.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -130,7 +130,7 @@ class Tempered:
         longer, log_likelihood = extend(population.trace, *observed)
         # Sites that the program itself fixes (`obs=`, `pyro.factor`) are let in with the observations.
         new = [a for a in longer.since(population.trace) if a not in longer.choices]
-        return self.let_in(replace(population, trace=longer), new, log_likelihood)
+        return self.let_in(population.with_trace(longer), new, log_likelihood)
 
     def let_in(self, population: Population, new: Sequence[str], log_likelihood: Tensor) -> Stepped:
         """Let sites in that the trace has and the weights do not yet count.

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -86,7 +85,7 @@ def _called(function: Any) -> str:
 def replaced(population: Population, index: Tensor, moved: Trace) -> Population:
     """The population with the particles at `index` (K,) replaced by those of a trace of K particles."""
     trace = put(population.trace, index, moved)
-    return replace(population, trace=trace)
+    return population.with_trace(trace)
 
 
 def put(trace: Trace, index: Tensor, other: Trace) -> Trace:
