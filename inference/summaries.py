@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from bcppl.beliefs import Belief, normalised, weighted_quantiles
+from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.poses import FREE, Freedom
@@ -55,7 +56,7 @@ def is_pose(population: Population, address: Address) -> bool:
 def _freedom(population: Population, address: Address) -> Freedom | None:
     # What is a pose now was one at every step.
     name = address if isinstance(address, str) else address[0]
-    return getattr(population.trace.distributions[name], "freedom", None)
+    return freedom_of(population.trace.distributions[name])
 
 
 def _belief(population: Population, address: Address) -> Belief:

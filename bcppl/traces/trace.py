@@ -12,6 +12,7 @@ import pyro
 import torch
 from torch import Tensor
 
+from bcppl.distributions.support import log_prob_inside
 from bcppl.errors import InferenceError, InputError
 from bcppl.traces.carried import Entry, same_inputs
 from bcppl.traces.hiding import Hiding, refused
@@ -117,7 +118,7 @@ class Trace:
         distribution = self._run.distributions[address]
         # A value that another one has moved out of the support is impossible, not a mistake.
         with torch.no_grad(), pyro.validation_enabled(False):
-            value = narrowed(distribution).log_prob(inward(self._run.values[address], distribution))
+            value = log_prob_inside(narrowed(distribution), inward(self._run.values[address], distribution))
         batch = distribution.batch_shape
         if value.shape not in ((), batch):
             raise InputError(

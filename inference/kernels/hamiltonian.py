@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.distributions import biject_to
 
 from bcppl.beliefs import normalised
+from bcppl.distributions.support import freedom_of, support_of
 from bcppl.errors import InputError
-from bcppl.inference.kernels.jacobian import base, support_of
 from bcppl.inference.kernels.kernel import Kernel, Move, put
 from bcppl.inference.population import Population
 from bcppl.inference.targets import Target, accept
@@ -218,7 +218,7 @@ def _refuse_unsuited(address: str, trace: Trace) -> None:
             f"latent are {', '.join(trace.choices) or 'none'}."
         )
     site = trace.distributions[address]
-    if getattr(base(site), "freedom", None) is not None:
+    if freedom_of(site) is not None:
         raise InputError(f"hmc cannot move {address!r}: it is a pose; move it with `drift({address!r})`.")
     if support_of(site).is_discrete or not trace[address].is_floating_point():
         raise InputError(f"hmc cannot move {address!r}: it is discrete; move it with a proposal.")

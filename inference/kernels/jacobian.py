@@ -20,12 +20,10 @@ from typing import Any, NamedTuple
 
 import roma
 import torch
-from pyro.distributions import constraints
-from pyro.distributions.torch_distribution import ExpandedDistribution, MaskedDistribution
 from torch import Tensor
-from torch.distributions import Independent
 
 from bcppl import poses
+from bcppl.distributions.support import freedom_of, support_of
 from bcppl.errors import InferenceError, InputError
 from bcppl.poses import Freedom
 
@@ -123,24 +121,9 @@ _UNCHARTED = (
 )
 
 
-def base(distribution: Any) -> Any:
-    """A distribution without what only gives it another shape."""
-    while isinstance(distribution, Independent | ExpandedDistribution | MaskedDistribution):
-        distribution = distribution.base_dist
-    return distribution
-
-
-def support_of(distribution: Any) -> Any:
-    """A distribution's support without the event dimensions wrapped around it."""
-    support = distribution.support
-    while isinstance(support, constraints.independent):
-        support = support.base_constraint
-    return support
-
-
 def chart_of(address: str, distribution: Any, value: Tensor) -> Chart:
     """The coordinates of values (N, *event) of a site."""
-    freedom = getattr(base(distribution), "freedom", None)
+    freedom = freedom_of(distribution)
     if freedom is not None:
         return Tangent(math.prod(value.shape[1:-1]) * freedom.dimension, freedom)
     support = support_of(distribution)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.beliefs import normalised
+from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import Kernel, fitted, replaced
 from bcppl.inference.population import Population
@@ -106,8 +107,8 @@ def displacement(start: Population, now: Population) -> Tensor:
 def _coordinates(start: Population, now: Population, address: str) -> tuple[Tensor, Tensor]:
     """How far each particle came, and where it is, along the free axes (N, K)."""
     old, new = start.trace[address], now.trace[address]
-    freedom = getattr(now.trace.distributions[address], "freedom", None)
-    if freedom is None:
+    freedom = freedom_of(now.trace.distributions[address])
+    if freedom is None or old.ndim != 2:
         old, new = (v.reshape(len(now), -1).to(torch.float64) for v in (old, new))
         return new - old, new
     mean = now.belief(address).mean

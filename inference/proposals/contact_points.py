@@ -14,13 +14,14 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose
+from bcppl.distributions.support import freedom_of
 from bcppl.distributions.touch import OnsetLocation
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.least_squares import Equations, aligned
 from bcppl.inference.proposals.proposal import Fitted
 from bcppl.inference.proposals.spread import spread_of
-from bcppl.poses import FREE, Freedom
+from bcppl.poses import FREE
 from bcppl.traces import Trace
 
 SITES = ("contacts_*", "peg_*", "onset_*")
@@ -63,7 +64,7 @@ def contact_alignment(address: str, sites: Sequence[str] = SITES, *, reach: floa
                     f"contact_alignment is to read {', '.join(sites)}, which fit no address; "
                     f"the program visits {', '.join(trace.addresses)}."
                 )
-            freedom: Freedom = getattr(trace.distributions[address], "freedom", FREE)
+            freedom = freedom_of(trace.distributions[address]) or FREE
             pose = trace[address]
             said, sure = zip(*(_equations(trace, address, site) for site in felt), strict=True)
             answer = aligned(pose, reduce(add, said), damping, freedom, reduce(add, sure))

@@ -19,6 +19,7 @@ from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.distributions.mixture import MixturePose
 from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.support import freedom_of
 from bcppl.distributions.vectors import NormalStep
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
@@ -239,7 +240,7 @@ def coordinates_of(trace: Trace, address: str) -> Coordinates:
             f"latent are {', '.join(trace.choices) or 'none'}."
         )
     distribution = trace.distributions[address]
-    freedom = getattr(distribution, "freedom", None)
+    freedom = freedom_of(distribution)
     if freedom is not None:
         return PoseCoordinates(freedom)
     value = trace[address]

@@ -16,12 +16,13 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.depth import LaplaceDepth, RobustDepth
+from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.least_squares import Equations, aligned
 from bcppl.inference.proposals.proposal import Fitted
 from bcppl.inference.proposals.spread import spread_of
-from bcppl.poses import FREE, Freedom
+from bcppl.poses import FREE
 from bcppl.simulators.renderer import DepthRenderer, Hits
 from bcppl.traces import Trace
 
@@ -68,7 +69,7 @@ def depth_alignment(address: str, sites: str = "depth_*", *, steps: int = 1, rea
                     f"depth_alignment is to read {sites!r}, which fits no address; "
                     f"the program visits {', '.join(trace.addresses)}."
                 )
-            freedom: Freedom = getattr(trace.distributions[address], "freedom", FREE)
+            freedom = freedom_of(trace.distributions[address]) or FREE
             pose = trace[address]
             for _ in range(steps):
                 each = [_equations(trace, address, image, pose) for image in images]

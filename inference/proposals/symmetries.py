@@ -15,8 +15,9 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.mixture import MixturePose
 from bcppl.distributions.poses import HELD
+from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
-from bcppl.poses import FREE, Freedom
+from bcppl.poses import FREE
 from bcppl.traces import Trace
 
 
@@ -93,7 +94,7 @@ def symmetry(
 
     def alike(trace: Trace) -> None:
         pose = trace[address]
-        freedom: Freedom = getattr(trace.distributions[address], "freedom", FREE)
+        freedom = freedom_of(trace.distributions[address]) or FREE
         if pose.ndim != 2 or pose.shape[-1] != 7 or address not in trace.choices:
             raise InputError(f"symmetry is to move {address!r}, which is no latent pose; name one that is.")
         motions = listed

@@ -1,0 +1,93 @@
+"""Log-probabilities that are -inf where a value lies outside a distribution's support."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from pyro.distributions.torch_distribution import ExpandedDistribution, MaskedDistribution
+from torch import Tensor
+from torch.distributions import Independent, constraints
+
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.poses import Freedom
+
+
+def base(distribution: Any) -> Any:
+    """A distribution without what only gives it another shape."""
+    while isinstance(distribution, Independent | ExpandedDistribution | MaskedDistribution):
+        distribution = distribution.base_dist
+    return distribution
+
+
+def freedom_of(distribution: Any) -> Freedom | None:
+    """Which axes of the poses at a site are free; None where its values are no poses."""
+    freedom: Freedom | None = getattr(base(distribution), "freedom", None)
+    return freedom
+
+
+def support_of(distribution: Any) -> Any:
+    """A distribution's support without the event dimensions wrapped around it."""
+    support = distribution.support
+    while isinstance(support, constraints.independent):
+        support = support.base_constraint
+    return support
+
+
+def log_prob_inside(distribution: Any, value: Tensor) -> Tensor:
+    """`distribution.log_prob(value)`, -inf where the value lies outside the support.
+
+    Pyro's densities go on beyond it where nothing validates them: an exponential grows below 0. Poses and
+    distributions that are lazy say themselves what is impossible. NaN is no value, and is handed through.
+    """
+    if not _is_bounded(distribution):
+        return distribution.log_prob(value)
+    inside = _inside(distribution, value, masked=True)
+    if not bool(inside.all()):
+        inside = inside | _any_entry(torch.isnan(value), len(distribution.event_shape))
+    if support_of(distribution).is_discrete:
+        safe = _inside(distribution, value, masked=False)
+        if not bool(safe.all()):
+            # A whole number may be an index: one that is out of range has no density to be masked afterwards.
+            with torch.random.fork_rng(devices=[]):
+                drawn = distribution.sample()
+            safe = safe.reshape(safe.shape + (1,) * len(distribution.event_shape))
+            value = torch.where(safe, value, drawn)
+    return torch.where(inside, distribution.log_prob(value), -torch.inf)
+
+
+def _is_bounded(distribution: Any) -> bool:
+    """Whether a value may lie outside the support, and only the support tells."""
+    innermost = base(distribution)
+    if isinstance(innermost, LazyDistribution) or freedom_of(innermost) is not None:
+        return False
+    try:
+        support = support_of(innermost)
+    except NotImplementedError:
+        return False
+    # The real line and its vectors hold all numbers; a support that hangs on what is not known tells nothing.
+    return isinstance(support, constraints.Constraint) and not (
+        support is constraints.real or constraints.is_dependent(support)
+    )
+
+
+def _inside(distribution: Any, value: Tensor, masked: bool) -> Tensor:
+    """Whether values lie in the support, over the batch; what is masked out does if `masked`."""
+    if isinstance(distribution, MaskedDistribution):
+        inside = _inside(distribution.base_dist, value, masked)
+        return inside | ~torch.as_tensor(distribution._mask, device=value.device) if masked else inside
+    if isinstance(distribution, Independent):
+        inside = _inside(distribution.base_dist, value, masked)
+        return _every_entry(inside, distribution.reinterpreted_batch_ndims)
+    if isinstance(distribution, ExpandedDistribution):
+        return _inside(distribution.base_dist, value, masked)
+    support = distribution.support
+    return _every_entry(support.check(value), len(distribution.event_shape) - support.event_dim)
+
+
+def _every_entry(true: Tensor, dimensions: int) -> Tensor:
+    return true.flatten(-dimensions).all(dim=-1) if dimensions > 0 else true
+
+
+def _any_entry(true: Tensor, dimensions: int) -> Tensor:
+    return true.flatten(-dimensions).any(dim=-1) if dimensions > 0 else true
