@@ -10,9 +10,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from bcppl import poses
 from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.poses import UniformPose
+from bcppl.distributions.support import freedom_of
 from bcppl.distributions.switch import Switch
 from bcppl.errors import InputError
+from bcppl.inference.proposals.coordinates import coordinates_of
+from bcppl.poses import Freedom
 from bcppl.traces import generate, simulate
 
 MEANS = torch.tensor([-1.0, 2.0, 5.0], dtype=torch.float64)
@@ -94,3 +99,59 @@ def test_what_does_not_fit_is_refused() -> None:
         Switch(which, lambda k, rows: dist.Normal(torch.zeros(3), 1.0))
     with pytest.raises(InputError, match="must have the same"):
         Switch(which, lambda k, rows: dist.Normal(torch.zeros(len(rows), k + 1), 1.0).to_event(1))
+
+
+def test_a_switch_has_the_support_of_its_choices() -> None:
+    which = torch.tensor([0, 1, 1])
+    one = torch.ones(3, dtype=torch.float64)
+    positive = Switch(
+        which, lambda k, rows: dist.LogNormal(one[rows], 1.0) if k else dist.Gamma(one[rows], 1.0)
+    )
+    assert bool((positive.support.check(torch.tensor([1.0, -1.0, 2.0])) == torch.tensor([1, 0, 1])).all())
+    with pyro.validation_enabled(False):
+        assert positive.log_prob(torch.tensor(-1.0, dtype=torch.float64)).tolist() == [-torch.inf] * 3
+    bounded = Switch(which, lambda k, rows: dist.Uniform(0 * one[rows], (k + 1.0) * one[rows]))
+    assert bounded.support.upper_bound.tolist() == [1.0, 2.0, 2.0]
+    with pytest.raises(InputError, match="different kinds"):
+        Switch(which, lambda k, rows: dist.Normal(one[rows], 1.0) if k else dist.Gamma(one[rows], 1.0))
+
+    def program() -> None:
+        choice = pyro.sample("which", dist.Bernoulli(torch.tensor(0.5, dtype=torch.float64)))
+        rate = torch.ones_like(choice)
+        size = pyro.sample("size", Switch(choice, lambda k, rows: dist.Exponential((k + 1) * rate[rows])))
+        count = Switch(choice, lambda k, rows: dist.Poisson(size[rows]))
+        pyro.sample("count", count)
+
+    trace, _ = generate(program, (), {}, 3)
+    torch.testing.assert_close(coordinates_of(trace, "size").places(trace["size"])[:, 0], trace["size"].log())
+    with pytest.raises(InputError, match="discrete"):
+        coordinates_of(trace, "count")
+
+
+def test_a_switch_over_poses_has_their_free_axes() -> None:
+    prior = UniformPose(poses.identity(), [0.01, 0.0, 0.0], 0.1, rotation="z")
+    other = UniformPose(poses.identity(), [0.01, 0.01, 0.0], 0.1, rotation="z")
+    which = torch.tensor([0, 1, 1])
+    assert freedom_of(Switch(which, lambda k, rows: prior.expand([len(rows)]))) == Freedom("x", "z")
+    with pytest.raises(InputError, match="different free axes"):
+        Switch(which, lambda k, rows: (other if k else prior).expand([len(rows)]))
+
+
+def test_the_cost_does_not_hang_on_what_was_chosen() -> None:
+    one = torch.ones(3, dtype=torch.float64)
+
+    def build(k: int, rows: Tensor) -> Any:
+        return Counting(one[rows]) if k else dist.Normal(one[rows], 1.0)
+
+    for which in ([0, 0, 0], [0, 1, 1], [1, 1, 1]):
+        assert Switch(torch.tensor(which), build, cost=2).cost == 2
+    with pytest.raises(InputError, match="say cost="):
+        Switch(torch.tensor([0, 1, 1]), build)
+
+
+def test_draws_of_different_precision_are_kept() -> None:
+    kinds = (torch.float32, torch.float64)
+    third = torch.tensor(1 / 3, dtype=torch.float64)
+    drawn = Switch(torch.tensor([0, 1]), lambda k, rows: dist.Delta(third.to(kinds[k]).expand(1))).sample()
+    assert drawn.dtype == torch.float64
+    assert float(drawn[1]) == 1 / 3

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
+from functools import reduce
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.distributions import constraints
 
 from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.support import freedom_of, log_prob_inside, support_of
 from bcppl.errors import InputError
+from bcppl.poses import Freedom
 
 
 class Switch(LazyDistribution):
@@ -25,13 +30,23 @@ class Switch(LazyDistribution):
     Args:
         which: (N,) whole numbers.
         build: `build(k, rows)` makes the distribution of the particles at `rows` (K,) int64, all of which
-            chose k; its batch shape is (K,), its event shape the same for every k.
+            chose k; its batch shape is (K,). Event shape, kind of support (real, positive, ...) and free
+            axes of poses are the same for every k, and so is `cost` where none is given.
+        cost: what a log-probability takes (see `LazyDistribution`), whatever was chosen. A batch in which
+            some choice is absent cannot tell, so say it where the choices' costs differ: kernels that sort
+            sites by cost keep their target only if it is the same at every value.
+
+    Attributes:
+        freedom: which axes are free where the choices are over poses, else None.
 
     Raises:
-        InputError: `which` is no vector of whole numbers, or what was built has another shape.
+        InputError: `which` is no vector of whole numbers, what was built has another shape, or the choices
+            differ in their support, their free axes, or their costs while no cost is given.
     """
 
-    def __init__(self, which: Tensor, build: Callable[[int, Tensor], Any]) -> None:
+    def __init__(
+        self, which: Tensor, build: Callable[[int, Tensor], Any], *, cost: int | None = None
+    ) -> None:
         if which.ndim != 1 or not bool((which == which.round()).all()):
             raise InputError(
                 f"a switch was given choices of shape {tuple(which.shape)}; "
@@ -54,7 +69,14 @@ class Switch(LazyDistribution):
                 "they must have the same."
             )
         built = [distribution for _, distribution in self.groups]
-        self.cost = max(getattr(each, "cost", 0) for each in built)
+        costs = sorted({int(getattr(each, "cost", 0)) for each in built})
+        if cost is None and len(costs) > 1:
+            raise InputError(
+                f"the choices of a switch have costs {', '.join(map(str, costs))}; "
+                "say cost= what it takes whatever is chosen, the largest of them."
+            )
+        self.cost = costs[0] if cost is None else cost
+        self.support, self.freedom = _common_support(self.groups), _common_freedom(built)
         inputs = tuple(tensor for each in built for tensor in getattr(each, "inputs", ()))
         super().__init__(len(which), shapes.pop(), inputs=(which, *inputs))
         if not all(hasattr(each, "inputs") for each in built):
@@ -71,7 +93,7 @@ class Switch(LazyDistribution):
         own = value.ndim > len(self.event_shape)
         total = torch.empty(self.batch_shape[0], dtype=torch.float64)
         for rows, distribution in self.groups:
-            total[rows] = distribution.log_prob(value[rows] if own else value).to(torch.float64)
+            total[rows] = log_prob_inside(distribution, value[rows] if own else value).to(torch.float64)
         return total
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
@@ -83,7 +105,66 @@ class Switch(LazyDistribution):
         if torch.Size(sample_shape) != torch.Size():
             raise InputError("a switch draws one value for each particle; ask for no sample_shape.")
         drawn = [(rows, distribution.sample()) for rows, distribution in self.groups]
-        values = drawn[0][1].new_empty(self.batch_shape + self.event_shape)
+        kind = reduce(torch.promote_types, (value.dtype for _, value in drawn))
+        values = drawn[0][1].new_empty(self.batch_shape + self.event_shape, dtype=kind)
         for rows, value in drawn:
-            values[rows] = value
+            values[rows] = value.to(kind)
         return values
+
+
+def _common_freedom(built: list[Any]) -> Freedom | None:
+    free = {freedom_of(each) for each in built}
+    if len(free) > 1:
+        raise InputError(
+            "the choices of a switch have poses with different free axes, or some have no poses; "
+            "give all the same, since their densities cannot be compared."
+        )
+    return free.pop()
+
+
+# Closed or half open makes no difference to what moves through them.
+_KINDS = {"GreaterThanEq": "GreaterThan", "HalfOpenInterval": "Interval"}
+
+
+def _kind(support: Any) -> str:
+    name = type(support).__name__.strip("_")
+    return "discrete" if support.is_discrete else _KINDS.get(name, name)
+
+
+def _common_support(groups: list[tuple[Tensor, Any]]) -> Any:
+    """The support of all choices; bounds that differ are spread over the particles."""
+    whole = groups[0][1].support
+    innermost = [support_of(distribution) for _, distribution in groups]
+    kinds = sorted({_kind(support) for support in innermost})
+    if len(kinds) > 1:
+        raise InputError(
+            f"the choices of a switch have supports of different kinds ({', '.join(kinds)}); "
+            "give all the same kind, since their densities cannot be compared."
+        )
+    if kinds == ["discrete"]:
+        return whole
+    common = copy(innermost[0])
+    for name, value in vars(innermost[0]).items():
+        if isinstance(value, int | float | Tensor):
+            setattr(
+                common,
+                name,
+                _spread([(r, vars(s)[name]) for (r, _), s in zip(groups, innermost, strict=True)]),
+            )
+    wrapped = whole.event_dim - common.event_dim
+    return constraints.independent(common, wrapped) if wrapped else common
+
+
+def _spread(bounds: list[tuple[Tensor, Any]]) -> Any:
+    """One bound for each particle, of bounds (K, ...) or () at rows (K,); itself where it is one for all."""
+    first = bounds[0][1]
+    if not any(isinstance(bound, Tensor) for _, bound in bounds) and all(b == first for _, b in bounds):
+        return first
+    each = [(rows, torch.as_tensor(bound, dtype=torch.float64)) for rows, bound in bounds]
+    tail = max((bound.shape[1:] for _, bound in each), key=len)
+    spread = torch.empty((sum(len(rows) for rows, _ in each), *tail), dtype=torch.float64)
+    for rows, bound in each:
+        spread[rows] = (
+            bound if bound.ndim == 0 else bound.reshape(bound.shape + (1,) * (len(tail) + 1 - bound.ndim))
+        )
+    return spread
