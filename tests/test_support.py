@@ -12,9 +12,11 @@ from pyro.distributions.torch_distribution import TorchDistributionMixin as Dist
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.poses import UniformPose
+from bcppl.beliefs import average_distance
+from bcppl.distributions.mixture import MixturePose
+from bcppl.distributions.poses import NormalPose, SwingTwistPose, UniformPose
 from bcppl.distributions.support import freedom_of, log_prob_inside
-from bcppl.errors import InferenceError
+from bcppl.errors import InferenceError, InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import PoseCoordinates, coordinates_of
 from bcppl.poses import Freedom
@@ -123,3 +125,21 @@ def test_a_mask_or_another_shape_leaves_a_pose_a_pose() -> None:
     trace, _ = generate(program, (), {}, 4)
     assert isinstance(coordinates_of(trace, "pose"), PoseCoordinates)
     assert Population(trace, torch.zeros(4, dtype=torch.float64)).belief("pose").freedom == Freedom("x", "z")
+
+
+def test_seven_numbers_without_a_unit_quaternion_are_no_pose() -> None:
+    center, deviations = poses.identity(), real(0.01, 0.01, 0.01, 0.1, 0.1, 0.1)
+    normal = NormalPose(center, deviations)
+    mixture = MixturePose(real(0.0), center[None], deviations)
+    priors = (normal, mixture, UniformPose(center, 0.1, 3.1), SwingTwistPose(center, 0.1, 0.1, 0.1))
+    scale = real(1.0, -1.0, 1.0 + 1e-8, 0.0, 2.0, 1.01)
+    value = center * torch.ones(6, 1, dtype=torch.float64)
+    value[:, 3:] *= scale[:, None]
+    for prior in priors:
+        found = prior.log_prob(value)
+        assert bool(found[:3].isfinite().all())
+        assert bool((found[3:] == -torch.inf).all())
+    with pytest.raises(InputError, match="unit length"):
+        NormalPose(value, deviations)
+    with pytest.raises(InputError, match="quaternion of length 2"):
+        average_distance(center, torch.zeros(1, 3, dtype=torch.float64), value[4])

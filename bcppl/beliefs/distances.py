@@ -14,7 +14,7 @@ def average_distance(
     world_from_part: Tensor, points: np.ndarray | Tensor, truth: np.ndarray | Tensor
 ) -> Tensor:
     """ADD (...) of poses (..., 7) against a true pose (7,) over model points (M, 3), metres."""
-    points, truth = torch.as_tensor(points), torch.as_tensor(truth, dtype=torch.float64)
+    points, truth = torch.as_tensor(points), poses.as_pose(truth, "the true pose")
     there = poses.transform(truth, points)
     return (poses.transform(world_from_part, points) - there).norm(dim=-1).mean(dim=-1)
 
@@ -26,7 +26,7 @@ def average_nearest_distance(
 
     Source: Hinterstoisser et al., ACCV 2012, eq. 4, for parts that look the same from several sides.
     """
-    points, truth = torch.as_tensor(points), torch.as_tensor(truth, dtype=torch.float64)
+    points, truth = torch.as_tensor(points), poses.as_pose(truth, "the true pose")
     there = poses.transform(truth, points).numpy()
     moved = poses.transform(world_from_part.reshape(-1, 7), points).numpy()
     each = [float(np.mean(cKDTree(particle).query(there)[0])) for particle in moved]

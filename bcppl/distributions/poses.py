@@ -21,6 +21,8 @@ from bcppl.poses import FREE, Freedom
 
 # A held axis may stray by rounding over thousands of moves, never by a nanometre.
 HELD = 1e-9
+# How far the length of a quaternion may lie from 1.
+UNIT = 1e-6
 
 
 class _PoseDistribution(TorchDistribution):
@@ -51,6 +53,11 @@ class _PoseDistribution(TorchDistribution):
         quaternion = roma.quat_product(poses.quaternion_xyzw(center).contiguous(), rotation)
         quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
         return poses.from_translation_quaternion_xyzw(center[..., :3] + translation, quaternion)
+
+
+def _is_unit(pose: Tensor) -> Tensor:
+    """Whether poses (..., 7) have unit quaternions: any other seven numbers are no pose."""
+    return (pose[..., 3:].square().sum(dim=-1) - 1.0).abs() <= 2.0 * UNIT
 
 
 def _half_widths(translation: Any, freedom_rotation: str) -> tuple[Tensor, Freedom]:
@@ -118,7 +125,7 @@ class UniformPose(_PoseDistribution):
         tangent = poses.local(self.center, value)
         inside = (tangent[..., :3].abs() <= self.widths + HELD).all(dim=-1)
         inside &= tangent[..., 3:].norm(dim=-1) <= self.angle + HELD
-        inside &= self.freedom.off_axis(tangent) <= HELD
+        inside &= (self.freedom.off_axis(tangent) <= HELD) & _is_unit(value)
         return torch.where(inside, value.new_tensor(self.log_density), -torch.inf)
 
 
@@ -186,7 +193,7 @@ class SwingTwistPose(_PoseDistribution):
         shift = value[..., :3] - self.center[..., :3]
         inside = (shift.abs() <= self.widths + HELD).all(dim=-1)
         # The angle of a vanishing tilt is the square root of rounding in the quaternion.
-        inside &= (tilt <= self.tilt + 1e-7) & (yaw.abs() <= self.yaw + HELD)
+        inside &= (tilt <= self.tilt + 1e-7) & (yaw.abs() <= self.yaw + HELD) & _is_unit(value)
         return torch.where(inside, value.new_tensor(self.log_density), -torch.inf)
 
 
@@ -215,7 +222,8 @@ class NormalPose(_PoseDistribution):
     windings next to the principal one where the spread is wide enough for them to matter.
 
     Raises:
-        InputError: the covariance has the wrong size or is not positive definite.
+        InputError: the covariance has the wrong size or is not positive definite, or a centre has no unit
+            quaternion.
     """
 
     def __init__(self, center: Any, covariance: Any, freedom: Freedom = FREE) -> None:
@@ -240,7 +248,13 @@ class NormalPose(_PoseDistribution):
         widest = float(matrix.diagonal(dim1=-2, dim2=-1)[..., turns].max().sqrt()) if turns else 0.0
         # Beyond half a radian the neighbouring windings carry more than 1e-16 of the mass.
         self._windings = (0.0,) if widest < 0.5 else (0.0, -2.0 * math.pi, 2.0 * math.pi)
-        super().__init__(torch.as_tensor(center, dtype=torch.float64), freedom)
+        middle = torch.as_tensor(center, dtype=torch.float64)
+        if bool(((middle[..., 3:].square().sum(dim=-1) - 1.0).abs() > 2e-3).any()):
+            raise InputError(
+                "a normal over poses was given a centre whose quaternion is not of unit length; "
+                "give x y z (m) qw qx qy qz, or mend it with `poses.as_pose`."
+            )
+        super().__init__(middle, freedom)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Poses (*sample_shape, *batch_shape, 7)."""
@@ -264,7 +278,8 @@ class NormalPose(_PoseDistribution):
                 - self.freedom.log_base_density(angle + winding)
             )
         density = terms[0] if len(terms) == 1 else torch.logsumexp(torch.stack(terms), dim=0)
-        return torch.where(self.freedom.off_axis(tangent) <= HELD, density, -torch.inf)
+        possible = (self.freedom.off_axis(tangent) <= HELD) & _is_unit(value)
+        return torch.where(possible, density, -torch.inf)
 
 
 class _Guess(Protocol):
