@@ -58,6 +58,8 @@ def log_prob_inside(distribution: Any, value: Tensor) -> Tensor:
 
 def _is_bounded(distribution: Any) -> bool:
     """Whether a value may lie outside the support, and only the support tells."""
+    if getattr(type(distribution), "support", None) in (constraints.real, constraints.real_vector):
+        return False
     innermost = base(distribution)
     if isinstance(innermost, LazyDistribution) or freedom_of(innermost) is not None:
         return False
