@@ -13,7 +13,7 @@ import trimesh
 from bcppl import poses
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import NormalPose
-from bcppl.inference.kernels import cycle, metropolis_hastings
+from bcppl.inference.kernels import cycle, metropolis_hastings, repeat
 from bcppl.inference.proposals import depth_alignment, drift, independent
 from bcppl.inference.tempered_smc import kernel as shipped
 from bcppl.parts import Part
@@ -66,7 +66,8 @@ def six_axes(scale: float = 0.04, believed: float | None = None) -> Case:
     inferred = Seen(spread, FREE, believed or scale, outlier)
     # Not the shipped kernel: its normal, fitted about the prior's centre, takes back half of what a prior
     # without Jacobian does wrong.
-    kernel = cycle(metropolis_hastings(drift("pose", (0.2, 2.0))), metropolis_hastings(turned_over))
+    over = repeat(metropolis_hastings(turned_over), 3)
+    kernel = cycle(metropolis_hastings(drift("pose", (0.2, 2.0))), over)
     return Case(program, CENTER, FREE, kernel, inferred, sweeps=6, settling=10)
 
 
@@ -77,6 +78,14 @@ def planar(scale: float = 0.015, believed: float | None = None) -> Case:
     inferred = Seen(spread, freedom, believed or scale, outlier)
     kernel = cycle(shipped("pose"), metropolis_hastings(independent("pose", components=None)))
     return Case(program, CENTER, freedom, kernel, inferred, sweeps=6, settling=10)
+
+
+def upright(scale: float = 0.015, believed: float | None = None) -> Case:
+    """In a plane that holds the optical axis, where the noise says how well two axes are known."""
+    spread, freedom, outlier = (0.03, 0.03, 0.4), Freedom("xz", "y"), 0.1
+    program = Seen(spread, freedom, scale, outlier)
+    inferred = Seen(spread, freedom, believed or scale, outlier)
+    return Case(program, CENTER, freedom, shipped("pose"), inferred, sweeps=6, settling=10)
 
 
 def quick() -> Case:

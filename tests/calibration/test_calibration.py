@@ -24,7 +24,8 @@ from tests.calibration.mutants import CASES, MUTANTS, case_of, covered, rank
 from tests.calibration.ranks import p_value, ranks
 
 SEED, ROUNDS = 1804_06788, 300
-SOUND, BROKEN = 0.01, 0.001  # of the smallest p-value times the number of quantities (Bonferroni)
+# Of the smallest p-value times the number of quantities (Bonferroni); the last for few rounds.
+SOUND, BROKEN, LOOSE = 0.01, 0.005, 0.001
 
 
 class Ranked(NamedTuple):
@@ -82,8 +83,8 @@ def test_ranks_count_what_lies_below_and_break_ties_at_random() -> None:
 
 
 def test_a_few_rounds_are_calibrated_and_a_flipped_sign_is_not() -> None:
-    assert ranked("depth, quick", None, 6, processes=1).corrected > BROKEN
-    assert ranked("depth, quick", "sign flipped", 6, processes=1).corrected < BROKEN
+    assert ranked("depth, quick", None, 6, processes=1).corrected > LOOSE
+    assert ranked("depth, quick", "sign flipped", 6, processes=1).corrected < LOOSE
 
 
 # ---- the long tests
@@ -102,7 +103,7 @@ FAILING = [
     ("depth, planar", "sign flipped", 30),
     ("touch", "sign flipped", 16),
     ("depth, six axes", "Jacobian of rotations dropped", ROUNDS),
-    ("touch", "noise 1.5 times as wide", 150),
+    ("depth, upright", "noise 1.5 times as wide", 150),
     ("depth, aligned", "way back forgotten", 16),
     ("depth, planar", "way back forgotten", 20),
     ("depth, planar", "fitted on the particle it moves", 100),
