@@ -81,6 +81,8 @@ class Population:
         later = replace(self, trace=trace)
         if "log_total" in self.__dict__:
             later.__dict__["log_total"] = self.log_total
+        if "effective_sample_size" in self.__dict__:
+            later.__dict__["effective_sample_size"] = self.effective_sample_size
         return later
 
     def reweighed(self, log_factor: Tensor) -> Population:
@@ -93,13 +95,18 @@ class Population:
             InferenceError: no particle has any weight left.
         """
         log_weights = self.log_weights + log_factor
-        total = float(torch.logsumexp(log_weights, 0))
-        if not math.isfinite(total):
+        highest = float(log_weights.max())
+        if not math.isfinite(highest):
             normalised(log_weights, self.trace.impossible())
+        # One exponential serves the evidence and the effective sample size: it is what a step costs.
+        weights = (log_weights - highest).exp_()
+        mass = float(weights.sum())
+        total = highest + math.log(mass)
         later = replace(
             self, log_weights=log_weights, log_evidence=self.log_evidence + (total - self.log_total)
         )
         later.__dict__["log_total"] = total
+        later.__dict__["effective_sample_size"] = mass * mass / float(weights.dot(weights))
         return later
 
     def selected(self, ancestors: Tensor) -> Population:

@@ -17,9 +17,6 @@ from torch import Tensor
 from bcppl.beliefs import normalised
 from bcppl.errors import InputError
 
-# Below this many particles, searching for the points is faster than counting them.
-FEW = 5000
-
 
 class Scheme(Protocol):
     """Ancestors (count,) int64 of particles with log weights (N,); N of them unless a count is given."""
@@ -38,10 +35,6 @@ def systematic(log_weights: Tensor, count: int | None = None) -> Tensor:
     """One uniform draw and equal steps: a particle gets its expected number, rounded down or up."""
     weights, count = _asked(log_weights, count)
     offset = torch.rand((), dtype=torch.float64)
-    if count < FEW:
-        # Rounding may leave a point past the last sum: that falls to the last particle with weight.
-        points = (torch.arange(count, dtype=torch.float64) + offset) / count
-        return torch.searchsorted(weights.cumsum(0), points, right=True).clamp_max(_last(weights))
     below = weights.cumsum(0).mul_(count).sub_(offset).ceil_()
     return _ancestors(_closed(below, weights, count), count)
 
@@ -128,9 +121,9 @@ def _closed(below: Tensor, weights: Tensor, count: int) -> Tensor:
 
 def _ancestors(below: Tensor, count: int) -> Tensor:
     """The particle (count,) whose stretch each point lies in."""
-    copies = below.long()
-    copies[1:] -= below[:-1].long()
-    return torch.repeat_interleave(copies, output_size=count)
+    # The point j lies behind as many particles as have j points or fewer below their ends; counting them so
+    # takes half to a third of the time of repeating each index.
+    return torch.bincount(below.long(), minlength=count)[:count].cumsum(0)
 
 
 def _independent(weights: Tensor, count: int) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from copy import copy
 from typing import Any
 
 import pyro.distributions as dist
@@ -21,9 +20,18 @@ def narrowed(distribution: Any) -> Any:
     scale = distribution.scale
     if scale.numel() < MANY or 0 not in scale.stride():
         return distribution
-    once = copy(distribution)
-    once.scale = scale[tuple(slice(0, 1) if step == 0 else slice(None) for step in scale.stride())]
+    once = object.__new__(type(distribution))
+    once.__dict__.update(distribution.__dict__)
+    once.scale = _once(scale)
     return once
+
+
+def _once(scale: Tensor) -> Tensor:
+    """One entry along the axes along which all are the same."""
+    for axis, step in enumerate(scale.stride()):
+        if step == 0:
+            scale = scale.narrow(axis, 0, 1)
+    return scale
 
 
 def drawn(distribution: Any) -> Tensor | None:
@@ -38,4 +46,4 @@ def drawn(distribution: Any) -> Tensor | None:
     if mean.numel() < MANY or mean.dtype != torch.float64 or mean.device.type != "cpu" or mean.requires_grad:
         return None
     uniform = torch.rand(distribution.batch_shape, dtype=torch.float64).mul_(2.0).sub_(1.0 - 2.0**-53)
-    return uniform.erfinv_().mul_(narrowed(distribution).scale * math.sqrt(2.0)).add_(mean)
+    return uniform.erfinv_().mul_(_once(distribution.scale) * math.sqrt(2.0)).add_(mean)
