@@ -153,6 +153,24 @@ def test_a_measured_recording_is_read_by_the_same_code() -> None:
         Sensing(PEG, rate=30.0)
 
 
+def test_the_wrench_of_a_window_is_what_contacts_are_read_from() -> None:
+    probe, sensing = lean(20.0), Sensing(PEG, rate=100.0)
+    part = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0], [0.0, 0, -1, 1, 0, 0, 0]], dtype=torch.float64)
+    track = ContactTrack.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
+    late = track.wrench(100, 150)
+    assert late.shape == (2, 50, 6) and track.count == 150
+    whole = torch.cat([track.wrench(0, 100), late], dim=1)
+    np.testing.assert_array_equal(
+        sensing.contacts(whole.numpy(), sensing.start(2))[0], track.window(0, 150)[0]
+    )
+    # The block pushes the peg up: along the world's z, which leans by 20 degrees in the peg's frame.
+    force = late[0, -1, :3].numpy()
+    np.testing.assert_allclose(
+        force / np.linalg.norm(force), [-np.sin(0.349066), 0, np.cos(0.349066)], atol=0.3
+    )
+    assert float(late[1].abs().max()) < 0.05
+
+
 def test_tracks_are_indexed_and_merged_like_the_poses_they_hang_on() -> None:
     probe = lean(15.0)
     physics, sensing = PegPhysics(block((0.2, 0.2, 0.02)), PEG), Sensing(PEG, rate=100.0)

@@ -85,6 +85,18 @@ class ContactTrack:
         pose = torch.from_numpy(self.rollout.world_from_peg[:, first:last].copy())
         return torch.from_numpy(self._contacts[:, first:last].copy()), pose
 
+    def wrench(self, first: int, last: int) -> Tensor:
+        """What a wrist sensor without noise or offset reads at stamps `first` to `last` (exclusive).
+
+        Simulated only if it is not known yet; not tared and not filtered.
+
+        Returns:
+            (N, last-first, 6) force (N) and torque (N m) that the environment exerts on the peg, in the
+            peg's frame about its origin, the sensor; NaN where the physics diverged.
+        """
+        self.advance(last)
+        return torch.from_numpy(self.rollout.wrench[:, first:last].copy())
+
     def pushes(self, first: int, last: int) -> Tensor:
         """Unit directions (N, last-first, 3), in the world, of the force that the part exerts on the peg.
 
