@@ -51,12 +51,12 @@ def infer(
         seed: same seed, same beliefs.
         sweeps: moves of every particle after each resampling: without, and with physics in the program. By
             default 12, and until the particles' mean squared displacement is half their variance on every
-            axis and four of five differ, at most 20.
+            axis and four of five differ, at most 60.
         share: particles are resampled below this effective sample size, and a likelihood is let in by steps
             that keep this conditional one, as shares of N: without, and with physics.
         scene: what `model.prepare(recording)` gives, if it is at hand.
     """
-    enough = until(displacement=0.5, distinct=max(1, round(0.8 * particles)), most=20)
+    enough = until(displacement=0.5, distinct=max(1, round(0.8 * particles)), most=60)
     moves = (12, enough) if sweeps is None else sweeps
 
     def by_physics(trace: Trace) -> int:
