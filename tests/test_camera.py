@@ -1,14 +1,20 @@
-"""Where a camera looks."""
+"""Where a camera looks, what its lens does, and what its regions and bins see."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
+import numpy.typing as npt
 import pytest
 import torch
 
 from bcppl import poses
 from bcppl.errors import InputError
-from bcppl.simulators.camera import looking_at
+from bcppl.simulators.camera import Camera, bin_depth, looking_at
+
+Array = npt.NDArray[np.float64]
 
 
 def test_the_point_is_straight_ahead_and_up_is_up() -> None:
@@ -26,3 +32,131 @@ def test_looking_along_up_is_refused() -> None:
     with pytest.raises(InputError, match="upwards"):
         looking_at([0.0, 0.0, 1.0], [0.0, 0.0, 0.0])
     assert np.isfinite(looking_at([0.0, 0.0, 1.0], [0.0, 0.0, 0.0], up=(0.0, 1.0, 0.0))).all()
+
+
+# ---- the lens
+
+STILL = np.array([0.0, 0, 0, 1, 0, 0, 0])
+LENSES = [(0.12, -0.25, 0.002, -0.004, 0.08), (-0.3, 0.12, 0.003, -0.005), (0.1, 0.0, 0.0, 0.0)]
+
+
+def lens(distortion: Sequence[float], width: int = 64, height: int = 48) -> Camera:
+    return Camera("lens", width, height, 51.0, 55.0, 30.3, 25.1, STILL, distortion=distortion)
+
+
+def pixels(camera: Camera) -> Array:
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    return np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64)
+
+
+@pytest.mark.parametrize("distortion", LENSES)
+def test_a_point_is_seen_where_the_textbook_says(distortion: Sequence[float]) -> None:
+    """OpenCV's documentation of calib3d, written out for one point at a time."""
+    camera = lens(distortion)
+    k1, k2, p1, p2, k3 = (*distortion, 0.0)[:5]
+    for point in np.random.default_rng(0).uniform([-0.4, -0.3, 0.7], [0.4, 0.3, 1.5], (40, 3)):
+        x, y = point[0] / point[2], point[1] / point[2]
+        r2 = x**2 + y**2
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        u = 51.0 * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)) + 30.3
+        v = 55.0 * (y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y) + 25.1
+        np.testing.assert_allclose(camera.project(point), [u, v], rtol=1e-12)
+
+
+@pytest.mark.parametrize("distortion", [(), *LENSES])
+def test_rays_are_seen_at_their_pixels(distortion: Sequence[float]) -> None:
+    camera = lens(distortion)
+    rays = camera.rays()
+    assert (rays[:, 2] == 1.0).all()
+    np.testing.assert_allclose(camera.project(rays * 0.7), pixels(camera), atol=1e-8)
+    if distortion:
+        assert np.abs(rays - lens(()).rays()).max() > 0.01
+
+
+def test_a_lens_that_folds_the_image_is_refused() -> None:
+    for distortion in [(-1.5, 0, 0, 0), (0.0, -2.0, 0, 0), (0, 0, 0.6, 0)]:
+        with pytest.raises(InputError, match="folds the image over"):
+            lens(distortion).rays()
+    with pytest.raises(InputError, match="k1 k2 p1 p2"):
+        lens([0.1] * 8).rays()
+
+
+def test_what_is_beside_or_behind_the_camera_is_not_seen() -> None:
+    """Far to the side a barrel's polynomial turns back and would bring the point into the image again."""
+    camera = lens((-0.3, 0.0, 0.0, 0.0))
+    seen = camera.project([[0, 0, -1.0], [0, 0, 0.0], [1.8, 0, 1.0], [0.1, 0, 1.0]])
+    assert np.isnan(seen[:3]).all() and np.isfinite(seen[3]).all()
+    folded = 1.8 * (1 - 0.3 * 1.8**2)
+    assert abs(folded) < 0.1, "the formula alone would put it near the middle"
+
+
+@pytest.mark.parametrize("distortion", [(), LENSES[0]])
+def test_a_region_sees_along_the_same_rays(distortion: Sequence[float]) -> None:
+    camera = lens(distortion)
+    region = camera.cropped(10, 7, 21, 16)
+    whole = camera.rays().reshape(48, 64, 3)
+    np.testing.assert_allclose(region.rays().reshape(16, 21, 3), whole[7:23, 10:31], rtol=1e-12, atol=1e-14)
+    for bad in [(-1, 0, 5, 5), (60, 0, 5, 5), (0, 44, 5, 5), (0, 0, 0, 5)]:
+        with pytest.raises(InputError, match="region"):
+            camera.cropped(*bad)
+
+
+@pytest.mark.parametrize("k", [2, 3, 5])
+def test_a_binned_pixel_sees_along_the_middle_of_its_block(k: int) -> None:
+    """Without distortion its ray is the mean of the block's; with it, that of the pixel in the middle."""
+    camera = lens(())
+    binned = camera.binned(k)
+    assert (binned.width, binned.height) == (64 // k, 48 // k)
+    rays = camera.rays().reshape(48, 64, 3)[: 48 // k * k, : 64 // k * k]
+    mean = rays.reshape(48 // k, k, 64 // k, k, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(binned.rays().reshape(mean.shape), mean, rtol=1e-12, atol=1e-14)
+    if k % 2:
+        whole = lens(LENSES[0]).rays().reshape(48, 64, 3)
+        middle = whole[k // 2 : 48 // k * k : k, k // 2 : 64 // k * k : k]
+        np.testing.assert_allclose(
+            lens(LENSES[0]).binned(k).rays().reshape(middle.shape), middle, rtol=1e-11, atol=1e-13
+        )
+
+
+def test_binning_takes_what_was_read_and_nothing_between() -> None:
+    nan = np.nan
+    depth = np.array(
+        [
+            [0.500, 0.502, 0.5, 0.7, nan, 0.0, 9.0],
+            [0.501, 0.503, 0.5, 0.7, -1.0, np.inf, 9.0],
+            [0.500, nan, 0.5, 0.7, 0.6, 0.0, 9.0],
+            [nan, 0.0, 0.7, 0.7, nan, 3.0, 9.0],
+        ]
+    )
+    binned = bin_depth(depth, 2, far=2.0)
+    np.testing.assert_allclose(binned, [[0.5015, 0.5, nan], [0.5, 0.7, 0.6]])
+    noisy = np.random.default_rng(0).choice([0.5, 0.7, nan], size=(60, 80))
+    read = bin_depth(noisy, 4)
+    assert np.isin(read[np.isfinite(read)], [0.5, 0.7]).all()
+    for bad in (0, 5, 2.0):
+        with pytest.raises(InputError, match="binned"):
+            bin_depth(depth, bad)
+    with pytest.raises(InputError, match="shape"):
+        bin_depth(depth[0], 2)
+
+
+# ---- the wrist
+
+
+def test_a_wrist_camera_goes_where_the_arm_goes() -> None:
+    hand = np.array([0.05, 0.0, 0.08, np.cos(0.2), 0.0, np.sin(0.2), 0.0])
+    camera = replace(lens(()), wrist_from_camera=hand)
+    rng = np.random.default_rng(1)
+    wrist = poses.retract(poses.identity(), torch.from_numpy(rng.normal(size=6)))
+    there = camera.on(wrist, name="lens at 1")
+    point = torch.from_numpy(rng.normal(size=(1, 3)))
+    through_wrist = poses.transform(wrist, poses.transform(torch.from_numpy(hand), point))
+    np.testing.assert_allclose(
+        poses.transform(torch.from_numpy(there.world_from_camera), point), through_wrist, atol=1e-12
+    )
+    assert (there.name, there.instrument) == ("lens at 1", "lens")
+    assert there.on(wrist, name="lens at 2").instrument == "lens"
+    with pytest.raises(InputError, match="wrist_from_camera"):
+        lens(()).on(wrist)
+    with pytest.raises(InputError, match="finite"):
+        camera.on(np.full(7, np.nan))

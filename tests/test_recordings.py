@@ -151,6 +151,26 @@ def test_everything_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     ]
 
 
+def test_a_camera_keeps_its_lens_and_its_wrist(tmp_path: Path) -> None:
+    """What version 1 did not know makes the file one of version 2; without it, it stays one of version 1."""
+    hand = dataclasses.replace(
+        camera("hand"),
+        distortion=(0.01, -0.02, 0.001, 0.0, 0.003),
+        wrist_from_camera=np.array([0.05, 0, 0.07, 1, 0, 0, 0]),
+    )
+    places = [np.array([0.0, 0, z, 0, 1, 0, 0]) for z in (0.5, 0.6)]
+    views = [hand.on(place, name=f"hand {k}") for k, place in enumerate(places)]
+    recording = dataclasses.replace(
+        full(), measurements=[Measurement(View(c), DepthImage(np.ones((6, 8)))) for c in views]
+    )
+    for made, version in ((recording, 2), (full(), 1)):
+        save(made, tmp_path / "lens.h5")
+        with h5py.File(tmp_path / "lens.h5") as file:
+            assert file.attrs["schema_version"] == version
+        assert_identical(load(tmp_path / "lens.h5"), made)
+    assert {view.instrument for view in views} == {"hand"}
+
+
 def test_saving_again_gives_the_same_bytes(tmp_path: Path) -> None:
     save(full(), tmp_path / "a.h5")
     save(load(tmp_path / "a.h5"), tmp_path / "b.h5")
@@ -261,7 +281,7 @@ def edited(tmp_path: Path, edit: Callable[[h5py.File], None]) -> str:
 
 def test_a_newer_schema_says_which_and_what_to_do(tmp_path: Path) -> None:
     message = edited(tmp_path, lambda file: file.attrs.__setitem__("schema_version", 7))
-    assert "schema version 7" in message and "reads version 1" in message and "upgrade" in message
+    assert "schema version 7" in message and "reads version 2" in message and "upgrade" in message
 
 
 @pytest.mark.parametrize(
@@ -361,6 +381,22 @@ WRONG: dict[str, tuple[Recording, str]] = {
     "camera in millimetres": (
         with_measurement(2, world_from_camera=np.array([0.0, 0, 600, 0, 1, 0, 0])),
         "measurement 2: camera .* wrong units",
+    ),
+    "camera of nine coefficients": (
+        with_measurement(2, distortion=[0.1] * 8),
+        "measurement 2: camera .* not Brown's k1 k2 p1 p2",
+    ),
+    "camera folded": (
+        with_measurement(2, distortion=(-3.0, 0.5, 0.0, 0.0)),
+        "measurement 2: camera .* folds the image over: .* pixels",
+    ),
+    "camera with a coefficient that is no number": (
+        with_measurement(2, distortion=(0.1, np.nan, 0.0, 0.0)),
+        "measurement 2: camera .* finite numbers",
+    ),
+    "camera on a wrist in another's place": (
+        with_measurement(2, wrist_from_camera=np.array([0, 0, 0.1, 0, 3, 0, 0])),
+        "measurement 2: camera .* wrist_from_camera has a quaternion of length 3",
     ),
     "camera not unit": (
         with_measurement(2, world_from_camera=np.array([0, 0, 0.6, 0, 2, 0, 0])),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -124,13 +126,14 @@ def test_hits_equal_another_caster_in_the_worlds_frame(mesh: trimesh.Trimesh) ->
     assert (np.isfinite(image) != np.isfinite(expected)).mean() < 0.0005
 
 
-def full_frame(part: Part, camera: Camera, pose: torch.Tensor) -> Array:
+def full_frame(part: Part, camera: Camera, pose: torch.Tensor, along: Array | None = None) -> Array:
     """Every pixel cast for every particle, with no culling: (N, H * W), +inf where the ray misses."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
     images = []
     eye, rays = world_rays(camera)
+    rays = rays if along is None else along
     scene = EmbreeScene(robust=True)
     TriangleMesh(scene, part.vertices[part.faces].astype(np.float32))
     for p in pose.numpy():
@@ -158,6 +161,28 @@ def test_culling_loses_no_hit(spread: float) -> None:
     both = np.isfinite(image) & np.isfinite(expected)
     assert (np.abs(image[both] - expected[both]) > 1e-5).mean() < 1e-4
     assert renderer.effort.amount < 0.5 * image.size
+
+
+@pytest.mark.parametrize("distortion", [(0.25, -0.3, 0.004, -0.006, 0.1), (-0.3, 0.12, 0.003, -0.005)])
+def test_a_lens_loses_no_hit(distortion: tuple[float, ...]) -> None:
+    """A slanted plane against its equation along the lens's rays, a ring against every ray cast."""
+    camera = replace(tilted_camera(96, 64), fx=70.0, fy=76.0, cx=45.0, cy=33.0, distortion=distortion)
+    part, pose = part_of(RING), torch.cat([random_poses(80, 5, 0.03), random_poses(40, 6, 0.3)])
+    turn = Rotation.from_quat(camera.world_from_camera[[4, 5, 6, 3]])
+    rays, eye = turn.apply(camera.rays()), camera.world_from_camera[:3]
+    image = DepthRenderer(part).images(camera, pose).reshape(len(pose), -1)
+    expected = full_frame(part, camera, pose, rays)
+    assert np.isfinite(expected).sum() > 10000
+    assert (np.isfinite(image) != np.isfinite(expected)).sum() <= 2
+    both = np.isfinite(image) & np.isfinite(expected)
+    assert (np.abs(image[both] - expected[both]) > 1e-5).mean() < 1e-4
+    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 2.0
+    plane = Part("plane", square, np.array([[0, 1, 2], [0, 2, 3]]))
+    depth = -eye[2] / rays[:, 2]
+    seen = DepthRenderer(plane).images(camera, poses.identity(1))[0].reshape(-1)
+    inside = (depth > 0) & (np.abs(eye + depth[:, None] * rays)[:, :2] < 1.9).all(axis=1)
+    assert inside.mean() > 0.9
+    np.testing.assert_allclose(seen[inside], depth[inside], rtol=3e-6)
 
 
 def test_counted_pixels_and_order_of_hits() -> None:

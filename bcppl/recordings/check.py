@@ -14,6 +14,7 @@ from bcppl.poses import as_pose, inverse, transform
 from bcppl.recordings.file import same
 from bcppl.recordings.measurements import DepthImage, Guess, Probe, ProbeWindow, Push, Recording, Touch, View
 from bcppl.simulators.camera import Camera
+from bcppl.simulators.distortion import coefficients
 
 Array = npt.NDArray[np.float64]
 
@@ -153,6 +154,12 @@ def _pose(what: str, values: Array) -> Iterator[str]:
 def _camera(what: str, camera: Camera, recording: Recording) -> Iterator[str]:
     if camera.width < 1 or camera.height < 1 or not (camera.fx > 0 and camera.fy > 0):
         yield f"{what} has no pixels or no focal length; give its width, height, fx and fy in pixels."
+    elif not np.isfinite([camera.fx, camera.fy, camera.cx, camera.cy]).all():
+        yield f"{what} has intrinsics that are not finite; give fx, fy, cx and cy in pixels."
+    elif camera.distortion:
+        yield from _distortion(what, camera)
+    if camera.wrist_from_camera is not None:
+        yield from _pose(f"{what}'s wrist_from_camera", camera.wrist_from_camera)
     if not 0 <= camera.near < camera.far:
         yield f"{what} sees from {camera.near:.4g} m to {camera.far:.4g} m; give near below far, in metres."
     wrong = list(_pose(f"{what}'s world_from_camera", camera.world_from_camera))
@@ -160,6 +167,14 @@ def _camera(what: str, camera: Camera, recording: Recording) -> Iterator[str]:
     poses_known = not wrong and not list(_pose("guess", recording.guess.world_from_part))
     if poses_known and _has_mesh(recording.part):
         yield from _stands_off(what, camera, recording)
+
+
+def _distortion(what: str, camera: Camera) -> Iterator[str]:
+    try:
+        coefficients(tuple(camera.distortion))
+        camera.rays()
+    except InputError as error:
+        yield f"{what}: {error}"
 
 
 def _stands_off(what: str, camera: Camera, recording: Recording) -> Iterator[str]:

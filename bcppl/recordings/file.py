@@ -1,19 +1,22 @@
 """The native recording file: one HDF5 file that holds a whole recording.
 
-Layout, schema version 1 (SI units, in each dataset's attribute `units`; frames are in the datasets' names):
+Layout, schema version 2 (SI units, in each dataset's attribute `units`; frames are in the datasets' names):
 
     /                         attributes format, schema_version, model, source
     /part, /peg               attributes name, source; vertices, faces, pieces/0000.. (kind, size, center)
     /guess                    world_from_part, translation, tilt, yaw, angle (absent where tilt and yaw rule)
     /truth                    world_from_part (the group is absent where the truth is unknown)
     /background/NAME          depth of what stands behind the part, by camera name
-    /cameras/NAME             width, height, fx, fy, cx, cy, near, far; world_from_camera
+    /cameras/NAME             width, height, fx, fy, cx, cy, near, far; world_from_camera; since version 2,
+                              and only where there is one: distortion (k1 k2 p1 p2 k3), wrist_from_camera,
+                              attribute device
     /probes/NAME              command_times, command_world_from_peg, stiffness, damping, stamps
     /measurements/000000..    attribute kind; action and observation
 
 Cameras and probes are written once and referred to by name. Names are percent-encoded where they would
 read as HDF5 paths. Depth is float32: values that float32 represents come back exactly, others are rounded
-by less than 0.1 micrometre at 1 m. Everything else comes back bit for bit.
+by less than 0.1 micrometre at 1 m. Everything else comes back bit for bit. A file states the lowest version
+that holds it, so that an older bcppl reads what it can, and refuses the rest rather than lose it.
 """
 
 from __future__ import annotations
@@ -31,6 +34,8 @@ import numpy.typing as npt
 
 from bcppl.errors import InputError
 from bcppl.parts import Part, Piece
+from bcppl.recordings.cameras import camera_version, read_camera, write_camera
+from bcppl.recordings.datasets import POSE_UNITS, array, number, put
 from bcppl.recordings.measurements import (
     DepthImage,
     Guess,
@@ -45,15 +50,11 @@ from bcppl.recordings.measurements import (
 from bcppl.simulators.camera import Camera
 
 FORMAT = "bcppl recording"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
-POSE_UNITS = "m m m 1 1 1 1"  # [x y z qw qx qy qz]
 WRENCH_UNITS = "N N N N m N m N m"
 STIFFNESS_UNITS = "N/m N/m N/m N m/rad N m/rad N m/rad"
 DAMPING_UNITS = "N s/m N s/m N s/m N m s/rad N m s/rad N m s/rad"
-SMALLEST_COMPRESSED = 256  # entries: below it gzip's chunk index outweighs what it saves
-INTRINSICS = {"width": "pixel", "height": "pixel", "fx": "pixel", "fy": "pixel", "cx": "pixel", "cy": "pixel"}
-RANGE = {"near": "m", "far": "m"}
 
 Array = npt.NDArray[np.float64]
 
@@ -137,20 +138,13 @@ def _key(name: str) -> str:
 # ---- writing
 
 
-def _put(group: h5py.Group, name: str, values: object, units: str, dtype: npt.DTypeLike = np.float64) -> None:
-    array = np.asarray(values, dtype=dtype)
-    compressed = array.size >= SMALLEST_COMPRESSED
-    options: dict[str, Any] = {"compression": "gzip", "shuffle": True} if compressed else {}
-    group.create_dataset(name, data=array, **options).attrs["units"] = units
-
-
 def _put_depth(group: h5py.Group, name: str, depth: Array) -> None:
-    _put(group, name, depth, "m", np.float32)
+    put(group, name, depth, "m", np.float32)
 
 
 def _write_recording(file: h5py.File, recording: Recording) -> None:
     file.attrs["format"] = FORMAT
-    file.attrs["schema_version"] = SCHEMA_VERSION
+    file.attrs["schema_version"] = _version(recording)
     file.attrs["model"] = recording.model
     file.attrs["source"] = recording.source
     _write_part(file.create_group("part"), recording.part)
@@ -158,20 +152,26 @@ def _write_recording(file: h5py.File, recording: Recording) -> None:
         _write_part(file.create_group("peg"), recording.peg)
     _write_guess(file.create_group("guess"), recording.guess)
     if recording.truth is not None:
-        _put(file.create_group("truth"), "world_from_part", recording.truth, POSE_UNITS)
+        put(file.create_group("truth"), "world_from_part", recording.truth, POSE_UNITS)
     background = file.create_group("background")
     for name, depth in recording.background.items():
         _put_depth(background, _key(name), depth)
     actions = [measurement.action for measurement in recording.measurements]
     cameras = file.create_group("cameras")
     for camera in _by_name((a.camera for a in actions if isinstance(a, View)), "cameras").values():
-        _write_camera(cameras.create_group(_key(camera.name)), camera)
+        write_camera(cameras.create_group(_key(camera.name)), camera)
     probes = file.create_group("probes")
     for probe in _by_name((a.probe for a in actions if isinstance(a, ProbeWindow)), "probes").values():
         _write_probe(probes.create_group(_key(probe.name)), probe)
     measurements = file.create_group("measurements")
     for index, measurement in enumerate(recording.measurements):
         _write_measurement(measurements.create_group(f"{index:06d}"), measurement)
+
+
+def _version(recording: Recording) -> int:
+    """The lowest schema version that holds a recording."""
+    cameras = (m.action.camera for m in recording.measurements if isinstance(m.action, View))
+    return max(map(camera_version, cameras), default=1)
 
 
 def _by_name(things: Iterable[Any], what: str) -> dict[str, Any]:
@@ -195,38 +195,31 @@ def same(first: Camera | Probe, second: Camera | Probe) -> bool:
 def _write_part(group: h5py.Group, part: Part) -> None:
     group.attrs["name"] = part.name
     group.attrs["source"] = part.source
-    _put(group, "vertices", part.vertices, "m")
-    _put(group, "faces", part.faces, "1", np.int64)
+    put(group, "vertices", part.vertices, "m")
+    put(group, "faces", part.faces, "1", np.int64)
     pieces = group.create_group("pieces")
     for index, piece in enumerate(part.pieces):
         stored = pieces.create_group(f"{index:04d}")
         stored.attrs["kind"] = piece.kind
-        _put(stored, "size", piece.size, "m")
-        _put(stored, "center", piece.center, "m")
+        put(stored, "size", piece.size, "m")
+        put(stored, "center", piece.center, "m")
 
 
 def _write_guess(group: h5py.Group, guess: Guess) -> None:
-    _put(group, "world_from_part", guess.world_from_part, POSE_UNITS)
-    _put(group, "translation", guess.translation, "m")
-    _put(group, "tilt", guess.tilt, "rad")
-    _put(group, "yaw", guess.yaw, "rad")
+    put(group, "world_from_part", guess.world_from_part, POSE_UNITS)
+    put(group, "translation", guess.translation, "m")
+    put(group, "tilt", guess.tilt, "rad")
+    put(group, "yaw", guess.yaw, "rad")
     if guess.angle is not None:
-        _put(group, "angle", guess.angle, "rad")
-
-
-def _write_camera(group: h5py.Group, camera: Camera) -> None:
-    for name, units in {**INTRINSICS, **RANGE}.items():
-        whole = name in ("width", "height")
-        _put(group, name, getattr(camera, name), units, np.int64 if whole else np.float64)
-    _put(group, "world_from_camera", camera.world_from_camera, POSE_UNITS)
+        put(group, "angle", guess.angle, "rad")
 
 
 def _write_probe(group: h5py.Group, probe: Probe) -> None:
-    _put(group, "command_times", probe.command_times, "s")
-    _put(group, "command_world_from_peg", probe.command, POSE_UNITS)
-    _put(group, "stiffness", probe.stiffness, STIFFNESS_UNITS)
-    _put(group, "damping", probe.damping, DAMPING_UNITS)
-    _put(group, "stamps", probe.stamps, "s")
+    put(group, "command_times", probe.command_times, "s")
+    put(group, "command_world_from_peg", probe.command, POSE_UNITS)
+    put(group, "stiffness", probe.stiffness, STIFFNESS_UNITS)
+    put(group, "damping", probe.damping, DAMPING_UNITS)
+    put(group, "stamps", probe.stamps, "s")
 
 
 def _write_measurement(group: h5py.Group, measurement: Measurement) -> None:
@@ -240,33 +233,25 @@ def _write_measurement(group: h5py.Group, measurement: Measurement) -> None:
             action.attrs["first"] = first
             action.attrs["last"] = last
         case Push(times, world_from_tip):
-            _put(action, "times", times, "s")
-            _put(action, "world_from_tip", world_from_tip, POSE_UNITS)
+            put(action, "times", times, "s")
+            put(action, "world_from_tip", world_from_tip, POSE_UNITS)
     observation = group.create_group("observation")
     match measurement.observation:
         case DepthImage(depth, rgb):
             _put_depth(observation, "depth", depth)
             if rgb is not None:
-                _put(observation, "rgb", rgb, "1", np.uint8)
+                put(observation, "rgb", rgb, "1", np.uint8)
         case Touch(times, wrench, world_from_peg):
-            _put(observation, "times", times, "s")
-            _put(observation, "wrench", wrench, WRENCH_UNITS)
-            _put(observation, "world_from_peg", world_from_peg, POSE_UNITS)
+            put(observation, "times", times, "s")
+            put(observation, "wrench", wrench, WRENCH_UNITS)
+            put(observation, "world_from_peg", world_from_peg, POSE_UNITS)
 
 
 # ---- reading
 
 
-def _array(group: h5py.Group, name: str) -> Array:
-    return np.asarray(group[name][()], dtype=np.float64)
-
-
-def _number(group: h5py.Group, name: str) -> float:
-    return float(group[name][()])
-
-
 def _read_recording(file: h5py.File) -> Recording:
-    cameras = {unquote(key): _read_camera(unquote(key), group) for key, group in file["cameras"].items()}
+    cameras = {unquote(key): read_camera(unquote(key), group) for key, group in file["cameras"].items()}
     probes = {unquote(key): _read_probe(unquote(key), group) for key, group in file["probes"].items()}
     return Recording(
         part=_read_part(file["part"]),
@@ -275,8 +260,8 @@ def _read_recording(file: h5py.File) -> Recording:
             _read_measurement(group, cameras, probes) for _, group in sorted(file["measurements"].items())
         ],
         peg=_read_part(file["peg"]) if "peg" in file else None,
-        background={unquote(key): _array(file["background"], key) for key in file["background"]},
-        truth=_array(file["truth"], "world_from_part") if "truth" in file else None,
+        background={unquote(key): array(file["background"], key) for key in file["background"]},
+        truth=array(file["truth"], "world_from_part") if "truth" in file else None,
         model=str(file.attrs["model"]),
         source=str(file.attrs["source"]),
     )
@@ -284,12 +269,12 @@ def _read_recording(file: h5py.File) -> Recording:
 
 def _read_part(group: h5py.Group) -> Part:
     pieces = [
-        Piece(str(stored.attrs["kind"]), _array(stored, "size"), _array(stored, "center"))
+        Piece(str(stored.attrs["kind"]), array(stored, "size"), array(stored, "center"))
         for _, stored in sorted(group["pieces"].items())
     ]
     return Part(
         name=str(group.attrs["name"]),
-        vertices=_array(group, "vertices"),
+        vertices=array(group, "vertices"),
         faces=np.asarray(group["faces"][()], dtype=np.int64),
         pieces=tuple(pieces),
         source=str(group.attrs["source"]),
@@ -298,32 +283,22 @@ def _read_part(group: h5py.Group) -> Part:
 
 def _read_guess(group: h5py.Group) -> Guess:
     return Guess(
-        world_from_part=_array(group, "world_from_part"),
-        translation=_array(group, "translation"),
-        tilt=_number(group, "tilt"),
-        yaw=_number(group, "yaw"),
-        angle=_number(group, "angle") if "angle" in group else None,
-    )
-
-
-def _read_camera(name: str, group: h5py.Group) -> Camera:
-    return Camera(
-        name=name,
-        width=int(group["width"][()]),
-        height=int(group["height"][()]),
-        world_from_camera=_array(group, "world_from_camera"),
-        **{field: _number(group, field) for field in ("fx", "fy", "cx", "cy", "near", "far")},
+        world_from_part=array(group, "world_from_part"),
+        translation=array(group, "translation"),
+        tilt=number(group, "tilt"),
+        yaw=number(group, "yaw"),
+        angle=number(group, "angle") if "angle" in group else None,
     )
 
 
 def _read_probe(name: str, group: h5py.Group) -> Probe:
     return Probe(
         name=name,
-        command_times=_array(group, "command_times"),
-        command=_array(group, "command_world_from_peg"),
-        stiffness=_array(group, "stiffness"),
-        damping=_array(group, "damping"),
-        stamps=_array(group, "stamps"),
+        command_times=array(group, "command_times"),
+        command=array(group, "command_world_from_peg"),
+        stiffness=array(group, "stiffness"),
+        damping=array(group, "damping"),
+        stamps=array(group, "stamps"),
     )
 
 
@@ -334,11 +309,11 @@ def _read_measurement(
     if kind == "view":
         rgb = np.asarray(observation["rgb"][()], dtype=np.uint8) if "rgb" in observation else None
         camera = cameras[str(action.attrs["camera"])]
-        return Measurement(View(camera), DepthImage(_array(observation, "depth"), rgb))
-    touch = Touch(*(_array(observation, name) for name in ("times", "wrench", "world_from_peg")))
+        return Measurement(View(camera), DepthImage(array(observation, "depth"), rgb))
+    touch = Touch(*(array(observation, name) for name in ("times", "wrench", "world_from_peg")))
     if kind == "window":
         first, last = int(action.attrs["first"]), int(action.attrs["last"])
         return Measurement(ProbeWindow(probes[str(action.attrs["probe"])], first, last), touch)
     if kind == "push":
-        return Measurement(Push(_array(action, "times"), _array(action, "world_from_tip")), touch)
+        return Measurement(Push(array(action, "times"), array(action, "world_from_tip")), touch)
     raise ValueError(f"measurement {group.name} is of unknown kind {kind!r}")

@@ -1,0 +1,155 @@
+"""Brown's lens distortion, there and back, on the image plane z = 1.
+
+A point (x, y) at radius r is seen at x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), and
+likewise in y with p1 and p2 exchanged: Brown, Decentering distortion of lenses, 1966, in the order of
+OpenCV's calibration: k1 k2 p1 p2 k3. The way back has no closed form and is found by Newton's method.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from bcppl.errors import InputError
+
+Array = npt.NDArray[np.float64]
+
+LARGEST = 1e3  # on the plane z = 1: beyond it nothing is seen, and sixth powers stay finite
+MOST_STEPS = 50
+EXACT = 1e-12  # on the plane z = 1: a millionth of a millionth of the distance
+ALONG = 16  # points between the optical axis and a pixel at which a fold is looked for
+
+
+def coefficients(distortion: tuple[float, ...]) -> tuple[float, float, float, float, float]:
+    """The five coefficients k1 k2 p1 p2 k3, those that are not given 0.
+
+    Raises:
+        InputError: there are neither none nor four nor five, or one is not finite.
+    """
+    if len(distortion) not in (0, 4, 5) or not np.isfinite(distortion).all():
+        raise InputError(
+            f"the distortion {[float(f'{k:.4g}') for k in distortion]} is not Brown's k1 k2 p1 p2 (k3), four "
+            "or five finite numbers; calibrate with that model, or rectify the images."
+        )
+    k1, k2, p1, p2, k3 = (*distortion, *(0.0,) * (5 - len(distortion)))
+    return k1, k2, p1, p2, k3
+
+
+def distorted(plane: Array, distortion: tuple[float, ...]) -> Array:
+    """Where points (..., 2) of the plane z = 1 appear on it, (..., 2)."""
+    k1, k2, p1, p2, k3 = coefficients(distortion)
+    x, y = plane[..., 0], plane[..., 1]
+    square = x * x + y * y
+    radial = 1.0 + square * (k1 + square * (k2 + square * k3))
+    return np.stack(
+        [
+            x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x),
+            y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def _slopes(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array, Array]:
+    """Derivatives of `distorted`: of x by x, of x by y (and y by x: they are equal), of y by y."""
+    k1, k2, p1, p2, k3 = coefficients(distortion)
+    x, y = plane[..., 0], plane[..., 1]
+    square = x * x + y * y
+    radial = 1.0 + square * (k1 + square * (k2 + square * k3))
+    growth = 2.0 * (k1 + square * (2.0 * k2 + 3.0 * square * k3))
+    return (
+        radial + x * x * growth + 2.0 * p1 * y + 6.0 * p2 * x,
+        x * y * growth + 2.0 * p1 * x + 2.0 * p2 * y,
+        radial + y * y * growth + 6.0 * p1 * y + 2.0 * p2 * x,
+    )
+
+
+def unfolded(plane: Array, distortion: tuple[float, ...]) -> npt.NDArray[np.bool_]:
+    """Whether the image is not folded over anywhere between the optical axis and points (..., 2), (...,)."""
+    within = np.abs(plane).max(axis=-1) <= LARGEST
+    k1, k2, p1, p2, k3 = coefficients(distortion)
+    if p1 == p2 == 0.0:
+        # The radius r (1 + k1 r^2 + ...) turns back where its derivative first vanishes.
+        roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+        turns = roots[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)].real
+        return np.asarray(within & ((plane**2).sum(axis=-1) < min(turns, default=np.inf)))
+    # With tangential terms the lines to the points are walked, all points together.
+    for share in np.arange(1, ALONG + 1) / ALONG:
+        xx, xy, yy = _slopes(np.clip(plane, -LARGEST, LARGEST) * share, distortion)
+        within = within & (xx * yy - xy * xy > 0.0) & (xx + yy > 0.0)
+    return np.asarray(within)
+
+
+def undistorted(seen: Array, distortion: tuple[float, ...]) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """The points (..., 2) that appear at `seen` (..., 2), and where (...,) there is exactly one."""
+    plane = seen.copy()
+    for _ in range(MOST_STEPS):
+        error = distorted(plane, distortion) - seen
+        if float(np.abs(error).max(initial=0.0)) <= EXACT:
+            break
+        xx, xy, yy = _slopes(plane, distortion)
+        determinant = xx * yy - xy * xy
+        determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+        step_x = (yy * error[..., 0] - xy * error[..., 1]) / determinant
+        step_y = (xx * error[..., 1] - xy * error[..., 0]) / determinant
+        plane = np.clip(plane - np.stack([step_x, step_y], axis=-1), -LARGEST, LARGEST)
+    found = np.abs(distorted(plane, distortion) - seen).max(axis=-1) <= 1e3 * EXACT
+    return plane, found & unfolded(plane, distortion)
+
+
+@lru_cache(maxsize=16)
+def undistorted_rays(
+    width: int,
+    height: int,
+    intrinsics: tuple[float, float, float, float],
+    distortion: tuple[float, ...],
+) -> Array:
+    """Directions (height * width, 3) of the pixels, z = 1; worked out once for each set of numbers.
+
+    Args:
+        width: of the image, pixels.
+        height: of the image, pixels.
+        intrinsics: fx, fy, cx, cy, pixels.
+        distortion: k1 k2 p1 p2 (k3).
+
+    Raises:
+        InputError: the coefficients are none, or they fold the image over.
+    """
+    fx, fy, cx, cy = intrinsics
+    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    seen = np.stack([(u - cx) / fx, (v - cy) / fy], axis=-1).reshape(-1, 2)
+    plane, sound = undistorted(seen, distortion)
+    if not sound.all():
+        first = int(np.argmin(sound))
+        raise InputError(
+            f"the distortion {[float(f'{k:.4g}') for k in distortion]} folds the image over: "
+            f"{int((~sound).sum())} of {sound.size} pixels (column {first % width}, row {first // width} is "
+            "the first) see along no single ray; check the order k1 k2 p1 p2 k3, or calibrate with views "
+            "that reach the corners."
+        )
+    rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
+    rays.setflags(write=False)
+    return rays
+
+
+@lru_cache(maxsize=16)
+def pinhole_shifts(
+    width: int,
+    height: int,
+    intrinsics: tuple[float, float, float, float],
+    distortion: tuple[float, ...],
+) -> Array:
+    """How far (height, width, 2) a pinhole camera without distortion would see each pixel's ray away from it.
+
+    In pixels, u then v, with the arguments of `undistorted_rays`; a renderer bounds a part's outline by it.
+    """
+    fx, fy, cx, cy = intrinsics
+    rays = undistorted_rays(width, height, intrinsics, distortion)
+    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    shifts = np.stack(
+        [fx * rays[:, 0] + cx - u.reshape(-1), fy * rays[:, 1] + cy - v.reshape(-1)], axis=-1
+    ).reshape(height, width, 2)
+    shifts.setflags(write=False)
+    return shifts
