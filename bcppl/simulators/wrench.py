@@ -9,7 +9,7 @@ force measurements", section 3). Several contacts at once give one location, mea
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +23,7 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.recordings.measurements import Touch
+from bcppl.simulators.sensing.load import ToolLoad
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice
@@ -69,6 +70,8 @@ class Sensing:
             flatly that it would take more, it has passed beside the contact: the nearest edge is the contact.
         miss_tolerance: metres; where noise lets the line of action pass beside the peg by no more than this,
             the nearest point of the peg's convex hull is the contact; beyond it there is none.
+        load: the tool's mass and centre, whose weight a measured wrench holds; None where the sensor or the
+            arm has taken it off already. A simulated wrench never holds it.
     """
 
     peg: Part
@@ -78,6 +81,7 @@ class Sensing:
     force: float = 3.0
     friction: float = 1.0
     miss_tolerance: float = 0.002
+    load: ToolLoad | None = None
 
     def __post_init__(self) -> None:
         if not self.rate > 0 or self.tare < 0 or not self.force > 0 or self.miss_tolerance < 0:
@@ -253,23 +257,42 @@ class Sensing:
         """Contact locations (T, 3) in the peg's frame, its poses (T, 7), of consecutive windows of one probe.
 
         The first window must be the probe's first, for it holds the samples that the sensor's zero is taken
-        from; the filter is carried from window to window.
+        from; the filter is carried from window to window. The tool's weight is taken off first.
 
         Raises:
-            InputError: a window's samples are not `rate` per second within 2 %, or its arrays do not fit.
+            InputError: a window's samples are not `rate` per second within 2 %, its arrays do not fit, or its
+                torques are in N mm.
         """
         state, measured = self.start(1), []
         for k, touch in enumerate(touches):
-            if touch.wrench.shape != (len(touch.times), 6) or touch.world_from_peg.shape != (
-                len(touch.times),
-                7,
-            ):
-                raise InputError(
-                    f"window {k} has {len(touch.times)} times, wrenches {touch.wrench.shape} and peg poses "
-                    f"{touch.world_from_peg.shape}; give (T,), (T, 6) and (T, 7)."
-                )
-            self.check_rate(touch.times, f"window {k}")
-            locations, state = self.contacts(touch.wrench[None].astype(np.float64), state)
+            locations, state = self.contacts(self._weightless(touch, f"window {k}")[None], state)
             pose = torch.from_numpy(np.array(touch.world_from_peg, dtype=np.float64))
             measured.append((torch.from_numpy(locations[0]), pose))
         return measured
+
+    def tared(self, touches: Sequence[Touch]) -> list[Tensor]:
+        """The wrench (T, 6) of the same windows, free of the tool's weight and tared but not filtered.
+
+        NaN while taring: what `bcppl.distributions.wrench.Wrench` compares with the simulated one.
+
+        Raises:
+            InputError: as for `measure`.
+        """
+        plain = replace(self, cutoff=None)
+        state, measured = plain.start(1), []
+        for k, touch in enumerate(touches):
+            cleaned, state = plain.clean(self._weightless(touch, f"window {k}")[None], state)
+            measured.append(torch.from_numpy(cleaned[0]))
+        return measured
+
+    def _weightless(self, touch: Touch, name: str) -> Array:
+        """A window's wrench (T, 6), checked, without the tool's weight."""
+        count = len(touch.times)
+        if touch.wrench.shape != (count, 6) or touch.world_from_peg.shape != (count, 7):
+            raise InputError(
+                f"{name} has {count} times, wrenches {touch.wrench.shape} and peg poses "
+                f"{touch.world_from_peg.shape}; give (T,), (T, 6) and (T, 7)."
+            )
+        self.check_rate(touch.times, name)
+        wrench = touch.wrench.astype(np.float64)
+        return wrench if self.load is None else wrench - self.load.weight(touch.world_from_peg)

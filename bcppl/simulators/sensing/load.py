@@ -1,0 +1,212 @@
+"""The weight of what hangs on a wrench sensor: taken off a measured wrench, and identified from static poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from bcppl.errors import InputError
+
+Array = npt.NDArray[np.float64]
+
+STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
+FARTHEST_CENTER = 2.0  # m: a centre farther than this from the sensor comes from torques in N mm
+TURNED = 0.05  # the least singular value, over the largest, of gravity's directions that tell the load apart
+
+
+@dataclass(frozen=True)
+class ToolLoad:
+    """Everything below the sensor, as gravity sees it.
+
+    Attributes:
+        mass: kg.
+        center: (3,) the centre of mass in the sensor's frame, metres: the peg's frame where wrenches are in it.
+        gravity: (3,) in the world, m/s^2.
+    """
+
+    mass: float
+    center: tuple[float, float, float]
+    gravity: tuple[float, float, float] = STANDARD_GRAVITY
+
+    def __post_init__(self) -> None:
+        center = np.asarray(self.center, dtype=np.float64)
+        if not (np.isfinite(self.mass) and self.mass >= 0) or center.shape != (3,):
+            raise InputError(
+                f"a tool's load has mass {self.mass!r} and centre {self.center!r}; "
+                "give kg, 0 or more, and three metres."
+            )
+        if not np.linalg.norm(center) <= FARTHEST_CENTER:
+            raise InputError(
+                f"a tool's centre of mass is {np.linalg.norm(center):.3g} m from the sensor; "
+                "give it in metres, in the sensor's frame."
+            )
+        _check_gravity(self.gravity)
+
+    def weight(self, world_from_sensor: Array) -> Array:
+        """Force and torque (..., 6) of the weight, in the sensor's frame about its origin, at poses (..., 7).
+
+        Only the orientation matters. The tool is taken to be at rest: what it takes to accelerate it stays in
+        the wrench.
+
+        Raises:
+            InputError: the poses do not end in seven finite numbers.
+        """
+        force = self.mass * gravity_in(world_from_sensor, self.gravity)
+        center = np.asarray(self.center, dtype=np.float64)
+        return np.concatenate([force, np.cross(center, force)], axis=-1)
+
+
+def gravity_in(world_from_sensor: Array, gravity: tuple[float, float, float] = STANDARD_GRAVITY) -> Array:
+    """Gravity (..., 3) in the axes of sensors at poses (..., 7), m/s^2.
+
+    Raises:
+        InputError: the poses do not end in seven finite numbers.
+    """
+    pose = np.asarray(world_from_sensor, dtype=np.float64)
+    if pose.ndim == 0 or pose.shape[-1] != 7 or not np.isfinite(pose).all():
+        raise InputError(
+            f"the sensor's poses have shape {pose.shape} or are not finite; "
+            "give x y z qw qx qy qz in the last dimension."
+        )
+    if pose.size == 0:
+        return np.empty((*pose.shape[:-1], 3))
+    turn = Rotation.from_quat(pose.reshape(-1, 7)[:, [4, 5, 6, 3]])
+    return np.asarray(turn.inv().apply(gravity)).reshape(*pose.shape[:-1], 3)
+
+
+def in_frame(wrench: Array, to_from_from: Array) -> Array:
+    """Wrenches (..., 6) of one frame, about its origin, in another's: say from the sensor's to the peg's.
+
+    Args:
+        wrench: force and torque (..., 6).
+        to_from_from: (7,) the pose that takes from the wrench's frame to the other: `peg_from_sensor`.
+
+    Raises:
+        InputError: the shapes do not fit.
+    """
+    wrench, pose = np.asarray(wrench, dtype=np.float64), np.asarray(to_from_from, dtype=np.float64)
+    if wrench.ndim == 0 or wrench.shape[-1] != 6 or pose.shape != (7,):
+        raise InputError(
+            f"wrenches have shape {wrench.shape} and the pose {pose.shape}; give (..., 6) and (7,)."
+        )
+    turn = Rotation.from_quat(pose[[4, 5, 6, 3]]).as_matrix()
+    force = wrench[..., :3] @ turn.T
+    return np.concatenate([force, wrench[..., 3:] @ turn.T + np.cross(pose[:3], force)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedLoad:
+    """What static poses say of a tool.
+
+    Attributes:
+        load: mass and centre of mass.
+        bias: (6,) what the sensor reads without any load, N and N m.
+        covariance: (10, 10) of mass (kg), centre (m) and bias (N, N m), in this order.
+        noise: standard deviations of a reading about the fit, N and N m.
+        readings: how many poses there were.
+    """
+
+    load: ToolLoad
+    bias: Array
+    covariance: Array
+    noise: tuple[float, float]
+    readings: int
+
+    @property
+    def spread(self) -> Array:
+        """Standard deviations (10,) of mass, centre and bias."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+
+def identify_load(
+    wrench: Array, world_from_sensor: Array, gravity: tuple[float, float, float] = STANDARD_GRAVITY
+) -> IdentifiedLoad:
+    """Mass, centre of mass and the sensor's bias, from readings at rest and free of contact.
+
+    With g the gravity in the sensor's axes, force = m g + bias and torque = (m c) x g + bias are linear in m,
+    m c and the biases: two least squares, their noise from their residuals. The centre is m c over m, its
+    covariance to first order. Poses tilted about two axes by 30 degrees or more are enough; six to ten, each
+    the mean of a second, are usual. Readings that share an error (a cable that pulls) are not that certain.
+
+    Args:
+        wrench: (K, 6) raw readings, force (N) and torque (N m) that the tool's weight exerts on the sensor,
+            in the sensor's frame about its origin.
+        world_from_sensor: (K, 7) where the sensor was.
+        gravity: (3,) in the world, m/s^2.
+
+    Raises:
+        InputError: fewer than four readings, numbers that are not finite, poses that are not tilted enough, a
+            force with the wrong sign, or torques in N mm.
+    """
+    wrench = np.asarray(wrench, dtype=np.float64)
+    pose = np.asarray(world_from_sensor, dtype=np.float64)
+    if wrench.ndim != 2 or wrench.shape[1:] != (6,) or pose.shape != (len(wrench), 7):
+        raise InputError(
+            f"static readings have shapes {wrench.shape} and {pose.shape}; give (K, 6) and (K, 7)."
+        )
+    if len(wrench) < 4:
+        raise InputError(
+            f"{len(wrench)} static readings do not tell a load from a bias; give four or more, "
+            "tilted about different axes."
+        )
+    if not np.isfinite(wrench).all():
+        raise InputError("a static reading holds a wrench that is not finite; leave it out.")
+    _check_gravity(gravity)
+    pulls = gravity_in(pose, gravity)
+    values = np.linalg.svd(pulls - pulls.mean(axis=0), compute_uv=False) / np.sqrt(len(pulls))
+    # Gravity that only moves along one line leaves the centre's place on it open.
+    if values[1] < TURNED * np.linalg.norm(gravity):
+        raise InputError(
+            "the static readings hold the sensor at nearly the same tilt, or tilted about one axis only by "
+            "little; add readings tilted by 30 degrees or more about two axes."
+        )
+    count, unit = len(pulls), np.tile(np.eye(3), (len(pulls), 1))
+    forces = np.column_stack([pulls.reshape(-1), unit])
+    # (m c) x g = -[g]x (m c)
+    crossed = np.stack([np.cross(axis, pulls) for axis in np.eye(3)], axis=-1).reshape(-1, 3)
+    torques = np.column_stack([crossed, unit])
+    (mass, *force_bias), force_covariance, force_noise = _least_squares(forces, wrench[:, :3].reshape(-1))
+    solution, torque_covariance, torque_noise = _least_squares(torques, wrench[:, 3:].reshape(-1))
+    if mass <= 0:
+        raise InputError(
+            f"the static readings give a mass of {mass:.3g} kg; the forces have the wrong sign or too little "
+            "load: give what the weight exerts on the sensor."
+        )
+    center = solution[:3] / mass
+    if not np.linalg.norm(center) <= FARTHEST_CENTER:
+        raise InputError(
+            f"the static readings put the centre of mass {np.linalg.norm(center):.0f} m from the sensor: "
+            "the torques are probably in N mm; scale them by 0.001."
+        )
+    # From (mass, force bias) and (m c, torque bias) to mass, centre and bias.
+    turn = np.zeros((10, 10))
+    turn[0, 0] = 1.0
+    turn[1:4, 0], turn[1:4, 4:7] = -center / mass, np.eye(3) / mass
+    turn[4:7, 1:4], turn[7:, 7:] = np.eye(3), np.eye(3)
+    apart = np.zeros((10, 10))
+    apart[:4, :4], apart[4:, 4:] = force_covariance, torque_covariance
+    load = ToolLoad(float(mass), (float(center[0]), float(center[1]), float(center[2])), gravity)
+    return IdentifiedLoad(
+        load,
+        np.concatenate([force_bias, solution[3:]]),
+        turn @ apart @ turn.T,
+        (force_noise, torque_noise),
+        count,
+    )
+
+
+def _least_squares(design: Array, seen: Array) -> tuple[Array, Array, float]:
+    """Solution, its covariance, and the noise's standard deviation from the residuals."""
+    solution = np.linalg.lstsq(design, seen, rcond=None)[0]
+    residual = seen - design @ solution
+    variance = float(residual @ residual) / (len(seen) - design.shape[1])
+    return solution, variance * np.linalg.inv(design.T @ design), float(np.sqrt(variance))
+
+
+def _check_gravity(gravity: tuple[float, float, float]) -> None:
+    size = float(np.linalg.norm(gravity))
+    if np.shape(gravity) != (3,) or not 0 < size < np.inf:
+        raise InputError(f"gravity is {gravity!r}; give three m/s^2 in the world, (0, 0, -9.80665), say.")
