@@ -1,0 +1,296 @@
+"""A depth image of parts at poses: all but the density of one pixel."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.depth.observed import KEPT, Observed
+from bcppl.distributions.depth.rendering import Array, Mask, RendersDepth
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.errors import InputError
+
+if TYPE_CHECKING:
+    from bcppl.simulators.camera import Camera
+
+
+class DepthDistribution(LazyDistribution):
+    """A depth image whose pixels are independent given the poses, the camera's error and its bias.
+
+    Neighbouring pixels err together. With `effective_pixels` the likelihood is raised to the power
+    min(1, effective_pixels / number of valid pixels in the region), with `temperature` to 1 / temperature,
+    the same for all particles. A power other than 1 makes it a power likelihood: no density of the image, and
+    evidence containing it is a surrogate's. A latent `camera_error` and `bias` carry what pixels have in
+    common by a density instead.
+
+    Args:
+        renderer: renders the part, or several.
+        camera: where the image is said to be taken; its range says which pixels are missing.
+        pose: (N, 7) `world_from_part`; (N, K, 7) for a renderer of K parts.
+        scale: of the noise, metres; what it is exactly, the distribution says.
+        background: (H, W) metres, depth of what else stands in view; NaN, 0 or None where unknown. With a
+            bias it is taken for where things are: one that the same sensor measured holds its bias already.
+        effective_pixels: how many independent pixels the image is worth; None for all.
+        region: (H, W) pixels that count at all; None for all.
+        temperature: what the log-likelihood is divided by, instead of `effective_pixels`.
+        camera_error: (N, 7) or (7,) `stated_camera_from_camera`: where the camera really stands, seen from
+            where it is said to stand. What it moves, a background image does not say: render the background
+            as a part of the scene.
+        bias: (N,) or one for all, metres that are added to every rendered depth, the background's too.
+
+    Raises:
+        InputError: a shape does not fit; the scale, effective_pixels, temperature or sensor's range is not
+            positive; both effective_pixels and temperature, or both camera_error and background are given.
+    """
+
+    cost = 1
+
+    def __init__(
+        self,
+        renderer: RendersDepth,
+        camera: Camera,
+        pose: Tensor,
+        scale: float,
+        background: Array | Tensor | None = None,
+        effective_pixels: float | None = None,
+        region: Mask | Tensor | None = None,
+        *,
+        temperature: float | None = None,
+        camera_error: Tensor | None = None,
+        bias: Tensor | float = 0.0,
+    ) -> None:
+        shape = (camera.height, camera.width)
+        _check_shapes(renderer, camera, pose, camera_error, bias)
+        if not (math.isfinite(scale) and scale > 0.0):
+            raise InputError(f"the scale of the depth noise is {scale}; give a positive length in metres.")
+        if effective_pixels is not None and not effective_pixels > 0.0:
+            raise InputError(
+                f"effective_pixels is {effective_pixels}; give a positive number, or None for all."
+            )
+        if temperature is not None and not (math.isfinite(temperature) and temperature > 0.0):
+            raise InputError(f"temperature is {temperature}; give a positive number, or None for 1.")
+        if temperature is not None and effective_pixels is not None:
+            raise InputError(
+                "both effective_pixels and temperature are given, and each says how much the image is worth; "
+                "give one of them."
+            )
+        if not camera.far > camera.near >= 0.0:
+            raise InputError(
+                f"camera {camera.name!r} has the range {camera.near} to {camera.far} m; give 0 <= near < far."
+            )
+        for name, array in (("background", background), ("region", region)):
+            if array is not None and tuple(array.shape) != shape:
+                raise InputError(
+                    f"the {name} of camera {camera.name!r} has shape {tuple(array.shape)}; "
+                    f"give one of its image's, {shape}."
+                )
+        if camera_error is not None and background is not None:
+            raise InputError(
+                f"camera {camera.name!r} is given both a camera_error and a background image, which was "
+                "rendered where the camera is said to stand; leave the background out, or render it as a "
+                "part of the scene (bcppl.simulators.scene.background_part)."
+            )
+        latent = tuple(x for x in (camera_error, bias) if isinstance(x, Tensor))
+        super().__init__(len(pose), shape, inputs=(pose, *latent))
+        self.renderer = renderer
+        self.camera = camera
+        self.pose = pose
+        self.scale = float(scale)
+        self.effective_pixels = effective_pixels
+        self.temperature = temperature
+        self.background = background
+        self.region = region
+        self.camera_error = camera_error
+        self.bias = bias
+        self._log_uniform = -math.log(camera.far - camera.near)
+
+    # ---- what a subclass says
+
+    @property
+    def _parameters(self) -> tuple[Any, ...]:
+        """All that the density of a pixel hangs on beside what is observed and rendered there."""
+        camera = self.camera
+        return (type(self), camera.near, camera.far, self.scale, self.effective_pixels, self.temperature)
+
+    def _log_density(self, depth: Tensor, rendered: Tensor) -> Tensor:
+        """Log-density of pixels that read `depth` where `rendered` is rendered, metres."""
+        raise NotImplementedError
+
+    def _noisy(self, rendered: Tensor) -> Tensor:
+        """Draws of pixels at which the depth `rendered` is known, metres."""
+        return torch.distributions.Laplace(rendered, self.scale).sample()
+
+    # ---- what is the same for all
+
+    @cached_property
+    def _behind(self) -> Array:
+        """The depth of the background, (H * W,): +inf where unknown, so that the nearer is the minimum."""
+        if self.background is None:
+            return np.full(self.camera.height * self.camera.width, np.inf)
+        behind = np.asarray(self.background, dtype=np.float64).reshape(-1)
+        return np.where(np.isfinite(behind) & (behind > 0.0), behind, np.inf)
+
+    @cached_property
+    def seen_pose(self) -> Tensor:
+        """Where the parts would look the same from where the camera is said to stand, as `pose`."""
+        pose = self.pose.detach()
+        if self.camera_error is None:
+            return pose
+        stated = torch.as_tensor(self.camera.world_from_camera, dtype=torch.float64)
+        error = poses.inverse(self.camera_error.detach().to(torch.float64))
+        moved = poses.compose(poses.compose(stated, error), poses.inverse(stated))
+        return poses.compose(moved if pose.ndim == 2 else moved[..., None, :], pose)
+
+    @cached_property
+    def _biases(self) -> Array | None:
+        """The biases (N,), metres; None where there is none."""
+        if not isinstance(self.bias, Tensor) and self.bias == 0.0:
+            return None
+        bias = torch.as_tensor(self.bias, dtype=torch.float64).detach()
+        return np.ascontiguousarray(bias.expand(len(self.pose)).numpy())
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-probability (N,) of a depth image (H, W), or of one for each particle (N, H, W).
+
+        Raises:
+            InputError: a pose, a camera's error or a bias is not finite, or the image has another shape.
+        """
+        self._check_finite()
+        seen = self.observed(value)
+        hits = self.renderer.hits(self.camera, self.seen_pose, counted=np.asarray(seen.valid.any(axis=0)))
+        pixel = hits.pixel
+        behind = seen.behind.take(pixel)
+        rendered = np.minimum(hits.depth, behind)
+        several = len(seen.depth) > 1
+        if several:
+            pixel = pixel + hits.particle * seen.depth.shape[1]
+        depth = torch.from_numpy(seen.depth.take(pixel))
+        if self._biases is None:
+            gain = self._log_density(depth, torch.from_numpy(rendered)).numpy()
+            gain -= seen.empty.take(pixel)
+            total = seen.emptiness
+        else:
+            shift = self._biases.take(hits.particle)
+            gain = self._log_density(depth, torch.from_numpy(rendered + shift)).numpy()
+            known = np.isfinite(behind)
+            without = np.where(known, behind + shift, 0.0)
+            gain -= np.where(
+                known, self._log_density(depth, torch.from_numpy(without)).numpy(), self._log_uniform
+            )
+            total = seen.biased(self._log_density, self._log_uniform, self._biases)
+        if several:
+            gain = np.where(seen.valid.take(pixel), gain, 0.0)
+        gains = np.bincount(hits.particle, weights=gain, minlength=len(self.pose))
+        return torch.from_numpy(seen.power * (total + gains))
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """One depth image for each particle, (N, H, W), metres, with no pixel missing.
+
+        Where the ray misses the part and the background is unknown, the pixel is uniform over the sensor's
+        range. Noise may push a pixel out of the range, where `log_prob` takes it for missing. A power
+        (`effective_pixels`, `temperature`) does not change the draws.
+
+        Raises:
+            InputError: a pose, a camera's error or a bias is not finite, or a sample_shape was asked for.
+        """
+        if torch.Size(sample_shape) != torch.Size():
+            raise InputError(
+                f"{type(self).__name__} draws one image for each particle; ask for no sample_shape, "
+                "or make it with more particles."
+            )
+        self._check_finite()
+        images = torch.from_numpy(self.renderer.images(self.camera, self.seen_pose))
+        rendered = torch.minimum(images, torch.from_numpy(self._behind).reshape(self.event_shape))
+        unknown = torch.isinf(rendered)
+        if self._biases is not None:
+            rendered = rendered + torch.from_numpy(self._biases)[:, None, None]
+        noisy = self._noisy(torch.where(unknown, 0.0, rendered))
+        return torch.where(unknown, self._uniform(rendered), noisy)
+
+    def _uniform(self, like: Tensor) -> Tensor:
+        return self.camera.near + (self.camera.far - self.camera.near) * torch.rand_like(like)
+
+    def observed(self, value: Tensor) -> Observed:
+        """What a depth image (H, W), or one for each particle (N, H, W), says without any pose.
+
+        Raises:
+            InputError: the image has another shape.
+        """
+        cached: Observed | None = KEPT.get(value)
+        if (
+            cached is not None
+            and cached.version == value._version
+            and cached.parameters == self._parameters
+            and cached.background is self.background
+            and cached.region is self.region
+        ):
+            return cached
+        batch = (self.batch_shape[0], *self.event_shape)
+        if value.shape not in (self.event_shape, torch.Size(batch)):
+            raise InputError(
+                f"a depth image of camera {self.camera.name!r} has shape {tuple(value.shape)}; "
+                f"give {tuple(self.event_shape)}, or {batch} for one image per particle."
+            )
+        depth = value.detach().to(torch.float64).reshape(-1, self._behind.size).numpy()
+        valid = np.isfinite(depth) & (depth > 0.0) & (depth >= self.camera.near) & (depth <= self.camera.far)
+        if self.region is not None:
+            valid &= np.asarray(self.region, dtype=bool).reshape(-1)
+        known = np.isfinite(self._behind)
+        behind = torch.from_numpy(np.where(known, self._behind, 0.0))
+        shown = self._log_density(torch.from_numpy(depth), behind).numpy()
+        empty = np.where(valid, np.where(known, shown, self._log_uniform), 0.0)
+        power = np.ones(len(depth))
+        if self.effective_pixels is not None:
+            power = np.minimum(1.0, self.effective_pixels / np.maximum(valid.sum(axis=1), 1))
+        elif self.temperature is not None:
+            power = power / self.temperature
+        read = (self._parameters, self.background, self.region)
+        observed = Observed(value._version, *read, self._behind, depth, valid, empty, power)
+        KEPT[value] = observed
+        return observed
+
+    def _check_finite(self) -> None:
+        count = len(self.pose)
+        latent = {"pose": self.pose, "camera error": self.camera_error, "bias": self.bias}
+        for what, value in latent.items():
+            if value is None:
+                continue
+            each = torch.as_tensor(value)
+            each = each.expand(count, *each.shape[1 if len(each.shape) and len(each) == count else 0 :])
+            bad = torch.nonzero(~torch.isfinite(each.reshape(count, -1)).all(dim=-1)).flatten().tolist()
+            if bad:
+                shown = ", ".join(map(str, bad[:10])) + (", ..." if len(bad) > 10 else "")
+                raise InputError(
+                    f"{len(bad)} of {count} particles have a {what} that is not finite "
+                    f"(particles {shown}) and cannot be seen by camera {self.camera.name!r}; "
+                    "look at what proposed them."
+                )
+
+
+def _check_shapes(
+    renderer: RendersDepth, camera: Camera, pose: Tensor, camera_error: Tensor | None, bias: Tensor | float
+) -> None:
+    parts = getattr(renderer, "parts", None)
+    wanted = (7,) if parts is None else (len(parts), 7)
+    if pose.ndim != 1 + len(wanted) or pose.shape[1:] != wanted:
+        each = "one world_from_part" if parts is None else f"a world_from_part of each of {len(parts)} parts"
+        raise InputError(
+            f"the pose of a depth image has shape {tuple(pose.shape)}; "
+            f"give {('N', *wanted)}, {each} per particle.".replace("'", "")
+        )
+    if camera_error is not None and tuple(camera_error.shape) not in ((7,), (len(pose), 7)):
+        raise InputError(
+            f"the camera_error of camera {camera.name!r} has shape {tuple(camera_error.shape)}; "
+            f"give ({len(pose)}, 7), one stated_camera_from_camera per particle."
+        )
+    if isinstance(bias, Tensor) and tuple(bias.shape) not in ((), (len(pose),)):
+        raise InputError(
+            f"the bias of camera {camera.name!r} has shape {tuple(bias.shape)}; "
+            f"give ({len(pose)},), metres, one per particle."
+        )

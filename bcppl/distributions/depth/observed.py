@@ -1,0 +1,94 @@
+"""What a depth image says without any pose: read once, kept with the image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
+
+from bcppl.distributions.depth.rendering import Array, Mask
+
+MOST_TOTALS = 100_000  # biases whose totals are kept
+AT_ONCE = 1 << 17  # pixels whose densities are worked out together: they then stay in the cache
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """What an observation alone says, computed once for all particles.
+
+    Attributes:
+        version: of the observation, (H, W) or (N, H, W); changes when the tensor is written to.
+        parameters: those of the distribution that read it; so are background and region.
+        background: (H, W) metres as it was given, or None.
+        region: (H, W) as it was given, or None.
+        behind: the depth of the background, +inf where unknown, (H * W,).
+        depth: its pixels, (1 or N, H * W).
+        valid: which of them count, (1 or N, H * W).
+        empty: their log-density where no ray meets the part, 0 where they do not count, (1 or N, H * W).
+        power: what the log-likelihood is multiplied by, (1 or N,).
+        totals: log-density of one image without the part, by the bias of the range.
+    """
+
+    version: int
+    parameters: tuple[Any, ...]
+    background: Array | Tensor | None
+    region: Mask | Tensor | None
+    behind: Array
+    depth: Array
+    valid: Mask
+    empty: Array
+    power: Array
+    totals: dict[float, float] = field(default_factory=dict)
+
+    @cached_property
+    def emptiness(self) -> Array:
+        """The log-density of each image where no ray meets the part and there is no bias, (1 or N,)."""
+        return np.asarray(self.empty.sum(axis=1))
+
+    def biased(
+        self, log_density: Callable[[Tensor, Tensor], Tensor], log_uniform: float, bias: Array
+    ) -> Array:
+        """The log-density (N,) of the image without the part, its background farther by biases (N,).
+
+        Each bias is worked out once: particles that were moved otherwise, or copied, keep theirs.
+        """
+        if len(self.depth) > 1:
+            return np.array(
+                [self._total(k, log_density, log_uniform, [b])[0] for k, b in enumerate(bias.tolist())]
+            )
+        unknown = sorted({b for b in bias.tolist() if b not in self.totals})
+        if unknown:
+            if len(self.totals) + len(unknown) > MOST_TOTALS:
+                self.totals.clear()
+                unknown = sorted(set(bias.tolist()))
+            self.totals.update(zip(unknown, self._total(0, log_density, log_uniform, unknown), strict=True))
+        return np.array([self.totals[b] for b in bias.tolist()])
+
+    def _total(
+        self,
+        image: int,
+        log_density: Callable[[Tensor, Tensor], Tensor],
+        log_uniform: float,
+        biases: list[float],
+    ) -> list[float]:
+        """The log-density of one image without the part, at each of some biases."""
+        known = np.flatnonzero(self.valid[image] & np.isfinite(self.behind))
+        nothing = log_uniform * float(self.valid[image].sum() - len(known))
+        depth = torch.from_numpy(self.depth[image].take(known))
+        behind = torch.from_numpy(self.behind.take(known))
+        totals: list[float] = []
+        rows = max(1, AT_ONCE // max(len(known), 1))
+        for first in range(0, len(biases), rows):
+            shift = torch.tensor(biases[first : first + rows], dtype=torch.float64)[:, None]
+            totals += (log_density(depth, behind + shift).sum(dim=1) + nothing).tolist()
+        return totals
+
+
+# Every run of a program makes its distributions anew, at other poses: what an image says is kept with it.
+KEPT: WeakTensorKeyDictionary = WeakTensorKeyDictionary()

@@ -1,0 +1,45 @@
+"""What a depth likelihood asks of a renderer, which it is given and does not import."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from bcppl.simulators.camera import Camera
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+
+class PixelHits(Protocol):
+    """The pixels that see a part, for N particles: one entry for each (particle, pixel)."""
+
+    @property
+    def particle(self) -> npt.NDArray[np.int64]:
+        """(M,) which particle."""
+
+    @property
+    def pixel(self) -> npt.NDArray[np.int64]:
+        """(M,) which pixel, v * width + u."""
+
+    @property
+    def depth(self) -> Array:
+        """(M,) depth along the optical axis, metres."""
+
+
+class RendersDepth(Protocol):
+    """A simulator of depth images, such as `bcppl.simulators.renderer.DepthRenderer`.
+
+    One that renders K parts together has them in its attribute `parts` and takes poses (N, K, 7), as
+    `bcppl.simulators.scene.SceneRenderer` does.
+    """
+
+    def hits(self, camera: Camera, world_from_part: Tensor, counted: Mask | None = None) -> PixelHits:
+        """What the camera sees of the part at poses (N, 7), at the counted pixels (H * W,) only."""
+
+    def images(self, camera: Camera, world_from_part: Tensor) -> Array:
+        """Depth images (N, H, W) in metres, +inf where a pixel does not see the part."""
