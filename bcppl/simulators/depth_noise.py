@@ -116,8 +116,8 @@ class DepthNoise:
 
 
 # Intel's D435 at 848 pixels: a focal length of 424 pixels (90 degrees), a baseline of 50 mm, a disparity that
-# is right to 0.08 of a pixel and read in steps of 1/32: Grunnet-Jepsen, Sweetser and Woodfill, Tuning depth
-# cameras for best performance, and Subpixel linearity improvement for Intel RealSense depth camera D400 series.
+# is right to 0.08 of a pixel and read in steps of 1/32. Grunnet-Jepsen, Sweetser and Woodfill: Tuning depth
+# cameras for best performance; Subpixel linearity improvement for Intel RealSense depth camera D400 series.
 REALSENSE_D435 = DepthNoise(
     scale=0.0,
     growth=0.08 / (424.0 * 0.05),
@@ -127,8 +127,8 @@ REALSENSE_D435 = DepthNoise(
     dropout=0.02,
 )
 
-# Axial noise of the first Kinect for angles up to 60 degrees, 1.2 mm + 1.9 mm (z/m - 0.4)^2: Nguyen, Izadi and
-# Lovell, Modeling Kinect sensor noise for improved 3D reconstruction and tracking, 3DIMPVT 2012, section 2. Its
+# Axial noise of the first Kinect up to 60 degrees, 1.2 mm + 1.9 mm (z/m - 0.4)^2: Nguyen, Izadi and Lovell,
+# Modeling Kinect sensor noise for improved 3D reconstruction and tracking, 3DIMPVT 2012, section 2. Its
 # disparity of 580 pixels x 75 mm is read in eighths: Khoshelham and Elberink, Sensors 12, 2012.
 KINECT = DepthNoise(
     scale=0.0012,
