@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.inference.chains import Chains
@@ -135,10 +136,7 @@ def _posed(population: Population, posterior: dict[str, Tensor]) -> list[str]:
 def _of_chains(arviz: Any, chains: Chains, draws: int | None) -> Any:
     recorded = min((len(states) for states in chains.draws.values()), default=0)
     draws = recorded if draws is None else draws
-    if not 1 <= draws <= recorded:
-        raise InputError(
-            f"{draws} draws were asked for of chains with {recorded} states; give 1 to that many."
-        )
+    draws = whole_number(f"{{}} draws were asked for of chains with {recorded} states", draws, most=recorded)
     last = Population(chains.trace, torch.zeros(len(chains.trace), dtype=torch.float64))
     # Chains are recorded move by move.
     posterior = {address: states[-draws:].movedim(1, 0) for address, states in chains.draws.items()}
@@ -174,9 +172,13 @@ def import_arviz() -> Any:
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Torch's generator started from a seed within, and put back afterwards."""
+    """Torch's generator started from a seed within, and put back afterwards.
+
+    Raises:
+        InputError: the seed is no whole number from 0 on.
+    """
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(seed_number(seed))
         yield
 
 
@@ -208,12 +210,10 @@ def draw(populations: Sequence[Population], draws: int | None, scheme: Scheme = 
     """Which particles equal-weight draws are, (draws,) int64 for each population, in random order.
 
     Raises:
-        InputError: `draws` is below 1.
+        InputError: `draws` is no whole number, 1 or more.
         InferenceError: no particle of a population has any weight.
     """
-    draws = min(map(len, populations)) if draws is None else draws
-    if draws < 1:
-        raise InputError(f"{draws} draws were asked for; give 1 or more.")
+    draws = min(map(len, populations)) if draws is None else whole_number("{} draws were asked for", draws)
     # A scheme gives ancestors in order; draws in order would look like a chain that does not mix.
     return [scheme(population.log_weights, draws)[torch.randperm(draws)] for population in populations]
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.inference.kernels import Kernel, fitted, put, refuse_other
 from bcppl.inference.population import Population
@@ -15,6 +16,7 @@ from bcppl.inference.progress import watched
 from bcppl.inference.schemes import Scheme, systematic
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace
+from bcppl.traces.shown import shapes
 
 
 class Chains(NamedTuple):
@@ -29,6 +31,13 @@ class Chains(NamedTuple):
     draws: Mapping[str, Tensor]
     acceptance: Tensor
     trace: Trace
+
+    def __repr__(self) -> str:
+        recorded = min((len(states) for states in self.draws.values()), default=0)
+        return (
+            f"Chains({len(self.acceptance)} chains, {recorded} recorded states, "
+            f"acceptance {float(self.acceptance.mean()):.3f}, draws: {shapes(self.draws)})"
+        )
 
 
 def markov_chains(
@@ -59,16 +68,16 @@ def markov_chains(
         progress: show a bar, on a terminal or in a notebook.
 
     Raises:
-        InputError: what is given is no kernel, no moves, or an address is not latent.
+        InputError: what is given is no kernel, no whole number of moves, or an address is not latent.
     """
     refuse_other("markov_chains", kernel)
+    moves = whole_number("chains are to make {} moves", moves)
+    every = whole_number("chains are to be recorded every {} moves", every)
     population = start if isinstance(start, Population) else _equal(start)
     weights = population.log_weights
     if scheme is not None and bool((weights != weights[0]).any()):
         population = population.selected(scheme(weights))
     trace, count = population.trace, len(population)
-    if moves < 1 or every < 1:
-        raise InputError(f"chains are to make {moves} moves, recorded every {every}; give 1 or more of each.")
     addresses = [addresses] if isinstance(addresses, str) else addresses
     recorded = list(trace.choices if addresses is None else addresses)
     for address in recorded:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, overload
 
@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from bcppl.beliefs import Belief, normalised
-from bcppl.distributions.support import freedom_of
+from bcppl.distributions.support import freedom_of, refuse_several_poses
 from bcppl.errors import InferenceError, InputError
 from bcppl.poses import FREE
 from bcppl.traces import Trace
+from bcppl.traces.indexing import Index, particles_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +26,12 @@ class Population:
     their weights.
 
     Raises:
-        InputError: there are founders, but not one for each particle.
+        InputError: the trace is none, the log weights are not N numbers below +inf, or there are founders,
+            but not one for each particle.
 
     Attributes:
         trace: of N particles.
-        log_weights: (N,) unnormalised, float64.
+        log_weights: (N,) unnormalised, float64 (made so, if they are of another type); -inf is no weight.
         log_evidence: log of the estimated evidence of all measurements so far; by default the log of the mean
             weight, which is right for what `generate` returns.
         founders: (N,) int64, the particle of the first population that each descends from; by default
@@ -45,6 +47,7 @@ class Population:
     log_pairs: float = math.nan
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "log_weights", _checked(self.trace, self.log_weights))
         if math.isnan(self.log_evidence):
             object.__setattr__(self, "log_evidence", _log_mean(self.log_weights))
         if len(self.founders) not in (0, len(self.log_weights)):
@@ -78,7 +81,12 @@ class Population:
 
     def with_trace(self, trace: Trace) -> Population:
         """The same weights for another trace of as many particles: extended, or moved."""
-        later = replace(self, trace=trace)
+        if trace.particles != len(self):
+            raise InputError(
+                f"a population of {len(self)} particles is given a trace of {trace.particles}; "
+                "give one of as many."
+            )
+        later = self._with(trace=trace)
         if "log_total" in self.__dict__:
             later.__dict__["log_total"] = self.log_total
         if "effective_sample_size" in self.__dict__:
@@ -102,22 +110,29 @@ class Population:
         weights = (log_weights - highest).exp_()
         mass = float(weights.sum())
         total = highest + math.log(mass)
-        later = replace(
-            self, log_weights=log_weights, log_evidence=self.log_evidence + (total - self.log_total)
-        )
+        later = self._with(log_weights=log_weights, log_evidence=self.log_evidence + (total - self.log_total))
         later.__dict__["log_total"] = total
         later.__dict__["effective_sample_size"] = mass * mass / float(weights.dot(weights))
         return later
 
     def selected(self, ancestors: Tensor) -> Population:
-        """The particles at `ancestors` (M,), equally weighted."""
+        """The particles at `ancestors` (M,), equally weighted.
+
+        Raises:
+            InputError: an ancestor is no particle.
+        """
+        try:
+            founders = self.founders.index_select(0, ancestors)
+        except (IndexError, RuntimeError, TypeError):
+            return self.selected(particles_at(ancestors, len(self)))
         count = len(ancestors)
-        drawn = Population(
-            self.trace[ancestors],
-            torch.zeros(count, dtype=torch.float64),
-            self.log_evidence,
-            self.founders.index_select(0, ancestors),
-            self.log_pairs + log_pair(count),
+        if count == 0:
+            raise InputError("a population is to go on with no particle; give the ancestors of 1 or more.")
+        drawn = self._with(
+            trace=self.trace.chosen(ancestors),
+            log_weights=torch.zeros(count, dtype=torch.float64),
+            founders=founders,
+            log_pairs=self.log_pairs + log_pair(count),
         )
         drawn.__dict__["log_total"] = math.log(count)
         return drawn
@@ -126,9 +141,9 @@ class Population:
     def __getitem__(self, index: str) -> Tensor: ...
 
     @overload
-    def __getitem__(self, index: Tensor) -> Population: ...
+    def __getitem__(self, index: Index) -> Population: ...
 
-    def __getitem__(self, index: str | Tensor) -> Any:
+    def __getitem__(self, index: str | Index) -> Any:
         if isinstance(index, str):
             if index in self.trace:
                 return self.trace[index]
@@ -136,12 +151,18 @@ class Population:
                 f"a population has no value at address {index!r}; it has "
                 f"{', '.join([*self.trace.choices, *self.trace.observations]) or 'none'}."
             )
-        return replace(
-            self,
-            trace=self.trace[index],
-            log_weights=self.log_weights[index],
-            founders=self.founders[index],
+        particles = particles_at(index, len(self))
+        return self._with(
+            trace=self.trace.chosen(particles),
+            log_weights=self.log_weights[particles],
+            founders=self.founders[particles],
         )
+
+    def _with(self, **changed: Any) -> Population:
+        """The same population with other fields, which are known to be right: a step makes several."""
+        other = object.__new__(type(self))
+        other.__dict__.update({name: self.__dict__[name] for name in FIELDS}, **changed)
+        return other
 
     def belief(self, address: str) -> Belief:
         """The particles read as a posterior over the pose at an address.
@@ -154,8 +175,9 @@ class Population:
                 f"a belief over {address!r} was asked for, which is no latent address; "
                 f"latent are {', '.join(self.trace.choices) or 'none'}."
             )
-        poses = self.trace[address]
-        freedom = freedom_of(self.trace.distributions[address])
+        poses, site = self.trace[address], self.trace.distributions[address]
+        refuse_several_poses(address, poses, site)
+        freedom = freedom_of(site)
         if poses.shape != (len(self), 7):
             raise InputError(
                 f"a belief over {address!r} was asked for, which is no pose: its values have shape "
@@ -173,6 +195,33 @@ class Population:
             f"log evidence {self.log_evidence:.4f}, latent: {', '.join(self.trace.choices) or 'none'}, "
             f"observed: {', '.join(self.trace.observations) or 'none'})"
         )
+
+
+FIELDS = tuple(each.name for each in fields(Population))
+
+
+def _checked(trace: object, log_weights: object) -> Tensor:
+    """Log weights (N,) float64, such that only -inf is not finite."""
+    if not isinstance(trace, Trace) or not isinstance(log_weights, Tensor):
+        raise InputError(
+            f"a population is given a {type(trace).__name__} and a {type(log_weights).__name__}; "
+            "give a trace and a tensor of log weights, Population(trace, log_weights)."
+        )
+    if tuple(log_weights.shape) != (trace.particles,) or log_weights.is_complex():
+        raise InputError(
+            f"a population of {trace.particles} particles is given log weights of shape "
+            f"{tuple(log_weights.shape)} and {log_weights.dtype}; give one real number for each."
+        )
+    log_weights = log_weights.to(torch.float64)
+    # The maximum is NaN where any is.
+    if not float(log_weights.max()) < math.inf:
+        which = (~(log_weights < math.inf)).nonzero().flatten().tolist()
+        raise InputError(
+            f"a population is given the log weight {float(log_weights[which[0]])} for {len(which)} of "
+            f"{len(log_weights)} particles (first: {', '.join(map(str, which[:5]))}); "
+            "give numbers, -inf for a particle without weight."
+        )
+    return log_weights
 
 
 def log_pair(count: int) -> float:

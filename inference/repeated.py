@@ -17,8 +17,9 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief, normalised
-from bcppl.errors import InputError
+from bcppl.errors import InferenceError, InputError
 from bcppl.inference.arviz import at_draws, check_alike, draw, import_arviz, seeded
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
@@ -42,15 +43,16 @@ def repeated(run: Run, times: int, seed: int = 0, *, processes: int = 1, progres
         progress: show a bar, on a terminal or in a notebook.
 
     Raises:
-        InputError: `times` or `processes` is below 1, `run` gives no population, it cannot be sent to
-            another process, or the runs differ in addresses or observations.
+        InputError: `times`, `processes` or the seed is out of range, `run` gives no population, it cannot be
+            sent to another process, or the runs differ in addresses or observations.
+        InferenceError: a run cannot go on; names it and its seed.
     """
-    if times < 1 or processes < 1:
-        raise InputError(f"{times} runs in {processes} processes were asked for; give at least 1 of each.")
-    seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(times)]
-    processes = min(processes, times)
+    times = whole_number("{} runs were asked for", times)
+    processes = min(whole_number("runs in {} processes were asked for", processes), times)
+    seeds = [int(s) for s in np.random.SeedSequence(seed_number(seed)).generate_state(times)]
     if processes == 1:
-        found = [_population(run, each) for each in watched(seeds, description="runs", progress=progress)]
+        numbered = watched(list(enumerate(seeds, 1)), description="runs", progress=progress)
+        found = [_population(run, each, number) for number, each in numbered]
     else:
         found = _shared_out(run, seeds, processes, progress)
     check_alike(found)
@@ -60,6 +62,10 @@ def repeated(run: Run, times: int, seed: int = 0, *, processes: int = 1, progres
 @dataclass(frozen=True, eq=False)
 class Repeated:
     """Independent runs of one inference; print it for a table.
+
+    A run in which no particle has any weight left estimates the evidence by 0, and counts as that, for the
+    mean is not unbiased without it. Of the posterior it says nothing: means, R-hat and what is pooled are
+    those of the others.
 
     Attributes:
         populations: one for each run.
@@ -73,9 +79,27 @@ class Repeated:
         return len(self.populations)
 
     @cached_property
+    def dead(self) -> tuple[int, ...]:
+        """The numbers, from 1, of the runs in which no particle has any weight."""
+        weightless = (not bool((p.log_weights > -torch.inf).any()) for p in self.populations)
+        return tuple(number for number, none in enumerate(weightless, start=1) if none)
+
+    @cached_property
+    def _alive(self) -> tuple[Population, ...]:
+        alive = [p for number, p in enumerate(self.populations, start=1) if number not in self.dead]
+        if not alive:
+            raise InferenceError(
+                f"no particle has any weight in any of {len(self)} runs: every particle says that what was "
+                "measured cannot be; widen the prior, or use more particles."
+            )
+        return tuple(alive)
+
+    @cached_property
     def log_evidences(self) -> Tensor:
-        """Log of each run's estimate of the evidence (R,)."""
-        return torch.tensor([p.log_evidence for p in self.populations], dtype=torch.float64)
+        """Log of each run's estimate of the evidence (R,), -inf of a dead one."""
+        each = torch.tensor([p.log_evidence for p in self.populations], dtype=torch.float64)
+        each[[number - 1 for number in self.dead]] = -torch.inf
+        return each
 
     @property
     def log_evidence(self) -> float:
@@ -84,7 +108,7 @@ class Repeated:
 
     @property
     def standard_error(self) -> float:
-        """Of `log_evidence`, by the delta method: that of the mean estimate, over the mean; NaN of one run.
+        """Of `log_evidence`, by the delta method: that of the mean over the mean; NaN of one run or none alive.
 
         It is too small where few runs carry the mean, for then the runs have not seen the others.
         """
@@ -95,12 +119,12 @@ class Repeated:
 
     @property
     def jackknife_error(self) -> float:
-        """Standard error of `log_evidence` by leaving out one run at a time; NaN of one run.
+        """Standard error of `log_evidence` by leaving out one run at a time; NaN of one run alive.
 
         Efron and Stein, The jackknife estimate of variance, Annals of Statistics 9, 1981, eq. 1.3.
         """
         count = len(self)
-        if count < 2:
+        if count - len(self.dead) < 2:
             return math.nan
         others = self.log_evidences.expand(count, count).clone()
         others.fill_diagonal_(-torch.inf)
@@ -110,25 +134,31 @@ class Repeated:
     @cached_property
     def log_weights(self) -> Tensor:
         """Log weights of all particles of all runs, one run after another, each run with its evidence."""
-        return torch.cat([normalised(p.log_weights).log() + p.log_evidence for p in self.populations])
+        return torch.cat([_of_run(p, z) for p, z in zip(self.populations, self.log_evidences, strict=True)])
 
     def belief(self, address: str) -> Belief:
-        """All particles of all runs read as a posterior over the pose at an address."""
+        """All particles of all runs read as a posterior over the pose at an address.
+
+        Raises:
+            InputError: no latent site has that address, or no pose is there.
+            InferenceError: all runs are dead.
+        """
+        first = self._alive[0].belief(address)
         each = torch.cat([p.trace.choices[address] for p in self.populations])
-        return replace(
-            self.populations[0].belief(address), world_from_part=each, log_weights=self.log_weights
-        )
+        return replace(first, world_from_part=each, log_weights=self.log_weights)
 
     def mean(self, address: str) -> Tensor:
         """The weighted mean (*event) over all runs at a latent address, of poses the mean pose (7,).
 
         Raises:
             InputError: no latent site has that address.
+            InferenceError: all runs are dead.
         """
-        if is_pose(self.populations[0], address):
+        alive = self._alive
+        if is_pose(alive[0], address):
             return self.belief(address).mean
-        share = torch.softmax(self.log_evidences, 0)
-        return torch.einsum("r,r...->...", share, torch.stack([mean(p, address) for p in self.populations]))
+        share = torch.softmax(self.log_evidences[self.log_evidences > -torch.inf], 0)
+        return torch.einsum("r,r...->...", share, torch.stack([mean(p, address) for p in alive]))
 
     @cached_property
     def pooled(self) -> Population:
@@ -167,19 +197,22 @@ class Repeated:
             seed: of the draws.
 
         Raises:
-            InputError: ArviZ is not installed, or there are fewer than two runs, or fewer than four draws.
+            InputError: ArviZ is not installed, or there are fewer than two runs alive, or fewer than four
+                draws.
+            InferenceError: all runs are dead.
         """
-        arviz = import_arviz()
-        if len(self) < 2:
-            raise InputError("R-hat compares runs, but there is one; repeat it 2 times or more.")
+        arviz, alive = import_arviz(), self._alive
+        if len(alive) < 2:
+            said = f" alive of {len(self)}" if self.dead else ""
+            raise InputError(f"R-hat compares runs, but there is one{said}; repeat it 2 times or more.")
         with seeded(seed):
-            chosen = draw(self.populations, draws)
+            chosen = draw(alive, draws)
         if len(chosen[0]) < 4:
             raise InputError(f"R-hat of {len(chosen[0])} draws was asked for; give 4 or more.")
         found = {}
-        for address in self.populations[0].trace.choices:
-            values = at_draws([p.trace.choices[address] for p in self.populations], chosen)
-            if is_pose(self.populations[0], address):
+        for address in alive[0].trace.choices:
+            values = at_draws([p.trace.choices[address] for p in alive], chosen)
+            if is_pose(alive[0], address):
                 belief = self.belief(address)
                 values = belief.freedom.coordinates(poses.local(belief.mean, values))
             numbers = values.to(torch.float64).reshape(*values.shape[:2], -1).numpy()
@@ -190,25 +223,31 @@ class Repeated:
 
     def table(self) -> str:
         """The runs, one to a line, their evidence together, and where ArviZ is installed their R-hat."""
-        shares = torch.softmax(self.log_evidences, 0).tolist()
+        shares = torch.exp(self.log_evidences - self.log_evidence).div(len(self)).tolist()
         lines = [f"{'run':>4} {'seed':>11} {'log evidence':>14} {'particles':>10} {'ESS':>8} {'share':>7}"]
         for number, (population, seed, share) in enumerate(
             zip(self.populations, self.seeds, shares, strict=True), start=1
         ):
+            size = "dead" if number in self.dead else f"{population.effective_sample_size:.1f}"
             lines.append(
-                f"{number:>4} {seed:>11} {population.log_evidence:>14.4f} {len(population):>10} "
-                f"{population.effective_sample_size:>8.1f} {share:>7.3f}"
+                f"{number:>4} {seed:>11} {float(self.log_evidences[number - 1]):>14.4f} "
+                f"{len(population):>10} {size:>8} {share:>7.3f}"
             )
         lines.append(
             f"log of the mean evidence {self.log_evidence:.4f}, standard error "
             f"{self.standard_error:.4f} (jackknife {self.jackknife_error:.4f})"
         )
-        return "\n".join([*lines, *self._agreement()])
+        return "\n".join([*lines, *(self._deaths() if self.dead else []), *self._agreement()])
+
+    def _deaths(self) -> list[str]:
+        which = f"run{'s' * (len(self.dead) > 1)} {', '.join(map(str, self.dead))}"
+        what = "no particle has any weight left: evidence 0, and nothing said of the posterior"
+        return [f"in {which} {what}; use more particles, or a wider prior."]
 
     def _agreement(self) -> list[str]:
         try:
             ratios = self.r_hat()
-        except InputError:
+        except (InputError, InferenceError):
             return []
         lines = []
         for address, ratio in ratios.items():
@@ -222,12 +261,22 @@ class Repeated:
         return self.table()
 
 
-def _population(run: Run, seed: int) -> Population:
-    with seeded(seed):
-        result = run(seed)
-        if isinstance(result, Iterator):
-            last = deque(result, maxlen=1)
-            result = last[0] if last else None
+def _of_run(population: Population, log_evidence: Tensor) -> Tensor:
+    """Log weights (N,) of a run's particles that sum to its evidence; -inf of one that is dead."""
+    if log_evidence == -torch.inf:
+        return torch.full_like(population.log_weights, -torch.inf)
+    return normalised(population.log_weights).log() + log_evidence
+
+
+def _population(run: Run, seed: int, number: int) -> Population:
+    try:
+        with seeded(seed):
+            result = run(seed)
+            if isinstance(result, Iterator):
+                last = deque(result, maxlen=1)
+                result = last[0] if last else None
+    except InferenceError as error:
+        raise InferenceError(f"run {number} (seed {seed}): {error}") from error
     found = getattr(result, "population", result)
     if not isinstance(found, Population):
         raise InputError(
@@ -255,11 +304,13 @@ def _shared_out(run: Run, seeds: Sequence[int], processes: int, progress: bool) 
     with ProcessPoolExecutor(
         processes - 1, get_context("spawn"), initializer=torch.set_num_threads, initargs=(threads,)
     ) as pool:
-        elsewhere = {k: pool.submit(_numbers, run, seeds[k]) for k in range(len(seeds)) if k not in here}
+        elsewhere = {
+            k: pool.submit(_numbers, run, seeds[k], k + 1) for k in range(len(seeds)) if k not in here
+        }
         found: dict[int, Population] = {}
         for k in watched([*here, *elsewhere], description="runs", progress=progress):
             if k in here:
-                found[k] = _population(run, seeds[k])
+                found[k] = _population(run, seeds[k], k + 1)
                 _refuse_series(found[k])
             else:
                 found[k] = _put_into(found[0], *elsewhere[k].result())
@@ -269,9 +320,9 @@ def _shared_out(run: Run, seeds: Sequence[int], processes: int, progress: bool) 
 Numbers = dict[str, Any]
 
 
-def _numbers(run: Run, seed: int) -> tuple[Numbers, Numbers]:
+def _numbers(run: Run, seed: int, number: int) -> tuple[Numbers, Numbers]:
     """What a run gave, as arrays: the trace's values, and what else the population holds."""
-    population = _population(run, seed)
+    population = _population(run, seed, number)
     trace = population.trace
     values = {"choices": trace.choices, "observations": trace.observations, "known": trace.known}
     rest = {f.name: getattr(population, f.name) for f in fields(population) if f.name != "trace"}

@@ -9,6 +9,8 @@ from collections.abc import Callable
 
 from torch import Tensor
 
+from bcppl.arguments import number_within
+from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.schemes import Scheme, multinomial, residual, ssp, stratified, systematic
 
@@ -31,7 +33,13 @@ Resample = Callable[[Population], tuple[Population, Tensor | None]]
 
 
 def always(scheme: Scheme = systematic) -> Resample:
-    """Resample at every opportunity."""
+    """Resample at every opportunity.
+
+    Raises:
+        InputError: what is given is no scheme.
+    """
+    if not callable(scheme):
+        raise InputError(f"resampling is given {scheme!r} in place of a scheme; give one such as systematic.")
 
     def resample(population: Population) -> tuple[Population, Tensor | None]:
         ancestors = scheme(population.log_weights)
@@ -40,13 +48,32 @@ def always(scheme: Scheme = systematic) -> Resample:
     return resample
 
 
+def refuse_scheme(where: str, resample: object) -> None:
+    """Refuse what does not say when to resample, such as a scheme by itself.
+
+    Raises:
+        InputError: it is no function of a population.
+    """
+    if not callable(resample) or resample in (systematic, stratified, multinomial, residual, ssp):
+        name = getattr(resample, "__name__", type(resample).__name__)
+        raise InputError(
+            f"{where} is told to resample by {name}, which does not say when; "
+            "give always(scheme), adaptive(scheme, 0.5) or never."
+        )
+
+
 def never(population: Population) -> tuple[Population, Tensor | None]:
     """Leave the weights as they are."""
     return population, None
 
 
 def adaptive(scheme: Scheme = systematic, threshold: float = 0.5) -> Resample:
-    """Resample when the effective sample size falls below a share `threshold` of the particles."""
+    """Resample when the effective sample size falls below a share `threshold` of the particles.
+
+    Raises:
+        InputError: the threshold is no number from 0 (never) to 1.
+    """
+    threshold = number_within("adaptive is given the threshold {}", threshold, least=0.0, most=1.0)
     resample = always(scheme)
 
     def when_needed(population: Population) -> tuple[Population, Tensor | None]:

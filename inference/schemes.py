@@ -14,8 +14,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from bcppl.arguments import whole_number
 from bcppl.beliefs import normalised
-from bcppl.errors import InputError
 
 
 class Scheme(Protocol):
@@ -26,7 +26,7 @@ class Scheme(Protocol):
 
         Raises:
             InferenceError: no particle has any weight, or a weight is not a number.
-            InputError: `count` is below 1.
+            InputError: `count` is no whole number, 1 or more.
         """
         ...
 
@@ -100,10 +100,9 @@ def _asked(log_weights: Tensor, count: int | None) -> tuple[Tensor, int]:
     weights = torch.softmax(log_weights, 0)
     if not bool(torch.isfinite(weights.sum())):
         normalised(log_weights)
-    count = len(log_weights) if count is None else count
-    if count < 1:
-        raise InputError(f"{count} particles are to be resampled; give 1 or more.")
-    return weights, count
+    if count is None:
+        return weights, len(log_weights)
+    return weights, whole_number("{} particles are to be resampled", count)
 
 
 def _last(weights: Tensor) -> int:

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import torch
 
+from bcppl.arguments import whole_number
 from bcppl.beliefs import normalised
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
@@ -22,7 +23,7 @@ def resized(population: Population, count: int, scheme: Scheme = systematic) -> 
 
     Raises:
         InferenceError: no particle has any weight.
-        InputError: `count` is below 1.
+        InputError: `count` is no whole number, 1 or more.
     """
     return population.selected(scheme(population.log_weights, count))
 
@@ -31,10 +32,9 @@ def replicated(population: Population, times: int) -> Population:
     """Every particle `times` times, side by side, each copy with the same weight; nothing is drawn.
 
     Raises:
-        InputError: `times` is below 1.
+        InputError: `times` is no whole number, 1 or more.
     """
-    if times < 1:
-        raise InputError(f"particles are to be replicated {times} times; give 1 or more.")
+    times = whole_number("particles are to be replicated {} times", times)
     return population[torch.arange(len(population)).repeat_interleave(times)]
 
 

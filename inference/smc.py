@@ -9,12 +9,13 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.importance import importance_sampling
@@ -89,7 +90,7 @@ class Step:
     belief: Belief
     info: Info
     population: Population
-    random_state: Tensor
+    random_state: Tensor = field(repr=False)
     taken: int = 0
 
     def __iter__(self) -> Iterator[Any]:
@@ -123,9 +124,12 @@ def smc(
 
     Raises:
         InferenceError: no particle is left with any weight; names the measurement.
-        InputError: the program samples no pose at `model.pose`, or `start` has taken more measurements in
+        InputError: the particles or the seed are no whole number, the program samples no pose at
+            `model.pose`, or `start` has taken more measurements in
             than there are.
     """
+    whole_number("SMC is to run {} particles", particles)
+    seed_number(seed)
     steps = _steps(model, recording, step, particles, seed, scene, start)
     left = len(recording.measurements) + (1 if start is None else -start.taken)
     return watched(steps, total=left, describe=lambda each: each.info.label, progress=progress)

@@ -39,7 +39,7 @@ from bcppl.inference.kernels.jacobian import (
 from bcppl.inference.kernels.kernel import put
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Fitted, Program, Proposal, program_of
-from bcppl.inference.resampling import Resample, adaptive
+from bcppl.inference.resampling import Resample, adaptive, refuse_scheme
 from bcppl.inference.step import Observed, StepFunction, StepInfo, Stepped
 from bcppl.traces import Trace, extend, simulate, update
 from bcppl.traces.gradient import differentiable, result_with_grad
@@ -113,7 +113,9 @@ def smcp3(pair: Pair, *, resample: Resample | None = None) -> StepFunction:
         InputError: no `Pair` is given.
     """
     _refuse_no_pair(pair)
-    resample = adaptive() if resample is None else resample
+    if resample is None:
+        resample = adaptive()
+    refuse_scheme("smcp3", resample)
 
     def step(population: Population, observed: Observed) -> Stepped:
         weighed = _by_halves(population, pair, observed)
@@ -177,6 +179,7 @@ def moved_trace(
     on = isinstance(old, SeriesTrace) and observed is not None
     latent: Values = {} if on else dict(old.choices)
     there = simulate(forward, (shown,), count)
+    _refuse_observed("forward", there.choices, shown)
     new, back = _read(there.result, there.choices, latent, lambda: _new_latent(old, shown, observed))
     kept = {a: v for a, v in new.items() if a in latent}
     fresh = {a: v for a, v in new.items() if a not in latent}
@@ -193,6 +196,7 @@ def moved_trace(
             f"latent are {', '.join(latent) or 'none'}."
         )
     way_back = assessed(backward, (reached,), back, count)
+    _refuse_observed("backward", way_back.choices, reached)
     inputs = charted(OLD, latent, old.distributions)
     for address, value in kept.items():
         refuse_leaving(address, inputs[OLD, address].chart, latent[address], value)
@@ -224,7 +228,19 @@ def moved_trace(
         _refuse_other_choices(there.choices, choices)
         found = {(OLD, a): values.get(a, reached[a]) for a in latent}
         refuse_apart("the backward program", inputs, found | {(FORWARD, a): v for a, v in choices.items()})
-    return reached, log_factor + way_back.log_prob() - there.log_prob() + log_stretch
+    chosen = there.log_prob()
+    log_factor = log_factor + way_back.log_prob() - chosen + log_stretch
+    # What ran out of the numbers of its type (see `metropolis_hastings`) came where nothing leads.
+    return reached, torch.where(chosen == -torch.inf, -torch.inf, log_factor)
+
+
+def _refuse_observed(which: str, choices: Values, seen: Trace) -> None:
+    for address in choices:
+        if address in seen.observations:
+            raise InputError(
+                f"the {which} program of a pair samples {address!r}, which is observed; sample at latent "
+                "addresses, and give other choices names of their own."
+            )
 
 
 def _shown(old: Trace, observed: Observed) -> Trace:

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.traces import Series, Trace, generate
@@ -49,9 +50,12 @@ def generate_stratified(
         The population. The variance of its evidence cannot be told from its founders.
 
     Raises:
-        InputError: there is no latent choice, fewer particles than strata, or no inverse distribution
-            function and no function given.
+        InputError: a count is no whole number, 1 or more, there is no latent choice, there are fewer
+            particles than strata, or no inverse distribution function and no function given.
     """
+    candidates = whole_number("a stratified start is given {} candidates for each particle", candidates)
+    if strata is not None and not callable(strata):
+        strata = whole_number("a start is given {} strata", strata)
     trace, _ = generate(program, args, observations, particles)
     if not trace.choices:
         raise InputError("a start is to be stratified, but the program has no latent choice; use generate.")

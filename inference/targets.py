@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.traces import Trace
 
@@ -31,16 +31,28 @@ class Target:
 
     def __post_init__(self) -> None:
         for address, exponent in self.exponents.items():
-            if not 0.0 <= exponent < math.inf:
-                raise InputError(f"site {address!r} is given the exponent {exponent}; give 0 or more.")
+            number_within(f"site {address!r} is given the exponent {{}}", exponent, least=0.0)
 
     def exponent(self, address: str) -> float:
         """How much of a site is let in."""
         return self.exponents.get(address, 1.0)
 
     def __call__(self, trace: Trace) -> Tensor:
-        """The log-density (N,)."""
+        """The log-density (N,).
+
+        Raises:
+            InputError: an exponent is given for an address that the program does not visit.
+        """
+        self._refuse_unvisited(trace)
         return self.part(trace, trace.addresses)
+
+    def _refuse_unvisited(self, trace: Trace) -> None:
+        if self.exponents and not self.exponents.keys() <= set(trace.addresses):
+            address = next(a for a in self.exponents if a not in trace.addresses)
+            raise InputError(
+                f"a target gives site {address!r} an exponent, but the program never visits it; "
+                f"it visits {', '.join(trace.addresses) or 'none'}."
+            )
 
     def part(self, trace: Trace, addresses: Sequence[str]) -> Tensor:
         """What some sites add to the log-density (N,)."""
@@ -68,6 +80,7 @@ class Target:
         Returns:
             Their indices (K,) in increasing order, and the trace of these K particles.
         """
+        self._refuse_unvisited(trace)
         counted = trace.distributions if addresses is None else set(addresses)
         sites = [(a, s) for a, s in trace.distributions.items() if a in counted and self.exponent(a) > 0.0]
         sites.sort(key=lambda site: cost_of(site[1]))

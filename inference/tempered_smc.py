@@ -14,6 +14,7 @@ from typing import Any
 
 from torch import Tensor
 
+from bcppl.arguments import number_within, whole_number
 from bcppl.inference.kernels import Kernel, Until, metropolis_hastings, mixture, until
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift, independent
@@ -55,7 +56,13 @@ def infer(
         share: particles are resampled below this effective sample size, and a likelihood is let in by steps
             that keep this conditional one, as shares of N: without, and with physics.
         scene: what `model.prepare(recording)` gives, if it is at hand.
+
+    Raises:
+        InputError: a number is out of range.
     """
+    particles = whole_number("SMC is to run {} particles", particles)
+    for kept in share:
+        number_within("a share of {} of the particles is to be kept", kept, least=0.0, below=1.0)
     enough = until(displacement=0.5, distinct=max(1, round(0.8 * particles)), most=60)
     moves = (12, enough) if sweeps is None else sweeps
 

@@ -13,7 +13,7 @@ that contains a surrogate likelihood is a surrogate's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -21,11 +21,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import normalised
 from bcppl.errors import InputError
 from bcppl.inference.kernels import Kernel, Until, refuse_other, rejuvenate, takes
 from bcppl.inference.population import Population
-from bcppl.inference.resampling import Resample, adaptive
+from bcppl.inference.resampling import Resample, adaptive, refuse_scheme
 from bcppl.inference.step import Observed, StepInfo, Stepped
 from bcppl.inference.targets import POSTERIOR, Target, cost_of
 from bcppl.traces import Trace, extend
@@ -103,6 +104,12 @@ def resample_move(
     return rejuvenation
 
 
+def kept_share(share: object) -> float:
+    """A share of the particles that tempering is to keep, from 0 up to below 1."""
+    what = "tempering is asked to keep a share of {} of the particles"
+    return number_within(what, share, least=0.0, below=1.0)
+
+
 class _Schedule(NamedTuple):
     share: float | Callable[[Trace], float]
     fixed: tuple[float, ...] | None
@@ -111,7 +118,7 @@ class _Schedule(NamedTuple):
         """The exponent that follows `reached`."""
         if self.fixed is not None:
             return next(e for e in self.fixed if e > reached)
-        kept = self.share(population.trace) if callable(self.share) else self.share
+        kept = kept_share(self.share(population.trace)) if callable(self.share) else self.share
         if kept <= 0.0:
             return 1.0
         return next_exponent(population.log_weights, log_likelihood, reached, kept)
@@ -216,8 +223,9 @@ def tempered(
         The step. It raises InferenceError where no particle is left with any weight.
 
     Raises:
-        InputError: what is given is no kernel, `share` is not in [0, 1), the exponents do not increase to 1,
-            or a rejuvenation is given beside a kernel or a resampling.
+        InputError: what is given is no kernel, `share` is not in [0, 1), `sweeps` is no whole number, 1 or
+            more, the exponents do not increase to 1, or a rejuvenation is given beside a kernel or a
+            resampling.
     """
     if kernel is not None:
         if callable(kernel) and takes(kernel, 2) and not takes(kernel, 1):
@@ -226,15 +234,22 @@ def tempered(
                 "if it is a rejuvenation such as waste_free_moves(...), give it as rejuvenation=..."
             )
         refuse_other("tempered", kernel)
-    if not callable(share) and not 0.0 <= share < 1.0:
-        raise InputError(
-            f"tempering is asked to keep a share of {share} of the particles; give 0 up to below 1."
-        )
-    fixed = None if exponents is None else tuple(float(e) for e in exponents)
+    if not callable(share):
+        share = kept_share(share)
+    if not callable(sweeps) and not isinstance(sweeps, Until):
+        # Without moves there is no kernel: None.
+        sweeps = whole_number("tempering is to move the particles in {} sweeps", sweeps)
+    fixed = None
+    if exponents is not None:
+        if not isinstance(exponents, Iterable):
+            raise InputError(f"tempering is given the exponents {exponents!r}; give a list, [0.1, 1.0].")
+        fixed = tuple(number_within("tempering is given the exponent {}", e) for e in exponents)
     if fixed is not None and (fixed[-1:] != (1.0,) or any(b <= a for a, b in pairwise((0.0, *fixed)))):
         raise InputError(
             f"tempering is given the exponents {list(fixed)}; give increasing ones that end with 1."
         )
+    if resample is not None:
+        refuse_scheme("tempered", resample)
     if rejuvenation is None:
         rejuvenation = resample_move(
             kernel, sweeps, adaptive() if resample is None else resample, always_move

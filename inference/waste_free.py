@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import torch
 
+from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.kernels import Kernel, fitted, put, refuse_other
 from bcppl.inference.population import Population, log_pair
@@ -32,11 +33,12 @@ def waste_free_moves(
         threshold: resample when the effective sample size is below this share of N; 1 is always.
 
     Raises:
-        InputError: what is given is no kernel, or there are no chains. When it runs: M does not divide N.
+        InputError: what is given is no kernel, no whole number of chains, or no threshold from 0 to 1.
+            When it runs: M does not divide N.
     """
     refuse_other("waste_free_moves", kernel)
-    if chains < 1:
-        raise InputError(f"waste-free SMC is asked for {chains} chains; give 1 or more.")
+    chains = whole_number("waste-free SMC is asked for {} chains", chains)
+    threshold = number_within("waste-free SMC is given the threshold {}", threshold, least=0.0, most=1.0)
 
     def rejuvenation(population: Population, target: Target) -> Rejuvenated:
         count = len(population)

@@ -132,5 +132,5 @@ def test_a_belief_that_spans_too_little_has_none() -> None:
     ):
         assert flat.gaussian_entropy == -math.inf and flat.nearest_neighbour_entropy() == -math.inf
     assert Belief(belief.world_from_part[:1], torch.zeros(1, dtype=torch.float64)).weight_entropy == 0.0
-    with pytest.raises(InputError, match="give 1 or more"):
+    with pytest.raises(InputError, match="give a whole number, 1 or more"):
         belief.nearest_neighbour_entropy(0)

@@ -140,7 +140,7 @@ def test_runs_hang_on_the_seed_alone_and_the_last_step_counts() -> None:
     assert float(repeated(steps, 2).log_evidences.max()) < 1.0
     for run, times, processes, said in (
         (lambda seed: 3.0, 1, 1, "a run gave a float"),
-        (importance, 0, 1, "0 runs in 1 processes"),
+        (importance, 0, 1, "0 runs were asked for"),
         (lambda seed: importance(seed), 2, 2, "cannot be sent to another process"),
     ):
         with pytest.raises(InputError, match=said):

@@ -21,7 +21,7 @@ from bcppl.errors import InputError
 from bcppl.poses import FREE, Freedom
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Belief:
     """Weighted particles over the pose of a part.
 
@@ -51,6 +51,9 @@ class Belief:
 
     def __len__(self) -> int:
         return len(self.log_weights)
+
+    def __repr__(self) -> str:
+        return f"Belief({len(self)} poses, {self.freedom})"
 
     @cached_property
     def weights(self) -> Tensor:

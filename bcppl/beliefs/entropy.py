@@ -17,7 +17,7 @@ from scipy.special import digamma
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.errors import InputError
+from bcppl.arguments import whole_number
 from bcppl.poses import Freedom
 
 
@@ -68,10 +68,9 @@ def nearest_neighbour_entropy(
         neighbours: k.
 
     Raises:
-        InputError: k is below 1.
+        InputError: k is no whole number, 1 or more.
     """
-    if neighbours < 1:
-        raise InputError(f"an entropy by {neighbours} neighbours was asked for; give 1 or more.")
+    neighbours = whole_number("an entropy by {} neighbours was asked for", neighbours)
     tangent = poses.local(mean, world_from_part)
     coordinates = freedom.coordinates(tangent)
     count, dimension = coordinates.shape

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from bcppl.arguments import number_within
 from bcppl.errors import InputError
 
 
@@ -54,6 +55,7 @@ class Path:
 
     def thinned(self, spacing: float) -> Path:
         """The path through one of its points in every `spacing` metres travelled, and its last point."""
+        spacing = number_within("a path is to be thinned to a spacing of {} m", spacing, above=0.0)
         stretch = torch.floor(self.travelled / spacing)
         kept = torch.ones(len(self.points), dtype=torch.bool)
         kept[1:-1] = stretch[1:-1] != stretch[:-2]

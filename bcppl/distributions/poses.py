@@ -6,7 +6,7 @@ Every class says with `freedom` which axes are free; the others are held at the 
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any, Protocol, SupportsFloat
 
 import numpy as np
 import roma
@@ -61,7 +61,12 @@ def _is_unit(pose: Tensor) -> Tensor:
 
 
 def _half_widths(translation: Any, freedom_rotation: str) -> tuple[Tensor, Freedom]:
-    widths = torch.as_tensor(translation, dtype=torch.float64).expand(3)
+    try:
+        widths = torch.as_tensor(translation, dtype=torch.float64).expand(3)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(
+            f"a pose prior has half widths {translation!r}; give one number for all axes, or three, metres."
+        ) from None
     if not bool(torch.isfinite(widths).all()) or bool((widths < 0).any()):
         raise InputError(
             f"a pose prior has half widths {widths.tolist()} m; "
@@ -72,8 +77,8 @@ def _half_widths(translation: Any, freedom_rotation: str) -> tuple[Tensor, Freed
 
 
 def _angle(value: float, name: str) -> float:
-    if not 0.0 <= value <= math.pi:
-        raise InputError(f"a pose prior has {name} {value:.4g}; give an angle in radians from 0 to pi.")
+    if not isinstance(value, SupportsFloat) or not 0.0 <= float(value) <= math.pi:
+        raise InputError(f"a pose prior has {name} {value!r}; give an angle in radians from 0 to pi.")
     return float(value)
 
 
@@ -95,7 +100,7 @@ class UniformPose(_PoseDistribution):
 
     def __init__(self, center: Any, translation: Any, angle: float, rotation: str = "all") -> None:
         self.angle = _angle(angle, "angle")
-        self.widths, freedom = _half_widths(translation, rotation if angle > 0 else "none")
+        self.widths, freedom = _half_widths(translation, rotation if self.angle > 0 else "none")
         super().__init__(poses.as_pose(center, "the centre of a pose prior"), freedom)
         volume = {
             "none": 1.0,
@@ -229,6 +234,11 @@ class NormalPose(_PoseDistribution):
     def __init__(self, center: Any, covariance: Any, freedom: Freedom = FREE) -> None:
         matrix = torch.as_tensor(covariance, dtype=torch.float64)
         if matrix.ndim == 1:
+            if bool((matrix < 0.0).any()):
+                raise InputError(
+                    f"a normal over poses was given the standard deviations {matrix.tolist()}; "
+                    "give none below 0 (metres, radians)."
+                )
             matrix = torch.diag(matrix**2)
         if matrix.shape[-2:] != (freedom.dimension, freedom.dimension):
             raise InputError(

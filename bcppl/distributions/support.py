@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.distributions import Independent, constraints
 
 from bcppl.distributions.lazy import LazyDistribution
+from bcppl.errors import InputError
 from bcppl.poses import Freedom
 
 
@@ -24,6 +25,19 @@ def freedom_of(distribution: Any) -> Freedom | None:
     """Which axes of the poses at a site are free; None where its values are no poses."""
     freedom: Freedom | None = getattr(base(distribution), "freedom", None)
     return freedom
+
+
+def refuse_several_poses(address: str, value: Tensor, distribution: Any) -> None:
+    """Refuse a latent site whose values (N, ..., 7) are several poses for each particle.
+
+    Raises:
+        InputError: they are.
+    """
+    if value.ndim != 2 and freedom_of(distribution) is not None:
+        raise InputError(
+            f"site {address!r} samples poses of shape {tuple(value.shape[1:])} for each particle, in a plate "
+            "or an event; sample each pose at an address of its own, `for k in range(...)`."
+        )
 
 
 def support_of(distribution: Any) -> Any:

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.special import log_ndtr
 
 from bcppl import poses
+from bcppl.arguments import number_within
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.path import Path
 
@@ -30,6 +31,15 @@ UPRIGHT = 1e-6
 
 def _latent(scales: tuple[Scale, ...]) -> tuple[Tensor, ...]:
     return tuple(s for s in scales if isinstance(s, Tensor) and s.ndim > 0)
+
+
+def _refuse_impossible(where: str, outlier: float | None, **scales: Scale) -> None:
+    """Refuse scales that are no scales. A latent one, (N,), may leave its support: then it is impossible."""
+    for name, scale in scales.items():
+        if not (isinstance(scale, Tensor) and scale.ndim > 0):
+            number_within(f"{where} has the {name} {{}}", scale, above=0.0)
+    if outlier is not None:
+        number_within(f"{where} has the outlier probability {{}}", outlier, least=0.0, below=1.0)
 
 
 def _at(distance: Distance, pose: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
@@ -78,11 +88,15 @@ class OnsetLocation(LazyDistribution):
         offset: metres; positive where the tip lies inside the part at onset, on average.
         spread: standard deviation of the threshold, metres.
         outlier: probability of an onset that has nothing to do with the part.
+
+    Raises:
+        InputError: the spread is not positive, or the outlier no probability below 1.
     """
 
     def __init__(
         self, distance: Distance, pose: Tensor, path: Path, offset: Scale, spread: Scale, outlier: float
     ) -> None:
+        _refuse_impossible("an onset's location", outlier, spread=spread)
         self.distance, self.pose, self.path = distance, pose, path
         self.offset, self.spread, self.outlier = offset, spread, outlier
         super().__init__(len(pose), (3,), (pose, *_latent((offset, spread))))
@@ -149,6 +163,9 @@ class ForceDirection(LazyDistribution):
         friction: coefficient of friction.
         spread: radians.
         outlier: probability of a direction that has nothing to do with the part.
+
+    Raises:
+        InputError: the friction or the spread is not positive, or the outlier no probability below 1.
     """
 
     def __init__(
@@ -161,6 +178,7 @@ class ForceDirection(LazyDistribution):
         spread: Scale,
         outlier: float,
     ) -> None:
+        _refuse_impossible("a force's direction", outlier, friction=friction, spread=spread)
         self.distance, self.pose = distance, pose
         self.tip, self.motion = tip.expand(len(pose), 3), motion.expand(len(pose), 3)
         self.friction, self.spread, self.outlier = friction, spread, outlier
@@ -212,11 +230,15 @@ class FreePath(LazyDistribution):
         onset: (3,) or (N, 3) where contact was felt; NaN for never: the whole path was free.
         tolerance: metres inside the part at which one free path in two is felt.
         spread: metres.
+
+    Raises:
+        InputError: the spread is not positive.
     """
 
     def __init__(
         self, distance: Distance, pose: Tensor, path: Path, onset: Tensor, tolerance: Scale, spread: Scale
     ) -> None:
+        _refuse_impossible("a free path", None, spread=spread)
         self.distance, self.pose, self.path = distance, pose, path
         self.onset, self.tolerance, self.spread = onset.expand(len(pose), 3), tolerance, spread
         super().__init__(len(pose), (), (pose, self.onset, *_latent((tolerance, spread))))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
@@ -12,11 +12,12 @@ from bcppl.errors import InputError
 from bcppl.traces.coincidence import refuse_coincidence
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.series import Series, runnable
+from bcppl.traces.shown import shapes
 from bcppl.traces.trace import Trace
 from bcppl.traces.verbs import refuse_unvisited, simulate, trace_of
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Proposed:
     """What `propose` returns.
 
@@ -27,8 +28,11 @@ class Proposed:
     """
 
     choices: Mapping[str, Tensor]
-    log_prob: Tensor = field(repr=False)
-    result: Any = field(default=None, repr=False)
+    log_prob: Tensor
+    result: Any = None
+
+    def __repr__(self) -> str:
+        return f"Proposed({shapes(self.choices)})"
 
 
 def propose(program: Program | Series, args: tuple[Any, ...], particles: int) -> Proposed:

@@ -73,7 +73,7 @@ def run(
         raise InputError(
             f"a program's arguments are of type {type(args).__name__}; give a tuple of them, `(x,)` for one."
         )
-    if not isinstance(particles, Integral) or particles < 1:
+    if not isinstance(particles, Integral) or isinstance(particles, bool) or particles < 1:
         raise InputError(
             f"a program was to be run for {particles} particles; give 1 or more, a whole number."
         )

@@ -31,9 +31,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bcppl.arguments import whole_number
 from bcppl.errors import InputError
+from bcppl.traces.indexing import Index
 from bcppl.traces.run import Program, Run
-from bcppl.traces.trace import Index, Trace
+from bcppl.traces.trace import Trace
 
 
 @dataclass(frozen=True)
@@ -195,7 +197,7 @@ class Chosen(Mapping[str, Tensor]):
         return len(self._whole)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SeriesTrace(Trace):
     """The newest step of a series for N particles, the earlier ones behind it.
 
@@ -284,6 +286,7 @@ class SeriesTrace(Trace):
 
     def _after(self, number: int) -> tuple[SeriesTrace, Tensor | None]:
         """The trace after so many steps, and which of its particles (N,) are ancestors of these."""
+        number = whole_number("step {} of a series was asked for", number, least=-self.steps - 1)
         wanted = self.steps + 1 + number if number < 0 else number
         if not 0 <= wanted <= self.steps:
             raise InputError(
@@ -310,13 +313,14 @@ class SeriesTrace(Trace):
         return torch.arange(then.particles) if index is None else index
 
     def __getitem__(self, key: str | tuple[str, int] | Index) -> Any:
-        if isinstance(key, str):
-            return super().__getitem__(key)
         if isinstance(key, tuple) and len(key) == 2 and isinstance(key[0], str):
-            then, chosen = self._after(int(key[1]))
+            then, chosen = self._after(key[1])
             value = then[key[0]]
             return value if chosen is None or key[0] not in then.choices else value.index_select(0, chosen)
-        index = self._index(key)
+        return super().__getitem__(list(key) if isinstance(key, tuple) else key)
+
+    def chosen(self, index: Tensor) -> Any:
+        """The trace of the particles at an index (K,) int64 that is known to be in range."""
         whole, first = (self, None) if self.origin is None else self.origin
         both = composed(first, index)
         assert both is not None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -16,18 +16,19 @@ from bcppl.distributions.support import log_prob_inside
 from bcppl.errors import InferenceError, InputError
 from bcppl.traces.carried import Entry, same_inputs
 from bcppl.traces.hiding import Hiding, refused
+from bcppl.traces.indexing import Index, particles_at
 from bcppl.traces.run import Program, Run, inward, refuse_other_than_tensors, run
 from bcppl.traces.shortcuts import narrowed
+from bcppl.traces.shown import shapes
 
-Index = Tensor | Sequence[int] | slice | int
 
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Trace:
     """Values by address for N particles, and the log-probability of every site, evaluated when asked for.
 
     `trace["hole"]` is a value; `trace[ancestors]`, `trace[mask]` and `trace[:50]` are traces of those
-    particles. Treat it as immutable: the verbs of `bcppl.traces` make new ones.
+    particles. Treat it as immutable: the verbs of `bcppl.traces` make new ones. Observations are copied when
+    they are given, so that an array may be used again; values of latent addresses are held as they are.
 
     Attributes:
         program, args: what was run.
@@ -137,10 +138,17 @@ class Trace:
                     f"the observation at site {address!r} is NaN in {int(seen.sum())} of {seen.numel()} "
                     "entries; leave out what was not measured, or mask it in the site's distribution."
                 )
+            dense = address in self.choices and float(value[which[0]]) == torch.inf
             raise InferenceError(
                 f"site {address!r} has a log-probability of {float(value[which[0]])} for "
                 f"{len(which)} of {self.particles} particles (first: {', '.join(map(str, which[:5]))}); "
-                "a value or a parameter of its distribution is out of range there."
+                + (
+                    f"rounding to {self.choices[address].dtype} put values on the edge of the support, "
+                    "where the density is infinite; give the prior parameters in double precision, or less "
+                    "extreme ones."
+                    if dense
+                    else "a value or a parameter of its distribution is out of range there."
+                )
             )
         return value
 
@@ -154,7 +162,13 @@ class Trace:
             raise InputError(
                 f"the trace has no value at address {key!r}; it has {', '.join(held) or 'none'}."
             )
-        index = self._index(key)
+        return self.chosen(particles_at(key, self.particles))
+
+    def chosen(self, index: Tensor) -> Any:
+        """The trace of the particles at an index (K,) int64 that is known to be in range.
+
+        For what has made the index itself, such as resampling; `trace[index]` looks at it first.
+        """
         return replace(
             self,
             particles=len(index),
@@ -162,13 +176,6 @@ class Trace:
             carried={a: e.take(index) for a, e in self.carried.items()},
             known={a: v[index] for a, v in self.known.items()},
         )
-
-    def _index(self, key: Index) -> Tensor:
-        if not isinstance(key, Tensor):
-            key = key if isinstance(key, slice) else torch.as_tensor(key)
-            return torch.arange(self.particles)[key].reshape(-1)
-        index = key.reshape(-1)
-        return index.nonzero().flatten() if index.dtype == torch.bool else index
 
     def impossible(self) -> list[str]:
         """The addresses, of those that are not latent, that every particle is known to say cannot be."""
@@ -183,6 +190,12 @@ class Trace:
 
     def __len__(self) -> int:
         return self.particles
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}({self.particles} particles, latent: {shapes(self.choices)}, "
+            f"observed: {shapes(self.observations)})"
+        )
 
     def where(self, mask: Tensor, other: Trace) -> Trace:
         """This trace where `mask` (N,) is true, the other (same program, same addresses) elsewhere."""

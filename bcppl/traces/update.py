@@ -7,7 +7,7 @@ PLDI 2019, section 4.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -28,7 +28,7 @@ class Update:
 
     trace: Trace
     previous: Trace
-    discarded: Mapping[str, Tensor]
+    discarded: Mapping[str, Tensor] = field(repr=False)
 
     @cached_property
     def log_ratio(self) -> Tensor:
@@ -59,7 +59,7 @@ class Regenerated:
 
     trace: Trace
     previous: Trace
-    discarded: Mapping[str, Tensor]
+    discarded: Mapping[str, Tensor] = field(repr=False)
 
     @cached_property
     def log_weight(self) -> Tensor:

@@ -13,9 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bcppl.distributions.support import refuse_several_poses
 from bcppl.errors import InputError
 from bcppl.traces.coincidence import refuse_coincidence
-from bcppl.traces.run import Program, Run, run
+from bcppl.traces.run import Program, Run, refuse_other_than_tensors, run
 from bcppl.traces.series import Series, SeriesTrace, Stage, runnable
 from bcppl.traces.trace import Trace
 
@@ -33,6 +34,19 @@ def trace_of(
     trace = kind(program, args, particles, hidden, dict(observed))
     trace._ran(ran)
     return trace
+
+
+def _copied(observations: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Observations as a trace keeps them: an array that is written to again does not change it."""
+    refuse_other_than_tensors(observations)
+    return {address: value.detach().clone() for address, value in observations.items()}
+
+
+def _refuse_poses_in_plates(trace: Trace, old: Mapping[str, Tensor]) -> None:
+    """A latent pose is one for each particle: proposals, kernels and beliefs read it so."""
+    for address, value in trace.choices.items():
+        if value.shape[-1:] == (7,) and value.ndim != 2 and address not in old:
+            refuse_several_poses(address, value, trace.distributions[address])
 
 
 def _one_each(value: Tensor, site: Any, particles: int) -> Tensor:
@@ -98,7 +112,7 @@ def generate(
         args: its arguments.
         particles: N.
         observations: values by address, of the shape of the site's plates and event: the same for all
-            particles.
+            particles. They are copied.
         choices: values (N, ...) of latent addresses, such as a proposal gave; the others are drawn. One value
             without the particle axis is that of all particles.
 
@@ -108,10 +122,10 @@ def generate(
 
     Raises:
         InputError: an observed address is never visited, an observation has not its site's shape, or a
-            choice is of an observed address or one never visited;
+            choice is of an observed address or one never visited, or a latent pose lies in a plate;
             see also `bcppl.traces.run.run`.
     """
-    program, choices = runnable(program), choices or {}
+    program, choices, observations = runnable(program), choices or {}, _copied(observations)
     again = [a for a in choices if a in observations]
     if again:
         raise InputError(f"address {again[0]!r} is observed and given a value for each particle; give one.")
@@ -122,6 +136,7 @@ def generate(
     _real(choices, ran)
     _refuse_one_each(observations, ran, particles)
     trace = trace_of(program, args, particles, ran, observations)
+    _refuse_poses_in_plates(trace, {})
     constrained = [a for a in ran.distributions if a in given or a in ran.fixed]
     return trace, _weight(trace, constrained)
 
@@ -143,7 +158,7 @@ def extend(
     Args:
         trace: what is extended.
         args: the new arguments.
-        observations: values of new addresses.
+        observations: values of new addresses; they are copied.
         choices: values (N, ...) of new latent addresses, such as a proposal gave; those that are left out are
             drawn from the program.
 
@@ -153,9 +168,9 @@ def extend(
 
     Raises:
         InputError: an address vanishes, or an observation or a choice is of an old address, of one never
-            visited, or of the wrong shape.
+            visited, or of the wrong shape, or a new latent pose lies in a plate.
     """
-    choices = choices or {}
+    choices, observations = choices or {}, _copied(observations)
     if isinstance(trace, SeriesTrace):
         return _stepped(trace, args, observations, choices)
     old = {**trace.choices, **trace.observations}
@@ -173,6 +188,7 @@ def extend(
     if lost:
         raise InputError(f"with the new arguments the program no longer visits address {lost[0]!r}.")
     longer = trace_of(trace.program, args, trace.particles, ran, {**trace.observations, **observations})
+    _refuse_poses_in_plates(longer, old)
     longer.known.update(trace.known)
     fixed = ran.fixed.difference(trace.distributions) if ran.fixed else ran.fixed
     new = [a for a in ran.distributions if a in observations or a in choices or a in fixed]
@@ -194,6 +210,8 @@ def _stepped(
         refuse_coincidence(program, args, trace.particles, ran)
     _refuse_one_each(observations, ran, trace.particles)
     longer = trace_of(program, args, trace.particles, ran, observations)
+    if program.number == 1:
+        _refuse_poses_in_plates(longer, {})
     return longer, _weight(longer, [a for a in ran.distributions if a in given or a in ran.fixed])
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import Kernel, Move, fitted, put, refuse_other
 from bcppl.inference.population import Population
@@ -93,7 +94,10 @@ def mixture(kernels: Sequence[Kernel] | Kernel, *more: Any, weights: Sequence[fl
     if isinstance(kernels, Sequence) and len(more) == 1 and weights is None and not callable(more[0]):
         weights, more = more[0], ()
     listed = _listed("mixture", (kernels, *more))
-    chances = torch.as_tensor([1.0] * len(listed) if weights is None else weights, dtype=torch.float64)
+    try:
+        chances = torch.as_tensor([1.0] * len(listed) if weights is None else weights, dtype=torch.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"mixture is given weights {weights!r}; give one number for each kernel.") from None
     sound = chances.shape == (len(listed),) and bool((torch.isfinite(chances) & (chances >= 0.0)).all())
     if not sound or not bool(chances.sum() > 0.0):
         raise InputError(
@@ -131,8 +135,7 @@ def repeat(kernel: Kernel, times: int) -> Kernel:
         InputError: what is given is no kernel, or the times are no whole number, 1 or more.
     """
     refuse_other("repeat", kernel)
-    if not isinstance(times, int) or times < 1:
-        raise InputError(f"a kernel is to be repeated {times} times; give a whole number, 1 or more.")
+    times = whole_number("a kernel is to be repeated {} times", times)
 
     def together(population: Population) -> Move:
         moves = [fitted(kernel, population)] * times

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 from torch.distributions import biject_to
 
+from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import normalised
 from bcppl.distributions.support import freedom_of, support_of
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, Move, put
+from bcppl.inference.kernels.kernel import Kernel, Move, put, spread
 from bcppl.inference.population import Population
 from bcppl.inference.targets import Target, accept
 from bcppl.traces import Trace, update
@@ -41,6 +42,10 @@ def hmc(
         jitter: each trajectory's step size is uniform within this share of `step_size`, so that none runs in
             circles.
 
+    Raises:
+        InputError: no address is named, the step size is not positive, the steps are no whole number, or the
+            jitter is not from 0 to below 1.
+
     Returns:
         A kernel. Fitting it raises InputError where an address is no latent one, a pose, discrete, or has a
         support without unconstrained coordinates; moving raises it where a site that hangs on the addresses
@@ -49,11 +54,9 @@ def hmc(
     named = tuple(a for each in addresses for a in ([each] if isinstance(each, str) else each))
     if not named:
         raise InputError("hmc was given no address to move; name at least one.")
-    if not step_size > 0 or steps < 1 or not 0 <= jitter < 1:
-        raise InputError(
-            f"hmc was given step size {step_size}, {steps} steps and jitter {jitter}; give a positive size, "
-            "at least one step and a jitter from 0 to below 1."
-        )
+    step_size = number_within("hmc was given step size {}", step_size, above=0.0)
+    steps = whole_number("hmc was given {} steps", steps)
+    jitter = number_within("hmc was given jitter {}", jitter, least=0.0, below=1.0)
 
     def kernel(population: Population) -> Move:
         factor = _factor(_Unconstrained(named, population.trace), population)
@@ -77,7 +80,7 @@ def hmc(
             values, log_stretch = space.values(position)
             # Where an exponential has run over or under, the particle has left the support.
             sound &= torch.isfinite(log_stretch) & space.inside(values)
-            values = {a: torch.where(_spread(sound, v), v, trace[a]) for a, v in values.items()}
+            values = {a: torch.where(spread(sound, v), v, trace[a]) for a, v in values.items()}
             log_ratio = 0.5 * (momentum**2 - turned**2).sum(dim=1) + log_stretch - space.values(start)[1]
             log_ratio = torch.where(sound, log_ratio, -torch.inf)
             new = update(trace, values).trace
@@ -205,10 +208,6 @@ def _bounds(support: Any) -> list[Tensor]:
 
 def _all(mask: Tensor) -> Tensor:
     return mask.reshape(len(mask), -1).all(dim=1)
-
-
-def _spread(mask: Tensor, like: Tensor) -> Tensor:
-    return mask.reshape(-1, *[1] * (like.ndim - 1))
 
 
 def _refuse_unsuited(address: str, trace: Trace) -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, Move, put
+from bcppl.inference.kernels.kernel import Kernel, Move, put, refuse_observed, spread
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.proposal import Fitted, Proposal, program_of
 from bcppl.inference.targets import Target, accept, visible
@@ -32,7 +32,7 @@ def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any
 
     Raises:
         InputError: what is given is no proposal. When the kernel moves: the proposal makes no choice at a
-            latent address.
+            latent address, or one at an observed address.
     """
     if not isinstance(proposal, Fitted) and not callable(proposal):
         raise InputError(
@@ -57,10 +57,16 @@ def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any
                     f"a proposal has no choice at a latent address: it chooses {chosen}, "
                     f"latent are {', '.join(trace.choices) or 'none'}; sample at one of these."
                 )
+            # What a proposal says it cannot have drawn has run out of the numbers of its type: it stays.
+            lost = forward.log_prob == -torch.inf
+            if bool(lost.any()):
+                new = {a: torch.where(spread(lost, v), trace[a], v) for a, v in new.items()}
             updated = update(trace, new)
+            refuse_observed("a proposal", forward.choices, updated.trace)
             back = {**forward.choices, **updated.discarded}
             backward = assess(program, (visible(target, updated.trace),), back, trace.particles)
-            passed, survivors = accept(target, trace, updated.trace, backward - forward.log_prob)
+            log_ratio = torch.where(lost, -torch.inf, backward - forward.log_prob)
+            passed, survivors = accept(target, trace, updated.trace, log_ratio)
             accepted = torch.zeros(trace.particles, dtype=torch.float64)
             accepted[passed] = 1.0
             return put(trace, passed, survivors), accepted

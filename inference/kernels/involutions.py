@@ -17,7 +17,7 @@ from bcppl.inference.kernels.jacobian import (
     refuse_apart,
     refuse_leaving,
 )
-from bcppl.inference.kernels.kernel import Kernel, Move, put
+from bcppl.inference.kernels.kernel import Kernel, Move, put, refuse_observed
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.proposal import Proposal, program_of
 from bcppl.inference.targets import Target, accept, visible
@@ -87,6 +87,7 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
                 refuse_apart("the involution, applied twice,", before, mapped(after))
                 _refuse_unequal(log_stretch, stretch(after, mapped(after)))
             updated = update(trace, new)
+            refuse_observed("the program of an involution", forward.choices, updated.trace)
             choices = {a: v for (kind, a), v in after.items() if kind == "choice"}
             backward = assess(choose, (visible(target, updated.trace),), choices, count)
             log_ratio = backward - forward.log_prob() + log_stretch

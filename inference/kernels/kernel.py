@@ -9,7 +9,7 @@ a share between the two for a move that is made of several.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -76,6 +76,25 @@ def takes(function: Callable[..., Any], count: int) -> bool:
     except ValueError:  # what is written in C may not say
         return True
     return True
+
+
+def refuse_observed(what: str, choices: Iterable[str], trace: Trace) -> None:
+    """Refuse a program that samples at an address that the model observes: it would be taken as auxiliary.
+
+    Raises:
+        InputError: names the address.
+    """
+    for address in choices:
+        if address not in trace.choices and address in trace.addresses:
+            raise InputError(
+                f"{what} samples {address!r}, which is observed; sample at latent addresses "
+                f"({', '.join(trace.choices) or 'none'}), and give auxiliary choices names of their own."
+            )
+
+
+def spread(mask: Tensor, like: Tensor) -> Tensor:
+    """A mask (N,) with as many axes as values (N, ...)."""
+    return mask.reshape(-1, *[1] * (like.ndim - 1))
 
 
 def _called(function: Any) -> str:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import normalised
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
@@ -68,15 +69,12 @@ def until(*, distinct: int | None = None, displacement: float | None = None, mos
     """
     if distinct is None and displacement is None:
         raise InputError("until is given nothing to wait for; give distinct, displacement or both.")
-    if distinct is not None and distinct < 1:
-        raise InputError(f"until is to wait for {distinct} distinct particles; give 1 or more.")
-    if displacement is not None and not 0.0 < displacement < 2.0:
-        raise InputError(
-            f"until is to wait for a displacement of {displacement} variances; give more than 0, less than 2."
-        )
-    if most < 1:
-        raise InputError(f"until may make {most} sweeps at most; give 1 or more.")
-    return Until(distinct, displacement, most)
+    if distinct is not None:
+        distinct = whole_number("until is to wait for {} distinct particles", distinct)
+    if displacement is not None:
+        what = "until is to wait for a displacement of {} variances"
+        displacement = number_within(what, displacement, above=0.0, below=2.0)
+    return Until(distinct, displacement, whole_number("until may make {} sweeps at most", most))
 
 
 def distinct(population: Population) -> int:
@@ -129,11 +127,13 @@ def rejuvenate(population: Population, kernel: Kernel, target: Target, sweeps: i
         sweeps: how many; 0 leaves the population as it is. Or `until(...)`.
 
     Raises:
-        InputError: a negative number of sweeps.
+        InputError: the sweeps are no whole number, 0 or more.
     """
-    most = sweeps.most if isinstance(sweeps, Until) else sweeps
-    if most < 0:
-        raise InputError(f"a population is to be moved {most} times; give 0 or more sweeps.")
+    most = (
+        sweeps.most
+        if isinstance(sweeps, Until)
+        else whole_number("a population is to be moved {} times", sweeps, least=0)
+    )
     start, shares, made = population, [], 0
     while made < most and not (isinstance(sweeps, Until) and sweeps.reached(start, population)):
         population, accepted = _sweep(population, kernel, target)

@@ -15,12 +15,13 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from bcppl.beliefs import normalised
+from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_other
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import spread_of
 from bcppl.inference.proposals.coordinates import coordinates_of
+from bcppl.inference.proposals.spread import learned_from
 from bcppl.inference.targets import Target, cost_of
 from bcppl.traces import Trace
 
@@ -141,15 +142,12 @@ def student_t(address: str, degrees: float = 5.0, width: float = 1.3) -> Surroga
     Raises:
         InputError: the degrees of freedom or the width are not greater than 0.
     """
-    if not (degrees > 0.0 and width > 0.0):
-        raise InputError(
-            f"student_t is given {degrees} degrees of freedom and a width of {width}; give more than 0."
-        )
+    degrees = number_within("student_t is given {} degrees of freedom", degrees, above=0.0)
+    width = number_within("student_t is given a width of {}", width, above=0.0)
 
     def fit(population: Population) -> Callable[[Trace], Tensor]:
-        coordinates = coordinates_of(population.trace, address)
-        places = coordinates.places(population.trace[address])
-        center = coordinates.mean(places, normalised(population.log_weights))
+        coordinates, places, weights = learned_from(population, address)
+        center = coordinates.mean(places, weights)
         factor = torch.linalg.cholesky(width * spread_of(address)(population))
 
         def log_density(trace: Trace) -> Tensor:
@@ -195,8 +193,7 @@ def delayed_acceptance(
         raise InputError(
             "delayed acceptance is to decide first by a function; give a surrogate as surrogate=..."
         )
-    if stages < 2:
-        raise InputError(f"delayed acceptance is asked for {stages} stages; give 2 or more.")
+    stages = whole_number("delayed acceptance is asked for {} stages", stages, least=2)
     if surrogate is not None and (first is not None or stages != 2):
         raise InputError(
             "delayed acceptance is given a surrogate and sites or stages besides; "

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arguments import number_within
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose
 from bcppl.distributions.support import freedom_of
 from bcppl.distributions.touch import OnsetLocation
@@ -50,8 +51,7 @@ def contact_alignment(address: str, sites: Sequence[str] = SITES, *, reach: floa
         InputError: the reach is not positive; when it is run: no site fits, or one is of another kind or of
             another pose than that at `address`.
     """
-    if not reach > 0.0:
-        raise InputError(f"contact_alignment is given reach {reach}; give more than 0.")
+    reach = number_within("contact_alignment is given reach {}", reach, above=0.0)
     spread = spread_of(address)
 
     def fit(population: Population) -> Callable[[Trace], None]:

@@ -19,7 +19,7 @@ from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.distributions.mixture import MixturePose
 from bcppl.distributions.poses import NormalPose
-from bcppl.distributions.support import freedom_of
+from bcppl.distributions.support import freedom_of, refuse_several_poses
 from bcppl.distributions.vectors import NormalStep
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
@@ -157,7 +157,22 @@ class VectorCoordinates:
     def _on_support(self, base: Any) -> Any:
         if self.transform.trivial:
             return base
-        return dist.TransformedDistribution(base, [self.transform], validate_args=False)
+        return OnSupport(base, [self.transform], validate_args=False)
+
+
+class OnSupport(dist.TransformedDistribution):
+    """A distribution over unbounded coordinates, transformed to the support of a site.
+
+    Where a step leads beyond what the value's type can hold (a log of -100 is 0 in single precision, one of
+    800 infinite in double), the value has no coordinates any more, and no density: no way leads back.
+    """
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (N,) of the values (N, *plates, *event); -inf where they have no coordinates."""
+        (transform,) = self.transforms
+        place = transform.inv(value)
+        density = self.base_dist.log_prob(place) - transform.log_abs_det_jacobian(place, value)
+        return torch.where(torch.isfinite(place).all(dim=-1), density, -torch.inf)
 
 
 class Unflattened(Transform):
@@ -232,7 +247,8 @@ def coordinates_of(trace: Trace, address: str) -> Coordinates:
     """The coordinates in which proposals move a latent address of a trace.
 
     Raises:
-        InputError: the address is not latent, is discrete, or its support has no unbounded coordinates.
+        InputError: the address is not latent, is discrete, holds several poses for each particle, or its
+            support has no unbounded coordinates.
     """
     if address not in trace.choices:
         raise InputError(
@@ -241,9 +257,10 @@ def coordinates_of(trace: Trace, address: str) -> Coordinates:
         )
     distribution = trace.distributions[address]
     freedom = freedom_of(distribution)
-    if freedom is not None:
-        return PoseCoordinates(freedom)
     value = trace[address]
+    if freedom is not None:
+        refuse_several_poses(address, value, distribution)
+        return PoseCoordinates(freedom)
     if distribution.support.is_discrete or not value.is_floating_point():
         raise InputError(
             f"address {address!r} is discrete and cannot be moved by small steps; use prior({address!r})."

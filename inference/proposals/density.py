@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import pyro
 import torch
 from torch import Tensor
 
-from bcppl.beliefs import normalised
+from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
-from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
+from bcppl.inference.proposals.coordinates import Coordinates
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import FLOOR, conditioned, covariance_of
+from bcppl.inference.proposals.spread import FLOOR, conditioned, covariance_of, learned_from
 from bcppl.inference.schemes import systematic
 from bcppl.traces import Trace
 
@@ -46,33 +46,36 @@ def independent(
         wide: the chance of the wide component, and its standard deviations in the population's.
 
     Raises:
-        InputError: fewer than one component, or a chance not in (0, 1); when it is fitted: the address is not
-            latent, or is discrete.
+        InputError: no whole number of components, a chance not in (0, 1), or a factor not above 0; when it is
+            fitted: the address is not latent, or is discrete.
     """
-    if components is not None and components < 1:
+    if components is not None:
+        components = whole_number("an independent proposal is given {} components", components)
+    inflation = number_within("an independent proposal is given the inflation {}", inflation, above=0.0)
+    if not isinstance(wide, Sequence) or len(wide) != 2:
         raise InputError(
-            f"an independent proposal is given {components} components; give 1 or more, or None."
+            f"the wide component of an independent proposal is {wide!r}; give its chance and its width."
         )
-    if not (0.0 < wide[0] < 1.0 and wide[1] > 0.0):
-        raise InputError(
-            f"the wide component of an independent proposal is {wide}; "
-            "give a chance above 0 and below 1, and a width above 0."
-        )
+    chance = number_within(
+        "the wide component of an independent proposal has the chance {}", wide[0], above=0.0, below=1.0
+    )
+    width = number_within(
+        "the wide component of an independent proposal has the width {}", wide[1], above=0.0
+    )
 
     def fit(population: Population) -> Callable[[Trace], None]:
-        known = coordinates_of(population.trace, address)
-        places, weights = known.places(population.trace[address]), normalised(population.log_weights)
+        known, places, weights = learned_from(population, address)
         if len(population) > TEACHERS:
-            places = places[systematic(population.log_weights, TEACHERS)]
+            places = places[systematic(weights.log(), TEACHERS)]
             weights = weights.new_full((TEACHERS,), 1.0 / TEACHERS)
         mixture = _kernel_density(known, places, weights)
         if components is not None:
             mixture = _maximised(known, places, weights, components)
         mean = known.mean(places, weights)
         whole = conditioned(covariance_of(known.steps(mean, places), weights))
-        shares = torch.cat([mixture.log_weights.exp() * (1.0 - wide[0]), weights.new_tensor([wide[0]])]).log()
+        shares = torch.cat([mixture.log_weights.exp() * (1.0 - chance), weights.new_tensor([chance])]).log()
         centers = torch.cat([mixture.centers, mean[None]])
-        covariances = torch.cat([inflation**2 * mixture.covariances, wide[1] ** 2 * whole[None]])
+        covariances = torch.cat([inflation**2 * mixture.covariances, width**2 * whole[None]])
 
         def anew(trace: Trace) -> None:
             pyro.sample(address, known.of(trace).mixture(shares, centers, covariances))

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.depth import LaplaceDepth, RobustDepth
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
@@ -53,10 +54,8 @@ def depth_alignment(address: str, sites: str = "depth_*", *, steps: int = 1, rea
         InputError: fewer than one step; when it is run: no depth image is at such an address, or one is of
             another pose than that at `address`.
     """
-    if steps < 1 or not reach > 0.0:
-        raise InputError(
-            f"depth_alignment is given {steps} steps and reach {reach}; give 1 or more, and more than 0."
-        )
+    steps = whole_number("depth_alignment is given {} steps", steps)
+    reach = number_within("depth_alignment is given reach {}", reach, above=0.0)
     spread = spread_of(address)
 
     def fit(population: Population) -> Callable[[Trace], None]:

@@ -10,11 +10,11 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from bcppl.beliefs import normalised
+from bcppl.arguments import number_within
 from bcppl.inference.population import Population
-from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
+from bcppl.inference.proposals.coordinates import Coordinates
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import spread_of
+from bcppl.inference.proposals.spread import learned_from, spread_of
 from bcppl.traces import Trace
 
 DIFFERENCES = 200  # how many are drawn when it is fitted
@@ -37,14 +37,19 @@ def differential_evolution(
         noise: standard deviation of the noise, in the particles' own spread.
 
     Raises:
-        InputError: when it is fitted: the address is not latent, or is discrete.
+        InputError: the scale or the noise is not positive, or the jumps are no share; when it is fitted: the
+            address is not latent, or is discrete.
     """
+    if scale is not None:
+        scale = number_within("differential_evolution is given the scale {}", scale, above=0.0)
+    jumps = number_within("differential_evolution is given the share of jumps {}", jumps, least=0.0, most=1.0)
+    noise = number_within("differential_evolution is given the noise {}", noise, above=0.0)
     spread = spread_of(address)
 
     def fit(population: Population) -> Callable[[Trace], None]:
         covariance = noise**2 * spread(population)
-        known = coordinates_of(population.trace, address)
-        drawn = _differences(known, known.places(population.trace[address]), population.log_weights)
+        known, places, weights = learned_from(population, address)
+        drawn = _differences(known, places, weights)
         usual = 2.38 / math.sqrt(2.0 * known.dimension) if scale is None else scale
         sizes = torch.tensor([usual, 1.0], dtype=torch.float64)
 
@@ -64,9 +69,8 @@ def differential_evolution(
     return Fitted(fit)
 
 
-def _differences(coordinates: Coordinates, places: Tensor, log_weights: Tensor) -> Tensor:
+def _differences(coordinates: Coordinates, places: Tensor, weights: Tensor) -> Tensor:
     """Steps (M, d) from particle to particle, both drawn by weight, no particle with itself."""
-    weights = normalised(log_weights)
     if int((weights > 0).sum()) < 2:
         return torch.zeros(1, coordinates.dimension, dtype=torch.float64)
     first = torch.multinomial(weights, DIFFERENCES, replacement=True)

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from bcppl.beliefs import normalised
+from bcppl.errors import InferenceError
 from bcppl.inference.population import Population
-from bcppl.inference.proposals.coordinates import coordinates_of
+from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
 
 # Spreads below these are rounding, not belief: metres and radians for poses, the value's own unit otherwise.
 FLOOR = 1e-6
@@ -24,14 +25,36 @@ def spread_of(address: str) -> Callable[[Population], Tensor]:
     """
 
     def spread(population: Population) -> Tensor:
-        coordinates = coordinates_of(population.trace, address)
-        places = coordinates.places(population.trace[address])
-        weights = normalised(population.log_weights)
+        coordinates, places, weights = learned_from(population, address)
         return conditioned(
             covariance_of(coordinates.steps(coordinates.mean(places, weights), places), weights)
         )
 
     return spread
+
+
+def learned_from(population: Population, address: str) -> tuple[Coordinates, Tensor, Tensor]:
+    """The coordinates, places (K, ...) and weights (K,) of the particles that can be learned from.
+
+    A draw that ran out of the numbers of its type (0 or infinity where values are positive) has no place in
+    unbounded coordinates: it teaches nothing.
+
+    Raises:
+        InferenceError: no particle with weight has a place.
+    """
+    coordinates = coordinates_of(population.trace, address)
+    values = population.trace[address]
+    places, weights = coordinates.places(values), normalised(population.log_weights)
+    finite = torch.isfinite(places).all(dim=-1)
+    if bool(finite.all()):
+        return coordinates, places, weights
+    total = float(weights[finite].sum())
+    if not total > 0.0:
+        raise InferenceError(
+            f"no particle's value at {address!r} can be learned from: all are 0 or infinite in "
+            f"{values.dtype}, at the edge of the support; give the prior less spread."
+        )
+    return coordinates, places[finite], weights[finite] / total
 
 
 def covariance_of(steps: Tensor, weights: Tensor) -> Tensor:

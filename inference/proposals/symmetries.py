@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.mixture import MixturePose
 from bcppl.distributions.poses import HELD
 from bcppl.distributions.support import freedom_of
@@ -30,12 +31,24 @@ class Continuous:
         point: (3,) a point on the axis, metres.
         turn: the largest angle to either side, radians, at most pi.
         slide: the largest shift to either side, metres.
+
+    Raises:
+        InputError: the axis is no direction, the turn not from 0 to pi, or the slide negative.
     """
 
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     point: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn: float = math.pi
     slide: float = 0.0
+
+    def __post_init__(self) -> None:
+        number_within("a continuous symmetry turns up to {} rad", self.turn, least=0.0, most=math.pi)
+        number_within("a continuous symmetry slides up to {} m", self.slide, least=0.0)
+        for name, given in (("axis", self.axis), ("point", self.point)):
+            if len(given) != 3 or not all(math.isfinite(x) for x in given):
+                raise InputError(f"a continuous symmetry has the {name} {given}; give three finite numbers.")
+        if not any(self.axis):
+            raise InputError("a continuous symmetry has an axis of no length; give a direction.")
 
     def at(self, share: Tensor) -> Tensor:
         """The motions (..., 7) `part_from_part` by a share (...,) of the largest amount, in [-1, 1]."""
@@ -58,8 +71,7 @@ def rotations(
     Raises:
         InputError: the order is below 2.
     """
-    if order < 2:
-        raise InputError(f"a rotational symmetry is of order {order}; give 2 or more.")
+    order = whole_number("a rotational symmetry is of order {}", order, least=2)
     shares = 2.0 * torch.arange(1, order, dtype=torch.float64) / order
     return Continuous(axis, point).at(shares)
 
@@ -82,14 +94,11 @@ def symmetry(
         InputError: the motions are no poses, or the spread is not positive; when it is run: the address is
             no latent pose, or a motion would leave the pose's free axes.
     """
-    if min(spread) <= 0.0:
-        raise InputError(f"symmetry is given a spread of {spread}; give positive metres and radians.")
+    if not isinstance(spread, Sequence) or len(spread) != 2:
+        raise InputError(f"symmetry is given a spread of {spread!r}; give two, metres and radians.")
+    metres = number_within("symmetry is given a spread of {} m", spread[0], above=0.0)
+    radians = number_within("symmetry is given a spread of {} rad", spread[1], above=0.0)
     family = transforms if isinstance(transforms, Continuous) else None
-    if family is not None and (not 0.0 <= family.turn <= math.pi or not any(family.axis)):
-        raise InputError(
-            f"a continuous symmetry has axis {family.axis} and turns up to {family.turn} rad; "
-            "give a direction, and an angle from 0 to pi."
-        )
     listed = poses.identity(1) if family is not None else _with_inverses(transforms)
 
     def alike(trace: Trace) -> None:
@@ -107,7 +116,7 @@ def symmetry(
                 f"a symmetry moves the pose at {address!r} along an axis that is held; "
                 "leave that motion out, or free the axis."
             )
-        deviations = torch.tensor([spread[0]] * 3 + [spread[1]] * 3, dtype=torch.float64)
+        deviations = torch.tensor([metres] * 3 + [radians] * 3, dtype=torch.float64)
         equal = torch.zeros(ends.shape[:-1], dtype=torch.float64)
         pyro.sample(address, MixturePose(equal, ends, freedom.coordinates(deviations), freedom))
 

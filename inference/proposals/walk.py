@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pyro
 import pyro.distributions as dist
 import torch
 from torch import Tensor
 
+from bcppl.arguments import number_within
+from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import coordinates_of
 from bcppl.inference.proposals.proposal import Fitted
@@ -30,9 +32,10 @@ def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fitted:
             Statistical Science 16, 2001).
 
     Raises:
-        InputError: when it is fitted: the address is not latent, or is discrete.
+        InputError: the scales are not two positive numbers, the smaller first; when it is fitted: the address
+            is not latent, or is discrete.
     """
-    smallest, largest = (math.log(s) for s in scales)
+    smallest, largest = map(math.log, _scales(scales))
     spread = spread_of(address)
 
     def fit(population: Population) -> Callable[[Trace], None]:
@@ -48,6 +51,17 @@ def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fitted:
         return random_walk
 
     return Fitted(fit)
+
+
+def _scales(scales: object) -> tuple[float, float]:
+    if not isinstance(scales, Sequence | Tensor) or isinstance(scales, str) or len(scales) != 2:
+        raise InputError(f"drift is given the scales {scales!r}; give two, (0.05, 1.0).")
+    smallest, largest = (number_within("drift is given the scale {}", s, above=0.0) for s in scales)
+    if smallest > largest:
+        raise InputError(
+            f"drift is given the scales {(smallest, largest)}; give the smaller one first, (0.05, 1.0)."
+        )
+    return smallest, largest
 
 
 def _pair(low: float, high: float) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,79 @@
+"""Checks of the numbers that functions are given: what is out of range is refused in one sentence."""
+
+from __future__ import annotations
+
+import math
+import operator
+
+from bcppl.errors import InputError
+
+# What torch's generators and numpy's seed sequences all take.
+LARGEST_SEED = 2**63 - 1
+
+
+def whole_number(what: str, value: object, *, least: int = 1, most: int | None = None) -> int:
+    """A count that is a whole number in a range, as an int.
+
+    Args:
+        what: the beginning of the sentence, {} where the value stands: "until may make {} sweeps at most".
+        value: what was given; numpy's and torch's whole numbers count as such, True and 3.0 do not.
+        least: the smallest that will do.
+        most: the largest; None for no bound.
+
+    Raises:
+        InputError: it is no whole number, or out of the range.
+    """
+    try:
+        count = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        count = None
+    if count is None or count < least or (most is not None and count > most):
+        upper = f"{least} or more" if most is None else f"from {least} to {most}"
+        raise InputError(f"{_said(what, value)}; give a whole number, {upper}.")
+    return count
+
+
+def seed_number(value: object) -> int:
+    """A seed: a whole number from 0 to 2^63 - 1.
+
+    Raises:
+        InputError: it is none.
+    """
+    return whole_number("the seed is {}", value, least=0, most=LARGEST_SEED)
+
+
+def number_within(
+    what: str,
+    value: object,
+    *,
+    above: float = -math.inf,
+    least: float = -math.inf,
+    below: float = math.inf,
+    most: float = math.inf,
+) -> float:
+    """A finite number in a range, as a float.
+
+    Args:
+        what: the beginning of the sentence, {} where the value stands: "adaptive is given threshold {}".
+        value: what was given.
+        above: what it must exceed.
+        least: the smallest that will do.
+        below: what it must not reach.
+        most: the largest that will do.
+
+    Raises:
+        InputError: it is no number, NaN or infinite, or out of the range.
+    """
+    try:
+        number = math.nan if isinstance(value, str | bytes | bool) else float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, RuntimeError):
+        number = math.nan
+    if math.isfinite(number) and above < number < below and least <= number <= most:
+        return number
+    bounds = [(above, "above"), (least, "at least"), (below, "below"), (most, "at most")]
+    asked = " and ".join(f"{name} {bound:g}" for bound, name in bounds if math.isfinite(bound))
+    raise InputError(f"{_said(what, value)}; give a finite number{' ' * bool(asked)}{asked}.")
+
+
+def _said(what: str, value: object) -> str:
+    return what.replace("{}", repr(value))
