@@ -9,14 +9,13 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from bcppl.parts import Part
-from bcppl.simulators.peg_model import SENSED
 from bcppl.simulators.stepping import POSE, Clock, Standing
 
 Array = npt.NDArray[np.float64]
 
 _OUT_OF_REACH = np.array([[0.0, 0.0, 1e3, 1.0, 0.0, 0.0, 0.0]])
 _MARGIN = 0.002  # m
-_GROUPS = 24  # particles start together at the latest of this many stamps: few, long runs are the fastest
+_IN_VAIN = 30  # particles times stamps: what costs as much as beginning one more run
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,17 +35,8 @@ class Approach:
 
 def free_approach(clock: Clock, stamps: int) -> Approach:
     """Simulate a probe of `stamps` stamps once, with the part out of reach."""
-    standing = clock.beginning(1)
-    standings, rows = [standing], np.empty((stamps, SENSED))
-    for stamp in range(stamps):
-        row, standing = clock.read(standing, _OUT_OF_REACH, stamp, stamp + 1)
-        rows[stamp] = row[0, 0]
-        standings.append(standing)
-    return Approach(
-        rows,
-        Standing(np.concatenate([s.state for s in standings]), np.concatenate([s.tail for s in standings])),
-        bool(clock.on_time(standing, stamps)[0]),
-    )
+    rows, standing = clock.followed(_OUT_OF_REACH, stamps)
+    return Approach(rows, standing, bool(clock.on_time(standing[-1:], stamps)[0]))
 
 
 def _box(part: Part) -> tuple[Array, Array]:
@@ -63,32 +53,63 @@ def _box(part: Part) -> tuple[Array, Array]:
 
 
 def first_possible_touch(
-    approach: Approach, part: Part, peg: Part, world_from_part: Array
+    approach: Approach, part: Part, peg: Part, world_from_part: Array, grip_from_peg: Array | None = None
 ) -> npt.NDArray[np.int64]:
     """The number of stamps (N,) that a probe can be read in free motion, for poses (N, 7) of the part.
 
     The peg's bounding box, seen in the part's axes and grown by 2 mm and by what it moves until the next
     stamp, does not meet the part's.
+
+    Args:
+        approach: the probe in free motion.
+        part: what is touched.
+        peg: what is held.
+        world_from_part: (N, 7).
+        grip_from_peg: (N, 7) where the peg is in the hand; None for where it should be.
     """
     stamps = len(approach.rows)
-    if not approach.on_time:
+    if not approach.on_time or stamps == 0:
         return np.zeros(len(world_from_part), dtype=np.int64)
     pose = approach.rows[:, POSE]
     turn = Rotation.from_quat(pose[:, [4, 5, 6, 3]])
     peg_center, peg_half = _box(peg)
     part_center, part_half = _box(part)
-    radius = float(np.linalg.norm(np.abs(peg_center) + peg_half))
+    held, held_from_peg = peg_center[None], np.eye(3)[None]
+    if grip_from_peg is not None:
+        held_from_peg = Rotation.from_quat(grip_from_peg[:, [4, 5, 6, 3]]).as_matrix()
+        held = grip_from_peg[:, :3] + held_from_peg @ peg_center
+    radius = float(np.linalg.norm(held, axis=1).max() + np.linalg.norm(peg_half))
     moved = (
         np.linalg.norm(np.diff(pose[:, :3], axis=0), axis=1)
         + radius * (turn[:-1].inv() * turn[1:]).magnitude()
     )
-    grown = _MARGIN + np.append(moved, 0.0) if stamps else np.zeros(0)
+    grown = _MARGIN + np.append(moved, 0.0)
     world = Rotation.from_quat(world_from_part[:, [4, 5, 6, 3]]).as_matrix()
-    center = pose[:, :3] + turn.apply(peg_center) if stamps else np.zeros((0, 3))
-    relative = np.einsum("nji,ntj->nti", world, center[None] - world_from_part[:, None, :3]) - part_center
-    rotation = np.abs(np.einsum("nji,tjk->ntik", world, turn.as_matrix()))
-    reach = rotation @ peg_half + part_half + grown[None, :, None]
+    part_from_world = world.swapaxes(1, 2)
+    # One matrix product for all stamps: (N, 3, 3) times (3, 3 T).
+    turns = turn.as_matrix().transpose(1, 0, 2).reshape(3, -1)
+    rotation = (part_from_world @ turns).reshape(-1, 3, stamps, 3)
+    path = (pose[None, :, :3] - world_from_part[:, None, :3]) @ world
+    relative = path + np.einsum("nitk,nk->nti", rotation, np.broadcast_to(held, (len(path), 3))) - part_center
+    if grip_from_peg is not None:
+        rotation = np.einsum("nitk,nkj->nitj", rotation, held_from_peg)
+    reach = (np.abs(rotation) @ peg_half).swapaxes(1, 2) + part_half + grown[None, :, None]
     meets = (np.abs(relative) <= reach).all(axis=-1)
     first = np.where(meets.any(axis=1), meets.argmax(axis=1), stamps)
-    stride = max(1, -(-stamps // _GROUPS))
-    return np.where(first < stamps, first // stride * stride, stamps)
+    return grouped(first.astype(np.int64), stamps)
+
+
+def grouped(first: npt.NDArray[np.int64], stamps: int) -> npt.NDArray[np.int64]:
+    """Starts (N,) moved earlier so that particles start together: few, long runs are the fastest.
+
+    A group is closed when its particles together would run `_IN_VAIN` stamps more than they need.
+    """
+    starts, counts = np.unique(first[first < stamps], return_counts=True)
+    together = np.full(stamps + 1, stamps, dtype=np.int64)
+    begin, wasted = 0, np.inf
+    for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
+        wasted += count * (start - begin)
+        if wasted > _IN_VAIN:
+            begin, wasted = start, 0
+        together[start] = begin
+    return together[first]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import warnings
+from collections.abc import Mapping
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -17,8 +18,10 @@ from bcppl.parts import Part
 from bcppl.recordings.measurements import Probe
 from bcppl.simulators.approach import Approach, first_possible_touch, free_approach
 from bcppl.simulators.effort import Effort
+from bcppl.simulators.grasp import in_series
 from bcppl.simulators.peg_model import SENSED, ContactParameters, build_model, check_probe
 from bcppl.simulators.stepping import POSE, WRENCH, Clock, Standing
+from bcppl.simulators.unknowns import FELT_IN_CONTACT_ONLY, Unknowns
 
 Array = npt.NDArray[np.float64]
 Selection = Tensor | npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice
@@ -61,11 +64,23 @@ class PegPhysics:
         self.effort = Effort()
         self._sessions: WeakKeyDictionary[Probe, Session] = WeakKeyDictionary()
 
-    def start(self, world_from_part: Tensor | Array, probe: Probe) -> Rollout:
+    def start(
+        self, world_from_part: Tensor | Array, probe: Probe, unknowns: Unknowns | None = None
+    ) -> Rollout:
         """Rollouts of a probe, not yet run, for poses (N, 7) of the part.
 
+        Where friction, a contact's settling or the peg's place in the hand is unknown, the free approach is
+        still simulated once for all; where the controller or the grasp's compliance is, each particle comes
+        near in its own way, and nothing is skipped.
+
+        Args:
+            world_from_part: (N, 7).
+            probe: what the arm does.
+            unknowns: what else differs between the particles; None for nothing.
+
         Raises:
-            InputError: the poses are not (N, 7) and finite, or the probe cannot be simulated.
+            InputError: the poses are not (N, 7) and finite, the probe cannot be simulated, or an unknown
+                does not fit or is physically impossible.
         """
         poses = torch.as_tensor(world_from_part).detach().cpu().numpy().astype(np.float64)
         if poses.ndim != 2 or poses.shape[1] != 7 or not np.isfinite(poses).all():
@@ -73,9 +88,10 @@ class PegPhysics:
                 f"the part's poses have shape {poses.shape} or are not finite; "
                 "give (N, 7) numbers x y z qw qx qy qz."
             )
+        rows = {} if unknowns is None else unknowns.rows(len(poses))
         if probe not in self._sessions:
             self._sessions[probe] = Session(self, probe)
-        return Rollout.at_rest(self._sessions[probe], poses)
+        return Rollout.at_rest(self._sessions[probe], poses, in_series(rows, np.asarray(probe.stiffness)))
 
 
 class Session:
@@ -105,6 +121,7 @@ class Rollout:
 
     Attributes:
         world_from_part: (N, 7).
+        unknowns: what else differs between the particles, by name (N, ...).
         wrench: (N, count, 6) what the environment exerts on the peg at the stamps: force (N), torque (N m),
             in the peg's frame about its origin, as a wrist sensor reads it; NaN once diverged.
         world_from_peg: (N, count, 7).
@@ -116,28 +133,41 @@ class Rollout:
         self,
         session: Session,
         world_from_part: Array,
+        unknowns: Mapping[str, Array],
         rows: Array,
         standing: Standing,
         free: npt.NDArray[np.int64],
         level: npt.NDArray[np.int64],
     ) -> None:
-        self.session, self.world_from_part = session, world_from_part
+        self.session, self.world_from_part, self.unknowns = session, world_from_part, unknowns
         self._rows, self._standing, self._free, self._level = rows, standing, free, level
 
     @classmethod
-    def at_rest(cls, session: Session, world_from_part: Array) -> Rollout:
+    def at_rest(cls, session: Session, world_from_part: Array, unknowns: Mapping[str, Array]) -> Rollout:
         """Before the first stamp."""
         particles = len(world_from_part)
         free, level = np.zeros(particles, dtype=np.int64), np.zeros(particles, dtype=np.int64)
         standing = session.clocks[0].beginning(particles)
-        return cls(session, world_from_part, np.empty((particles, 0, SENSED)), standing, free, level)
+        none = np.empty((particles, 0, SENSED))
+        return cls(session, world_from_part, unknowns, none, standing, free, level)
+
+    @property
+    def _skips(self) -> bool:
+        """Whether the free approach is the same for all particles, and simulated once."""
+        return (
+            self.session.skip and self.session.densely_read and self.unknowns.keys() <= FELT_IN_CONTACT_ONLY
+        )
 
     def _skip_approach(self) -> None:
         """Begin each simulation at the last stamp of its free approach."""
         session = self.session
-        if not session.densely_read:
-            return
-        self._free = first_possible_touch(session.approach, session.part, session.peg, self.world_from_part)
+        self._free = first_possible_touch(
+            session.approach,
+            session.part,
+            session.peg,
+            self.world_from_part,
+            self.unknowns.get("grip_from_peg"),
+        )
         self._standing = session.approach.standing[self._free]
 
     def __len__(self) -> int:
@@ -169,6 +199,7 @@ class Rollout:
         return Rollout(
             self.session,
             self.world_from_part[rows].copy(),
+            {name: value[rows].copy() for name, value in self.unknowns.items()},
             self._rows[rows].copy(),
             self._standing[rows],
             self._free[rows],
@@ -179,9 +210,11 @@ class Rollout:
         """For each particle this rollout where a mask (N,) is true, else the other; both are run equally far.
 
         Raises:
-            InputError: the other is of another probe, or of another number of particles.
+            InputError: the other is of another probe or another number of particles, or leaves something
+                else open.
         """
-        if other.session is not self.session or len(other) != len(self):
+        alike = other.session is self.session and other.unknowns.keys() == self.unknowns.keys()
+        if not alike or len(other) != len(self):
             raise InputError(
                 f"rollouts of {len(self)} particles of probe {self.session.name!r} cannot be merged with "
                 f"{len(other)} of {other.session.name!r}; both must be of one physics, probe and population."
@@ -191,6 +224,8 @@ class Rollout:
         mine = self.advance(count)[:]
         theirs = other.advance(count)[taken]
         mine.world_from_part[taken], mine._rows[taken] = theirs.world_from_part, theirs._rows
+        for name, value in mine.unknowns.items():
+            value[taken] = theirs.unknowns[name]
         mine._free, mine._level = mine._free.copy(), mine._level.copy()
         mine._free[taken], mine._level[taken] = theirs._free, theirs._level
         mine._standing = mine._standing.put(taken, theirs._standing)
@@ -214,7 +249,7 @@ class Rollout:
         if count <= done or len(self) == 0:
             return self if count <= done else self._extended(np.empty((0, count - done, SENSED)))
         with self.session.effort.measure(items=len(self) if done == 0 else 0):
-            if done == 0 and self.session.skip:
+            if done == 0 and self._skips:
                 self._skip_approach()
             fresh = np.full((len(self), count - done, SENSED), np.nan)
             full = np.flatnonzero(self._level == _FULL)
@@ -236,7 +271,7 @@ class Rollout:
         if len(members) == 0:
             return
         clock, free = self.session.clocks[level], self._free[members]
-        if self.session.skip and level == _FULL:
+        if level == _FULL and self._skips:
             fresh[members] = self.session.approach.rows[first:last]
         cuts = [first, *sorted({int(f) for f in free if first < f < last}), last]
         standing = self._standing
@@ -244,7 +279,8 @@ class Rollout:
             moving = members[free <= start]
             if len(moving) == 0:
                 continue
-            rows, moved = clock.read(standing[moving], self.world_from_part[moving], start, stop)
+            unknowns = {name: value[moving] for name, value in self.unknowns.items()}
+            rows, moved = clock.read(standing[moving], self.world_from_part[moving], unknowns, start, stop)
             fresh[moving, start - first : stop - first] = rows
             standing = standing.put(moving, moved)
             self.session.effort.amount += (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import os
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import mujoco
@@ -13,6 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bcppl.recordings.measurements import Probe
+from bcppl.simulators.grasp import as_gripped
+from bcppl.simulators.model_copies import ModelCopies
 from bcppl.simulators.peg_model import SENSED, controls, hold, steps_of
 
 Array = npt.NDArray[np.float64]
@@ -69,6 +72,7 @@ class Clock:
         self._low, self._high, self._weight = steps_of(probe, time_step)
         steps = self.step_after(len(self._high))
         self._controls = controls(probe, probe.command_times[0] + time_step * np.arange(max(1, steps)))
+        self._copies = ModelCopies(self.model)
         self._data = [mujoco.MjData(self.model) for _ in range(_threads())]
 
     def step_after(self, stamps: int) -> int:
@@ -86,13 +90,14 @@ class Clock:
         return Standing(state, np.zeros((particles, 2, SENSED)))
 
     def read(
-        self, standing: Standing, world_from_part: Array, first: int, last: int
+        self, standing: Standing, world_from_part: Array, unknowns: Mapping[str, Array], first: int, last: int
     ) -> tuple[Array, Standing]:
         """Run on from where stamps before `first` have been read, up to stamp `last` (exclusive).
 
         Args:
             standing: of N particles, `first` stamps read.
             world_from_part: (N, 7).
+            unknowns: what else differs between the particles, from `grasp.in_series`.
             first: the next stamp.
             last: where to stop.
 
@@ -101,9 +106,42 @@ class Clock:
             exerts on it; and where the simulations stand now.
         """
         start, stop = self.step_after(first), self.step_after(last)
-        sensed, state = self._run(standing.state, world_from_part, start, stop)
+        sensed = np.empty((len(standing.state), stop - start, SENSED))
+        state = standing.state
+        for begin, end, states, rows in self._blocks(state, world_from_part, unknowns, start, stop):
+            sensed[:, begin - start : end - start] = rows
+            state = states[:, -1].copy()
         rows = np.concatenate([standing.tail, sensed], axis=1)
-        shift = 2 - start
+        read = self._at_stamps(rows, 2 - start, first, last)
+        if "grasp_compliance" in unknowns:
+            read = as_gripped(read, unknowns["grasp_compliance"])
+        return read, Standing(state, rows[:, -2:].copy())
+
+    def followed(self, world_from_part: Array, stamps: int) -> tuple[Array, Standing]:
+        """One simulation from the beginning, for a pose (1, 7) of the part.
+
+        Returns:
+            Rows (stamps, 13), and where it stands after 0, 1, ... `stamps` stamps.
+        """
+        begin, stop = self.beginning(1), self.step_after(stamps)
+        states, sensed = [begin.state], [begin.tail[0]]
+        for *_, state, rows in self._blocks(begin.state, world_from_part, {}, 0, stop):
+            states.append(state[0])
+            sensed.append(rows[0])
+        every, rows = np.concatenate(states), np.concatenate(sensed)
+        after = np.array([self.step_after(count) for count in range(stamps + 1)])
+        tails = np.stack([rows[after], rows[after + 1]], axis=1)
+        return self._at_stamps(rows[None], 2, 0, stamps)[0], Standing(every[after], tails)
+
+    def on_time(self, standing: Standing, stamps: int) -> npt.NDArray[np.bool_]:
+        """Which particles (N,) are finite and as far as they should be: MuJoCo stops those that diverge."""
+        expected = self.time_step * self.step_after(stamps)
+        with np.errstate(invalid="ignore"):
+            timely = np.abs(standing.state[:, 0] - expected) < 0.5 * self.time_step
+        return timely & np.isfinite(standing.state).all(axis=1)
+
+    def _at_stamps(self, rows: Array, shift: int, first: int, last: int) -> Array:
+        """Sensor rows (N, last-first, 13) at stamps, of rows of which number k is that of step k - shift."""
         low, weight = rows[:, self._low[first:last] + shift], self._weight[first:last, None]
         if weight.any():
             high = rows[:, self._high[first:last] + shift]
@@ -114,33 +152,30 @@ class Clock:
             low[..., 3:7] /= np.linalg.norm(low[..., 3:7], axis=-1, keepdims=True)
         # The sensors report what the flange exerts on the peg.
         low[..., WRENCH] *= -1.0
-        return low, Standing(state, rows[:, -2:].copy())
+        return low
 
-    def on_time(self, standing: Standing, stamps: int) -> npt.NDArray[np.bool_]:
-        """Which particles (N,) are finite and as far as they should be: MuJoCo stops those that diverge."""
-        expected = self.time_step * self.step_after(stamps)
-        with np.errstate(invalid="ignore"):
-            timely = np.abs(standing.state[:, 0] - expected) < 0.5 * self.time_step
-        return timely & np.isfinite(standing.state).all(axis=1)
+    def _blocks(
+        self, state: Array, world_from_part: Array, unknowns: Mapping[str, Array], first: int, last: int
+    ) -> Iterator[tuple[int, int, Array, Array]]:
+        """Steps `first` to `last` (exclusive) in blocks.
 
-    def _run(self, state: Array, world_from_part: Array, first: int, last: int) -> tuple[Array, Array]:
-        """Steps `first` to `last` (exclusive): raw sensor rows (N, last-first, 13) and the states after them.
-
-        A sensor row describes the state before its step: row k is the time k * time_step.
+        Of each: where it begins and ends, the states (N, steps, S) after each step, and the raw sensor rows
+        (N, steps, 13). A sensor row describes the state before its step: row k is the time k * time_step.
         """
         particles = len(state)
-        sensed = np.empty((particles, last - first, SENSED))
+        models = self._copies.of(unknowns)
         block = max(1, _BLOCK // (8 * max(1, particles) * (_CONTROLS + SENSED + state.shape[1])))
         for start in range(first, last, block):
             stop = min(last, start + block)
             control = np.empty((particles, stop - start, _CONTROLS))
             control[..., :9] = self._controls[start:stop, :9]
-            control[..., 12:16] = self._controls[start:stop, 9:]
+            if "damping" in unknowns:
+                control[..., :6] *= unknowns["damping"][:, None]
             control[..., 9:12] = world_from_part[:, None, :3]
+            control[..., 12:16] = self._controls[start:stop, 9:]
             control[..., 16:] = world_from_part[:, None, 3:]
             states, rows = _pool().rollout(
-                self.model, self._data, np.ascontiguousarray(state), control, control_spec=_CONTROL
+                models, self._data, np.ascontiguousarray(state), control, control_spec=_CONTROL
             )
-            sensed[:, start - first : stop - first] = rows
-            state = states[:, -1].copy()
-        return sensed, state
+            yield start, stop, states, rows
+            state = states[:, -1]

@@ -10,6 +10,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.recordings.measurements import Probe
 from bcppl.simulators.physics import PegPhysics, Rollout, Selection, rows_of
+from bcppl.simulators.unknowns import Unknowns
 from bcppl.simulators.wrench import Sensing, SensingState
 
 Array = npt.NDArray[np.float64]
@@ -21,7 +22,7 @@ class ContactTrack:
     Attributes:
         rollout: the physics.
         sensing: how contacts are read from the wrench.
-        inputs: the poses (N, 7) of the part, as one tensor: what the track hangs on.
+        inputs: what the track hangs on: the poses (N, 7) of the part, and what else is unknown.
     """
 
     def __init__(
@@ -37,20 +38,27 @@ class ContactTrack:
 
     @classmethod
     def start(
-        cls, physics: PegPhysics, sensing: Sensing, world_from_part: Tensor, probe: Probe
+        cls,
+        physics: PegPhysics,
+        sensing: Sensing,
+        world_from_part: Tensor,
+        probe: Probe,
+        unknowns: Unknowns | None = None,
     ) -> ContactTrack:
         """Before the first stamp, for poses (N, 7) of the part.
 
+        Poses and wrenches are of the grip, and contact is located on a peg that is held as planned, whatever
+        `unknowns.grip_from_peg` is: what is measured is read in the same way.
+
         Raises:
-            InputError: the poses are not (N, 7) and finite, the probe cannot be simulated, or its stamps are
-                not at sensing's rate.
+            InputError: the poses are not (N, 7) and finite, the probe cannot be simulated, its stamps are
+                not at sensing's rate, or an unknown does not fit or is physically impossible.
         """
         sensing.check_rate(probe.stamps, f"probe {probe.name!r}")
-        rollout = physics.start(world_from_part, probe)
+        rollout = physics.start(world_from_part, probe, unknowns)
+        inputs = (world_from_part, *(() if unknowns is None else unknowns.tensors))
         particles = len(rollout)
-        return cls(
-            rollout, sensing, (world_from_part,), sensing.start(particles), np.empty((particles, 0, 3))
-        )
+        return cls(rollout, sensing, inputs, sensing.start(particles), np.empty((particles, 0, 3)))
 
     def __len__(self) -> int:
         return len(self.rollout)
@@ -114,9 +122,10 @@ class ContactTrack:
     def __getitem__(self, index: Selection) -> ContactTrack:
         """The tracks of some particles, in the order of an index tensor, a mask or a slice."""
         rows = rows_of(index)
-        kept = self.inputs[0][index if isinstance(index, slice) else torch.as_tensor(rows)]
+        chosen = index if isinstance(index, slice) else torch.as_tensor(rows)
+        kept = tuple(each[chosen] for each in self.inputs)
         return ContactTrack(
-            self.rollout[rows], self.sensing, (kept,), self._state[rows], self._contacts[rows].copy()
+            self.rollout[rows], self.sensing, kept, self._state[rows], self._contacts[rows].copy()
         )
 
     def where(self, mask: Tensor, other: ContactTrack) -> ContactTrack:
@@ -128,7 +137,10 @@ class ContactTrack:
         taken = np.flatnonzero(~mask.cpu().numpy())
         contacts = self._contacts.copy()
         contacts[taken] = other._contacts[taken]
-        poses = torch.where(mask[:, None], self.inputs[0], other.inputs[0])
+        inputs = tuple(
+            torch.where(mask.reshape(-1, *[1] * (mine.ndim - 1)), mine, theirs)
+            for mine, theirs in zip(self.inputs, other.inputs, strict=True)
+        )
         return ContactTrack(
-            rollout, self.sensing, (poses,), self._state.put(taken, other._state[taken]), contacts
+            rollout, self.sensing, inputs, self._state.put(taken, other._state[taken]), contacts
         )
