@@ -1,4 +1,4 @@
-"""What the wrench itself adds to contact locations on the simulated 6 s probe: the same runs with and without."""
+"""What the wrench itself adds to contact locations on the simulated 6 s probe: runs with and without it."""
 
 from __future__ import annotations
 
@@ -47,6 +47,7 @@ class Feeling:
     contact: ContactParameters = peg_in_hole.CONTACT
 
     def __call__(self, scene: Any, actions: Sequence[View | ProbeWindow]) -> None:
+        """The program."""
         settings = scene.settings
         hole = pyro.sample("hole", scene.prior)
         for k, action in enumerate(actions):

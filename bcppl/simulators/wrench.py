@@ -96,7 +96,8 @@ class Sensing:
             )
 
     @cached_property
-    def _sections(self) -> Array:
+    def sections(self) -> Array:
+        """The low-pass filter as second-order sections (S, 6)."""
         if self.cutoff is None:
             return np.empty((0, 6))
         return np.asarray(butter(2, self.cutoff, fs=self.rate, output="sos"), dtype=np.float64)
@@ -141,7 +142,7 @@ class Sensing:
 
     def start(self, signals: int) -> SensingState:
         """The state before the first sample of N signals."""
-        return SensingState(np.empty((signals, 0, 6)), np.zeros((signals, len(self._sections), 2, 6)))
+        return SensingState(np.empty((signals, 0, 6)), np.zeros((signals, len(self.sections), 2, 6)))
 
     def check_rate(self, times: Array, name: str) -> None:
         """Refuse times (T,) that are not `rate` per second.
@@ -173,7 +174,7 @@ class Sensing:
             signal = wrench[:, taring:] - zero
             if self.cutoff is not None:
                 signal, memory = sosfilt(
-                    self._sections, signal, axis=1, zi=np.ascontiguousarray(np.moveaxis(memory, 0, 1))
+                    self.sections, signal, axis=1, zi=np.ascontiguousarray(np.moveaxis(memory, 0, 1))
                 )
                 memory = np.ascontiguousarray(np.moveaxis(memory, 1, 0))
             cleaned[:, taring:] = signal

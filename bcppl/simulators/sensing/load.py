@@ -1,4 +1,4 @@
-"""The weight of what hangs on a wrench sensor: taken off a measured wrench, and identified from static poses."""
+"""The weight of what hangs on a wrench sensor: taken off a measured wrench, identified from static poses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class ToolLoad:
 
     Attributes:
         mass: kg.
-        center: (3,) the centre of mass in the sensor's frame, metres: the peg's frame where wrenches are in it.
+        center: (3,) the centre of mass, metres, in the frame that the wrenches are in: the peg's, say.
         gravity: (3,) in the world, m/s^2.
     """
 
@@ -200,10 +200,14 @@ def identify_load(
 
 def _least_squares(design: Array, seen: Array) -> tuple[Array, Array, float]:
     """Solution, its covariance, and the noise's standard deviation from the residuals."""
-    solution = np.linalg.lstsq(design, seen, rcond=None)[0]
+    solution = np.asarray(np.linalg.lstsq(design, seen, rcond=None)[0], dtype=np.float64)
     residual = seen - design @ solution
     variance = float(residual @ residual) / (len(seen) - design.shape[1])
-    return solution, variance * np.linalg.inv(design.T @ design), float(np.sqrt(variance))
+    return (
+        solution,
+        np.asarray(variance * np.linalg.inv(design.T @ design), dtype=np.float64),
+        float(np.sqrt(variance)),
+    )
 
 
 def _check_gravity(gravity: tuple[float, float, float]) -> None:

@@ -1,0 +1,65 @@
+"""How a wrench errs, and how much of that is left after averaging, filtering and taring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import sosfilt
+
+from bcppl.errors import InputError
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class WrenchNoise:
+    """Independent noise of each sample of a wrench, the same along and about every axis.
+
+    Attributes:
+        force: standard deviation of a force, N.
+        torque: standard deviation of a torque, N m.
+    """
+
+    force: float = 0.1
+    torque: float = 0.005
+
+    def __post_init__(self) -> None:
+        if not (0 < self.force < np.inf and 0 < self.torque < np.inf):
+            raise InputError(
+                f"a wrench has noise of {self.force!r} N and {self.torque!r} N m; give numbers above 0."
+            )
+
+    def covariance(self, share: float = 1.0) -> Array:
+        """Covariance (6, 6) of a wrench that keeps a share of a sample's variance.
+
+        Args:
+            share: 1 / n for the mean of n samples, `filtered_share` behind a filter; and 1 / n more where the
+                sensor's zero is the mean of n samples.
+        """
+        if not share > 0:
+            raise InputError(f"a wrench keeps {share!r} of its noise's variance; give a share above 0.")
+        return share * np.diag([self.force**2] * 3 + [self.torque**2] * 3)
+
+
+def noise_at_rest(wrench: Array) -> WrenchNoise:
+    """The noise of samples (n, 6) without contact: their scatter about their mean, all axes alike.
+
+    Raises:
+        InputError: fewer than five samples, or one that is not finite.
+    """
+    wrench = np.asarray(wrench, dtype=np.float64)
+    if wrench.ndim != 2 or wrench.shape[1] != 6 or len(wrench) < 5 or not np.isfinite(wrench).all():
+        raise InputError(
+            f"wrenches at rest have shape {wrench.shape} or are not finite; give five samples (n, 6) or more."
+        )
+    variance = wrench.var(axis=0, ddof=1)
+    return WrenchNoise(float(np.sqrt(variance[:3].mean())), float(np.sqrt(variance[3:].mean())))
+
+
+def filtered_share(sections: Array) -> float:
+    """The share of white noise's variance that a filter of second-order sections (S, 6) lets through."""
+    impulse = np.zeros(20000)
+    impulse[0] = 1.0
+    return float(np.square(sosfilt(sections, impulse)).sum()) if len(sections) else 1.0
