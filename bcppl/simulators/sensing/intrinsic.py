@@ -9,8 +9,8 @@ and nothing known of the force, the likelihood of r is, the force integrated out
     e = tau - r x f,   V(r) = [-[r]x, I] S [-[r]x, I]',
 
 times the probability that the force lies in a friction cone at r. The posterior over the surface is computed
-on nodes: everywhere that a bundle of lines parallel to the measured one enters the peg, and on sharp edges and
-corners near it. Nothing is linearised but the friction cone's margin.
+on nodes: everywhere that a bundle of lines parallel to the measured one enters the peg, and on sharp edges
+and corners near it. Nothing is linearised but the friction cone's margin.
 """
 
 from __future__ import annotations
