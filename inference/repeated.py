@@ -108,7 +108,7 @@ class Repeated:
 
     @property
     def standard_error(self) -> float:
-        """Of `log_evidence`, by the delta method: that of the mean over the mean; NaN of one run or none alive.
+        """Of `log_evidence`, by the delta method: that of the mean over the mean; NaN of one run or none.
 
         It is too small where few runs carry the mean, for then the runs have not seen the others.
         """

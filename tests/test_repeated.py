@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.poses import UniformPose
-from bcppl.errors import InputError
+from bcppl.errors import InferenceError, InputError
 from bcppl.inference.population import Population
 from bcppl.inference.repeated import Repeated, repeated
 from bcppl.inference.summaries import mean
@@ -176,3 +176,33 @@ def test_processes_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert torch.equal(mine.trace["x"], other.trace["x"])
         assert torch.equal(mine.trace.log_prob(), other.trace.log_prob())
     assert float(mean(one.pooled, "x")) == float(mean(two.pooled, "x"))
+
+
+def test_a_dead_run_counts_as_no_evidence_and_is_named() -> None:
+    alive = [importance(seed, 40) for seed in (1, 2)]
+    dead = Population(alive[0].trace, torch.full((40,), -torch.inf))
+    runs = Repeated((alive[0], dead, alive[1]), (1, 2, 3))
+    assert runs.dead == (2,)
+    assert "in run 2 no particle has any weight left" in str(runs)
+    both = Repeated(tuple(alive), (1, 3))
+    assert runs.log_evidence == pytest.approx(both.log_evidence + math.log(2 / 3))
+    torch.testing.assert_close(runs.mean("x"), both.mean("x"))
+    assert math.isfinite(runs.standard_error) and math.isfinite(runs.jackknife_error)
+    assert runs.pooled.effective_sample_size == pytest.approx(both.pooled.effective_sample_size)
+
+
+def test_runs_that_all_died_say_so() -> None:
+    dead = Population(importance(1, 5).trace, torch.full((5,), -torch.inf))
+    runs = Repeated((dead, dead), (1, 2))
+    assert "in runs 1, 2 no particle" in str(runs) and runs.log_evidence == -math.inf
+    for ask in (lambda: runs.mean("x"), lambda: runs.r_hat()):
+        with pytest.raises(InferenceError, match="in any of 2 runs"):
+            ask()
+
+
+def test_a_run_that_cannot_go_on_is_named() -> None:
+    def run(seed: int) -> Population:
+        return importance(1, 5).reweighed(torch.full((5,), -torch.inf, dtype=torch.float64))
+
+    with pytest.raises(InferenceError, match=r"run 1 \(seed \d+\): no particle has any weight left"):
+        repeated(run, 2, progress=False)
