@@ -29,7 +29,6 @@ Selection = Tensor | npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice
 _FARTHEST = (
     1.0  # m: a peg that is farther than this from where it would be in free motion has been flung away
 )
-_LONGEST_GAP = 0.025  # s between stamps up to which the free approach may be skipped
 _FULL, _HALVED, _DIVERGED = 0, 1, 2
 
 
@@ -101,14 +100,7 @@ class Session:
         check_probe(probe)
         self.part, self.peg, self.skip, self.effort = physics.part, physics.peg, physics.skip, physics.effort
         self.name, self.stamps = probe.name, np.asarray(probe.stamps, dtype=np.float64)
-        self.begin = float(probe.command_times[0])
         self.clocks = [Clock(physics.model, probe, physics.parameters.time_step / k) for k in (1, 2)]
-
-    @property
-    def densely_read(self) -> bool:
-        """Whether the stamps follow the motion closely enough to tell from them where the peg has been."""
-        times = np.concatenate([[self.begin], self.stamps])
-        return bool((np.diff(times) <= _LONGEST_GAP).all())
 
     @functools.cached_property
     def approach(self) -> Approach:
@@ -154,9 +146,7 @@ class Rollout:
     @property
     def _skips(self) -> bool:
         """Whether the free approach is the same for all particles, and simulated once."""
-        return (
-            self.session.skip and self.session.densely_read and self.unknowns.keys() <= FELT_IN_CONTACT_ONLY
-        )
+        return self.session.skip and self.unknowns.keys() <= FELT_IN_CONTACT_ONLY
 
     def _skip_approach(self) -> None:
         """Begin each simulation at the last stamp of its free approach."""

@@ -117,11 +117,12 @@ class Clock:
             read = as_gripped(read, unknowns["grasp_compliance"])
         return read, Standing(state, rows[:, -2:].copy())
 
-    def followed(self, world_from_part: Array, stamps: int) -> tuple[Array, Standing]:
+    def followed(self, world_from_part: Array, stamps: int) -> tuple[Array, Standing, Array]:
         """One simulation from the beginning, for a pose (1, 7) of the part.
 
         Returns:
-            Rows (stamps, 13), and where it stands after 0, 1, ... `stamps` stamps.
+            Rows (stamps, 13), where it stands after 0, 1, ... `stamps` stamps, and the peg's poses (S, 7) at
+            all steps.
         """
         begin, stop = self.beginning(1), self.step_after(stamps)
         states, sensed = [begin.state], [begin.tail[0]]
@@ -131,7 +132,8 @@ class Clock:
         every, rows = np.concatenate(states), np.concatenate(sensed)
         after = np.array([self.step_after(count) for count in range(stamps + 1)])
         tails = np.stack([rows[after], rows[after + 1]], axis=1)
-        return self._at_stamps(rows[None], 2, 0, stamps)[0], Standing(every[after], tails)
+        path = rows[2:, POSE].copy()
+        return self._at_stamps(rows[None], 2, 0, stamps)[0], Standing(every[after], tails), path
 
     def on_time(self, standing: Standing, stamps: int) -> npt.NDArray[np.bool_]:
         """Which particles (N,) are finite and as far as they should be: MuJoCo stops those that diverge."""
@@ -149,7 +151,9 @@ class Clock:
             opposite = np.sum(low[..., 3:7] * high[..., 3:7], axis=-1) < 0
             high[opposite, 3:7] *= -1.0
             low += weight * (high - low)
-            low[..., 3:7] /= np.linalg.norm(low[..., 3:7], axis=-1, keepdims=True)
+            # A stamp on a step is read as it is, whichever others are read with it.
+            between = weight[:, 0] > 0
+            low[:, between, 3:7] /= np.linalg.norm(low[:, between, 3:7], axis=-1, keepdims=True)
         # The sensors report what the flange exerts on the peg.
         low[..., WRENCH] *= -1.0
         return low

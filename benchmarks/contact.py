@@ -1,0 +1,211 @@
+"""Contact physics beside a bare MuJoCo rollout, what skipping free motion saves, what unknowns cost."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+import torch
+from report import Row, cores, finish, options, show
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.poses import prior_from_guess
+from bcppl.inference.tempered_smc import infer
+from bcppl.models.peg_in_hole import CONTACT, model
+from bcppl.models.worlds.peg_in_hole import record
+from bcppl.recordings import Recording
+from bcppl.recordings.measurements import Probe, ProbeWindow
+from bcppl.simulators.model_copies import ModelCopies
+from bcppl.simulators.peg_model import build_model, controls, hold
+from bcppl.simulators.physics import PegPhysics
+from bcppl.simulators.unknowns import Unknowns
+from bcppl.simulators.wrench import Sensing
+
+PARTICLES = 75
+CONTROL = int(
+    mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+)
+
+
+def timed(runs: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Seconds of each run, medians over repeats in which they take turns, after one that is not counted."""
+    spent: dict[str, list[float]] = {name: [] for name in runs}
+    for repeat in range(repeats + 1):
+        for name, run in runs.items():
+            begun = time.perf_counter()
+            run()
+            if repeat:
+                spent[name].append(time.perf_counter() - begun)
+    return {name: statistics.median(each) for name, each in spent.items()}
+
+
+def bare(recording: Recording, probe: Probe, world_from_part: Tensor) -> tuple[Callable[[], Any], int]:
+    """MuJoCo's own rollout of the same model, controls and steps, all arrays ready-made; and its steps."""
+    assert recording.peg is not None
+    chosen = build_model(recording.part, recording.peg, CONTACT)
+    hold(chosen, probe)
+    steps = 1 + round((probe.stamps[-1] - probe.command_times[0]) / CONTACT.time_step)
+    told = controls(probe, probe.command_times[0] + CONTACT.time_step * np.arange(steps))
+    part = world_from_part.numpy()
+    control = np.empty((len(part), steps, 20))
+    control[..., :9], control[..., 12:16] = told[:, :9], told[:, 9:]
+    control[..., 9:12], control[..., 16:] = part[:, None, :3], part[:, None, 3:]
+    size = mujoco.mj_stateSize(chosen, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    state = np.zeros((len(part), size))
+    state[:, 1:8] = told[0, 6:]
+    pool = mujoco.rollout.Rollout(nthread=cores())
+    data = [mujoco.MjData(chosen) for _ in range(cores())]
+    return lambda: pool.rollout(chosen, data, state, control, control_spec=CONTROL), steps
+
+
+def after_vision(recording: Recording, particles: int) -> Tensor:
+    """Equally weighted poses (N, 7) of the belief after the depth images."""
+    views = [m for m in recording.measurements if m.kind == "view"]
+    seen = Recording(**{**recording.__dict__, "measurements": views})
+    *_, last = infer(model, seen, particles=particles, seed=1)
+    chosen = torch.multinomial(last.belief.weights, particles, replacement=True)
+    return last.belief.world_from_part[chosen]
+
+
+def unknowns(particles: int) -> dict[str, Unknowns]:
+    """What may be unknown, as a model would draw it."""
+    one = torch.ones(particles, dtype=torch.float64)
+    spread = torch.rand(particles, dtype=torch.float64)
+    offset = torch.randn(particles, 6, dtype=torch.float64) * torch.tensor([0.001] * 3 + [0.02] * 3)
+    shared = {
+        "friction": 0.2 + 0.2 * spread,
+        "grip_from_peg": poses.retract(poses.identity(particles), offset),
+    }
+    return {
+        "friction": Unknowns(friction=shared["friction"]),
+        "friction and the peg in the hand": Unknowns(**shared),
+        "controller's stiffness": Unknowns(stiffness=0.8 + 0.4 * spread),
+        "grasp's compliance": Unknowns(grasp_compliance=1e-5 * spread[:, None] * one[:, None].expand(-1, 6)),
+    }
+
+
+def main() -> None:
+    arguments = options(__doc__ or "").parse_args()
+    torch.manual_seed(arguments.seed)
+    particles, repeats = (25, 2) if arguments.quick else (PARTICLES, 9)
+    recording = record(arguments.seed)
+    assert recording.peg is not None and recording.truth is not None
+    peg = recording.peg
+    probe = next(m.action.probe for m in recording.measurements if isinstance(m.action, ProbeWindow))
+    stamps = len(probe.stamps)
+    beliefs = {
+        "prior": prior_from_guess(recording.guess).sample((particles,)),
+        "after vision": after_vision(recording, particles),
+    }
+    whole, skipping = (PegPhysics(recording.part, peg, CONTACT, skip=skip) for skip in (False, True))
+    sensing = Sensing(peg, rate=(stamps - 1) / (probe.stamps[-1] - probe.stamps[0]))
+    rows: list[Row] = []
+
+    def run(physics: PegPhysics, pose: Tensor, given: Unknowns | None = None) -> Callable[[], Any]:
+        return lambda: physics.start(pose, probe, given).advance(stamps)
+
+    lines = []
+    for name, pose in beliefs.items():
+        alone, steps = bare(recording, probe, pose)
+        wrench = whole.start(pose, probe).advance(stamps).wrench
+        found = timed(
+            {
+                "bare": alone,
+                "ours": run(whole, pose),
+                "skipping": run(skipping, pose),
+                "sensing": lambda wrench=wrench: sensing.contacts(wrench, sensing.start(particles)),
+            },
+            repeats,
+        )
+        before = skipping.effort.copy()
+        run(skipping, pose)()
+        share = skipping.effort.since(before).amount / (particles * steps * CONTACT.time_step)
+        ratio, saved = found["ours"] / found["bare"], found["skipping"] / found["ours"]
+        rate = particles * steps / found["ours"]
+        lines.append([name, *(1e3 * found[k] for k in found), ratio, saved, share, rate / 1e3])
+        rows += [
+            Row(f"{name}: whole rollout / bare mujoco.rollout", ratio, "", 1.3),
+            Row(f"{name}: with skip / without, time", saved, "", 0.5),
+            Row(f"{name}: with skip / without, steps", share, ""),
+            Row(f"{name}: steps per second", rate, "1/s"),
+            Row(f"{name}: sensing / whole rollout", found["sensing"] / found["ours"], ""),
+        ]
+    show(
+        f"{particles} particles x {probe.stamps[-1]:.2f} s, steps of {1e3 * CONTACT.time_step:g} ms",
+        [
+            "",
+            "bare ms",
+            "whole ms",
+            "skipping ms",
+            "sensing ms",
+            "whole/bare",
+            "skip/whole",
+            "steps",
+            "1000 steps/s",
+        ],
+        lines,
+    )
+
+    pose, given = beliefs["after vision"], unknowns(particles)
+    found = timed(
+        {
+            f"{name}, {kind}": run(physics, pose, each)
+            for name, each in {"nothing": None, **given}.items()
+            for kind, physics in (("whole", whole), ("skipping", skipping))
+        },
+        max(2, repeats // 2),
+    )
+    lines = []
+    for name in ("nothing", *given):
+        one, two = found[f"{name}, whole"], found[f"{name}, skipping"]
+        lines.append(
+            [name, 1e3 * one, one / found["nothing, whole"], 1e3 * two, two / found["nothing, skipping"]]
+        )
+        rows.append(Row(f"unknown {name}: whole rollout / with nothing unknown", lines[-1][2], ""))
+        rows.append(Row(f"unknown {name}: with skip / with nothing unknown", lines[-1][4], ""))
+    show("unknown, after vision", ["", "whole ms", "of nothing's", "skipping ms", "of nothing's"], lines)
+
+    lines = []
+    for count in (PARTICLES, 1000):
+        copies, values = (
+            ModelCopies(whole.model),
+            unknowns(count)["friction and the peg in the hand"].rows(count),
+        )
+        begun = time.perf_counter()
+        copies.of(values)
+        made = time.perf_counter() - begun
+        again = timed({"again": lambda copies=copies, values=values: copies.of(values)}, 5)["again"]
+        lines.append([f"{count} models", 1e3 * made, 1e3 * again])
+        rows += [
+            Row(f"{count} models copied and set", 1e3 * made, "ms"),
+            Row(f"{count} models set again", 1e3 * again, "ms"),
+        ]
+    show("models for unknowns", ["", "copied and set ms", "set again ms"], lines)
+
+    if not arguments.quick:
+        spent = {}
+        for name, physics in (("whole", whole), ("skipping", skipping)):
+            scene = model.prepare(recording)
+            scene = type(scene)(**{**scene.__dict__, "physics": physics})
+            before = physics.effort.copy()
+            for _ in infer(model, recording, particles=particles, seed=arguments.seed, scene=scene):
+                pass
+            spent[name] = physics.effort.since(before)
+        saved = spent["skipping"].seconds / spent["whole"].seconds
+        show(
+            "physics of a whole inference over the probe",
+            ["", "s", "seconds simulated", "rollouts"],
+            [[name, each.seconds, each.amount, each.items] for name, each in spent.items()],
+        )
+        rows.append(Row("whole inference: with skip / without, time", saved, "", 0.5))
+    finish(rows, arguments.json)
+
+
+if __name__ == "__main__":
+    main()
