@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -21,7 +20,6 @@ from bcppl.distributions.poses import NormalPose, UniformPose
 from bcppl.distributions.touch import OnsetLocation
 from bcppl.errors import InputError
 from bcppl.inference.kernels import metropolis_hastings
-from bcppl.inference.population import Population
 from bcppl.inference.proposals import contact_alignment, depth_alignment, program_of
 from bcppl.inference.proposals.proposal import Proposal
 from bcppl.inference.targets import POSTERIOR
@@ -31,6 +29,7 @@ from bcppl.simulators.camera import Camera, looking_at
 from bcppl.simulators.distance import SignedDistance
 from bcppl.simulators.renderer import DepthRenderer
 from bcppl.traces import Proposed, Trace, assess, propose, simulate
+from tests.invariance import equal_weights, largest_z
 
 DRAWS = 2000
 SOUND, BROKEN = 4.5, 8.0  # |z| of the worst of a few dozen expectations: below if invariant, above if not
@@ -38,10 +37,6 @@ SOUND, BROKEN = 4.5, 8.0  # |z| of the worst of a few dozen expectations: below 
 
 def matrix(rows: object) -> Tensor:
     return torch.as_tensor(rows, dtype=torch.float64)
-
-
-def equal_weights(trace: Trace) -> Population:
-    return Population(trace, torch.zeros(len(trace), dtype=torch.float64))
 
 
 # A corner of a box, at its frame's origin, fills the view with three faces: a coarse image's outline
@@ -90,10 +85,7 @@ def worst_z(
     for _ in range(times):
         trace, accepted = move(trace, POSTERIOR)
         assert float(accepted.mean()) > 0.1, "hardly anything moved"
-    change = functions(trace) - before
-    moving = change.std(dim=0) > 1e-9
-    z = change.mean(dim=0)[moving] / (change.std(dim=0)[moving] / math.sqrt(DRAWS))
-    return float(z.abs().max())
+    return largest_z(before, functions(trace), still=1e-9)
 
 
 def of_both(trace: Trace) -> Tensor:

@@ -33,6 +33,7 @@ from bcppl.inference.proposals import drift
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.poses import Freedom, identity
 from bcppl.traces import Trace, simulate
+from tests.invariance import equal_weights, largest_z
 
 DRAWS = 20_000
 SOUND, BROKEN = 4.5, 8.0  # |z| of the worst expectation: below if invariant, above if not
@@ -51,10 +52,6 @@ def fresh(trace: Trace) -> None:
     pyro.sample("x", dist.Exponential(torch.full((len(trace),), 0.4, dtype=torch.float64)))
 
 
-def equal_weights(trace: Trace) -> Population:
-    return Population(trace, torch.zeros(len(trace), dtype=torch.float64))
-
-
 def worst_z(kernel: Kernel, times: int = 2) -> float:
     """The largest |z| of the change in some expectations from exact draws."""
     torch.manual_seed(1)
@@ -68,9 +65,7 @@ def worst_z(kernel: Kernel, times: int = 2) -> float:
     move = kernel(equal_weights(trace[:500]))
     for _ in range(times):
         trace, _ = move(trace, POSTERIOR)
-    change = functions(trace) - before
-    z = change.mean(dim=0) / (change.std(dim=0) / math.sqrt(DRAWS))
-    return float(z.abs().max())
+    return largest_z(before, functions(trace))
 
 
 SHORT, FRESH = metropolis_hastings(short), metropolis_hastings(fresh)

@@ -18,10 +18,10 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.inference.kernels import delayed_acceptance, hamiltonian, hmc, rejuvenate
 from bcppl.inference.kernels.kernel import Kernel
-from bcppl.inference.population import Population
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace, carried, generate, simulate
 from bcppl.traces.gradient import log_prob_with_grad
+from tests.invariance import equal_weights, largest_z, number
 
 DRAWS = 10_000
 SOUND, BROKEN = 4.5, 8.0
@@ -29,14 +29,6 @@ SOUND, BROKEN = 4.5, 8.0
 
 def vector(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
-
-
-def number(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
-
-
-def equal_weights(trace: Trace) -> Population:
-    return Population(trace, torch.zeros(len(trace), dtype=torch.float64))
 
 
 # ---- programs with exact draws
@@ -107,9 +99,7 @@ def worst_z(case: str, kernel: Kernel | None = None, target: Any = POSTERIOR, ti
     for _ in range(times):
         trace, accepted = move(trace, target)
         assert 0.02 < float(accepted.mean()) <= 1.0
-    change = functions(trace) - before
-    z = change.mean(dim=0) / (change.std(dim=0) / math.sqrt(DRAWS))
-    return float(z[change.std(dim=0) > 1e-12].abs().max())
+    return largest_z(before, functions(trace))
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -18,23 +18,15 @@ from bcppl.errors import InputError
 from bcppl.inference.kernels import involutions, involutive
 from bcppl.inference.kernels.jacobian import Charted, Real, Simplex, Tangent, log_abs_det_jacobian
 from bcppl.inference.kernels.kernel import Kernel
-from bcppl.inference.population import Population
 from bcppl.inference.targets import POSTERIOR
 from bcppl.poses import FREE, Freedom
 from bcppl.traces import Trace, simulate
+from tests.invariance import equal_weights, largest_z, number
 
 DRAWS = 10_000
 SOUND, BROKEN = 4.5, 8.0
 
 Values = Mapping[str, Tensor]
-
-
-def number(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
-
-
-def equal_weights(trace: Trace) -> Population:
-    return Population(trace, torch.zeros(len(trace), dtype=torch.float64))
 
 
 def of_vectors(x: Tensor) -> Tensor:
@@ -194,11 +186,7 @@ def worst_z(program: Any, kernel: Kernel, functions: Any, target: Any = POSTERIO
     for _ in range(times):
         trace, accepted = move(trace, target)
         assert 0.05 < float(accepted.mean()) <= 1.0
-    change = functions(trace) - before
-    moving = change.std(dim=0) > 1e-12
-    assert bool(moving.any()), "nothing moved"
-    z = change.mean(dim=0)[moving] / (change.std(dim=0)[moving] / math.sqrt(DRAWS))
-    return float(z.abs().max())
+    return largest_z(before, functions(trace))
 
 
 @pytest.mark.parametrize("case", CASES)

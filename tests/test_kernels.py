@@ -6,7 +6,6 @@ density without the Jacobian of the rotations, an edge that is not seen.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -25,21 +24,10 @@ from bcppl.inference.proposals import Fitted, drift
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.poses import Freedom
 from bcppl.traces import Trace, generate, simulate
+from tests.invariance import equal_weights, largest_z, matrix, number
 
 DRAWS = 20_000
 SOUND, BROKEN = 4.5, 8.0  # |z| of the worst of a dozen expectations: below if invariant, above if not
-
-
-def matrix(rows: list[list[float]]) -> Tensor:
-    return torch.tensor(rows, dtype=torch.float64)
-
-
-def number(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
-
-
-def equal_weights(trace: Trace) -> Population:
-    return Population(trace, torch.zeros(len(trace), dtype=torch.float64))
 
 
 def of_vectors(x: Tensor) -> Tensor:
@@ -76,11 +64,7 @@ def worst_z(
     before = functions(trace[address])
     for _ in range(times):
         trace, _ = move(trace, target)
-    change = functions(trace[address]) - before
-    moving = change.std(dim=0) > 1e-12
-    assert bool(moving.any()), "nothing moved"
-    z = change.mean(dim=0)[moving] / (change.std(dim=0)[moving] / math.sqrt(DRAWS))
-    return float(z.abs().max())
+    return largest_z(before, functions(trace[address]))
 
 
 # ---- targets with exact draws

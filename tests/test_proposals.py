@@ -32,24 +32,14 @@ from bcppl.inference.proposals import (
     rotations,
     symmetry,
 )
+from bcppl.inference.proposals.coordinates import coordinates_of
 from bcppl.inference.targets import POSTERIOR
 from bcppl.poses import Freedom
 from bcppl.traces import Trace, assess, generate, propose, simulate
+from tests.invariance import equal_weights, largest_z, matrix, number
 
 DRAWS = 7_000
 SOUND, BROKEN = 4.5, 8.0  # |z| of the worst of a few dozen expectations: below if invariant, above if not
-
-
-def number(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
-
-
-def matrix(rows: Any) -> Tensor:
-    return torch.tensor(rows, dtype=torch.float64)
-
-
-def equal_weights(trace: Trace) -> Population:
-    return Population(trace, torch.zeros(len(trace), dtype=torch.float64))
 
 
 def of_vectors(x: Tensor) -> Tensor:
@@ -85,11 +75,7 @@ def worst_z(
     before = all_of(trace)
     for _ in range(times):
         trace, _ = move(trace, POSTERIOR)
-    change = all_of(trace) - before
-    moving = change.std(dim=0) > 1e-12
-    assert bool(moving.any()), "nothing moved"
-    z = change.mean(dim=0)[moving] / (change.std(dim=0)[moving] / math.sqrt(DRAWS))
-    return float(z.abs().max())
+    return largest_z(before, all_of(trace))
 
 
 # ---- targets with exact draws
@@ -342,7 +328,7 @@ def two_modes_density(pose: Tensor) -> Tensor:
 
 
 def _known(population: Population) -> tuple[Any, Tensor, Tensor]:
-    known = density.coordinates_of(population.trace, "pose")
+    known = coordinates_of(population.trace, "pose")
     return known, population.trace["pose"], torch.full((len(population),), 1.0 / len(population)).double()
 
 

@@ -26,17 +26,10 @@ from bcppl.inference.step import Observed
 from bcppl.poses import Freedom
 from bcppl.traces import Series, Trace, generate, simulate
 from bcppl.traces.propose import assessed
+from tests.invariance import equal_weights, largest_z, number
 
 DRAWS = 20_000
 SOUND, BROKEN, WIDEST = 4.5, 8.0, 5.0
-
-
-def number(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
-
-
-def equal_weights(trace: Trace) -> Population:
-    return Population(trace, torch.zeros(len(trace), dtype=torch.float64))
 
 
 def silent(*args: Any) -> Trace:
@@ -215,11 +208,8 @@ def worst_z(case: str) -> float:
     before = torch.cat([one, functions(trace)], dim=1)
     after = weights * torch.cat([one, functions(population.trace)], dim=1)
     assert not torch.equal(functions(trace), functions(population.trace))
-    change = after - before
-    moving = change.std(dim=0) > 1e-12
-    z = change.mean(dim=0)[moving] / (change.std(dim=0)[moving] / math.sqrt(DRAWS))
     # Weights that spread so far have no mean that could be compared: that is no proper weighting either.
-    return float(z.abs().max()) if float(weights.std()) < WIDEST * float(weights.mean()) else math.inf
+    return largest_z(before, after) if float(weights.std()) < WIDEST * float(weights.mean()) else math.inf
 
 
 @pytest.mark.parametrize("case", CASES)
