@@ -1,0 +1,47 @@
+"""Parts from mesh files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from bcppl.errors import InputError
+from bcppl.parts import Part
+
+
+def load_mesh(path: str | Path, name: str | None = None, scale: float = 1.0, source: str = "") -> Part:
+    """A part from an OBJ, STL, PLY or other mesh file that trimesh reads, checked, without pieces yet.
+
+    Vertices that a file holds several times, for their normals or texture or because STL has it so, are
+    merged: without it most closed meshes look open. All bodies of a file become one part.
+
+    Args:
+        path: the file; its coordinates are the part's frame.
+        name: the part's name; None for the file's.
+        scale: metres for one unit of the file: 0.001 for millimetres.
+        source: attribution and licence.
+
+    Raises:
+        InputError: there is no such file, it holds no mesh, or the mesh is empty, open, or in millimetres.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"there is no mesh file {path}; give the path of an OBJ, STL or PLY file.")
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False)
+    except Exception as error:  # every format has a reader of its own, with errors of its own
+        raise InputError(
+            f"mesh file {path} cannot be read ({error}); export it again as OBJ or STL."
+        ) from error
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise InputError(f"mesh file {path} holds no triangles; export it again as OBJ or STL.")
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh.remove_unreferenced_vertices()
+    if len(mesh.faces) and mesh.is_watertight and mesh.volume < 0:
+        mesh.invert()
+    vertices = scale * np.asarray(mesh.vertices, dtype=np.float64)
+    part = Part(name or path.stem, vertices, np.asarray(mesh.faces, dtype=np.int64), (), source)
+    part.check()
+    return part
