@@ -35,6 +35,9 @@ ACROSS = 19  # lines across the bundle
 ALONG = 21  # nodes on the stretch of an edge
 _BATCH = 400  # wrenches whose bundles are cast at once
 _FLATTEST = 0.05  # cosine between force and normal below which a surface is not pushed
+_UNLIKELY = (
+    -18.0
+)  # log-likelihood, less its value at its peak, below which a wrench is not explained: six sigma
 _LONGEST_LEVER = 30.0  # a force that acts this many times as far off as the peg reaches has torques in N mm
 
 
@@ -87,7 +90,9 @@ class IntrinsicSensing:
 
         Returns:
             The posterior of each wrench. It has no nodes for a wrench that is not finite or has no force, and
-            for one that no single contact explains.
+            for one that no single contact explains within six deviations: a line of action that passes beside
+            the peg, a force that leaves every friction cone (is `friction` large enough?), a torque about the
+            line that only several contacts can make.
 
         Raises:
             InputError: shapes do not fit, a covariance is not positive definite, or torques are in N mm.
@@ -119,7 +124,7 @@ class IntrinsicSensing:
             normals: (M, K, 3) outward, of the face there, or of those that meet there and between.
         """
         covariance = _checked(covariance, len(wrench))
-        score, _ = self._log_likelihood(wrench, covariance, point, normals)
+        score, *_ = self._log_likelihood(wrench, covariance, point, normals)
         level = posterior.mass_above(score)
         return np.where(np.isfinite(posterior.log_evidence), level, 1.0)
 
@@ -139,10 +144,7 @@ class IntrinsicSensing:
 
     def _on_faces(self, bundle: _Bundle) -> _Found:
         """Where each bundle of lines enters the peg, and what share of its area every line stands for."""
-        step = 2.0 * WIDTH / ACROSS
-        axis = step * (np.arange(ACROSS) - 0.5 * (ACROSS - 1))
-        grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-        grid = grid[np.linalg.norm(grid, axis=1) <= WIDTH]
+        grid, step = _disc(ACROSS)
         offset = np.einsum("mxi,mij,gj->mgx", bundle.side, bundle.root, grid)
         lines = (bundle.point[:, None] + offset).reshape(-1, 3)
         crossing = self.surface.entered(lines, np.repeat(bundle.direction, len(grid), axis=0))
@@ -196,11 +198,10 @@ class IntrinsicSensing:
     def _scored(self, found: _Found, chosen: Indices, wrench: Array, covariance: Array) -> Nodes:
         row = chosen[found.row]
         share = self.shares[found.kind] / sum(self.shares)
-        score, normal = self._log_likelihood(
-            wrench[row], _of_rows(covariance, row), found.point, found.normals
-        )
+        given = wrench[row], _of_rows(covariance, row)
+        score, fit, normal = self._log_likelihood(*given, found.point, found.normals)
         with np.errstate(divide="ignore"):
-            log_weight = score + np.log(found.size * share)
+            log_weight = np.where(fit > _UNLIKELY, score + np.log(found.size * share), -np.inf)
         force = wrench[row, :3]
         along = np.sum(found.point * force, axis=1) / np.linalg.norm(force, axis=1)
         kind = np.full(len(row), found.kind)
@@ -208,16 +209,15 @@ class IntrinsicSensing:
 
     def _log_likelihood(
         self, wrench: Array, covariance: Array, point: Array, normals: Array
-    ) -> tuple[Array, Array]:
-        """Log p (Q,) of wrenches (Q, 6) of contacts at points (Q, 3), and the normals (Q, 3) pushed against.
+    ) -> tuple[Array, Array, Array]:
+        """Log p (Q,) of wrenches (Q, 6) of contacts at points (Q, 3), its exponent, the normals pushed.
 
         The covariance is (6, 6) or (Q, 6, 6); the normals (Q, K, 3) are all that a contact may have there.
         """
         force = wrench[:, :3]
         error = wrench[:, 3:] - np.cross(point, force)
         spread = _of_residual(point, covariance)
-        log_density = -0.5 * np.sum(error * np.linalg.solve(spread, error[..., None])[..., 0], axis=1)
-        log_density -= 0.5 * np.linalg.slogdet(spread)[1]
+        fit = -0.5 * np.sum(error * np.linalg.solve(spread, error[..., None])[..., 0], axis=1)
         squarely = -np.einsum("qx,qkx->qk", force, normals)
         best = squarely.argmax(axis=1) if len(force) else np.empty(0, dtype=np.int64)
         normal = normals[np.arange(len(best)), best]
@@ -226,7 +226,8 @@ class IntrinsicSensing:
         size = np.linalg.norm(sliding, axis=1)
         gradient = self.friction * normal + sliding / np.maximum(size, 1e-12)[:, None]
         variance = np.sum((gradient[:, None] @ covariance[..., :3, :3])[:, 0] * gradient, axis=1)
-        return log_density + log_ndtr((self.friction * pressed - size) / np.sqrt(variance)), normal
+        fit = fit + log_ndtr((self.friction * pressed - size) / np.sqrt(variance))
+        return fit - 0.5 * np.linalg.slogdet(spread)[1], fit, normal
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,12 +275,38 @@ class _Bundle:
         side = np.linalg.svd(direction[:, None, :])[2][:, 1:].swapaxes(1, 2)
         # An error e of the torque about a point moves the line by f x e / |f|^2 there.
         moved = np.swapaxes(side, 1, 2) @ _cross_matrix(direction) / size[..., None]
-        # The covariance is convex along the line, so the sum of those at both ends of the peg bounds it.
-        spread = np.zeros((len(wrench), 2, 2))
-        for sign in (-1.0, 1.0):
-            end = point + sign * surface.radius * direction
-            spread += moved @ _of_residual(end, covariance) @ np.swapaxes(moved, 1, 2)
-        return _Bundle(direction, point, side, np.asarray(np.linalg.cholesky(spread), dtype=np.float64))
+
+        def bounded(first: Array, last: Array) -> Array:
+            # The covariance is convex along the line, so the sum of those at both ends bounds it.
+            spread = np.zeros((len(wrench), 2, 2))
+            for along in (first, last):
+                there = _of_residual(point + along[:, None] * direction, covariance)
+                spread += moved @ there @ np.swapaxes(moved, 1, 2)
+            return np.asarray(np.linalg.cholesky(spread), dtype=np.float64)
+
+        radius = np.full(len(wrench), surface.radius)
+        root = bounded(-radius, radius)
+        # A few lines tell where along it a peg is entered at all; from there to there is a closer bound.
+        grid, _ = _disc(7)
+        lines = (point[:, None] + np.einsum("mxi,mij,gj->mgx", side, root, grid)).reshape(-1, 3)
+        crossing = surface.entered(lines, np.repeat(direction, len(grid), axis=0))
+        row = crossing.line // len(grid)
+        along = np.sum((crossing.point - point[row]) * direction[row], axis=1)
+        first, last = np.full(len(wrench), np.inf), np.full(len(wrench), -np.inf)
+        np.minimum.at(first, row, along)
+        np.maximum.at(last, row, along)
+        met = first <= last
+        return _Bundle(
+            direction, point, side, bounded(np.where(met, first, -radius), np.where(met, last, radius))
+        )
+
+
+def _disc(across: int) -> tuple[Array, float]:
+    """Points (G, 2) of a square grid within `WIDTH`, so many from side to side, and their distance."""
+    step = 2.0 * WIDTH / across
+    axis = step * (np.arange(across) - 0.5 * (across - 1))
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    return grid[np.linalg.norm(grid, axis=1) <= WIDTH], step
 
 
 def _cross_matrix(vector: Array) -> Array:

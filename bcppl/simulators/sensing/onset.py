@@ -12,6 +12,8 @@ from bcppl.errors import InputError
 Array = npt.NDArray[np.float64]
 
 _FINE = 0.05  # of the time between samples: the grid of onset times
+_STEPS = (0.5, 1.0)  # samples in which a force may grow to what it stays at
+_STEP = 0.01  # the prior probability of each of these; else the force grows on and on
 
 
 @dataclass(frozen=True)
@@ -43,8 +45,8 @@ class OnsetDetector:
     alarm.
 
     When it began is computed once `after` more samples are there: the force is taken to be zero until the
-    onset and then to grow evenly, in an unknown direction at an unknown rate; the onset's time is anywhere
-    before the alarm beforehand.
+    onset and then to grow evenly, in an unknown direction at an unknown rate, or (beforehand unlikely) to
+    step within a sample; beforehand the onset is anywhere before the alarm.
 
     Attributes:
         rest: the number of first samples, free of contact.
@@ -139,16 +141,18 @@ class OnsetDetector:
         seen, at = scaled[first : alarm + self.after + 1], times[first : alarm + self.after + 1]
         step = float(np.median(np.diff(at)))
         onset = np.arange(times[first], times[alarm] - 0.5 * _FINE * step, _FINE * step)
-        ramp = np.maximum(at - onset[:, None], 0.0) / step
+        risen = np.maximum(at - onset[:, None], 0.0) / step
+        ramp = np.concatenate([np.minimum(risen / rise, 1.0) for rise in _STEPS] + [risen])
         # The zero is the mean of `rest` samples and errs alike in all that are seen (Woodbury's identity).
         known = self.rest + len(seen)
         power = np.square(ramp).sum(axis=1) - ramp.sum(axis=1) ** 2 / known
         fit = ramp @ seen - ramp.sum(axis=1)[:, None] * seen.sum(axis=0) / known
-        # The rate is beforehand normal, as wide as what the largest force seen would take in one sample.
+        # The force in the end is beforehand normal, as wide as the largest seen; so is the rate, per sample.
         rate = float(np.linalg.norm(seen, axis=1).max()) ** 2
         log_p = 0.5 * np.square(fit).sum(axis=1) / (power + 1.0 / rate)
         log_p -= 0.5 * scaled.shape[1] * np.log1p(rate * power)
-        weight = np.exp(log_p - log_p.max())
+        log_p[: -len(onset)] += np.log(_STEP)
+        weight = np.exp(log_p - log_p.max()).reshape(-1, len(onset)).sum(axis=0)
         weight /= weight.sum()
         mean = float(weight @ onset)
         spread = float(np.sqrt(weight @ np.square(onset - mean) + (_FINE * step) ** 2 / 12.0))

@@ -154,7 +154,7 @@ class PegSurface:
         sharp = np.asarray((mesh.face_adjacency_angles >= SHARP) & mesh.face_adjacency_convex)
         count = np.bincount(mesh.face_adjacency_edges[sharp].reshape(-1), minlength=len(mesh.vertices))
         chosen = np.flatnonzero(count >= 3)
-        weights = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) / 4.0
+        weights = np.array([(i, j, 9 - i - j) for i in range(10) for j in range(10 - i)]) / 9.0
         normals = []
         for vertex in chosen:
             around = self.normals[[f for f in mesh.vertex_faces[vertex] if f >= 0]]
