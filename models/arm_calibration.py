@@ -4,7 +4,8 @@ A ball on the flange is seated in a socket and the arm is moved through many pos
 stays where it is; the joint angles are recorded. By the nominal URDF the ball seems to wander by millimetres.
 Latent are what the encoders read too little (`offsets`), where the ball is on its link (`ball`), how each
 joint's origin differs from the drawing (`errors`), and how well the ball sits (`noise`). Where a socket
-is need not be known: it is integrated out under a flat prior, so a turn of the whole arm about its base keeps its prior.
+is need not be known: it is integrated out under a flat prior, so a turn of the whole arm about its base
+keeps its prior.
 
 What is measured are angles, so the density of the ball's place needs the volume sqrt(det J J^T) by which
 angles become places. Without it a smaller arm, whose ball wanders less, would seem likelier: on real

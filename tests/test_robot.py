@@ -1,0 +1,274 @@
+"""Robots: poses against an independent computation, one batch against a loop, and files that are wrong."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.errors import InputError
+from bcppl.models.robots import SHIPPED, load_robot
+from bcppl.simulators.camera import Camera, looking_at
+from bcppl.simulators.renderer import DepthRenderer
+from bcppl.simulators.robot import Robot
+
+FOLDER = Path(__file__).parents[1] / "models/robots"
+FLANGE = {"panda": "panda_hand", "iiwa": "lbr_iiwa_flange"}
+# Franka's own Denavit-Hartenberg table (Craig's convention): a, d, alpha of joints 1 to 7.
+PANDA = (
+    (0.0, 0.333, 0.0),
+    (0.0, 0.0, -math.pi / 2),
+    (0.0, 0.316, math.pi / 2),
+    (0.0825, 0.0, math.pi / 2),
+    (-0.0825, 0.384, -math.pi / 2),
+    (0.0, 0.0, math.pi / 2),
+    (0.088, 0.0, math.pi / 2),
+)
+
+
+@pytest.fixture(scope="module", params=SHIPPED)
+def robot(request: pytest.FixtureRequest) -> Robot:
+    return load_robot(request.param, tip=FLANGE[request.param])
+
+
+def postures(robot: Robot, *shape: int, seed: int = 0) -> Tensor:
+    low, high = (torch.tensor([getattr(j, k) for j in robot.joints]) for k in ("lower", "upper"))
+    drawn = torch.rand(*shape, len(robot.joints), generator=torch.Generator().manual_seed(seed))
+    return (low + (high - low) * drawn).to(torch.float64)
+
+
+def same(a: Tensor, b: Tensor, within: float = 1e-12) -> bool:
+    return float(poses.local(a, b).abs().max()) < within
+
+
+def test_panda_follows_its_table_of_denavit_and_hartenberg() -> None:
+    panda = load_robot("panda", tip="panda_link7")
+    for angles in postures(panda, 5):
+        whole = np.eye(4)
+        for (a, d, alpha), angle in zip(PANDA, angles.tolist(), strict=True):
+            before, after = np.eye(4), np.eye(4)
+            before[:3, :3], before[0, 3] = Rotation.from_euler("x", alpha).as_matrix(), a
+            after[:3, :3], after[2, 3] = Rotation.from_euler("z", angle).as_matrix(), d
+            whole = whole @ before @ after
+        expected = poses.from_rotation_matrix(torch.from_numpy(whole[:3, 3]), torch.from_numpy(whole[:3, :3]))
+        assert same(panda.base_from_link("panda_link7", angles), expected)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_poses_are_those_of_mujoco(name: str) -> None:
+    robot = load_robot(name)
+    text = (FOLDER / name / f"{name}.urdf").read_text()
+    text = re.sub(r"<(visual|collision|inertial)>.*?</\1>", "", text, flags=re.S)
+    for link in robot.links[1:]:
+        mass = (
+            '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+        )
+        text = re.sub(rf'<link name="{link}"\s*(/>|>\s*</link>)', f'<link name="{link}">{mass}</link>', text)
+    text = text.replace("<robot ", "<robot ", 1)
+    text = re.sub(
+        r"(<robot[^>]*>)",
+        r'\1<mujoco><compiler fusestatic="false" boundmass="1" boundinertia="1"/></mujoco>',
+        text,
+    )
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    angles = postures(robot, 1)[0]
+    for joint, value in zip(robot.joints, angles.tolist(), strict=True):
+        data.qpos[model.jnt_qposadr[model.joint(joint.name).id]] = value
+    if name == "panda":
+        data.qpos[model.jnt_qposadr[model.joint("panda_finger_joint2").id]] = float(angles[-1])
+    mujoco.mj_forward(model, data)
+    found = robot.base_from_links(angles)
+    for link, pose in zip(robot.links[1:], found[1:], strict=True):
+        body = data.body(link)
+        assert same(pose, torch.from_numpy(np.concatenate([body.xpos, body.xquat])), 1e-9), link
+
+
+def test_one_batch_is_a_loop_and_offsets_are_shifted_angles(robot: Robot) -> None:
+    angles, offsets = postures(robot, 2, 3), 0.02 * torch.randn(4, len(robot.joints), dtype=torch.float64)
+    together = robot.base_from_links(angles, offsets)
+    assert together.shape == (4, 2, 3, len(robot.links), 7)
+    one_by_one = [[[robot.base_from_links(q + o) for q in row] for row in angles] for o in offsets]
+    assert same(together, torch.stack([torch.stack([torch.stack(r) for r in p]) for p in one_by_one]))
+    changing = offsets[:, None, None].expand(-1, 2, 3, -1)
+    assert same(robot.base_from_links(angles, changing), together)
+    tip = robot.links[-1]
+    assert torch.allclose(robot.position(tip, angles, offsets), together[..., -1, :3], atol=1e-13)
+
+
+def test_a_point_of_an_arm_that_is_not_as_drawn_is_that_of_a_changed_file(tmp_path: Path) -> None:
+    panda = load_robot("panda", tip="panda_hand_tcp")
+    angles = postures(panda, 3)
+    errors = 0.01 * torch.randn(2, 7, 6, dtype=torch.float64)
+    point = 0.1 * torch.randn(2, 3, dtype=torch.float64)
+    found = panda.position("panda_hand_tcp", angles, point=point, errors=errors)
+    for particle in range(2):
+        text = (FOLDER / "panda/panda.urdf").read_text()
+        for joint, error in zip(panda.joints, errors[particle].numpy(), strict=True):
+            turn = Rotation.from_matrix(joint.parent_from_child[:3, :3]) * Rotation.from_rotvec(error[3:])
+            shift = joint.parent_from_child[:3, 3] + error[:3]
+            numbers = [" ".join(map(repr, map(float, v))) for v in (turn.as_euler("xyz"), shift)]
+            head, tail = text.split(f'<joint name="{joint.name}"', 1)
+            tail = re.sub(
+                r"<origin [^>]*/>", f'<origin rpy="{numbers[0]}" xyz="{numbers[1]}"/>', tail, count=1
+            )
+            text = f'{head}<joint name="{joint.name}"{tail}'
+        (tmp_path / "changed.urdf").write_text(text)
+        changed = Robot(tmp_path / "changed.urdf", tip="panda_hand_tcp")
+        pose = changed.base_from_link("panda_hand_tcp", angles)
+        expected = torch.stack([poses.transform(p, point[particle][None])[0] for p in pose])
+        assert torch.allclose(found[particle], expected, atol=1e-12)
+
+
+def test_gradients_are_right(robot: Robot) -> None:
+    angles, tip = postures(robot, 2), robot.links[-1]
+    joints = len(robot.joints)
+    given = [torch.zeros(2, n, dtype=torch.float64).requires_grad_() for n in (joints, 3)]
+    errors = torch.zeros(2, joints, 6, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda o, p, e: robot.position(tip, angles, o, p, e + 1e-3), (*given, errors), fast_mode=True
+    )
+    assert torch.autograd.gradcheck(lambda o: robot.base_from_link(tip, angles, o), given[:1], fast_mode=True)
+
+
+def test_what_mimics_follows_and_what_is_held_stays() -> None:
+    panda = load_robot("panda")
+    assert [j.name for j in panda.joints][-1] == "panda_finger_joint1"
+    fingers = panda.base_from_links(
+        [0.0, 0, 0, -1, 0, 1, 0, 0.03], links=["panda_leftfinger", "panda_rightfinger"]
+    )
+    assert float((fingers[0, :3] - fingers[1, :3]).norm()) == pytest.approx(0.06)
+    held = load_robot("panda", held={"panda_finger_joint1": 0.03})
+    again = held.base_from_links([0.0, 0, 0, -1, 0, 1, 0], links=["panda_leftfinger"])
+    assert same(again, fingers[:1])
+
+
+def test_a_camera_on_the_wrist_goes_where_the_wrist_goes(robot: Robot) -> None:
+    angles = postures(robot, 4)
+    wrist_from_camera = poses.as_pose([0.05, 0.0, 0.03, 0.0, 1.0, 0.0, 0.0])
+    wrist = robot.base_from_link(robot.links[-1], angles)
+    camera = robot.base_from_link(robot.links[-1], angles, link_from_tool=wrist_from_camera)
+    assert same(poses.compose(poses.inverse(wrist), camera), wrist_from_camera.expand(4, 7))
+
+
+def test_the_arm_drawn_as_one_part_looks_as_its_links_do(robot: Robot) -> None:
+    angles = postures(robot, 1, seed=3)[0]
+    camera = Camera("c", 64, 48, 60.0, 60.0, 32.0, 24.0, looking_at([1.8, 0.4, 0.6], [0.0, 0.0, 0.5]))
+    links = [
+        DepthRenderer(part).images(camera, pose[None])[0]
+        for part, pose in zip(robot.parts, robot.placed(angles), strict=True)
+    ]
+    whole = DepthRenderer(robot.drawn(angles)).images(camera, poses.identity(1))[0]
+    assert np.isfinite(whole).sum() > 100
+    assert np.array_equal(np.isfinite(whole), np.isfinite(np.min(links, axis=0)))
+    seen = np.isfinite(whole)
+    assert np.allclose(whole[seen], np.min(links, axis=0)[seen], atol=1e-5)
+
+
+# ---- what is wrong is said
+
+
+URDF = """<robot name="arm"><link name="base"/>
+<link name="hand"><visual><geometry>{shape}</geometry></visual></link>
+<joint name="elbow" type="{kind}"><parent link="{parent}"/><child link="hand"/><axis xyz="{axis}"/>
+<limit lower="-2" upper="2" effort="1" velocity="1"/></joint></robot>"""
+
+
+def written(folder: Path, **parts: str) -> Path:
+    known = {"shape": '<box size="1 1 1"/>', "kind": "revolute", "parent": "base", "axis": "0 0 1", **parts}
+    (folder / "arm.urdf").write_text(URDF.format(**known))
+    return folder / "arm.urdf"
+
+
+def said(error: pytest.ExceptionInfo[InputError]) -> str:
+    text = str(error.value)
+    assert text.endswith(".") and "\n" not in text and "Traceback" not in text
+    return text
+
+
+def test_a_missing_mesh_is_named_with_the_folders_looked_in(tmp_path: Path) -> None:
+    file = written(tmp_path, shape='<mesh filename="package://arm_description/meshes/hand.stl"/>')
+    robot = Robot(file, mesh_folders=[tmp_path / "packages"])
+    assert robot.base_from_link("hand", [0.5]).shape == (7,)  # poses need no mesh
+    with pytest.raises(InputError) as error:
+        _ = robot.parts
+    text = said(error)
+    for word in ("hand.stl", str(tmp_path / "packages/arm_description/meshes"), "'hand'", "mesh_folders"):
+        assert word in text
+
+
+@pytest.mark.parametrize("folder", ["arm_description/meshes", "meshes"])
+def test_meshes_of_a_package_are_found_in_its_folder(tmp_path: Path, folder: str) -> None:
+    place = tmp_path / "packages" / folder
+    place.mkdir(parents=True)
+    (place / "hand.stl").write_bytes((FOLDER / "panda/meshes/hand.stl").read_bytes())
+    shape = '<mesh filename="package://arm_description/meshes/hand.stl" scale="0.5 0.5 0.5"/>'
+    robot = Robot(written(tmp_path, shape=shape), mesh_folders=[tmp_path / "packages"])
+    assert robot.parts[0].extent == pytest.approx([0.0316, 0.102, 0.046], abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("parts", "word"),
+    [
+        ({"kind": "floating"}, "floating"),
+        ({"parent": "shoulder"}, "'shoulder'"),
+        ({"axis": "0 0 0"}, "axis"),
+        ({"parent": "hand"}, "one tree"),
+        ({"kind": 'revolute"><oops'}, "cannot be read"),
+    ],
+)
+def test_a_urdf_that_is_wrong_is_refused(tmp_path: Path, parts: dict[str, str], word: str) -> None:
+    with pytest.raises(InputError) as error:
+        Robot(written(tmp_path, **parts))
+    assert word in said(error)
+
+
+def test_no_urdf_at_all_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text("solid")
+    for call in (lambda: Robot(tmp_path / "arm.urdf"), lambda: load_robot("pander"), lambda: Robot(tmp_path)):
+        with pytest.raises(InputError) as error:
+            call()
+        said(error)
+
+
+@pytest.mark.parametrize(
+    ("angles", "word"),
+    [
+        (torch.zeros(8), "(..., 7)"),
+        (torch.tensor([0.0, 20, 0, -90, 0, 90, 45]), "degrees"),
+        (torch.tensor([0.0, math.nan, 0, -1, 0, 1, 0]), "panda_joint2"),
+        (torch.zeros(()), "(..., 7)"),
+    ],
+)
+def test_angles_that_are_wrong_are_refused(angles: Tensor, word: str) -> None:
+    panda = load_robot("panda", tip="panda_hand")
+    with pytest.raises(InputError) as error:
+        panda.base_from_links(angles)
+    assert word in said(error)
+
+
+def test_what_a_robot_does_not_have_is_refused() -> None:
+    panda = load_robot("panda", tip="panda_hand")
+    angles = torch.tensor([0.0, 0, 0, -1, 0, 1, 0], dtype=torch.float64)
+    offsets, errors = torch.zeros(3, 7).double(), torch.zeros(2, 7, 6).double()
+    for call in (
+        lambda: load_robot("panda", tip="panda_foot"),
+        lambda: load_robot("panda", held={"panda_joint9": 0.0}),
+        lambda: panda.base_from_link("panda_foot", angles),
+        lambda: panda.position("panda_foot", angles),
+        lambda: panda.base_from_links(angles, torch.zeros(3, 6).double()),
+        lambda: panda.position("panda_hand", angles, offsets, errors=errors),
+        lambda: panda.position("panda_hand", angles, errors=torch.zeros(3, 6, 6).double()),
+        lambda: panda.position("panda_hand", angles, point=torch.zeros(3, 4).double()),
+    ):
+        with pytest.raises(InputError) as error:
+            call()
+        said(error)
