@@ -16,8 +16,10 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.inference.kernels import Kernel, Until, metropolis_hastings, mixture, until
+from bcppl.inference.kernels.kernel import Move
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift, independent
+from bcppl.inference.proposals.together import continuous, drift_together
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.inference.smc import Step, smc
 from bcppl.inference.tempering import tempered
@@ -27,10 +29,23 @@ PHYSICS = 2  # the cost of a site that simulates contact (`bcppl.distributions.l
 
 
 def kernel(pose: str) -> Kernel:
-    """How a pose is moved: by a random walk, some of its steps long ones, or to wherever the others are."""
+    """How a pose is moved: by a random walk, some of its steps long ones, or to wherever the others are.
+
+    Where a program has other latent values that can be moved (a camera's error, a grasp), half of the moves
+    are random walks of all of them together.
+    """
     # A fifth of the draws are three times as wide as the particles: few particles may have missed a mode.
     anew = independent(pose, 1, inflation=1.2, wide=(0.2, 3.0))
-    return mixture([metropolis_hastings(drift(pose, (0.2, 2.0))), metropolis_hastings(anew)])
+    alone = mixture([metropolis_hastings(drift(pose, (0.2, 2.0))), metropolis_hastings(anew)])
+
+    def shaped(population: Population) -> Move:
+        others = [address for address in continuous(population.trace) if address != pose]
+        if not others:
+            return alone(population)
+        walk = metropolis_hastings(drift_together(pose, *others, scales=(0.2, 2.0)))
+        return mixture([alone, walk])(population)
+
+    return shaped
 
 
 def infer(

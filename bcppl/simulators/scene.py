@@ -152,21 +152,25 @@ class SceneRenderer:
 
     def _composed(self, camera: Camera, pose: Tensor, counted: Mask | None, first: int) -> SceneHits:
         """The nearest hits for some particles (n, K, 7), which are numbered from `first` on."""
-        count, size = len(pose), camera.width * camera.height
+        everything = camera.width * camera.height
+        pixels = np.arange(everything) if counted is None else np.flatnonzero(np.asarray(counted).reshape(-1))
+        count, size = len(pose), len(pixels)
+        column = np.zeros(everything, dtype=np.int64)
+        column[pixels] = np.arange(size)
         still = [count > 1 and bool((pose[:, k] == pose[:1, k]).all()) for k in range(len(self.parts))]
         same, whose = np.full(size, np.inf), np.zeros(size, dtype=np.int16)
         for k in (k for k, shared in enumerate(still) if shared):
             found = self._renderers[k].hits(camera, pose[:1, k], counted)
-            _draw(same, whose, found.pixel, found.depth, k)
+            _draw(same, whose, column.take(found.pixel), found.depth, k)
         nearest, owner = np.tile(same, count), np.tile(whose, count)
         for k in (k for k, shared in enumerate(still) if not shared):
             found = self._renderers[k].hits(camera, pose[:, k], counted)
-            _draw(nearest, owner, found.particle * size + found.pixel, found.depth, k)
+            _draw(nearest, owner, found.particle * size + column.take(found.pixel), found.depth, k)
         key = np.flatnonzero(nearest < np.inf)
         seen = np.diff(np.searchsorted(key, size * np.arange(count + 1)))
         particle = np.repeat(np.arange(count), seen)
         part = owner.take(key).astype(np.int64)
-        return SceneHits(particle + first, key - size * particle, nearest.take(key), part)
+        return SceneHits(particle + first, pixels.take(key - size * particle), nearest.take(key), part)
 
 
 def _draw(nearest: Array, owner: npt.NDArray[np.int16], place: Indices, depth: Array, part: int) -> None:

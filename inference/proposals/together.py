@@ -1,0 +1,116 @@
+"""Several latent values moved at once, along what ties them to one another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from bcppl.errors import InputError
+from bcppl.inference.population import Population
+from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
+from bcppl.inference.proposals.proposal import Fitted
+from bcppl.inference.proposals.spread import FLOOR, covariance_of, learned_from
+from bcppl.traces import Trace
+
+# A ridge a tenth as wide as it is long is still followed.
+SHRUNK = 0.01
+
+
+def drift_together(*addresses: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fitted:
+    """A random walk over several latent values, shaped by the covariance of all of them together.
+
+    Where measurements tell a difference (where a part is, seen from a camera that may stand elsewhere), each
+    value alone can hardly move: the particles lie on a ridge, and this walks along it. The first address is
+    drawn from its normal, every further one from its normal given the steps before it.
+
+    Args:
+        *addresses: which latent values to move, two or more.
+        scales: as `drift`.
+
+    Raises:
+        InputError: fewer than two addresses, or one twice; when it is fitted: an address is not latent, or is
+            discrete.
+    """
+    if len(set(addresses)) != len(addresses) or len(addresses) < 2:
+        raise InputError(
+            f"drift_together is given the addresses {addresses!r}; give two or more, each once; "
+            "use drift for one."
+        )
+    smallest, largest = (torch.tensor(math.log(s), dtype=torch.float64) for s in scales)
+
+    def fit(population: Population) -> Callable[[Trace], None]:
+        links = _links(population, addresses)
+
+        def random_walk(trace: Trace) -> None:
+            size = torch.exp(pyro.sample("drift scale", dist.Uniform(smallest, largest)))
+            taken = torch.zeros(len(trace), 0, dtype=torch.float64)
+            for link in links:
+                coordinates = link.coordinates.of(trace)
+                place = coordinates.places(trace[link.address])
+                center = coordinates.stepped(place, taken @ link.gain.T)
+                value = pyro.sample(link.address, coordinates.normal(center, link.covariance, size))
+                step = coordinates.steps(place, coordinates.places(value))
+                taken = torch.cat([taken, step], dim=1)
+
+        return random_walk
+
+    return Fitted(fit)
+
+
+class _Link(NamedTuple):
+    """One address: how its step hangs on the steps before it.
+
+    Attributes:
+        address: which.
+        coordinates: its own.
+        gain: (d, D) of the steps before it (D,), its mean given them.
+        covariance: (d, d) of what is left.
+    """
+
+    address: str
+    coordinates: Coordinates
+    gain: Tensor
+    covariance: Tensor
+
+
+def _links(population: Population, addresses: tuple[str, ...]) -> list[_Link]:
+    steps, known = [], []
+    for address in addresses:
+        coordinates, places, weights = learned_from(population, address)
+        if len(places) < len(population):
+            raise InputError(
+                f"drift_together is to move {address!r}, of which some particles are at the edge of the "
+                "support, 0 or infinite; give its prior less spread."
+            )
+        known.append(coordinates)
+        steps.append(coordinates.steps(coordinates.mean(places, weights), places))
+    together = torch.cat(steps, dim=1)
+    covariance = covariance_of(together, weights)
+    diagonal = torch.diag(covariance.diagonal() + FLOOR**2)
+    covariance = ((1.0 - SHRUNK) * covariance + SHRUNK * diagonal) * (2.38**2 / together.shape[1])
+    links, end = [], 0
+    for address, coordinates in zip(addresses, known, strict=True):
+        before, own = slice(0, end), slice(end, end + coordinates.dimension)
+        gain = torch.linalg.solve(covariance[before, before], covariance[before, own]).T
+        left = covariance[own, own] - gain @ covariance[before, own]
+        links.append(_Link(address, coordinates, gain, 0.5 * (left + left.T)))
+        end += coordinates.dimension
+    return links
+
+
+def continuous(trace: Trace) -> list[str]:
+    """The latent addresses of a trace that can be moved by small steps."""
+    movable = []
+    for address in trace.choices:
+        try:
+            coordinates_of(trace, address)
+        except InputError:
+            continue
+        movable.append(address)
+    return movable
