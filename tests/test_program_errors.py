@@ -12,26 +12,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.population import Population
 from bcppl.traces import assess, extend, generate, simulate, update
+from tests.invariance import number
+from tests.small_programs import Felt, beside_the_plate, first_entry, line
 
 N = 5
-
-
-def number(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
-
-
-class Felt(LazyDistribution):
-    """Anything that is felt at x; what its log-probability is, is said by those that inherit from it."""
-
-    def __init__(self, x: Tensor) -> None:
-        super().__init__(len(x), (), (x,))
-
-    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
-        return torch.zeros(self.batch_shape)
 
 
 def growing(steps: int) -> None:
@@ -52,10 +39,6 @@ def twice() -> None:
 
 def stacked() -> None:
     pyro.sample("x", dist.Normal(torch.zeros(3, N), 1.0))
-
-
-def beside_the_plate() -> None:
-    pyro.sample("x", dist.Normal(torch.zeros(3), 1.0))
 
 
 def plated(mean: Tensor, dim: int | None = None, name: str = "points", subsample: int | None = None) -> None:
@@ -106,17 +89,6 @@ def of_torch() -> None:
 
 def sampled_whole() -> None:
     pyro.sample("x", dist.Categorical(torch.tensor([0.5, 0.5])))
-
-
-def first_entry() -> None:
-    part = pyro.sample("part", dist.Normal(torch.zeros(3), 1.0).to_event(1))
-    pyro.sample("x", dist.Normal(part[0], 1.0))
-
-
-def line(data: Tensor, dim: int | None = None) -> None:
-    slope = pyro.sample("slope", dist.Normal(number(0.0), 1.0))
-    with pyro.plate("points", len(data), dim=dim):
-        pyro.sample("y", dist.Normal(slope * data, 1.0))
 
 
 def updated(values: dict[str, Tensor]) -> Any:
@@ -272,61 +244,6 @@ def test_errors_of_the_program_that_particles_do_not_bring_about_stay_as_they_ar
         simulate(of_one_number, (lambda x: torch.zeros(3) + torch.zeros(2),), N)
     with pytest.raises(TypeError, match="unsupported operand"):
         simulate(of_one_number, (lambda x: x + "a",), N)  # type: ignore[operator]
-
-
-DATA = torch.linspace(-1, 1, N, dtype=torch.float64)
-BY_COINCIDENCE: dict[str, Callable[[], Any]] = {
-    "simulate": lambda: simulate(line, (DATA,), N),
-    "generate": lambda: generate(line, (DATA,), {"y": DATA}, N),
-    "assess": lambda: assess(line, (DATA,), {"slope": DATA, "y": DATA}, N),
-    "extend": lambda: extend(simulate(lengthened, (False,), N), (True,), {"y": DATA}),
-    "first site": lambda: simulate(beside_the_plate, (), 3),
-    "entry of a vector": lambda: simulate(first_entry, (), 3),
-}
-
-
-def lengthened(on: bool) -> None:
-    if on:
-        line(DATA)
-    else:
-        pyro.sample("slope", dist.Normal(number(0.0), 1.0))
-
-
-@pytest.mark.parametrize("case", BY_COINCIDENCE)
-def test_shapes_that_fit_by_coincidence_are_refused(case: str) -> None:
-    with pytest.raises(InputError, match=r"coincidence alone; with one more, .*`\[:, ") as caught:
-        BY_COINCIDENCE[case]()
-    assert ". " not in str(caught.value)
-
-
-def test_one_more_particle_runs_no_simulator_and_draws_nothing() -> None:
-    sampled, ran = [], []
-
-    class Counted(Felt):
-        cost = 2
-
-        def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
-            sampled.append(len(self.inputs[0]))
-            return super().sample(sample_shape)
-
-    def program(data: Tensor) -> None:
-        ran.append(1)
-        torch.rand(1)
-        line(data)
-        pyro.sample("felt", Counted(pyro.sample("x", dist.Normal(number(0.0), 1.0))))
-
-    states = []
-    for count, runs in ((N, 2), (N + 1, 1)):
-        ran.clear(), sampled.clear(), torch.manual_seed(3)  # type: ignore[func-returns-value]
-        trace = simulate(program, (DATA[:, None],), count)
-        assert len(ran) == runs and sampled == [count] and trace["y"].shape == (count, N)
-        torch.manual_seed(3)
-        torch.rand(1), torch.randn(count, dtype=torch.float64), torch.randn(N, count, dtype=torch.float64)
-        torch.randn(count, dtype=torch.float64)
-        states.append(torch.rand(1))
-        torch.manual_seed(3)
-        simulate(program, (DATA[:, None],), count)
-        assert torch.equal(torch.rand(1), states[-1]), "the generator stands where one run left it"
 
 
 @pytest.mark.parametrize("value", [number(0.7), torch.tensor(1)])

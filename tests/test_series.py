@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +21,8 @@ from bcppl.inference.smc import smc
 from bcppl.inference.tempering import tempered
 from bcppl.traces import Model, Series, Trace, assess, extend, generate, regenerate, simulate, update
 from bcppl.traces.carried import carried
+from tests.invariance import number
+from tests.small_programs import normal_log
 
 N, STEPS = 6, 5
 SEEN = torch.linspace(-1.0, 2.0, STEPS + 1, dtype=torch.float64)
@@ -31,14 +32,6 @@ INDICES = [
     torch.tensor([5, 4, 3, 2, 1, 0]),
     torch.tensor([2, 2, 2, 3, 3, 3]),
 ]
-
-
-def number(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
-
-
-def normal_log(value: Tensor, mean: Tensor | float, scale: float) -> Tensor:
-    return -0.5 * ((value - mean) / scale) ** 2 - math.log(scale * math.sqrt(2 * math.pi))
 
 
 def init() -> dict[str, Any]:
@@ -301,50 +294,6 @@ def test_smc_follows_a_pose_that_moves() -> None:
         mean = each.belief.mean[:3]
         assert float((mean - torch.tensor([0.1 * taken, 0.0, 0.0])).abs().max()) < 0.004, taken
     assert len(each.population.trace["pose", 0]) == 300 and each.population.trace.steps == 5
-
-
-def in_a_plate() -> Tensor:
-    with pyro.plate("points", 4):
-        return pyro.sample("x", dist.Normal(number(0.0), 1.0))
-
-
-def alone() -> Tensor:
-    return pyro.sample("x", dist.Normal(number(0.0), 1.0))
-
-
-def onward(x: Tensor) -> Tensor:
-    return pyro.sample("x", dist.Normal(x, 1.0))
-
-
-def forgetting(x: Tensor) -> None:
-    pyro.sample("x", dist.Normal(x, 1.0))
-
-
-WRONG: dict[str, tuple[Callable[[], Any], str]] = {
-    "state in a plate": (lambda: simulate(Series(in_a_plate, onward), (), N), r"\(4, 6\) .*`.to_event\(1\)`"),
-    "state in a plate of N": (
-        lambda: simulate(Series(in_a_plate, onward), (), 4),
-        r"coincidence alone; .*\(4, 5\) .*`.to_event\(1\)`",
-    ),
-    "no return": (
-        lambda: extend(simulate(Series(alone, forgetting), (), N), (), {}),
-        "step returned nothing.* return the next state",
-    ),
-    "swapped": (lambda: simulate(Series(onward, alone), (), N), "init of a series, 'onward', .*missing.*'x'"),
-    "arguments": (
-        lambda: extend(simulate(Series(alone, onward), (), N), (1, 2), {}),
-        "step of a series, 'onward', .*too many",
-    ),
-    "no function": (lambda: Series(alone, 3), "step of a series is of type int; give two functions"),  # type: ignore[arg-type]
-}
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_a_series_that_is_not_put_together_right_is_refused_in_a_sentence(case: str) -> None:
-    act, says = WRONG[case]
-    with pytest.raises(InputError, match=says) as caught:
-        act()
-    assert ". " not in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_a_series_may_have_no_state() -> None:

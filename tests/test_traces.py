@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import pyro
@@ -17,18 +16,11 @@ from bcppl import poses
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.poses import NormalPose, UniformPose
 from bcppl.errors import InputError
-from bcppl.traces import Trace, assess, carried, extend, generate, propose, regenerate, simulate, update
+from bcppl.traces import Trace, assess, extend, generate, propose, regenerate, simulate, update
+from tests.invariance import number
+from tests.small_programs import normal_log
 
 N = 5
-
-
-def number(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
-
-
-def normal_log(value: Tensor, mean: Tensor | float, scale: float) -> Tensor:
-    """The normal's log-density, written out."""
-    return -0.5 * ((value - mean) / scale) ** 2 - math.log(scale * math.sqrt(2 * math.pi))
 
 
 class Counted(LazyDistribution):
@@ -195,89 +187,6 @@ def test_where_takes_each_particle_whole() -> None:
     assert calls == []
 
 
-@dataclass(eq=False)
-class Counter:
-    """Carried state: counts how far each particle was run, and remembers what it was started from."""
-
-    start: Tensor
-    steps: Tensor
-    log: list[str]
-
-    def __getitem__(self, index: Tensor) -> Counter:
-        return Counter(self.start[index], self.steps[index], self.log)
-
-    def where(self, mask: Tensor, other: Counter) -> Counter:
-        self.log.append("merged")
-        return Counter(
-            torch.where(mask, self.start, other.start), torch.where(mask, self.steps, other.steps), self.log
-        )
-
-
-def carrying(log: list[str]) -> Callable[[int], Any]:
-    """A program that carries a counter; it hangs on x, not on z, and every window runs it on by one step."""
-
-    def program(windows: int) -> Any:
-        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
-        pyro.sample("z", dist.Normal(number(0.0), 1.0))
-
-        def start() -> Counter:
-            log.append(f"started {len(x)}")
-            return Counter(x.clone(), torch.zeros(len(x), dtype=torch.int64), log)
-
-        state = carried("counter", x, start)
-
-        class Window(LazyDistribution):
-            def __init__(self, k: int) -> None:
-                self.k = k
-                super().__init__(len(x), (), (x,))
-
-            def log_prob(self, value: Tensor) -> Tensor:
-                assert torch.equal(state.start, x), "the state belongs to other particles"
-                log.extend(["ran"] * int((self.k + 1 - state.steps).clamp_min(0).max()))
-                state.steps = state.steps.clamp_min(self.k + 1)
-                return normal_log(value, x, 1.0)
-
-        for k in range(windows):
-            pyro.sample(f"w_{k}", Window(k))
-        return state
-
-    return program
-
-
-def test_carried_state_goes_on_and_is_indexed_and_merged_with_its_particles() -> None:
-    log: list[str] = []
-    trace, _ = generate(carrying(log), (1,), {"w_0": number(0.0)}, N)
-    assert log == [f"started {N}", "ran"]
-    trace, _ = extend(trace, (2,), {"w_1": number(0.0)})
-    assert log == [f"started {N}", "ran", "ran"], "the second window goes on from the first"
-    log.clear()
-    trace = trace[torch.tensor([4, 4, 1, 0])]
-    trace, _ = extend(trace, (3,), {"w_2": number(1.0)})
-    assert log == ["ran"], "resampled particles keep their state"
-    log.clear()
-    moved = update(trace, {"z": trace["z"] + 1.0})
-    moved.log_ratio  # noqa: B018
-    assert log == [], "the state does not hang on z"
-    moved = update(trace, {"x": trace["x"] + 1.0})
-    moved.log_ratio  # noqa: B018
-    assert log == ["started 4", "ran", "ran", "ran"], "a new x throws the state away"
-    log.clear()
-    mixed = moved.trace.where(torch.tensor([True, False, False, True]), trace)
-    mixed, _ = extend(mixed, (4,), {"w_3": number(1.0)})
-    assert log == ["merged", "ran"], "accepted and refused particles keep their own states"
-    assert torch.equal(mixed.result.start, mixed["x"])
-
-
-def test_a_state_started_for_other_inputs_is_not_merged_in() -> None:
-    log: list[str] = []
-    trace, _ = generate(carrying(log), (1,), {"w_0": number(0.0)}, N)
-    moved = update(trace, {"x": trace["x"] + 1.0}).trace
-    again = update(moved, {"x": trace["x"]}).trace
-    mixed = again.where(torch.zeros(N, dtype=torch.bool), moved)
-    mixed, _ = extend(mixed, (2,), {"w_1": number(0.0)})
-    assert torch.equal(mixed.result.start, moved["x"])
-
-
 def test_what_was_simulated_assesses_to_its_own_density() -> None:
     torch.manual_seed(0)
     trace = simulate(several, (2,), N)
@@ -326,28 +235,6 @@ def test_verbs_leave_pyros_settings_and_draw_from_torchs_generator_only() -> Non
     first.log_prob()
     update(first, {"x": first["x"] + 1}).log_ratio  # noqa: B018
     assert torch.equal(state, torch.get_rng_state()), "known values are not drawn again"
-
-
-def test_two_windows_of_one_run_share_the_state_that_the_first_began() -> None:
-    started = []
-
-    class State:
-        def __getitem__(self, index: torch.Tensor) -> State:
-            return self
-
-        def where(self, mask: torch.Tensor, other: State) -> State:
-            return self
-
-    def start() -> State:
-        started.append(1)
-        return State()
-
-    def twice() -> None:
-        x = pyro.sample("x", dist.Normal(torch.tensor(0.0, dtype=torch.float64), 1.0))
-        assert carried("state", x, start) is carried("state", x, start)
-
-    simulate(twice, (), 5)
-    assert len(started) == 1
 
 
 def test_a_hidden_site_says_nothing_whatever_is_made_of_the_trace() -> None:

@@ -1,0 +1,33 @@
+"""What tests of SMCP3 share: mutants of its weights, which they have to find, and a program of no choice."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bcppl.inference.kernels.jacobian import log_abs_det_jacobian
+from bcppl.traces import Trace
+from bcppl.traces.propose import assessed
+
+
+def silent(*args: Any) -> Trace:
+    """Mutant: the backward program's choices are not weighed."""
+    trace = assessed(*args)
+    trace.known.update({a: torch.zeros(len(trace), dtype=torch.float64) for a in trace.addresses})
+    return trace
+
+
+def flat(again: Any, inputs: Any, outputs: Any, **options: Any) -> Tensor:
+    """Mutant: volumes are not weighed."""
+    return torch.zeros_like(log_abs_det_jacobian(again, inputs, outputs, **options))
+
+
+def turned_over(*args: Any, **options: Any) -> Tensor:
+    """Mutant: volumes are weighed the wrong way round."""
+    return -log_abs_det_jacobian(*args, **options)
+
+
+def nothing(trace: Trace) -> None:
+    pass

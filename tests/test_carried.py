@@ -1,0 +1,124 @@
+"""Simulator states that traces carry: begun once, gone on with, indexed and merged with the particles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.traces import carried, extend, generate, simulate, update
+from tests.invariance import number
+from tests.small_programs import normal_log
+
+N = 5
+
+
+@dataclass(eq=False)
+class Counter:
+    """Carried state: counts how far each particle was run, and remembers what it was started from."""
+
+    start: Tensor
+    steps: Tensor
+    log: list[str]
+
+    def __getitem__(self, index: Tensor) -> Counter:
+        return Counter(self.start[index], self.steps[index], self.log)
+
+    def where(self, mask: Tensor, other: Counter) -> Counter:
+        self.log.append("merged")
+        return Counter(
+            torch.where(mask, self.start, other.start), torch.where(mask, self.steps, other.steps), self.log
+        )
+
+
+def carrying(log: list[str]) -> Callable[[int], Any]:
+    """A program that carries a counter; it hangs on x, not on z, and every window runs it on by one step."""
+
+    def program(windows: int) -> Any:
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        pyro.sample("z", dist.Normal(number(0.0), 1.0))
+
+        def start() -> Counter:
+            log.append(f"started {len(x)}")
+            return Counter(x.clone(), torch.zeros(len(x), dtype=torch.int64), log)
+
+        state = carried("counter", x, start)
+
+        class Window(LazyDistribution):
+            def __init__(self, k: int) -> None:
+                self.k = k
+                super().__init__(len(x), (), (x,))
+
+            def log_prob(self, value: Tensor) -> Tensor:
+                assert torch.equal(state.start, x), "the state belongs to other particles"
+                log.extend(["ran"] * int((self.k + 1 - state.steps).clamp_min(0).max()))
+                state.steps = state.steps.clamp_min(self.k + 1)
+                return normal_log(value, x, 1.0)
+
+        for k in range(windows):
+            pyro.sample(f"w_{k}", Window(k))
+        return state
+
+    return program
+
+
+def test_carried_state_goes_on_and_is_indexed_and_merged_with_its_particles() -> None:
+    log: list[str] = []
+    trace, _ = generate(carrying(log), (1,), {"w_0": number(0.0)}, N)
+    assert log == [f"started {N}", "ran"]
+    trace, _ = extend(trace, (2,), {"w_1": number(0.0)})
+    assert log == [f"started {N}", "ran", "ran"], "the second window goes on from the first"
+    log.clear()
+    trace = trace[torch.tensor([4, 4, 1, 0])]
+    trace, _ = extend(trace, (3,), {"w_2": number(1.0)})
+    assert log == ["ran"], "resampled particles keep their state"
+    log.clear()
+    moved = update(trace, {"z": trace["z"] + 1.0})
+    moved.log_ratio  # noqa: B018
+    assert log == [], "the state does not hang on z"
+    moved = update(trace, {"x": trace["x"] + 1.0})
+    moved.log_ratio  # noqa: B018
+    assert log == ["started 4", "ran", "ran", "ran"], "a new x throws the state away"
+    log.clear()
+    mixed = moved.trace.where(torch.tensor([True, False, False, True]), trace)
+    mixed, _ = extend(mixed, (4,), {"w_3": number(1.0)})
+    assert log == ["merged", "ran"], "accepted and refused particles keep their own states"
+    assert torch.equal(mixed.result.start, mixed["x"])
+
+
+def test_a_state_started_for_other_inputs_is_not_merged_in() -> None:
+    log: list[str] = []
+    trace, _ = generate(carrying(log), (1,), {"w_0": number(0.0)}, N)
+    moved = update(trace, {"x": trace["x"] + 1.0}).trace
+    again = update(moved, {"x": trace["x"]}).trace
+    mixed = again.where(torch.zeros(N, dtype=torch.bool), moved)
+    mixed, _ = extend(mixed, (2,), {"w_1": number(0.0)})
+    assert torch.equal(mixed.result.start, moved["x"])
+
+
+def test_two_windows_of_one_run_share_the_state_that_the_first_began() -> None:
+    started = []
+
+    class State:
+        def __getitem__(self, index: torch.Tensor) -> State:
+            return self
+
+        def where(self, mask: torch.Tensor, other: State) -> State:
+            return self
+
+    def start() -> State:
+        started.append(1)
+        return State()
+
+    def twice() -> None:
+        x = pyro.sample("x", dist.Normal(torch.tensor(0.0, dtype=torch.float64), 1.0))
+        assert carried("state", x, start) is carried("state", x, start)
+
+    simulate(twice, (), 5)
+    assert len(started) == 1
