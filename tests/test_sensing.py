@@ -136,6 +136,8 @@ def test_a_simulated_wrench_with_the_tools_weight_and_a_bias_reads_as_without() 
     assert torch.isfinite(locations).all(dim=-1).sum() > 30
     torch.testing.assert_close(locations, felt[0], atol=1e-7, rtol=0, equal_nan=True)
     np.testing.assert_allclose(loaded.tared([touch])[0][10:], raw[10:], atol=1e-9)
+    with pytest.raises(InputError, match="N mm"):
+        loaded.measure([Touch(stamps, heavy * [1, 1, 1, 1000, 1000, 1000], pose[0].numpy())])
     ((without, _),) = sensing.measure([touch])
     assert not torch.allclose(without, felt[0], atol=1e-3, equal_nan=True)
 

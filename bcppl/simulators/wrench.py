@@ -24,6 +24,7 @@ from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.recordings.measurements import Touch
 from bcppl.simulators.sensing.load import ToolLoad
+from bcppl.simulators.sensing.units import refuse_millimetres
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice
@@ -194,11 +195,17 @@ class Sensing:
             InputError: the wrenches are not (N, T, 6).
         """
         cleaned, state = self.clean(wrench, state)
-        locations = np.full((*wrench.shape[:2], 3), np.nan)
+        return self._located(cleaned), state
+
+    def _touching(self, cleaned: Array) -> npt.NDArray[np.bool_]:
+        """Where (N, T) cleaned wrenches (N, T, 6) have the force of a contact."""
         with np.errstate(invalid="ignore"):
-            touching = np.linalg.norm(cleaned[..., :3], axis=-1) >= self.force
+            return np.asarray(np.linalg.norm(cleaned[..., :3], axis=-1) >= self.force)
+
+    def _located(self, cleaned: Array) -> Array:
+        locations, touching = np.full((*cleaned.shape[:2], 3), np.nan), self._touching(cleaned)
         locations[touching] = self.locate(cleaned[touching])
-        return locations, state
+        return locations
 
     def locate(self, wrench: Array) -> Array:
         """Where the lines of action of wrenches (M, 6) enter the peg: (M, 3) in its frame, NaN if not."""
@@ -266,9 +273,12 @@ class Sensing:
         """
         state, measured = self.start(1), []
         for k, touch in enumerate(touches):
-            locations, state = self.contacts(self._weightless(touch, f"window {k}")[None], state)
+            cleaned, state = self.clean(self._weightless(touch, f"window {k}")[None], state)
+            refuse_millimetres(
+                cleaned[self._touching(cleaned)], float(np.linalg.norm(self._ball[0])) + self._ball[1]
+            )
             pose = torch.from_numpy(np.array(touch.world_from_peg, dtype=np.float64))
-            measured.append((torch.from_numpy(locations[0]), pose))
+            measured.append((torch.from_numpy(self._located(cleaned)[0]), pose))
         return measured
 
     def tared(self, touches: Sequence[Touch]) -> list[Tensor]:

@@ -26,6 +26,7 @@ from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.simulators.sensing.candidates import CORNER, EDGE, FACE, Candidates, Nodes, SurfacePosterior
 from bcppl.simulators.sensing.surface import PegSurface
+from bcppl.simulators.sensing.units import refuse_millimetres
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -38,7 +39,6 @@ _FLATTEST = 0.05  # cosine between force and normal below which a surface is not
 _UNLIKELY = (
     -18.0
 )  # log-likelihood, less its value at its peak, below which a wrench is not explained: six sigma
-_LONGEST_LEVER = 30.0  # a force that acts this many times as far off as the peg reaches has torques in N mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,18 +129,9 @@ class IntrinsicSensing:
         return np.where(np.isfinite(posterior.log_evidence), level, 1.0)
 
     def _check_units(self, wrench: Array, covariance: Array) -> None:
-        force = np.linalg.norm(wrench[:, :3], axis=1)
         noise = np.sqrt(np.trace(covariance[..., :3, :3], axis1=-2, axis2=-1))
-        clear = force > 10.0 * noise
-        if np.count_nonzero(clear) < 3:
-            return
-        farthest = self.surface.radius + float(np.linalg.norm(self.surface.center))
-        lever = float(np.median(np.linalg.norm(wrench[clear, 3:], axis=1) / force[clear]))
-        if lever > _LONGEST_LEVER * farthest:
-            raise InputError(
-                f"the wrenches push {lever:.3g} m beside the origin of a peg that ends {farthest:.3g} m from "
-                "it: their torques are probably in N mm; scale them by 0.001."
-            )
+        clear = np.linalg.norm(wrench[:, :3], axis=1) > 10.0 * noise
+        refuse_millimetres(wrench[clear], self.surface.radius + float(np.linalg.norm(self.surface.center)))
 
     def _on_faces(self, bundle: _Bundle) -> _Found:
         """Where each bundle of lines enters the peg, and what share of its area every line stands for."""
