@@ -1,0 +1,129 @@
+"""A camera finds where it stands from depth images of the arm itself: calibration without a target.
+
+The camera's pose in the arm's base frame is drawn from the prior, and what the sensor adds to every range.
+Each view is a depth image of the arm at other joint angles: its links are drawn where its joints put them.
+Table, floor and room are in the picture and in no model; no mask is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.depth import RobustDepth
+from bcppl.distributions.poses import NormalPose
+from bcppl.simulators.camera import Camera, bin_depth
+from bcppl.simulators.effort import Effort
+from bcppl.simulators.renderer import DepthRenderer
+from bcppl.simulators.robot import Robot
+from bcppl.traces import Trace
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is known of the camera.
+
+    Attributes:
+        scale: of the Laplace noise, metres: stereo smears shapes of a centimetre.
+        outlier: the probability that a pixel on the arm shows something else.
+        bias: standard deviation of what the sensor adds to every range, metres.
+        effective_pixels: how many independent pixels a whole image is worth, those beside the arm included.
+        bins: so many pixels in each direction are read as one, the median of them.
+    """
+
+    scale: float = 0.01
+    outlier: float = 0.1
+    bias: float = 0.005
+    effective_pixels: float | None = 200.0
+    bins: int = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What stays the same over a run.
+
+    Attributes:
+        camera: its optics, binned; its stated pose is not used.
+        prior: over `base_from_camera`.
+        renderers: of the arm at each view's joint angles, one rigid part each.
+        settings: of the likelihood.
+    """
+
+    camera: Camera
+    prior: Any
+    renderers: Sequence[DepthRenderer]
+    settings: Settings
+
+    @property
+    def efforts(self) -> Mapping[str, Effort]:
+        """What each simulator has done so far."""
+        return {f"rendering {k}": renderer.effort for k, renderer in enumerate(self.renderers)}
+
+
+def arm_in_view(scene: Scene, views: int) -> None:
+    """The program: where the camera stands, its bias, and a depth image for each of the first views."""
+    settings = scene.settings
+    camera = pyro.sample("camera", scene.prior)
+    bias = pyro.sample("bias", dist.Normal(torch.zeros(()).double(), settings.bias))
+    camera_from_base = poses.inverse(camera)
+    for k, renderer in enumerate(scene.renderers[:views]):
+        depth = RobustDepth(
+            renderer,
+            scene.camera,
+            camera_from_base,
+            scale=settings.scale,
+            outlier=settings.outlier,
+            effective_pixels=settings.effective_pixels,
+            bias=bias,
+        )
+        pyro.sample(f"depth_{k}", depth)
+
+
+def prepare(robot: Robot, camera: Camera, prior: Any, angles: Sequence[Array], **settings: Any) -> Scene:
+    """The scene of some views.
+
+    Args:
+        robot: the arm; its meshes are needed.
+        camera: its optics.
+        prior: over `base_from_camera`, such as `prior_from_guess` gives.
+        angles: (J,) joint angles of each view, radians.
+        settings: fields of `Settings`.
+
+    Raises:
+        InputError: as `Robot.drawn`.
+    """
+    chosen = Settings(**settings)
+    still = replace(camera, world_from_camera=poses.identity().numpy())
+    renderers = [DepthRenderer(robot.drawn(q)) for q in angles]
+    return Scene(still.binned(chosen.bins), prior, renderers, chosen)
+
+
+def observations(scene: Scene, images: Sequence[Array]) -> Mapping[str, Tensor]:
+    """The depth images (H, W) of the views, metres, NaN or 0 where missing, by address."""
+    near, far = scene.camera.near, scene.camera.far
+    binned = [bin_depth(image, scene.settings.bins, near=near, far=far) for image in images]
+    return {f"depth_{k}": torch.from_numpy(image) for k, image in enumerate(binned)}
+
+
+def along_the_view(trace: Trace) -> None:
+    """A proposal: the sensor reads farther and the camera stands nearer, or the other way round.
+
+    The two are hardly told apart, so that neither moves far alone.
+    """
+    bias = pyro.sample("bias", dist.Normal(trace["bias"], 0.005))
+    camera = trace["camera"]
+    forward = poses.rotation_matrix(camera)[..., 2]
+    moved = camera[..., :3] + forward * (bias - trace["bias"])[..., None]
+    around = torch.tensor([0.0005] * 6, dtype=torch.float64)
+    pyro.sample("camera", NormalPose(torch.cat([moved, camera[..., 3:]], dim=-1), around))

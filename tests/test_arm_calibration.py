@@ -1,0 +1,167 @@
+"""Calibration by a ball in sockets: the density of what is measured, and real recordings."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from bcppl.errors import InputError
+from bcppl.inference.importance import importance_sampling
+from bcppl.models.arm_calibration import (
+    Arm,
+    arm_calibration,
+    linearised,
+    observations,
+    read_seatings,
+    sockets,
+)
+from bcppl.models.robots import load_robot
+from bcppl.simulators.robot import Robot
+from bcppl.traces import generate
+
+DATA = Path(__file__).parents[2] / "shared/data/ball_in_socket"
+needed = pytest.mark.skipif(not DATA.is_dir(), reason=f"the ball-in-socket recordings are not at {DATA}")
+
+PLACES = {"panda_2_clean": ("front_left", "mid-high"), "panda_3": ("backcenter", "frontleft")}
+
+
+def wandering(robot: Robot, angles: Tensor) -> float:
+    """Root mean square distance of the ball from its mean place, mm."""
+    places = robot.position("ball_link", angles)
+    return 1e3 * float((places - places.mean(dim=0)).square().sum(dim=1).mean().sqrt())
+
+
+def apart(robot: Robot, pair: list[Tensor]) -> float:
+    first, second = (robot.position("ball_link", q).mean(dim=0) for q in pair)
+    return 1e3 * float((first - second).norm())
+
+
+@needed
+@pytest.mark.parametrize("name", ["panda_2", "panda_3"])
+def test_recordings_read_as_they_were_described(name: str) -> None:
+    folder = DATA / "data" / {"panda_2": "panda_2_clean"}.get(name, name)
+    pairs = [read_seatings(place) for place in sorted(folder.iterdir())]
+    nominal = Robot(DATA / "urdf/panda.urdf", tip="ball_link")
+    calibrated = Robot(DATA / f"calibrated_urdf/{name}/panda_calibrated.urdf", tip="ball_link")
+    assert min(wandering(nominal, q) for pair in pairs for q in pair) > 3.0
+    assert max(wandering(calibrated, q) for pair in pairs for q in pair) < 0.6
+    assert all(46.5 < apart(nominal, pair) < 53.0 for pair in pairs)
+    assert np.mean([apart(calibrated, pair) for pair in pairs]) == pytest.approx(50.0, abs=0.1)
+
+
+@needed
+@pytest.mark.parametrize("name", PLACES)
+def test_two_positions_teach_the_distance_at_the_others(name: str) -> None:
+    arm = Arm(Robot(DATA / "urdf/panda.urdf", tip="ball_link"))
+    data = {p.name: read_seatings(p) for p in sorted((DATA / "data" / name).iterdir())}
+    seen = [q for place in PLACES[name] for q in data[place]]
+    torch.manual_seed(0)
+    population = importance_sampling(
+        arm_calibration, (arm, seen), observations(seen), 200, linearised(arm, seen)
+    )
+    assert population.effective_sample_size > 30.0
+    weights = population.log_weights.softmax(dim=0)
+    off, spread = [], []
+    for place, pair in data.items():
+        if place not in PLACES[name]:
+            first, second = (sockets(arm, population.trace, q) for q in pair)
+            distance = 1e3 * (first - second).norm(dim=1)
+            off.append(float(weights @ distance) - 50.0)
+            spread.append(float((weights @ (distance - distance @ weights) ** 2).sqrt()))
+    assert max(map(abs, off)) < 0.4
+    assert 0.05 < np.mean(spread) < 0.3
+    assert max(abs(o) / s for o, s in zip(off, spread, strict=True)) < 3.5
+
+
+def arm_and_seating() -> tuple[Arm, Tensor]:
+    robot = load_robot("panda", tip="panda_hand_tcp")
+    middle = torch.tensor([0.0, 0.3, 0.2, -1.8, 0.1, 2.2, 0.6], dtype=torch.float64)
+    angles = middle + 0.4 * torch.rand(6, 7, generator=torch.Generator().manual_seed(0)).double()
+    return Arm(robot, link="panda_hand_tcp"), angles
+
+
+def test_the_volume_is_that_of_the_angles_jacobian() -> None:
+    arm, angles = arm_and_seating()
+    torch.manual_seed(1)
+    values = {a: s * torch.randn(3, *s.shape, dtype=torch.float64) for a, s in arm.spread.items()}
+    step, columns = 1e-6, []
+    for k in range(7):
+        moved = step * torch.eye(7, dtype=torch.float64)[k]
+        ahead, back = arm.places(values, angles + moved), arm.places(values, angles - moved)
+        columns.append((ahead - back) / (2.0 * step))
+    slope = torch.stack(columns, dim=-1)
+    expected = torch.log(torch.linalg.svdvals(slope)).sum(dim=(1, 2))
+    assert torch.allclose(arm.log_volume(values, angles), expected, atol=1e-6)
+
+
+def test_the_density_of_angles_does_not_hang_on_the_unit_of_places() -> None:
+    """An arm of twice the size with twice the noise says the same of its angles, but for the flat prior."""
+    arm, angles = arm_and_seating()
+    robot = arm.robot
+    values = {a: torch.zeros(1, *s.shape, dtype=torch.float64) for a, s in arm.spread.items()}
+    reach = robot.position("panda_hand_tcp", angles)
+    # Every joint's origin once more as far: an arm of twice the size.
+    shifts = torch.stack([torch.from_numpy(j.parent_from_child[:3, 3].copy()) for j in robot.joints])
+    hand = torch.tensor([0.0, 0.0, 0.107 + 0.1034], dtype=torch.float64)
+    twice = dict(values)
+    twice["errors"] = torch.cat([shifts, torch.zeros(7, 3)], dim=1)[None].double()
+    twice["ball"] = hand[None]
+    assert torch.allclose(arm.places(twice, angles)[0], 2.0 * reach, atol=1e-12)
+    gain = arm.log_volume(twice, angles) - arm.log_volume(values, angles)
+    assert float(gain) == pytest.approx(3 * len(angles) * math.log(2.0))
+
+
+def test_a_turn_about_the_base_says_nothing() -> None:
+    arm, angles = arm_and_seating()
+    start = {a: torch.zeros(2, *s.shape, dtype=torch.float64) for a, s in arm.spread.items()}
+    start["offsets"][1, 0] = 0.3
+    start["noise"] = torch.full((2,), 3e-4, dtype=torch.float64)
+    given = {a: v for a, v in start.items()}
+    trace, _ = generate(arm_calibration, (arm, [angles]), {**observations([angles])}, 2, given)
+    both = trace.log_prob("seating_0", "volume_0")
+    assert float(both[0]) == pytest.approx(float(both[1]), rel=1e-9)
+
+
+def test_offsets_that_are_made_up_are_found_again() -> None:
+    arm, angles = arm_and_seating()
+    truth = torch.tensor([0.0, 0.01, -0.012, 0.008, -0.01, 0.012, 0.0], dtype=torch.float64)
+    seatings = []
+    for seed in range(3):
+        # Postures of one seat: Newton's steps along the least change of the angles.
+        q = (
+            angles.repeat(4, 1)
+            + 0.3 * torch.rand(24, 7, generator=torch.Generator().manual_seed(seed)).double()
+        )
+        goal = arm.robot.position("panda_hand_tcp", q[:1] + truth)
+        for _ in range(20):
+            moved = q.clone().requires_grad_()
+            places = arm.robot.position("panda_hand_tcp", moved + truth)
+            rows = [torch.autograd.grad(places[:, k].sum(), moved, retain_graph=True)[0] for k in range(3)]
+            q = q + (torch.linalg.pinv(torch.stack(rows, 1)) @ (goal - places.detach())[..., None])[..., 0]
+        noise = 1e-5 * torch.randn(24, 7, generator=torch.Generator().manual_seed(seed)).double()
+        seatings.append(q + noise)
+    known = Arm(arm.robot, "panda_hand_tcp", offset=0.02, shift=0.0, turn=0.0, mount=1e-4, noise=2e-5)
+    torch.manual_seed(0)
+    population = importance_sampling(
+        arm_calibration, (known, seatings), observations(seatings), 300, linearised(known, seatings)
+    )
+    weights = population.log_weights.softmax(dim=0)
+    found = (weights[:, None] * population["offsets"]).sum(dim=0)
+    assert population.effective_sample_size > 30.0
+    # The first is a turn about the base, the last one turns the ball about itself.
+    assert float((found - truth)[1:6].abs().max()) < 5e-4
+    spread = (weights[:, None] * (population["offsets"] - found) ** 2).sum(dim=0).sqrt()
+    assert float(spread[0]) > 0.01 > 20.0 * float(spread[1:6].max())
+
+
+def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
+    for text in (None, "1,2,x\n", "0.1,0.2,0.3\n"):
+        if text is not None:
+            (tmp_path / "hole_0.csv").write_text(text)
+        with pytest.raises(InputError, match=r"hole_0\.csv"):
+            read_seatings(tmp_path)
