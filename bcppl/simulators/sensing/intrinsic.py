@@ -31,14 +31,13 @@ from bcppl.simulators.sensing.units import refuse_millimetres
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-WIDTH = 3.2  # how many deviations the bundle reaches to each side, of a bound of them along the whole peg
+WIDTH = 3.2  # how many deviations the bundle reaches to each side, of a bound of them along the line
 ACROSS = 19  # lines across the bundle
 ALONG = 21  # nodes on the stretch of an edge
 _BATCH = 400  # wrenches whose bundles are cast at once
 _FLATTEST = 0.05  # cosine between force and normal below which a surface is not pushed
-_UNLIKELY = (
-    -18.0
-)  # log-likelihood, less its value at its peak, below which a wrench is not explained: six sigma
+_WEAKEST = 5.0  # deviations of a force below which it has no direction to speak of
+_UNLIKELY = -18.0  # exponent of the likelihood below which a wrench is not explained: six deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +88,10 @@ class IntrinsicSensing:
             covariance: (6, 6), or (M, 6, 6), of their noise: `WrenchNoise.covariance`.
 
         Returns:
-            The posterior of each wrench. It has no nodes for a wrench that is not finite or has no force, and
-            for one that no single contact explains within six deviations: a line of action that passes beside
-            the peg, a force that leaves every friction cone (is `friction` large enough?), a torque about the
-            line that only several contacts can make.
+            The posterior of each wrench. It has no nodes for a wrench that is not finite, or whose force is
+            below five deviations; and for one that no single contact explains within six deviations: a line
+            of action that passes beside the peg, a force that leaves every friction cone (is `friction` large
+            enough?), a torque about the line that only several contacts can make.
 
         Raises:
             InputError: shapes do not fit, a covariance is not positive definite, or torques are in N mm.
@@ -101,8 +100,11 @@ class IntrinsicSensing:
         if wrench.ndim != 2 or wrench.shape[1] != 6:
             raise InputError(f"wrenches have shape {wrench.shape}; give (wrenches, 6).")
         covariance = _checked(covariance, len(wrench))
-        rows = np.flatnonzero(np.isfinite(wrench).all(axis=1) & (wrench[:, :3] != 0.0).any(axis=1))
-        self._check_units(wrench[rows], _of_rows(covariance, rows))
+        rows = np.flatnonzero(np.isfinite(wrench).all(axis=1))
+        noise = np.linalg.eigvalsh(_of_rows(covariance, rows)[..., :3, :3])[..., -1]
+        clear = np.linalg.norm(wrench[rows, :3], axis=1) > _WEAKEST * np.sqrt(noise)
+        rows = rows[clear]
+        refuse_millimetres(wrench[rows], self.surface.radius + float(np.linalg.norm(self.surface.center)))
         parts = [_NONE]
         for first in range(0, len(rows), _BATCH):
             chosen = rows[first : first + _BATCH]
@@ -127,11 +129,6 @@ class IntrinsicSensing:
         score, *_ = self._log_likelihood(wrench, covariance, point, normals)
         level = posterior.mass_above(score)
         return np.where(np.isfinite(posterior.log_evidence), level, 1.0)
-
-    def _check_units(self, wrench: Array, covariance: Array) -> None:
-        noise = np.sqrt(np.trace(covariance[..., :3, :3], axis1=-2, axis2=-1))
-        clear = np.linalg.norm(wrench[:, :3], axis=1) > 10.0 * noise
-        refuse_millimetres(wrench[clear], self.surface.radius + float(np.linalg.norm(self.surface.center)))
 
     def _on_faces(self, bundle: _Bundle) -> _Found:
         """Where each bundle of lines enters the peg, and what share of its area every line stands for."""
