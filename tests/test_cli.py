@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -15,42 +14,12 @@ import h5py
 import numpy as np
 import pytest
 
-from bcppl.cli import main
-from bcppl.recordings import DepthImage, Measurement, Recording, View, load, problems, save
+from bcppl.recordings import DepthImage, Measurement, Recording, View, problems, save
 from bcppl.simulators.camera import Camera
+from tests.command_line import SHIPPED, Ran, short
 
-SHIPPED = Path(str(files("bcppl.models") / "recordings/point_probe_10_pushes.h5"))
-PROBE = Path(str(files("bcppl.models") / "point_probe.py"))
 DATA = Path(__file__).parents[2] / "shared/data"
 replace = dataclasses.replace
-
-
-@dataclasses.dataclass
-class Ran:
-    code: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def bcppl(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Callable[..., Ran]:
-    """Runs a command in an empty folder of its own."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.delenv("BCPPL_TRACEBACK", raising=False)
-
-    def run(*words: object) -> Ran:
-        monkeypatch.setattr(sys, "argv", ["bcppl", *map(str, words)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as caught:
-            main()
-        said = capsys.readouterr()
-        code = caught.value.code
-        return Ran(code if isinstance(code, int) else 0 if code is None else 1, said.out, said.err)
-
-    return run
 
 
 def assert_refused(ran: Ran, says: str) -> None:
@@ -59,11 +28,6 @@ def assert_refused(ran: Ran, says: str) -> None:
     assert len(lines) == 1 and lines[0].startswith("bcppl: ") and lines[0].endswith("."), ran.err
     assert says in lines[0], lines[0]
     assert "Traceback" not in ran.err + ran.out
-
-
-def short(count: int = 3) -> Recording:
-    whole = load(SHIPPED)
-    return replace(whole, measurements=whole.measurements[:count])
 
 
 def changed(values: Any, place: Any, to: float) -> Any:
@@ -279,89 +243,6 @@ def test_simulate_refuses(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     assert_refused(bcppl("simulate", "point_probe", "--out", "."), "is a folder")
     assert_refused(bcppl("simulate", "point_probe", "--seed", -1), "--seed is -1")
     assert list(tmp_path.iterdir()) == []
-
-
-# ---- what works
-
-
-def test_a_users_own_files_are_taken_as_readily_as_names(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
-    mine = (
-        PROBE.read_text().replace('f"onset_{k}"', 'f"begin_{k}"').replace("def point_probe(", "def my_probe(")
-    )
-    (tmp_path / "my_probe.py").write_text(mine.replace("program=point_probe", "program=my_probe"))
-    (tmp_path / "my_smc.py").write_text(
-        "from bcppl.inference.smc import smc, tempered\n"
-        "def infer(model, recording, *, particles, seed, scene):\n"
-        "    options = {'particles': particles, 'seed': seed, 'scene': scene}\n"
-        "    yield from smc(model, recording, step=tempered(), **options)\n"
-    )
-    save(short(), tmp_path / "short.h5")
-    words = ("--particles", 8, "--model", "my_probe.py", "--inference", tmp_path / "my_smc.py")
-    ran = bcppl("run", "short.h5", *words)
-    assert ran.code == 0, ran.err
-    assert "push 3" in ran.out and "standard deviation" in ran.out
-    found = sorted(p.name for p in (tmp_path / "runs/short").iterdir())
-    assert found == [
-        "add_over_time.png",
-        *(f"belief_{k:03d}.h5" for k in range(4)),
-        "belief_in_3d.png",
-        "run.json",
-    ]
-
-
-def test_the_same_seed_writes_the_same_beliefs(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
-    save(short(2), tmp_path / "short.h5")
-    for out, seed in (("a", 1), ("b", 1), ("c", 2)):
-        assert bcppl("run", "short.h5", "--particles", 8, "--seed", seed, "--out", out).code == 0
-    read = {out: h5py.File(tmp_path / out / "belief_002.h5") for out in "abc"}
-    poses = {out: np.array(file["world_from_part"]) for out, file in read.items()}
-    assert np.array_equal(poses["a"], poses["b"]) and not np.array_equal(poses["a"], poses["c"])
-
-
-STOPS = {
-    "RuntimeError('boom')": (1, "boom"),
-    "InferenceError('no particle is left; use more.')": (1, "no particle is left; use more."),
-    "InputError('what was given is wrong.')": (2, "what was given is wrong."),
-    "KeyboardInterrupt": (130, None),
-}
-
-
-@pytest.mark.parametrize("error", STOPS)
-def test_what_was_computed_before_a_stop_is_kept(
-    error: str, bcppl: Callable[..., Ran], tmp_path: Path
-) -> None:
-    (tmp_path / "stops.py").write_text(
-        "from bcppl.errors import InferenceError, InputError\n"
-        "from bcppl.inference.tempered_smc import infer as whole\n"
-        "def infer(*args, **options):\n"
-        "    for count, step in enumerate(whole(*args, **options)):\n"
-        "        if count == 3:\n"
-        f"            raise {error}\n"
-        "        yield step\n"
-    )
-    ran = bcppl("run", SHIPPED, "--particles", 8, "--inference", "stops.py", "--out", "kept")
-    code, says = STOPS[error]
-    assert ran.code == code and "Traceback" not in ran.err + ran.out
-    if says is not None:
-        assert says in ran.err and len(ran.err.strip().splitlines()) == 1
-    found = sorted(p.name for p in (tmp_path / "kept").iterdir())
-    assert found == [
-        "add_over_time.png",
-        *(f"belief_{k:03d}.h5" for k in range(3)),
-        "belief_in_3d.png",
-        "run.json",
-    ]
-    assert "push 2" in ran.out and "standard deviation" in ran.out
-
-
-def test_an_earlier_runs_beliefs_do_not_lie_among_the_new(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
-    save(short(1), tmp_path / "short.h5")
-    (tmp_path / "out").mkdir()
-    for name in ("belief_007.h5", "old.png", "notes.txt"):
-        (tmp_path / "out" / name).write_text("old")
-    assert bcppl("run", "short.h5", "--particles", 4, "--out", "out").code == 0
-    found = {p.name for p in (tmp_path / "out").iterdir()}
-    assert "notes.txt" in found and "belief_007.h5" not in found
 
 
 def test_as_a_program() -> None:

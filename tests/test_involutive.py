@@ -289,9 +289,6 @@ def test_volumes_are_those_of_the_base_measure() -> None:
     torch.testing.assert_close(squared, torch.log(4 * p.prod(-1) / (p**2).sum(-1) ** 3))
 
 
-# ---- maps that are refused
-
-
 def test_maps_that_are_refused_name_the_address() -> None:
     def once(program: Any, auxiliary: Any, involution: Any, check: bool = False) -> None:
         torch.manual_seed(0)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.poses import NormalPose, UniformPose
+from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.inference.kernels import Kernel, cycle, metropolis_hastings, rejuvenate, repeat
 from bcppl.inference.population import Population
@@ -24,7 +24,19 @@ from bcppl.inference.proposals import Fitted, drift
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.poses import Freedom
 from bcppl.traces import Trace, generate, simulate
-from tests.invariance import equal_weights, largest_z, matrix, number
+from tests.exact_targets import (
+    CENTER,
+    COVARIANCE,
+    SEEN,
+    WIDE,
+    correlated,
+    correlated_draws,
+    draws_of,
+    edged,
+    planar,
+    wide,
+)
+from tests.invariance import equal_weights, largest_z, number
 
 DRAWS = 20_000
 SOUND, BROKEN = 4.5, 8.0  # |z| of the worst of a dozen expectations: below if invariant, above if not
@@ -67,45 +79,7 @@ def worst_z(
     return largest_z(before, functions(trace[address]))
 
 
-# ---- targets with exact draws
-
-COVARIANCE = matrix([[1.0, 0.8, 0.0], [0.8, 1.0, 0.3], [0.0, 0.3, 0.5]])
-SEEN = torch.tensor([1.0, -0.5, 2.0], dtype=torch.float64)
-
-
-def correlated() -> None:
-    x = pyro.sample("x", dist.MultivariateNormal(torch.zeros(3, dtype=torch.float64), COVARIANCE))
-    pyro.sample("y", dist.Normal(x, 0.7).to_event(1))
-
-
-def correlated_draws(count: int) -> Trace:
-    """The posterior by Gauss: precision S^-1 + I / s^2."""
-    posterior = torch.linalg.inv(torch.linalg.inv(COVARIANCE) + torch.eye(3, dtype=torch.float64) / 0.49)
-    exact = torch.distributions.MultivariateNormal(posterior @ SEEN / 0.49, posterior)
-    return generate(correlated, (), {"y": SEEN}, count)[0].at({"x": exact.sample((count,))})
-
-
-CENTER = poses.as_pose([0.1, -0.2, 0.3, 0.5, 0.5, -0.5, 0.5])
-WIDE = torch.tensor([0.2, 0.1, 0.3, 1.1, 0.9, 1.3], dtype=torch.float64)
-PLANAR = Freedom("xy", "z")
-TURNING = matrix([[0.04, 0.0, 0.1], [0.0, 0.01, 0.0], [0.1, 0.0, 1.0]])
-
-
-def wide() -> None:
-    pyro.sample("pose", NormalPose(CENTER, WIDE))
-
-
-def planar() -> None:
-    pyro.sample("pose", NormalPose(CENTER, TURNING, PLANAR))
-
-
-def edged() -> None:
-    pyro.sample("pose", UniformPose(CENTER, (0.1, 0.02, 0.0), 1.2))
-
-
-def draws_of(program: Callable[[], None]) -> Callable[[int], Trace]:
-    return lambda count: simulate(program, (), count)
-
+# ---- what is compared
 
 CASES: dict[str, tuple[Callable[[int], Trace], str, Callable[[Tensor], Tensor]]] = {
     "correlated Gaussian": (correlated_draws, "x", of_vectors),

@@ -1,0 +1,33 @@
+"""Fixtures that several test files use."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from bcppl.cli import main
+from tests.command_line import Ran
+
+
+@pytest.fixture
+def bcppl(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Callable[..., Ran]:
+    """Runs a command in an empty folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.delenv("BCPPL_TRACEBACK", raising=False)
+
+    def run(*words: object) -> Ran:
+        monkeypatch.setattr(sys, "argv", ["bcppl", *map(str, words)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as caught:
+            main()
+        said = capsys.readouterr()
+        code = caught.value.code
+        return Ran(code if isinstance(code, int) else 0 if code is None else 1, said.out, said.err)
+
+    return run
