@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.beliefs import normalised
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.poses import UniformPose
 from bcppl.inference.importance import importance_sampling
@@ -33,13 +31,10 @@ from bcppl.inference.schemes import systematic
 from bcppl.inference.step import Observed, StepFunction, steps
 from bcppl.inference.tempering import tempered
 from bcppl.inference.waste_free import waste_free_moves
+from tests.agreement import RUNS, agrees, posterior_agrees
+from tests.invariance import number
 
-RUNS = 20
 LONG = pytest.mark.long
-
-
-def number(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -72,15 +67,6 @@ class Case:
             *_, (population, _) = steps(self.step() if step is None else step, start, observed)
             last.append(population)
         return np.array([p.log_evidence for p in last]) - self.log_evidence, last
-
-
-def agrees(errors: np.ndarray, resolution: float) -> None:
-    """The mean of Zhat / Z is 1 within 3 standard errors, and known to `resolution`."""
-    ratios = np.exp(errors)
-    error = ratios.std(ddof=1) / math.sqrt(len(ratios))
-    print("Zhat / Z", ratios.mean(), "+-", error, "sd of log Zhat", errors.std(ddof=1))
-    assert abs(ratios.mean() - 1) < 3 * error
-    assert error < resolution
 
 
 # ---- the hidden Markov model of Gen.jl's particle filter test
@@ -145,29 +131,6 @@ CHAIN = Case(
     particles=1000,
     sweeps=2,
 )
-
-# ---- posteriordb's sblrc-blr, the prior on sigma > 0 a normal that is not doubled
-
-Y, *COLUMNS = torch.from_numpy(np.loadtxt(Path(__file__).parent / "data/sblrc.csv", delimiter=",")).T
-X = torch.stack(COLUMNS, dim=1)
-
-
-def regression(count: int) -> None:
-    beta = pyro.sample("beta", dist.Normal(torch.zeros(5, dtype=torch.float64), 10.0).to_event(1))
-    sigma = pyro.sample("sigma", dist.HalfNormal(number(10.0)))
-    pyro.factor("not doubled", torch.full_like(sigma, -math.log(2.0)))
-    if count:
-        pyro.sample("y", dist.Normal(beta @ X.T, sigma[:, None]).to_event(1))
-
-
-def least_squares(_: int) -> None:
-    """A proposal for the regression: about the least squares, wider than the posterior."""
-    best = torch.linalg.lstsq(X, Y[:, None]).solution[:, 0]
-    size = (Y - X @ best).square().sum().div(95).sqrt()
-    sigma = pyro.sample("sigma", dist.LogNormal(size.log(), 0.12))
-    factor = torch.linalg.cholesky(torch.linalg.inv(X.T @ X))
-    pyro.sample("beta", dist.MultivariateNormal(best, scale_tril=1.3 * sigma[:, None, None] * factor))
-
 
 # ---- two Gaussian shells
 
@@ -250,17 +213,6 @@ def test_evidence(name: str) -> None:
     agrees(errors, {**CASES, **LONGER}[name][1])
 
 
-def posterior_agrees(populations: list[Population], read: Callable[[Any], Tensor], exact: Tensor) -> None:
-    """The weighted mean of something, over runs, within 3.5 standard errors of what it is."""
-    found = torch.stack(
-        [torch.tensordot(normalised(p.log_weights), read(p.trace), dims=1) for p in populations]
-    )
-    error = found.std(0) / math.sqrt(len(found))
-    print("found", found.mean(0), "+-", error, "exact", exact)
-    assert bool(((found.mean(0) - exact).abs() < 3.5 * error + 1e-5).all())
-    assert bool((error < 0.1 * exact.abs()).all())
-
-
 def test_posterior_of_the_gaussian() -> None:
     _, populations = runs("gaussian")
     exact = torch.linalg.inv(torch.eye(6).double() + torch.linalg.inv(COVARIANCE)).diagonal()
@@ -277,16 +229,6 @@ def test_posterior_of_the_chain() -> None:
 
     posterior_agrees(populations, chain, means)
     posterior_agrees(populations, lambda t: (chain(t) - means) ** 2, torch.tensor([0.75, 1.0, 0.75]).double())
-
-
-def test_regression_by_importance() -> None:
-    """Tempering it takes moves that scale beta and sigma together; a proposal about the data does without."""
-    populations = []
-    for seed in range(RUNS):
-        torch.manual_seed(seed)
-        populations.append(importance_sampling(regression, (1,), {"y": Y}, 1000, least_squares))
-    agrees(np.array([p.log_evidence for p in populations]) + 195.660735, 0.01)
-    posterior_agrees(populations, lambda trace: trace["sigma"], number(1.04285))
 
 
 def test_belief_over_the_points() -> None:
