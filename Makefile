@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 RECORDINGS := point_probe_10_pushes peg_probe
 # Packages that the benchmarks measure beside bcppl; each gets an environment of its own.
-PEERS := particles blackjax
+PEERS := particles blackjax open3d
 # Test processes; each keeps to one thread.
 JOBS ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest

@@ -23,8 +23,9 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals.least_squares import Equations, aligned
 from bcppl.inference.proposals.proposal import Fitted
 from bcppl.inference.proposals.spread import spread_of
+from bcppl.parts import Part
 from bcppl.poses import FREE
-from bcppl.simulators.renderer import DepthRenderer, Hits
+from bcppl.simulators.renderer import Hits
 from bcppl.traces import Trace
 
 Array = npt.NDArray[np.float64]
@@ -85,8 +86,9 @@ def depth_alignment(address: str, sites: str = "depth_*", *, steps: int = 1, rea
 def _equations(trace: Trace, address: str, image: str, pose: Tensor) -> tuple[Equations, Tensor]:
     """What one depth image says of poses (N, 7), and how sure its likelihood is of that, (N, 6, 6)."""
     site: Any = trace.distributions[image]
-    renderer = getattr(site, "renderer", None)
-    if not isinstance(site, LaplaceDepth | RobustDepth) or not isinstance(renderer, DepthRenderer):
+    renderer: Any = getattr(site, "renderer", None)
+    of_one_part = isinstance(getattr(renderer, "part", None), Part)
+    if not isinstance(site, LaplaceDepth | RobustDepth) or not of_one_part:
         raise InputError(
             f"depth_alignment reads site {image!r}, which is a {type(site).__name__} and no depth image; "
             "name those that are with `sites`."
