@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from bcppl.errors import InputError
 from bcppl.parts import Part, Piece
-from bcppl.simulators.cover import Cell, convex_cells, grown_in, polygons_of
+from bcppl.simulators.cover import Cell, convex_cells, grown_in, polygons_of, straightened
 from bcppl.simulators.extrusion import RAMP, REACH
 from bcppl.simulators.fidelity import geometric_error
 
@@ -85,19 +85,22 @@ def prismatic(part: Part, axis: str = "z", tolerance: float = 5e-6) -> Part:
     return made
 
 
-def hole_outline(part: Part, height: float, inside: tuple[float, float] = (0.0, 0.0)) -> shapely.Polygon:
+def hole_outline(
+    part: Part, height: float, inside: tuple[float, float] = (0.0, 0.0), tolerance: float = 5e-6
+) -> shapely.Polygon:
     """The outline of the hole around a point in a cross section, in the part's x-y plane, metres.
 
     Args:
         part: with a closed mesh.
         height: z of the section, metres.
         inside: a point in the hole.
+        tolerance: metres within which corners that lie on a straight line are dropped, as by `prismatic`.
 
     Raises:
         InputError: there is no hole around the point.
     """
-    section = _section(part.mesh, height)
-    for polygon in section.geoms:
+    section = shapely.simplify(_section(part.mesh, height), tolerance)
+    for polygon in polygons_of(section):
         for ring in polygon.interiors:
             if shapely.Polygon(ring).contains(shapely.Point(inside)):
                 return shapely.Polygon(ring)
@@ -243,7 +246,8 @@ def _capped(
     shapely.prepare(allowed := halfway.buffer(0.2 * tolerance))
     found = []
     cores = [np.array([goes.get(tuple(p.tolist()), p) for p in cell.core]) for cell in cells]
-    wide = grown_in(section, cores, REACH)
+    slim = [straightened(core) for core in cores]  # a chamfer may bring two corners together
+    wide = grown_in(section, [s if len(s) > 2 else c for s, c in zip(slim, cores, strict=True)], REACH)
     for cell, core, wider in zip(cells, cores, wide, strict=True):
         corners = [np.insert(cell.core, 2, rest, axis=1), np.insert(core, 2, end, axis=1)]
         both = 0.5 * (cell.grown[:, None] + wider[None]).reshape(-1, 2)

@@ -1,0 +1,106 @@
+"""Meshes taken apart by CoACD: the error is measured, bounded by the clearance, and the result is kept."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+import trimesh
+
+from bcppl.errors import InputError
+from bcppl.parts import Part, Piece
+from bcppl.simulators import decomposition
+from bcppl.simulators.decomposition import decomposed
+from bcppl.simulators.fidelity import geometric_error
+from bcppl.simulators.shapes import block
+
+
+def angle(tall: float = 0.01) -> Part:
+    outline = shapely.Polygon([(0, 0), (0.03, 0), (0.03, 0.01), (0.01, 0.01), (0.01, 0.03), (0, 0.03)])
+    mesh = trimesh.creation.extrude_polygon(outline, tall)
+    return Part("angle", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def ring() -> Part:
+    mesh = trimesh.creation.annulus(0.0051, 0.01, 0.01, sections=32)
+    mesh.merge_vertices()
+    return Part("ring", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def test_the_error_of_pieces_is_exact_on_both_sides() -> None:
+    half = np.array([0.03, 0.02, 0.01])
+    solid = block((0.06, 0.04, 0.02))
+    moved = replace(solid, pieces=[Piece("box", half, np.array([0.0003, 0.0, -0.01]))])
+    error = geometric_error(moved, count=500)
+    assert error.added == pytest.approx(0.0003, abs=1e-9) and error.lost == pytest.approx(0.0003, abs=1e-9)
+    smaller = replace(solid, pieces=[Piece("box", half - 0.001, np.array([0.0, 0.0, -0.01]))])
+    error = geometric_error(smaller, count=500)
+    # A corner is off along the diagonal, and is a point that is always looked at.
+    assert error.added == 0.0 and error.lost == pytest.approx(0.001 * np.sqrt(3.0), rel=1e-6)
+    halves = [Piece("box", half * [0.5, 1, 1], np.array([x, 0.0, -0.01])) for x in (-0.015, 0.015)]
+    assert geometric_error(replace(solid, pieces=halves), count=500).largest < 1e-12
+
+
+def test_a_convex_part_needs_no_coacd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def missing(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", missing)
+    whole = decomposed(replace(block((0.06, 0.04, 0.02)), pieces=()), clearance=0.0001, cache=tmp_path)
+    assert len(whole.part.pieces) == 1 and whole.error.largest < 1e-12
+    with pytest.raises(InputError, match=r"not convex.*pip install 'bcppl\[mesh\]'") as told:
+        decomposed(angle(), clearance=0.0001, cache=tmp_path)
+    assert "\n" not in str(told.value)
+
+
+def test_pieces_are_kept_by_content_and_damage_is_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pytest.importorskip("coacd")
+    made = decomposed(angle(), clearance=0.0002, cache=tmp_path)
+    assert made.error == geometric_error(made.part) and made.error.largest <= 0.00004
+    assert sum(trimesh.convex.convex_hull(p.size).volume for p in made.part.pieces) == pytest.approx(
+        angle().mesh.volume, rel=0.01
+    )
+    (file,) = tmp_path.iterdir()
+    calls: list[Any] = []
+    real = decomposition._coacd
+    monkeypatch.setattr(decomposition, "_coacd", lambda *given: calls.append(given) or real(*given))
+    again = decomposed(replace(angle(), name="another name"), clearance=0.0002, cache=tmp_path)
+    assert not calls and again.error == made.error and again.part.name == "another name"
+    for a, b in zip(made.part.pieces, again.part.pieces, strict=True):
+        np.testing.assert_array_equal(a.size, b.size)
+    for damage in (b"", file.read_bytes()[:-40], b"PK" + bytes(200)):
+        file.write_bytes(damage)
+        calls.clear()
+        with pytest.warns(RuntimeWarning, match="damaged"):
+            mended = decomposed(angle(), clearance=0.0002, cache=tmp_path)
+        assert len(calls) == 1 and mended.error == made.error
+    assert list(tmp_path.iterdir()) == [file]  # nothing half written is left
+    decomposed(angle(tall=0.011), clearance=0.0002, cache=tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_decomposition_coarser_than_the_clearance_allows_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("coacd")
+    with pytest.raises(InputError, match=r"'ring' in \d+ convex pieces gains .* mm") as told:
+        decomposed(ring(), clearance=0.0002, thresholds=(0.1,), cache=tmp_path)
+    assert "\n" not in str(told.value)
+    coarse = decomposed(ring(), clearance=0.01, thresholds=(0.1,), cache=tmp_path)
+    # What the pieces add stands in the hole: a ring of 10.2 mm that lets no peg of 10 mm through.
+    assert coarse.error.added > 0.0001
+    with pytest.raises(InputError, match="greater than 0"):
+        decomposed(ring(), clearance=0.0, cache=tmp_path)
+
+
+def test_a_cache_that_cannot_be_written_is_told_and_does_not_stop(tmp_path: Path) -> None:
+    pytest.importorskip("coacd")
+    (tmp_path / "file").write_text("in the way")
+    with pytest.warns(RuntimeWarning, match="cannot be kept"):
+        made = decomposed(angle(), clearance=0.001, cache=tmp_path / "file")
+    assert made.error.largest < 0.0002

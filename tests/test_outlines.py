@@ -1,0 +1,172 @@
+"""Parts drawn from outlines and sections: exactly the solid, no seams, and one sentence for each mistake."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+import torch
+import trimesh
+from scipy.signal import butter, sosfiltfilt
+
+from bcppl.errors import InputError
+from bcppl.models.parts import SHAPES, insert_peg, insert_tray
+from bcppl.parts import Part
+from bcppl.recordings.measurements import Probe
+from bcppl.simulators.extrusion import extruded
+from bcppl.simulators.fidelity import geometric_error, solid_of
+from bcppl.simulators.layers import hole_outline, prismatic
+from bcppl.simulators.meshes import load_mesh
+from bcppl.simulators.outlines import (
+    NAMED,
+    block_with_hole,
+    check_fit,
+    named_outline,
+    peg_for,
+    round_outline,
+    roundness_error,
+)
+from bcppl.simulators.peg_model import ContactParameters
+from bcppl.simulators.physics import PegPhysics
+from bcppl.simulators.shapes import block, box_peg
+
+NIST = Path(__file__).parents[2] / "shared/data/nist_insertion"
+nist_needed = pytest.mark.skipif(not NIST.is_dir(), reason=f"the published insertion parts are not in {NIST}")
+
+
+def volume_of_union(part: Part) -> float:
+    return float(trimesh.boolean.union([solid_of(piece) for piece in part.pieces], engine="manifold").volume)
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_a_block_and_its_peg_are_exactly_their_outlines(name: str) -> None:
+    hole = named_outline(name, 0.0161)
+    part = block_with_hole(hole, offset=(0.006, -0.004), turn=0.3)
+    peg = peg_for(hole, 0.0001, 0.05)
+    for drawn, volume in ((part, (0.06**2 - hole.area) * 0.025), (peg, peg.mesh.volume)):
+        error = geometric_error(drawn, count=4000)
+        assert error.added < 1e-9 and error.lost < 1e-9
+        assert volume_of_union(drawn) == pytest.approx(volume, rel=1e-6)
+    section = shapely.Polygon(np.asarray(peg.mesh.section([0, 0, 1], [0, 0, -0.025]).discrete[0])[:, :2])
+    assert check_fit(hole, section) == pytest.approx(0.0001, abs=1e-9)
+    np.testing.assert_allclose(part.mesh.bounds, [[-0.03, -0.03, -0.025], [0.03, 0.03, 0.0]], atol=1e-15)
+
+
+def test_the_stated_error_of_a_round_outline_is_its_error_either_way() -> None:
+    for sides in (7, 64):
+        ring = shapely.get_coordinates(round_outline(0.016, sides).exterior)
+        inside = 0.008 - np.linalg.norm(0.5 * (ring[1:] + ring[:-1]), axis=1)
+        outside = np.linalg.norm(ring, axis=1) - 0.008
+        np.testing.assert_allclose(inside, roundness_error(0.016, sides), rtol=1e-9)
+        np.testing.assert_allclose(outside, roundness_error(0.016, sides), rtol=1e-9)
+    assert roundness_error(0.016) < 0.05 * 0.0001
+
+
+def slide(part: Part, peg: Part) -> tuple[np.ndarray, np.ndarray]:
+    """A peg pressed on the top with 7.5 N and drawn across: the force and where it was, at each step."""
+    track = np.array([(-0.021, -0.021), (0.021, -0.018), (0.021, 0.02), (-0.02, 0.021)])
+    times = np.array([0.0, 0.3, 0.5, 0.7, 0.9])
+    command = np.zeros((5, 7))
+    command[:, :2], command[:, 2], command[:, 3] = track[[0, 0, 1, 2, 3]], [0.052] + 4 * [0.047], 1.0
+    stiffness, damping = np.array(3 * [2500.0] + 3 * [150.0]), np.array(3 * [120.0] + 3 * [2.5])
+    probe = Probe("slide", times, command, stiffness, damping, np.arange(0.0, 0.9, 0.0005))
+    pose = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64)
+    rollout = PegPhysics(part, peg, ContactParameters(time_step=0.0005)).start(pose, probe)
+    rollout.advance(len(probe.stamps))
+    force = sosfiltfilt(butter(2, 20, fs=2000, output="sos"), rollout.wrench[0, :, :3], axis=0)
+    return force[700:], rollout.world_from_peg[0, 700:, :3]
+
+
+def test_a_peg_that_slides_over_the_top_feels_no_seam() -> None:
+    peg = box_peg(0.004, 0.05)
+    _, smooth = slide(block((0.06, 0.06, 0.025)), peg)
+    for name in ("hexagon", "round"):
+        force, where = slide(block_with_hole(named_outline(name, 0.0161)), peg)
+        # Blocks that overlap without ramps hold the peg back by 57 um.
+        assert abs(where - smooth).max() < 0.00002
+        assert np.median(force[:, 2]) == pytest.approx(7.5, rel=0.02)
+
+
+def test_a_stepped_part_with_a_chamfered_bore_is_its_layers_along_any_axis() -> None:
+    cylinder, cone = trimesh.creation.cylinder, trimesh.creation.cone
+    foot = trimesh.creation.box([0.05, 0.04, 0.005])
+    post = trimesh.creation.box([0.03, 0.03, 0.02])
+    post.apply_translation([0.002, 0.0, 0.0125])
+    bore = cylinder(0.006, 0.02, sections=24)
+    bore.apply_translation([0.002, 0.0, 0.0165])
+    chamfer = cone(0.0225, 0.0225, sections=24)  # 45 degrees, 7 mm wide at the top, 6 mm one below
+    chamfer.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))
+    chamfer.apply_translation([0.002, 0.0, 0.0225 - 0.007 + 0.0225])
+    screw = cylinder(0.002, 0.02, sections=12)
+    screw.apply_translation([-0.018, 0.01, 0.0])
+    solid = trimesh.boolean.difference(
+        [trimesh.boolean.union([foot, post], engine="manifold"), bore, chamfer, screw], engine="manifold"
+    )
+    turn = np.roll(np.eye(3), 1, axis=0)  # its z to the part's x
+    part = Part("stepped", np.asarray(solid.vertices) @ turn.T, np.asarray(solid.faces))
+    made = prismatic(part, axis="x", tolerance=1e-7)
+    error = geometric_error(made, count=5000)
+    assert error.added < 1e-6 and error.lost < 1e-6
+    assert volume_of_union(made) == pytest.approx(solid.volume, rel=1e-5)
+    with pytest.raises(InputError, match="walls along y"):
+        prismatic(part, axis="y")
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_the_shipped_trays_and_pegs_are_within_5_um_of_their_meshes(shape: str) -> None:
+    for part in (insert_tray(shape), insert_peg(shape)):
+        error = geometric_error(part, count=1000)
+        assert error.added <= 5.1e-6 and error.lost <= 5.1e-6
+        assert "BSD-3" in part.source
+        if NIST.is_dir():
+            stem = f"{'tray_insert_' if 'tray' in part.name else ''}{shape}_peg_8mm"
+            published = load_mesh(NIST / f"industreal_{stem}.obj")
+            assert part.mesh.volume == pytest.approx(published.mesh.volume, rel=1e-6)
+    bore = hole_outline(insert_tray(shape), 0.015)
+    assert bore.area == pytest.approx(math.pi * 0.0045**2 if shape == "round" else 0.009 * 0.008, rel=2e-3)
+
+
+@nist_needed
+@pytest.mark.parametrize("kind, edges", [("round", 36), ("rectangular", 72)])
+def test_an_open_hole_plate_is_refused_with_its_open_edges(kind: str, edges: int) -> None:
+    with pytest.raises(InputError, match=rf"{edges} open edges"):
+        load_mesh(NIST / f"factory_{kind}_hole_8mm_subdiv_3x.obj")
+
+
+def test_a_mesh_in_millimetres_is_refused_and_scaled_on_request(tmp_path: Path) -> None:
+    path = tmp_path / "block.stl"
+    trimesh.creation.box([60.0, 60.0, 25.0]).export(path)
+    with pytest.raises(InputError, match="in millimetres"):
+        load_mesh(path)
+    part = load_mesh(path, scale=0.001)
+    np.testing.assert_allclose(part.extent, [0.06, 0.06, 0.025])
+    assert len(part.vertices) == 8
+    with pytest.raises(InputError, match="there is no mesh file"):
+        load_mesh(tmp_path / "none.obj")
+    (tmp_path / "bad.obj").write_text("v 0 0\nf 1 2 nonsense\n")
+    with pytest.raises(InputError, match=r"cannot be read|empty mesh"):
+        load_mesh(tmp_path / "bad.obj")
+
+
+def test_outlines_that_cannot_be_drawn_are_refused_in_a_sentence() -> None:
+    square = named_outline("square")
+    cases = {
+        "Self-intersection": lambda: extruded("bow", shapely.Polygon([(0, 0), (1, 1), (1, 0), (0, 1)]), 0, 1),
+        "millimetres": lambda: extruded("big", shapely.box(0, 0, 60, 60), 0, 25),
+        "MultiPolygon": lambda: extruded("two", shapely.MultiPolygon([square]), 0, 1),
+        "empty": lambda: extruded("none", shapely.Polygon(), 0, 1),
+        "top above": lambda: extruded("flat", square, 0.0, 0.0),
+        "does not lie inside": lambda: block_with_hole(square, offset=(0.025, 0.0)),
+        "no peg": lambda: peg_for(square, 0.017, 0.05),
+        "clearance": lambda: peg_for(square, -0.001, 0.05),
+        "stands up to 0.707 mm": lambda: check_fit(square, named_outline("square", 0.017)),
+        "no outline 'star'": lambda: named_outline("star"),
+        "no insert tray": lambda: insert_tray("oval"),
+    }
+    for words, draw in cases.items():
+        with pytest.raises(InputError, match=words) as told:
+            draw()
+        assert "\n" not in str(told.value) and str(told.value).endswith(".")
