@@ -1,0 +1,101 @@
+"""A peg that sits in the hand not quite as planned: its place in the grip is unknown, like the part's pose.
+
+`peg_in_hole` with one more site. Commands, the measured peg pose, the wrench and contact locations are all of
+the grip, the frame in which a peg held as planned would lie; only its surface is elsewhere, by
+`grip_from_peg`. While the hand keeps its orientation, a peg that sits a millimetre to the left is felt like a
+part that lies a millimetre to the right. What tells the two apart is the camera, or touching again with the
+hand turned: half a turn about the peg's axis changes the sign of the one and not of the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import pyro
+import torch
+
+from bcppl import poses
+from bcppl.distributions.contact import ChamferContacts, PegPose
+from bcppl.distributions.depth import RobustDepth
+from bcppl.distributions.poses import NormalPose
+from bcppl.errors import InputError
+from bcppl.models import peg_in_hole
+from bcppl.recordings.measurements import ProbeWindow, Recording, View
+from bcppl.simulators.track import ContactTrack
+from bcppl.simulators.unknowns import Unknowns
+from bcppl.traces import Model, carried
+
+
+@dataclass(frozen=True, eq=False)
+class Scene(peg_in_hole.Scene):
+    """What stays the same over a run, and what is thought of the hand."""
+
+    hand: NormalPose
+
+
+def grasped_peg(scene: Scene, actions: Sequence[View | ProbeWindow]) -> None:
+    """The program: the part's pose, the peg's place in the hand, then what every view and window shows."""
+    settings = scene.settings
+    hole = pyro.sample("hole", scene.prior)
+    unknowns = Unknowns(grip_from_peg=pyro.sample("grip_from_peg", scene.hand))
+    for k, action in enumerate(actions):
+        if isinstance(action, View):
+            depth = RobustDepth(
+                scene.renderer,
+                action.camera,
+                hole,
+                scale=settings.depth_scale,
+                outlier=settings.outlier,
+                background=scene.background.get(action.camera.name),
+                effective_pixels=settings.effective_pixels,
+            )
+            pyro.sample(f"depth_{k}", depth)
+        else:
+            assert scene.physics is not None and scene.sensing is not None
+            begin = partial(ContactTrack.start, scene.physics, scene.sensing, hole, action.probe, unknowns)
+            track = carried(f"probe {action.probe.name}", (hole, *unknowns.tensors), begin)
+            window = (track, action.first, action.last)
+            pyro.sample(f"contacts_{k}", ChamferContacts(*window, settings.contact_scale, settings.one_empty))
+            peg = PegPose(
+                *window, settings.translation_scale, settings.rotation_scale, every=settings.pose_every
+            )
+            pyro.sample(f"peg_{k}", peg)
+
+
+def prepare(
+    recording: Recording, grip_shift: float = 0.0015, grip_turn: float = math.radians(1.5), **settings: Any
+) -> Scene:
+    """The scene of a recording.
+
+    Args:
+        recording: what was measured.
+        grip_shift: how far the peg may sit off in the hand along each axis of the grip, metres.
+        grip_turn: likewise about each axis, radians; both are standard deviations.
+        settings: fields of `peg_in_hole.Settings`.
+
+    Raises:
+        InputError: a spread is not positive, there are probe windows and no peg, or the part cannot be
+            touched.
+    """
+    if not (grip_shift > 0 and grip_turn > 0):
+        raise InputError(
+            f"grasped_peg has grip_shift {grip_shift!r} and grip_turn {grip_turn!r}; give two numbers "
+            "greater than 0, or choose peg_in_hole for a peg that is held as planned."
+        )
+    spread = torch.tensor([grip_shift] * 3 + [grip_turn] * 3, dtype=torch.float64)
+    known = peg_in_hole.prepare(recording, **settings)
+    return Scene(**known.__dict__, hand=NormalPose(poses.identity(), spread))
+
+
+def invent(seed: int, **options: Any) -> Recording:
+    """A block with a hole, touched twice with the hand turned between: `bcppl.models.worlds.grasped_peg`."""
+    from bcppl.models.worlds.grasped_peg import record
+
+    return record(seed, **options)
+
+
+model = Model(program=grasped_peg, prepare=prepare, observe=peg_in_hole.observe, pose="hole", invent=invent)

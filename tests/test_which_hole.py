@@ -1,0 +1,58 @@
+"""A plate with equal holes: the camera does not tell which is seen, touching beside it does."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from bcppl import poses
+from bcppl.cli import loading
+from bcppl.errors import InputError
+from bcppl.models import which_hole
+from bcppl.models.worlds import which_hole as world
+from bcppl.simulators.physics import PegPhysics
+from bcppl.simulators.shapes import box_peg
+from bcppl.traces import extend, generate, update
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_vision_leaves_it_open_and_each_touch_settles_one_half(seed: int) -> None:
+    recording, true = world.record(seed), world.which(seed)
+    scene = which_hole.prepare(recording)
+    empty, _ = generate(which_hole.which_hole, (scene, []), {}, 4)
+    truth = torch.from_numpy(recording.truth).expand(4, 7).clone()
+    trace = update(empty, {"which": torch.arange(4), "hole": truth}).trace
+    values = which_hole.model.observe(scene, recording.measurements)
+    trace, _ = extend(trace, (scene, [m.action for m in recording.measurements]), values)
+    assert float(trace.log_prob("depth_0").std()) < 0.01
+    right = trace.log_prob(*[f"{kind}_{k}" for kind in ("contacts", "peg") for k in (1, 2)])
+    behind = trace.log_prob(*[f"{kind}_{k}" for kind in ("contacts", "peg") for k in (3, 4)])
+    for which in range(4):
+        assert (right[true] - right[which] > 10.0) == (which % 2 != true % 2)
+        assert (behind[true] - behind[which] > 10.0) == (which // 2 != true // 2)
+
+
+def test_the_plate_s_pieces_are_its_mesh() -> None:
+    """A pin is let into every hole and by nothing else: what is touched is what is seen."""
+    plate, pin = world.plate(), box_peg(0.002, 0.03)
+    generator = torch.Generator().manual_seed(0)
+    places = torch.rand(60, 2, generator=generator, dtype=torch.float64) * 0.09 - 0.03
+    inside = (places[:, None] - torch.tensor(which_hole.HOLES)).abs().amax(dim=-1).amin(dim=-1)
+    places, inside = places[(inside - 0.009).abs() > 0.0015], inside[(inside - 0.009).abs() > 0.0015] < 0.009
+    over = poses.identity(len(places))
+    over[:, :2], over[:, 2] = -places, -0.036
+    recording = world.record(0)
+    probe = recording.measurements[1].action.probe
+    command = probe.command[:2].copy()
+    command[:, :3], command[:, 3:] = [[0, 0, 0.0], [0, 0, -0.012]], [1, 0, 0, 0]
+    down = type(probe)(
+        "down", probe.command_times[[0, 60]], command, probe.stiffness, probe.damping, probe.stamps[:60]
+    )
+    force = PegPhysics(plate, pin).start(over, down).advance(60).wrench[:, -1, 2]
+    assert inside.sum() > 5 and ((force < 1.0) == inside.numpy()).all()
+
+
+def test_it_is_offered_by_name_and_refuses_what_cannot_be_chosen_from() -> None:
+    assert loading.model("which_hole") is which_hole.model
+    with pytest.raises(InputError, match="two or more"):
+        which_hole.prepare(world.record(0), holes=[(0.0, 0.0)])
