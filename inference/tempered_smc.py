@@ -15,10 +15,11 @@ from typing import Any
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.inference.kernels import Kernel, Until, metropolis_hastings, mixture, until
+from bcppl.distributions.support import support_of
+from bcppl.inference.kernels import Kernel, Until, metropolis_hastings, mixture, sequence, until
 from bcppl.inference.kernels.kernel import Move
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import drift, independent
+from bcppl.inference.proposals import drift, independent, prior
 from bcppl.inference.proposals.together import continuous, drift_together
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.inference.smc import Step, smc
@@ -30,6 +31,8 @@ PHYSICS = 2  # the cost of a site that simulates contact (`bcppl.distributions.l
 
 def kernel(pose: str) -> Kernel:
     """How a pose is moved: by a random walk, some of its steps long ones, or to wherever the others are.
+
+    Discrete values (which of several holes it is) are drawn anew from the program.
 
     Where a program has other latent values that can be moved (a camera's error, a grasp), half of the moves
     are random walks of all of them together.
@@ -45,7 +48,14 @@ def kernel(pose: str) -> Kernel:
         walk = metropolis_hastings(drift_together(pose, *others, scales=(0.2, 2.0)))
         return mixture([alone, walk])(population)
 
-    return shaped
+    def chosen_anew(population: Population) -> Move:
+        sites = population.trace.distributions
+        choices = [a for a in population.trace.choices if support_of(sites[a]).is_discrete]
+        # Without moves between them, resampling alone lets choices die out that the data does not tell apart.
+        again = [metropolis_hastings(prior(choice)) for choice in choices]
+        return sequence([shaped, *again])(population) if choices else shaped(population)
+
+    return chosen_anew
 
 
 def infer(
