@@ -10,6 +10,7 @@ from bcppl.cli import loading
 from bcppl.errors import InputError
 from bcppl.models import which_hole
 from bcppl.models.worlds import which_hole as world
+from bcppl.recordings import ProbeWindow
 from bcppl.simulators.physics import PegPhysics
 from bcppl.simulators.shapes import box_peg
 from bcppl.traces import extend, generate, update
@@ -42,7 +43,9 @@ def test_the_plate_s_pieces_are_its_mesh() -> None:
     over = poses.identity(len(places))
     over[:, :2], over[:, 2] = -places, -0.036
     recording = world.record(0)
-    probe = recording.measurements[1].action.probe
+    action = recording.measurements[1].action
+    assert isinstance(action, ProbeWindow)
+    probe = action.probe
     command = probe.command[:2].copy()
     command[:, :3], command[:, 3:] = [[0, 0, 0.0], [0, 0, -0.012]], [1, 0, 0, 0]
     down = type(probe)(
