@@ -1,0 +1,115 @@
+"""The camera from views of the arm: what is drawn, which way a bias goes, and real depth images."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.poses import prior_from_guess
+from bcppl.inference.importance import tempered_importance_sampling
+from bcppl.inference.kernels import metropolis_hastings, mixture
+from bcppl.inference.tempered_smc import kernel
+from bcppl.inference.tempering import tempered
+from bcppl.models.arm_in_view import (
+    Scene,
+    along_the_view,
+    arm_in_view,
+    observations,
+    prepare,
+    widened,
+)
+from bcppl.models.robots import load_robot
+from bcppl.parts import Part
+from bcppl.recordings.measurements import Guess
+from bcppl.simulators.camera import Camera, looking_at
+from bcppl.simulators.robot import Robot
+from bcppl.traces import generate
+
+XARM = Path(__file__).parents[2] / "shared/data/xarm7_realsense"
+needed = pytest.mark.skipif(not XARM.is_dir(), reason=f"the xArm's frames are not at {XARM}")
+
+POSTURES = ([0.3, 0.2, -0.4, -1.8, 0.3, 2.0, 0.5], [-0.5, -0.6, 0.8, -1.2, 1.0, 1.6, -0.4])
+TRUTH = torch.from_numpy(looking_at([1.3, 0.3, 0.7], [0.1, 0.0, 0.4]))
+CAMERA = Camera("c", 96, 72, 90.0, 90.0, 48.0, 36.0, poses.identity().numpy(), 0.3, 5.0)
+
+
+def near_the_truth(shift: float, angle: float) -> Guess:
+    moved = torch.tensor([0.6 * shift, -0.4 * shift, 0.5 * shift, 0.4 * angle, -0.5 * angle, 0.3 * angle])
+    return Guess(poses.retract(TRUTH, moved.double()).numpy(), np.full(3, shift), angle=angle)
+
+
+def drawn(bias: float, **settings: float) -> tuple[Scene, dict[str, Tensor]]:
+    """A scene, and what its camera at the truth would see before a wall 3 m away, without noise."""
+    robot = load_robot("panda", tip="panda_hand")
+    prior = prior_from_guess(near_the_truth(0.03, 0.05))
+    scene = prepare(robot, CAMERA, prior, [np.array(q) for q in POSTURES], bins=2, **settings)
+    images = []
+    for renderer in scene.renderers:
+        small = renderer.images(scene.camera, poses.inverse(TRUTH)[None])[0]
+        image = np.where(np.isfinite(small), small + bias, 3.0)
+        images.append(np.kron(image, np.ones((2, 2))))  # read back by blocks
+    return scene, dict(observations(scene, images))
+
+
+def log_likelihood(scene: Scene, seen: dict[str, Tensor], camera: Tensor, bias: float) -> Tensor:
+    given = {"camera": camera, "bias": torch.full((len(camera),), bias, dtype=torch.float64)}
+    trace, _ = generate(arm_in_view, (scene, len(seen)), seen, len(camera), given)
+    return trace.log_prob(*seen)
+
+
+def test_the_truth_is_the_likeliest_with_its_own_bias() -> None:
+    scene, seen = drawn(0.02, widening=0.0)
+    steps = torch.cat([torch.diag(torch.tensor([0.01] * 3 + [0.02] * 3)), torch.zeros(1, 6)]).double()
+    moved = poses.retract(TRUTH, torch.cat([steps, -steps[:6]]))
+    found = log_likelihood(scene, seen, moved, 0.02)
+    assert int(found.argmax()) == 6
+    assert float(found[6]) > float(log_likelihood(scene, seen, TRUTH[None], 0.0))
+
+
+def test_camera_and_bias_are_found_together() -> None:
+    scene, seen = drawn(0.012, widening=0.0, effective_pixels=1000.0)
+    torch.manual_seed(0)
+    moves = mixture([kernel("camera"), metropolis_hastings(along_the_view)], [0.6, 0.4])
+    population, _ = tempered_importance_sampling(arm_in_view, (scene, 2), seen, 32, tempered(moves, sweeps=3))
+    off = poses.local(TRUTH, population.belief("camera").mean)
+    before = poses.local(TRUTH, torch.from_numpy(near_the_truth(0.03, 0.05).world_from_part))
+    assert float(off[:3].norm()) < 0.01 < 0.5 * float(before[:3].norm()) + 0.01
+    assert math.degrees(float(off[3:].norm())) < 1.0
+
+
+def test_a_part_is_widened_on_all_sides() -> None:
+    ball = trimesh.creation.icosphere(3, 0.1)
+    loose = Part(
+        "ball", ball.vertices[ball.faces].reshape(-1, 3), np.arange(3 * len(ball.faces)).reshape(-1, 3)
+    )
+    wider = widened(loose, 0.005)
+    assert np.allclose(np.linalg.norm(wider.vertices, axis=1), 0.105, atol=1e-5)
+    assert wider.mesh.is_watertight
+
+
+@needed
+def test_real_images_say_that_the_sensor_widens_what_stands_in_front() -> None:
+    """At the reference pose every frame is likelier with the arm drawn half a matching window wider."""
+    optical = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    body = np.load(XARM / "HT_base_cam.npy").astype(np.float64)
+    turn, _, back = np.linalg.svd(body[:3, :3] @ optical.T)
+    there = poses.from_rotation_matrix(torch.from_numpy(body[:3, 3]), torch.from_numpy(turn @ back))
+    camera = Camera("d", 1280, 720, 908.302, 908.293, 642.962, 372.732, poses.identity().numpy(), 0.3, 10.0)
+    robot = Robot(XARM / "xarm7_plain.urdf")
+    angles = [np.load(XARM / f"joint_state_{k}.npy") for k in (0, 3)]
+    images = [1e-3 * np.asarray(Image.open(XARM / f"depth_{k}.png")).astype(np.float64) for k in (0, 3)]
+    prior = prior_from_guess(Guess(there.numpy(), np.full(3, 0.05), angle=0.09))
+    found = []
+    for by in (0.0, 0.0055):
+        scene = prepare(robot, camera, prior, angles, widening=by, effective_pixels=None)
+        seen = dict(observations(scene, images))
+        found.append(log_likelihood(scene, seen, there[None], 0.01))
+    assert float(found[1] - found[0]) > 50.0
