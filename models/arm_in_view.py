@@ -49,9 +49,9 @@ class Settings:
 
     scale: float = 0.01
     outlier: float = 0.1
-    bias: float = 0.01
+    bias: float = 0.005
     widening: float = 0.0055
-    effective_pixels: float | None = 300.0
+    effective_pixels: float | None = 200.0
     bins: int = 12
 
 
