@@ -23,6 +23,10 @@ def renderer_for(part: Part, cameras: Iterable[Camera] = ()) -> DepthRasteriser 
     `DepthRenderer` casts rays: its time goes with the pixels and hardly with the faces. It is chosen for
     finer meshes, and where a camera's lens distorts.
 
+    The rasteriser is compiled when it is first used, once for an installation: 11 s, then 0.6 s to load the
+    code in every process. Where all rendering of a run takes a second, as with the
+    shipped models, that is not worth while: they take `DepthRenderer`.
+
     Args:
         part: what is rendered; its mesh may be open.
         cameras: those that will see it; without any, none is taken to distort.
