@@ -4,7 +4,9 @@
 the grip, the frame in which a peg held as planned would lie; only its surface is elsewhere, by
 `grip_from_peg`. While the hand keeps its orientation, a peg that sits a millimetre to the left is felt like a
 part that lies a millimetre to the right. What tells the two apart is the camera, or touching again with the
-hand turned: half a turn about the peg's axis changes the sign of the one and not of the other.
+hand turned: half a turn about the peg's axis changes the sign of the one and not of the other. It does so
+across the axis and not along it: how deep the peg sits in the hand is told from the part's height by the
+camera alone, as well as the camera's own pose is known.
 """
 
 from __future__ import annotations

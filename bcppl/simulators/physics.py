@@ -207,7 +207,8 @@ class Rollout:
         if not alike or len(other) != len(self):
             raise InputError(
                 f"rollouts of {len(self)} particles of probe {self.session.name!r} cannot be merged with "
-                f"{len(other)} of {other.session.name!r}; both must be of one physics, probe and population."
+                f"{len(other)} of {other.session.name!r}; both must be of one physics, probe and "
+                "population, with the same things unknown."
             )
         count = max(self.count, other.count)
         taken = np.flatnonzero(~np.asarray(rows_of(mask), dtype=bool))
