@@ -34,8 +34,8 @@ def kernel(pose: str) -> Kernel:
 
     Discrete values (which of several holes it is) are drawn anew from the program.
 
-    Where a program has other latent values that can be moved (a camera's error, a grasp), half of the moves
-    are random walks of all of them together.
+    Where a program has other latent values that can be moved (a camera's error, a grasp), each of them then
+    walks alone, and all of them together.
     """
     # A fifth of the draws are three times as wide as the particles: few particles may have missed a mode.
     anew = independent(pose, 1, inflation=1.2, wide=(0.2, 3.0))
@@ -45,8 +45,9 @@ def kernel(pose: str) -> Kernel:
         others = [address for address in continuous(population.trace) if address != pose]
         if not others:
             return alone(population)
+        each = [metropolis_hastings(drift(other, (0.2, 2.0))) for other in others]
         walk = metropolis_hastings(drift_together(pose, *others, scales=(0.2, 2.0)))
-        return mixture([alone, walk])(population)
+        return sequence([alone, *each, walk])(population)
 
     def chosen_anew(population: Population) -> Move:
         sites = population.trace.distributions

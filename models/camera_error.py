@@ -3,7 +3,9 @@
 The pose of the part is drawn from the prior; the error of each camera's stated pose and the bias of its range
 from what the robot's owner says of the calibration. Every view is a depth image rendered where the camera
 then stands. Errors that all pixels share are so explained, instead of making the belief sure of a wrong pose.
-What is known to stand behind the part is rendered with it: it tells much of the errors.
+
+A camera's error is not drawn as such but as the pose at which the camera, taken by its word, sees the part.
+An image tells that pose whatever the error is, so particles need not follow a ridge. Both say the same.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from bcppl.errors import InputError
 from bcppl.recordings.measurements import DepthImage, Measurement, Recording, View
 from bcppl.simulators.camera import Camera, bin_depth
 from bcppl.simulators.effort import Effort
-from bcppl.simulators.scene import SceneRenderer, background_part, placed
+from bcppl.simulators.renderer import DepthRenderer
 from bcppl.traces import Model
 
 
@@ -40,8 +42,8 @@ class Settings:
         bias: standard deviation of what a camera adds to every range, metres.
         scale: of the Laplace noise, metres.
         outlier: the probability that a pixel shows something else than what is rendered.
-        effective_pixels: how many independent pixels an image is worth; None for all that are looked at: what
-            they have in common is in the errors.
+        effective_pixels: how many independent pixels an image is worth, all that are looked at; None for all:
+            the errors hold what all pixels have in common, not what neighbours at an edge have.
         bins: so many pixels in each direction are read as one, the median of them.
     """
 
@@ -50,8 +52,8 @@ class Settings:
     bias: float = 0.002
     scale: float = 0.002
     outlier: float = 0.1
-    effective_pixels: float | None = None
-    bins: int = 2
+    effective_pixels: float | None = 100.0
+    bins: int = 3
 
 
 class Look(NamedTuple):
@@ -60,47 +62,49 @@ class Look(NamedTuple):
     Attributes:
         region: left, top, width and height of where the part may be, pixels.
         camera: of that region, binned.
-        renderer: of the part and, in the frame where the camera is said to stand, what is behind it.
     """
 
     region: tuple[int, int, int, int]
     camera: Camera
-    renderer: SceneRenderer
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stays the same over a run: the prior of the part's pose, and what is looked at, by camera."""
+    """What stays the same over a run: the prior, the renderer, and what is looked at, by camera."""
 
     prior: Any
+    renderer: DepthRenderer
     looks: Mapping[str, Look]
     settings: Settings
 
     @property
     def efforts(self) -> Mapping[str, Effort]:
         """What each simulator has done so far."""
-        return {f"rendering {name}": look.renderer.effort for name, look in self.looks.items()}
+        return {"rendering": self.renderer.effort}
 
 
 def camera_error(scene: Scene, actions: Sequence[View]) -> None:
-    """The program: the part's pose, each camera's error and bias, and a depth image for every view."""
+    """The program: the part's pose, each camera's bias and error, and a depth image for every view."""
     settings = scene.settings
-    spread = torch.tensor([settings.camera_shift] * 3 + [settings.camera_turn] * 3)
     part = pyro.sample("part", scene.prior)
     known: dict[str, tuple[Tensor, Tensor]] = {}
     for k, view in enumerate(actions):
-        camera = view.camera
-        if camera.instrument not in known:  # one error for all views of one camera
-            error = pyro.sample(f"error_{camera.instrument}", NormalPose(poses.identity(), spread))
-            bias = pyro.sample(f"bias_{camera.instrument}", dist.Normal(0.0, scene.settings.bias))
-            known[camera.instrument] = error, bias
-        error, bias = known[camera.instrument]
-        _, seen, renderer = scene.looks[camera.name]
-        still = [torch.as_tensor(camera.world_from_camera)] * (len(renderer.parts) - 1)
+        name, camera = view.camera.instrument, scene.looks[view.camera.name].camera
+        if name not in known:  # one error for all views of one camera, also of one on a wrist
+            bias = pyro.sample(
+                f"bias_{name}", dist.Normal(torch.zeros((), dtype=torch.float64), settings.bias)
+            )
+            along, covariance = apparent(camera, part, settings)
+            farther = bias[..., None] * along
+            seen = pyro.sample(f"seen_by_{name}", NormalPose(poses.retract(part, farther), covariance))
+            stated = torch.as_tensor(camera.world_from_camera)
+            moved = poses.compose(part, poses.inverse(poses.retract(seen, -farther)))
+            known[name] = poses.compose(poses.inverse(stated), poses.compose(moved, stated)), bias
+        error, bias = known[name]
         depth = RobustDepth(
-            renderer,
-            seen,
-            placed(part, *still),
+            scene.renderer,
+            camera,
+            part,
             scale=settings.scale,
             outlier=settings.outlier,
             effective_pixels=settings.effective_pixels,
@@ -110,18 +114,37 @@ def camera_error(scene: Scene, actions: Sequence[View]) -> None:
         pyro.sample(f"depth_{k}", depth)
 
 
+def apparent(camera: Camera, part: Tensor, settings: Settings) -> tuple[Tensor, Tensor]:
+    """How a camera's errors move what it sees of a part (N, 7), in the part's tangent space.
+
+    Returns:
+        What one metre of bias does, (N, 6), and the covariance (N, 6, 6) that an error of the stated pose
+        makes: with an error of v along and w about the camera's axes, a part at p in them seems to be moved
+        by -v + p x w and turned by -w.
+    """
+    stated = torch.as_tensor(camera.world_from_camera)
+    place = poses.compose(poses.inverse(stated), part)[..., :3]
+    from_camera = poses.rotation_matrix(stated).expand(*part.shape[:-1], 3, 3)
+    unit = torch.eye(3, dtype=torch.float64).expand(*place.shape, 3)
+    across = torch.linalg.cross(place[..., None, :].expand_as(unit), unit, dim=-1).transpose(-1, -2)
+    turned = poses.rotation_matrix(part).transpose(-1, -2) @ from_camera
+    upper = torch.cat([-from_camera, from_camera @ across], dim=-1)
+    effect = torch.cat([upper, torch.cat([torch.zeros_like(turned), -turned], dim=-1)], dim=-2)
+    spread = torch.tensor([settings.camera_shift] * 3 + [settings.camera_turn] * 3, dtype=torch.float64)
+    along = (from_camera @ (place / place[..., 2:])[..., None])[..., 0]
+    scaled = effect * spread
+    return torch.cat([along, torch.zeros_like(along)], dim=-1), scaled @ scaled.transpose(-1, -2)
+
+
 def prepare(recording: Recording, **settings: Any) -> Scene:
     """The scene of a recording; `settings` are fields of `Settings`."""
     chosen = Settings(**settings)
     looks: dict[str, Look] = {}
     for camera in (m.action.camera for m in recording.measurements if isinstance(m.action, View)):
         if camera.name not in looks:
-            behind = recording.background.get(camera.name)
-            still = [] if behind is None else [background_part(camera, behind)]
             region = where_it_may_be(camera, recording)
-            seen = camera.cropped(*region).binned(chosen.bins)
-            looks[camera.name] = Look(region, seen, SceneRenderer([recording.part, *still]))
-    return Scene(prior_from_guess(recording.guess), looks, chosen)
+            looks[camera.name] = Look(region, camera.cropped(*region).binned(chosen.bins))
+    return Scene(prior_from_guess(recording.guess), DepthRenderer(recording.part), looks, chosen)
 
 
 def where_it_may_be(camera: Camera, recording: Recording) -> tuple[int, int, int, int]:

@@ -1,0 +1,211 @@
+"""Depth with a camera's error, a bias, an occluder, several parts: against moving things, and integrals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.depth import DepthDistribution, LaplaceDepth, OccludedDepth, RobustDepth
+from bcppl.errors import InputError
+from bcppl.parts import Part
+from bcppl.simulators.camera import Camera, looking_at
+from bcppl.simulators.renderer import DepthRenderer
+from bcppl.simulators.scene import SceneRenderer, placed
+
+Array = npt.NDArray[np.float64]
+Kind = type[DepthDistribution]
+
+KINDS = [LaplaceDepth, RobustDepth, OccludedDepth]
+SCALE = 0.003
+BOX = trimesh.creation.box((0.06, 0.04, 0.03))
+PART = Part("box", np.asarray(BOX.vertices), np.asarray(BOX.faces, dtype=np.int64))
+RENDERER = DepthRenderer(PART)
+CAMERA = Camera(
+    "above", 24, 18, 40.0, 42.0, 10.2, 9.1, looking_at((0.1, -0.12, 0.2), (0, 0, 0)), near=0.05, far=0.6
+)
+N = 7
+
+
+def steps(scale: float, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return scale * torch.randn(N, 6, generator=generator, dtype=torch.float64)
+
+
+POSE = poses.retract(poses.identity(N), steps(0.01, 0))
+ERROR = poses.retract(poses.identity(N), steps(0.01, 1))
+BIAS = steps(0.004, 2)[:, 0].contiguous()
+
+
+def table() -> Array:
+    depth = np.full((18, 24), 0.3)
+    depth[:, :6], depth[0, 10] = np.nan, 0.0
+    depth[:, 12:14] = 0.2
+    return depth
+
+
+def image(background: Array | None = None) -> Tensor:
+    torch.manual_seed(5)
+    seen = LaplaceDepth(RENDERER, CAMERA, POSE[:1], SCALE, background).sample()[0]
+    seen[2, 3:6], seen[9, 10], seen[4, 4] = 0.0, math.nan, 0.7
+    return seen
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_camera_error_is_a_camera_that_stands_elsewhere(kind: Kind) -> None:
+    seen, shared = image(), poses.retract(poses.identity(1), steps(0.01, 8)[:1])[0]
+    together = kind(RENDERER, CAMERA, POSE, SCALE, camera_error=ERROR).log_prob(seen)
+    once = kind(RENDERER, CAMERA, POSE, SCALE, camera_error=shared).log_prob(seen)
+    stated = torch.from_numpy(CAMERA.world_from_camera)
+    for k in range(N):
+        for error, found in ((ERROR[k], together), (shared, once)):
+            there = replace(CAMERA, world_from_camera=poses.compose(stated, error).numpy())
+            alone = kind(RENDERER, there, POSE[k : k + 1], SCALE).log_prob(seen)
+            torch.testing.assert_close(found[k], alone[0], rtol=1e-6, atol=1e-3)
+    assert (together - kind(RENDERER, CAMERA, POSE, SCALE).log_prob(seen)).abs().min() > 1.0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_camera_error_moves_the_whole_scene(kind: Kind) -> None:
+    """The table too, where it is a part: the same as a scene seen from elsewhere."""
+    flat = trimesh.creation.box((0.5, 0.5, 0.01))
+    scene = SceneRenderer([PART, Part("table", np.asarray(flat.vertices), np.asarray(flat.faces, np.int64))])
+    under = torch.tensor([0, 0, -0.05, 1, 0, 0, 0], dtype=torch.float64)
+    pose, seen = placed(POSE, under), image(table())
+    found = kind(scene, CAMERA, pose, SCALE, camera_error=ERROR, bias=BIAS).log_prob(seen)
+    stated = torch.from_numpy(CAMERA.world_from_camera)
+    for k in range(N):
+        there = replace(CAMERA, world_from_camera=poses.compose(stated, ERROR[k]).numpy())
+        alone = kind(scene, there, pose[k : k + 1], SCALE, bias=float(BIAS[k])).log_prob(seen)
+        torch.testing.assert_close(found[k], alone[0], rtol=1e-6, atol=1e-2)
+
+
+@pytest.mark.parametrize("kind", [LaplaceDepth, RobustDepth])
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("each", [False, True])
+def test_a_bias_is_an_image_that_reads_less(kind: Kind, known: bool, each: bool) -> None:
+    """Their density hangs on the difference alone, so the bias can be taken off the readings instead."""
+    behind = table() if known else None
+    camera = replace(CAMERA, near=0.0, far=9.0)  # so that the same pixels count
+    base = torch.where(image(table()) > 0.0, image(table()), math.nan)
+    seen = torch.stack([base + 0.001 * k for k in range(N)]) if each else base
+    found = kind(RENDERER, camera, POSE, SCALE, behind, bias=BIAS).log_prob(seen)
+    for k in range(N):
+        less = (seen[k] if each else seen) - BIAS[k]
+        alone = kind(RENDERER, camera, POSE[k : k + 1], SCALE, behind).log_prob(less)
+        torch.testing.assert_close(found[k], alone[0], rtol=1e-9, atol=1e-9)
+    again = kind(RENDERER, camera, POSE, SCALE, behind, bias=BIAS).log_prob(seen)  # totals that were kept
+    assert torch.equal(again, found)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_error_and_no_bias_change_nothing(kind: Kind) -> None:
+    seen = image(table())
+    plain = kind(RENDERER, CAMERA, POSE, SCALE, table()).log_prob(seen)
+    zero = kind(RENDERER, CAMERA, POSE, SCALE, table(), bias=torch.zeros(N, dtype=torch.float64))
+    torch.testing.assert_close(zero.log_prob(seen), plain, rtol=1e-12, atol=1e-9)
+    still = kind(RENDERER, CAMERA, POSE, SCALE, camera_error=poses.identity(N)).log_prob(seen)
+    torch.testing.assert_close(
+        still, kind(RENDERER, CAMERA, POSE, SCALE).log_prob(seen), rtol=1e-6, atol=1e-3
+    )
+    assert kind(RENDERER, CAMERA, POSE, SCALE, camera_error=ERROR, bias=BIAS).inputs == (POSE, ERROR, BIAS)
+
+
+def density(site: DepthDistribution, readings: Array) -> Array:
+    """The density (R,) of one pixel, for each of the R particles' readings."""
+    return np.asarray(site.log_prob(torch.from_numpy(readings)[:, None, None]).exp())
+
+
+@pytest.mark.parametrize("rendered", [0.08, 0.3, 0.0502, 0.7])
+def test_an_occluded_pixel_integrates_to_one(rendered: float) -> None:
+    """Over the range, with what Laplace's noise carries out of it; nearer is likelier than farther."""
+    camera = Camera("one", 1, 1, 1.0, 1.0, 0.0, 0.0, poses.identity().numpy(), near=0.05, far=0.6)
+    behind = np.full((1, 1), rendered)
+
+    def site(count: int) -> OccludedDepth:
+        away = poses.identity(count)
+        away[:, 2] = -5.0
+        return OccludedDepth(RENDERER, camera, away, SCALE, behind, occluder=0.2, outlier=0.1)
+
+    edges = np.unique(
+        np.concatenate([np.linspace(0.05, 0.6, 4001), rendered + np.linspace(-0.03, 0.03, 801)])
+    )
+    edges = edges[(edges >= 0.05) & (edges <= 0.6)]
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    below = 0.5 * math.exp(-abs(rendered - 0.05) / SCALE)
+    below = below if rendered > 0.05 else 1 - below
+    above = 0.5 * math.exp(-abs(0.6 - rendered) / SCALE)
+    above = above if rendered < 0.6 else 1 - above
+    inside = 1.0 - below - above
+    total = float((density(site(len(middle)), middle) * np.diff(edges)).sum())
+    assert total == pytest.approx(0.3 + 0.7 * inside, abs=2e-3)
+    if rendered == 0.3:
+        nearer, farther = density(site(2), np.array([0.2, 0.4]))
+        assert nearer / farther == pytest.approx(1 + (0.2 / 0.25) / (0.1 / 0.55), rel=1e-6)
+
+
+def test_occluded_samples_scatter_as_their_density_says() -> None:
+    torch.manual_seed(0)
+    site = OccludedDepth(
+        RENDERER, CAMERA, POSE[:1].expand(400, 7), SCALE, np.full((18, 24), 0.3), occluder=0.2, outlier=0.1
+    )
+    rendered = np.minimum(RENDERER.images(CAMERA, POSE[:1])[0], 0.3)
+    draws = site.sample().numpy()
+    far = draws > rendered + 12 * SCALE
+    near = draws < rendered - 12 * SCALE
+    room = (rendered - CAMERA.near - 12 * SCALE) / (rendered - CAMERA.near)
+    span = CAMERA.far - CAMERA.near
+    expect_far = 0.1 * (CAMERA.far - rendered - 12 * SCALE) / span
+    expect_near = 0.1 * (rendered - 12 * SCALE - CAMERA.near) / span + 0.2 * room
+    for found, expected in ((far, expect_far), (near, expect_near)):
+        assert abs(found.mean() - expected.mean()) < 5 * math.sqrt(0.2 / draws.size)
+
+
+def test_a_temperature_divides() -> None:
+    seen = image()
+    whole = RobustDepth(RENDERER, CAMERA, POSE, SCALE).log_prob(seen)
+    cool = RobustDepth(RENDERER, CAMERA, POSE, SCALE, temperature=4.0).log_prob(seen)
+    torch.testing.assert_close(cool, whole / 4.0, rtol=1e-12, atol=0.0)
+    with pytest.raises(InputError, match="both effective_pixels and temperature"):
+        RobustDepth(RENDERER, CAMERA, POSE, SCALE, effective_pixels=50.0, temperature=2.0)
+    with pytest.raises(InputError, match="temperature"):
+        RobustDepth(RENDERER, CAMERA, POSE, SCALE, temperature=0.0)
+
+
+def test_an_empty_image_says_nothing() -> None:
+    nothing = torch.full((18, 24), math.nan, dtype=torch.float64)
+    for kind in KINDS:
+        site = kind(RENDERER, CAMERA, POSE, SCALE, table(), bias=BIAS)
+        assert torch.equal(site.log_prob(nothing), torch.zeros(N, dtype=torch.float64))
+
+
+def test_bad_input_is_named() -> None:
+    scene = SceneRenderer([PART, PART])
+    for renderer, pose, said in [
+        (scene, POSE, r"\(N, 2, 7\)"),
+        (RENDERER, placed(POSE, POSE), r"\(N, 7\)"),
+        (scene, placed(POSE, POSE, POSE), "2 parts"),
+    ]:
+        with pytest.raises(InputError, match=said):
+            LaplaceDepth(renderer, CAMERA, pose, SCALE)
+    with pytest.raises(InputError, match="part of the scene"):
+        LaplaceDepth(RENDERER, CAMERA, POSE, SCALE, table(), camera_error=ERROR)
+    with pytest.raises(InputError, match="stated_camera_from_camera"):
+        LaplaceDepth(RENDERER, CAMERA, POSE, SCALE, camera_error=ERROR[:3])
+    with pytest.raises(InputError, match="bias of camera 'above' has shape"):
+        LaplaceDepth(RENDERER, CAMERA, POSE, SCALE, bias=BIAS[:3])
+    with pytest.raises(InputError, match="add up to less than 1"):
+        OccludedDepth(RENDERER, CAMERA, POSE, SCALE, occluder=0.6, outlier=0.5)
+    bias, error = BIAS.clone(), ERROR.clone()
+    bias[3], error[4, 2] = math.nan, math.inf
+    with pytest.raises(InputError, match=r"1 of 7 particles have a bias that is not finite .*particles 3"):
+        LaplaceDepth(RENDERER, CAMERA, POSE, SCALE, bias=bias).log_prob(image())
+    with pytest.raises(InputError, match=r"camera error that is not finite .*particles 4"):
+        LaplaceDepth(RENDERER, CAMERA, POSE, SCALE, camera_error=error).sample()
