@@ -151,6 +151,7 @@ def _corner_normals(polygon: shapely.Polygon) -> dict[tuple[float, float], list[
     found = {}
     for ring in (polygon.exterior, *polygon.interiors):
         corners = np.asarray(ring.coords)[:-1]
+        corners = corners[np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1) > 0]
         normal = _outward(corners)
         for corner, before, after in zip(corners, np.roll(normal, 1, axis=0), normal, strict=True):
             if _turn(before, after) > 0:
