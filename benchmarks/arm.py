@@ -47,7 +47,7 @@ XARM = DATA / "xarm7_realsense"
 APART = 50.0  # mm
 WITHIN = 0.4  # mm
 PARTICLES = 300
-CAMERAS = 60  # particles of the camera's pose
+CAMERAS = 100  # particles of the camera's pose
 OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # optical_from_body
 
 
@@ -170,7 +170,7 @@ def seen(seeds: range, settings: dict[str, float]) -> list[Row]:
             (scene, len(angles)),
             images_of(scene, images),
             CAMERAS,
-            tempered(moves, sweeps=5, share=0.6),
+            tempered(moves, sweeps=8, share=0.6),
         )
         seconds = time.perf_counter() - begun
         belief = population.belief("camera")
