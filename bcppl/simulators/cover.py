@@ -167,6 +167,8 @@ def _grown(
     convex: dict[tuple[float, float], list[Array]],
 ) -> Array:
     """A convex polygon around a core: its inner sides moved out as far as is allowed."""
+    if len(straightened(core)) < 3:  # a chamfer may end in an edge
+        return core
     normal = _outward(core)
     level = np.sum(normal * core, axis=1)
     middle = shapely.points(0.5 * (core + np.roll(core, -1, axis=0)))

@@ -246,8 +246,8 @@ def _capped(
     shapely.prepare(allowed := halfway.buffer(0.2 * tolerance))
     found = []
     cores = [np.array([goes.get(tuple(p.tolist()), p) for p in cell.core]) for cell in cells]
-    slim = [straightened(core) for core in cores]  # a chamfer may bring two corners together
-    wide = grown_in(section, [s if len(s) > 2 else c for s, c in zip(slim, cores, strict=True)], REACH)
+    wide = grown_in(section, [straightened(core) for core in cores], REACH)
+    wide = [wider if len(wider) > 2 else core for wider, core in zip(wide, cores, strict=True)]
     for cell, core, wider in zip(cells, cores, wide, strict=True):
         corners = [np.insert(cell.core, 2, rest, axis=1), np.insert(core, 2, end, axis=1)]
         both = 0.5 * (cell.grown[:, None] + wider[None]).reshape(-1, 2)
