@@ -9,7 +9,7 @@ particles are moved until they have left where they were resampled. Copy this fi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from torch import Tensor
@@ -17,9 +17,9 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.support import support_of
 from bcppl.inference.kernels import Kernel, Until, metropolis_hastings, mixture, sequence, until
-from bcppl.inference.kernels.kernel import Move
+from bcppl.inference.kernels.kernel import Move, takes
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import drift, independent, prior
+from bcppl.inference.proposals import Program, drift, independent, prior, spread_of
 from bcppl.inference.proposals.together import continuous, drift_together
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.inference.smc import Step, smc
@@ -29,25 +29,35 @@ from bcppl.traces import Model, Trace
 PHYSICS = 2  # the cost of a site that simulates contact (`bcppl.distributions.lazy`)
 
 
-def kernel(pose: str) -> Kernel:
+def kernel(pose: str, proposals: Sequence[Program] = ()) -> Kernel:
     """How a pose is moved: by a random walk, some of its steps long ones, or to wherever the others are.
 
     Discrete values (which of several holes it is) are drawn anew from the program.
 
     Where a program has other latent values that can be moved (a camera's error, a grasp), each of them then
     walks alone, and all of them together.
+
+    Args:
+        pose: its address.
+        proposals: programs that the model's author gives along (`bcppl.traces.Model`); each is used once.
     """
     # A fifth of the draws are three times as wide as the particles: few particles may have missed a mode.
     anew = independent(pose, 1, inflation=1.2, wide=(0.2, 3.0))
     alone = mixture([metropolis_hastings(drift(pose, (0.2, 2.0))), metropolis_hastings(anew)])
 
-    def shaped(population: Population) -> Move:
+    def moved(population: Population) -> Move:
         others = [address for address in continuous(population.trace) if address != pose]
         if not others:
             return alone(population)
         each = [metropolis_hastings(drift(other, (0.2, 2.0))) for other in others]
         walk = metropolis_hastings(drift_together(pose, *others, scales=(0.2, 2.0)))
         return sequence([alone, *each, walk])(population)
+
+    def spreads(population: Population) -> dict[str, Tensor]:
+        return {a: spread_of(a)(population) for a in continuous(population.trace)}
+
+    given = [metropolis_hastings(p, *([spreads] if takes(p, 2) else [])) for p in proposals]
+    shaped = sequence([moved, *given]) if given else moved
 
     def chosen_anew(population: Population) -> Move:
         sites = population.trace.distributions
@@ -77,8 +87,9 @@ def infer(
         particles: how many.
         seed: same seed, same beliefs.
         sweeps: moves of every particle after each resampling: without, and with physics in the program. By
-            default 12, and until the particles' mean squared displacement is half their variance on every
-            axis and four of five differ, at most 60.
+            default 12 (6 where the model brings proposals of its own, which go farther), and until the
+            particles' mean squared displacement is half their variance on every axis and four of five differ,
+            at most 60.
         share: particles are resampled below this effective sample size, and a likelihood is let in by steps
             that keep this conditional one, as shares of N: without, and with physics.
         scene: what `model.prepare(recording)` gives, if it is at hand.
@@ -90,7 +101,7 @@ def infer(
     for kept in share:
         number_within("a share of {} of the particles is to be kept", kept, least=0.0, below=1.0)
     enough = until(displacement=0.5, distinct=max(1, round(0.8 * particles)), most=60)
-    moves = (12, enough) if sweeps is None else sweeps
+    moves = (6 if model.proposals else 12, enough) if sweeps is None else sweeps
 
     def by_physics(trace: Trace) -> int:
         return int(any(getattr(site, "cost", 0) >= PHYSICS for site in trace.distributions.values()))
@@ -99,7 +110,7 @@ def infer(
         return adaptive(systematic, share[by_physics(population.trace)])(population)
 
     step = tempered(
-        kernel(model.pose),
+        kernel(model.pose, model.proposals),
         sweeps=lambda trace: moves[by_physics(trace)],
         resample=resample,
         share=lambda trace: share[by_physics(trace)],

@@ -26,6 +26,12 @@ class Model:
             For a series it is given the newest measurement alone, and names the step's own addresses.
         pose: address of the sought pose (`world_from_part`).
         invent: `invent(seed, **options) -> Recording`, a recording made up by the model; None if it has none.
+        proposals: programs that an inference may use, `proposal(trace)` or `proposal(trace, spreads)`: what
+            the model's author knows of its posterior, such as one latent value's conditional given the
+            others. Each draws new values at latent addresses, every particle's from its own old ones;
+            `spreads` are covariances of other particles in the coordinates of each continuous latent value,
+            by address. No answer hangs on proposals, only how soon it comes: a model still never knows how it
+            is inferred.
     """
 
     program: Program | Series
@@ -33,3 +39,4 @@ class Model:
     observe: Callable[[Any, Sequence[Any]], Mapping[str, Tensor]]
     pose: str
     invent: Callable[..., Any] | None = None
+    proposals: Sequence[Callable[..., Any]] = ()

@@ -1,0 +1,80 @@
+"""What errors of stated cameras do to what they see, and which pixels a part can be in."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from bcppl import poses
+from bcppl.simulators.camera import Camera, looking_at
+from bcppl.simulators.region import region_of
+from bcppl.simulators.shapes import block_with_square_hole
+from bcppl.simulators.stated_cameras import apparent_covariance, line_of_sight, seen_elsewhere
+
+PART = poses.as_pose([0.03, -0.02, 0.04, 0.5, 0.5, -0.5, 0.5])
+SHIFT, TURN = 0.002, 0.009
+
+
+def camera(eye: tuple[float, float, float], name: str = "camera") -> Camera:
+    return Camera(
+        name, 160, 120, 160.0, 160.0, 79.5, 59.5, looking_at(eye, (0.0, 0.0, 0.0)), near=0.1, far=2.0
+    )
+
+
+CAMERA = camera((0.3, -0.2, 0.35))
+
+
+def seen(by: Camera, error: torch.Tensor, part: torch.Tensor = PART) -> torch.Tensor:
+    """Where a camera that really stands at `stated error` sees the part, taken by its word."""
+    stated = torch.from_numpy(by.world_from_camera)
+    really = poses.compose(stated, poses.retract(poses.identity(), error))
+    return poses.compose(stated, poses.compose(poses.inverse(really), part))
+
+
+def test_covariance_is_that_of_small_errors_of_the_stated_pose() -> None:
+    step = 1e-6
+    columns = [
+        poses.local(seen(CAMERA, -step * axis), seen(CAMERA, step * axis)) / (2.0 * step)
+        for axis in torch.eye(6, dtype=torch.float64)
+    ]
+    scaled = torch.stack(columns, dim=-1) * torch.tensor([SHIFT] * 3 + [TURN] * 3, dtype=torch.float64)
+    found = apparent_covariance(CAMERA, PART.expand(2, 7), SHIFT, TURN)
+    torch.testing.assert_close(found, (scaled @ scaled.T).expand(2, 6, 6), rtol=1e-6, atol=1e-12)
+
+
+def test_a_part_farther_along_the_line_of_sight_stays_in_its_pixel_and_is_deeper() -> None:
+    camera_from_world = poses.inverse(torch.from_numpy(CAMERA.world_from_camera))
+    farther = PART[:3] + 0.1 * line_of_sight(CAMERA, PART)
+    near, far = poses.transform(camera_from_world, torch.stack([PART[:3], farther])).numpy()
+    np.testing.assert_allclose(CAMERA.project(far), CAMERA.project(near), atol=1e-9)
+    assert abs(far[2] - near[2] - 0.1) < 1e-12
+
+
+def test_one_error_is_carried_to_another_place() -> None:
+    error = torch.tensor([0.004, -0.003, 0.002, 0.02, -0.01, 0.03], dtype=torch.float64)
+    other = camera((-0.1, 0.4, 0.3), "elsewhere")
+    found = seen_elsewhere(CAMERA, other, PART, seen(CAMERA, error))
+    assert float(poses.local(found, seen(other, error)).abs().max()) < 1e-12
+
+
+def test_a_part_that_may_be_anywhere_within_reach_stays_in_its_region() -> None:
+    part, generator = block_with_square_hole(hole=0.016, offset=(0.007, 0.005)), np.random.default_rng(0)
+    middle = 0.5 * (part.vertices.min(axis=0) + part.vertices.max(axis=0))
+    expected = poses.as_pose([0.01, 0.0, 0.02, 1.0, 0.0, 0.0, 0.0])
+    left, top, width, height = region_of(CAMERA, part, expected, within=0.02)
+    assert width < CAMERA.width and height < CAMERA.height
+    camera_from_world = poses.inverse(torch.from_numpy(CAMERA.world_from_camera))
+    for turn in Rotation.random(300, random_state=generator):
+        shift = generator.normal(size=3)
+        shift *= 0.02 / np.linalg.norm(shift)
+        points = turn.apply(part.vertices - middle) + middle + expected[:3].numpy() + shift
+        u, v = CAMERA.project(poses.transform(camera_from_world, torch.from_numpy(points)).numpy()).T
+        inside = (left <= u) & (u <= left + width) & (top <= v) & (v <= top + height)
+        outside = (u < 0) | (u > CAMERA.width - 1) | (v < 0) | (v > CAMERA.height - 1)
+        assert (inside | outside).all()
+
+
+def test_the_whole_image_where_the_part_may_be_behind_the_camera() -> None:
+    part = block_with_square_hole(hole=0.016)
+    assert region_of(CAMERA, part, CAMERA.world_from_camera, within=0.02) == (0, 0, 160, 120)
