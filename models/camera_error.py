@@ -127,22 +127,26 @@ def given_seen(scene: Scene, looks: Mapping[str, tuple[Camera, Tensor, Tensor]])
     """Nearly the conditional of the part's pose, given where cameras see it and their biases, by instrument.
 
     The product of the densities of `seen_by_*`, each taken as normal in the tangent space about the product's
-    mean. It hangs on nothing else, so a proposal that draws from it is nearly always accepted.
+    mean, on the axes that the prior leaves free. It hangs on nothing else, so a proposal that draws from it
+    is nearly always accepted.
     """
-    settings = scene.settings
+    settings, prior = scene.settings, scene.prior
+    free = prior.freedom
+    axes = list(free.axes)
     camera, seen, bias = next(iter(looks.values()))
-    center = farther(camera, seen, -bias)
+    start = free.coordinates(poses.local(prior.center, farther(camera, seen, -bias)))
+    center = poses.retract(prior.center, free.embed(start))
     for _ in range(2):  # the first centre is a few millimetres off, which changes the covariances by 1 %
-        precision, pull = torch.zeros(1, 6, 6, dtype=torch.float64), torch.zeros(1, 6, 1, dtype=torch.float64)
+        precision: Any = 0.0
+        pull: Any = 0.0
         for camera, seen, bias in looks.values():
             covariance = apparent_covariance(camera, center, settings.camera_shift, settings.camera_turn)
-            own = torch.linalg.inv(covariance)
-            there = farther(camera, seen, -bias)
-            precision = precision + own
-            pull = pull + own @ poses.local(center, there)[..., None]
+            own = torch.linalg.inv(covariance)[..., axes, :]
+            precision = precision + own[..., axes]
+            pull = pull + own @ poses.local(center, farther(camera, seen, -bias))[..., None]
         covariance = torch.linalg.inv(precision)
-        center = poses.retract(center, (covariance @ pull)[..., 0])
-    return NormalPose(center, 0.5 * (covariance + covariance.transpose(-1, -2)))
+        center = poses.retract(center, free.embed((covariance @ pull)[..., 0]))
+    return NormalPose(center, 0.5 * (covariance + covariance.transpose(-1, -2)), free)
 
 
 def looks_of(trace: Trace) -> dict[str, tuple[Camera, Tensor, Tensor]]:

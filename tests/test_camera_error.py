@@ -28,9 +28,10 @@ UNSEEN = Target({"depth_0": 0.0, "depth_1": 0.0})
 INSTRUMENTS = ("camera_0", "camera_1")
 
 
-@pytest.fixture(scope="module")
-def recording() -> Recording:
-    return record(1)
+@pytest.fixture(scope="module", params=[None, World(tilt=0.0)], ids=["any tilt", "flat"])
+def recording(request: pytest.FixtureRequest) -> Recording:
+    """All axes free, or tilt held."""
+    return record(1, request.param)
 
 
 def draws(recording: Recording, count: int) -> Trace:
@@ -51,6 +52,7 @@ def expectations(trace: Trace) -> Tensor:
             500.0 * trace[f"bias_{name}"][:, None],
         ]
     x = torch.cat(columns, dim=1)
+    x = x[:, x.std(dim=0) > 1e-9]
     return torch.cat([x, (x[:, :, None] * x[:, None, :]).flatten(1), torch.cos(2.0 * x)], dim=1)
 
 
@@ -64,7 +66,7 @@ def test_proposals_leave_the_target_invariant(recording: Recording, proposal: Ca
     for _ in range(2):
         after, accepted = move(after, UNSEEN)
     assert largest_z(expectations(before), expectations(after)) < SOUND
-    assert float(accepted.mean()) > 0.05
+    assert float(accepted.mean()) > 0.2
 
 
 def test_the_part_is_drawn_from_its_conditional(recording: Recording) -> None:
