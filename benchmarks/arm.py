@@ -164,7 +164,7 @@ def seen(seeds: range, settings: dict[str, float]) -> list[Row]:
         guess = Guess(poses.retract(truth, -tangent).numpy(), np.full(3, 0.05), angle=math.radians(5.0))
         torch.manual_seed(seed)
         begun = time.perf_counter()
-        scene = prepare(robot, camera(), prior_from_guess(guess), angles, **settings)
+        scene = prepare(robot, camera(), prior_from_guess(guess), angles, images, **settings)
         population, info = tempered_importance_sampling(
             arm_in_view,
             (scene, len(angles)),

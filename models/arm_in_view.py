@@ -2,7 +2,7 @@
 
 The camera's pose in the arm's base frame is drawn from the prior, and what the sensor adds to every range.
 Each view is a depth image of the arm at other joint angles: its links are drawn where its joints put them.
-Table, floor and room are in the picture and in no model; no mask is needed.
+No mask is needed: what stands still behind the arm (table, floor, room) is what the other views show there.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import NormalPose
+from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.simulators.camera import Camera, bin_depth
 from bcppl.simulators.effort import Effort
@@ -47,12 +48,12 @@ class Settings:
         bins: so many pixels in each direction are read as one, the median of them.
     """
 
-    scale: float = 0.01
+    scale: float = 0.02
     outlier: float = 0.1
     bias: float = 0.005
     widening: float = 0.0055
     effective_pixels: float | None = 200.0
-    bins: int = 12
+    bins: int = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +64,14 @@ class Scene:
         camera: its optics, binned; its stated pose is not used.
         prior: over `base_from_camera`.
         renderers: of the arm at each view's joint angles, one rigid part each.
+        backgrounds: (H, W) metres, what stands behind the arm in each view, NaN where unknown.
         settings: of the likelihood.
     """
 
     camera: Camera
     prior: Any
     renderers: Sequence[DepthRenderer]
+    backgrounds: Sequence[Array]
     settings: Settings
 
     @property
@@ -83,7 +86,7 @@ def arm_in_view(scene: Scene, views: int) -> None:
     camera = pyro.sample("camera", scene.prior)
     bias = pyro.sample("bias", dist.Normal(torch.zeros(()).double(), settings.bias))
     camera_from_base = poses.inverse(camera)
-    for k, renderer in enumerate(scene.renderers[:views]):
+    for k, (renderer, behind) in enumerate(zip(scene.renderers[:views], scene.backgrounds, strict=False)):
         depth = RobustDepth(
             renderer,
             scene.camera,
@@ -91,28 +94,63 @@ def arm_in_view(scene: Scene, views: int) -> None:
             scale=settings.scale,
             outlier=settings.outlier,
             effective_pixels=settings.effective_pixels,
+            background=behind,
+            background_is_measured=True,
             bias=bias + settings.widening,  # the drawn surface is nearer by that much
         )
         pyro.sample(f"depth_{k}", depth)
 
 
-def prepare(robot: Robot, camera: Camera, prior: Any, angles: Sequence[Array], **settings: Any) -> Scene:
-    """The scene of some views.
+def prepare(
+    robot: Robot,
+    camera: Camera,
+    prior: Any,
+    angles: Sequence[Array],
+    images: Sequence[Array],
+    **settings: Any,
+) -> Scene:
+    """The scene of some views by a camera that stands still.
 
     Args:
         robot: the arm; its meshes are needed.
         camera: its optics.
         prior: over `base_from_camera`, such as `prior_from_guess` gives.
         angles: (J,) joint angles of each view, radians.
+        images: (H, W) depth image of each view, metres, NaN or 0 where missing.
         settings: fields of `Settings`.
 
     Raises:
-        InputError: as `Robot.drawn`.
+        InputError: as `Robot.drawn`, or there is not one image for each view.
     """
+    if len(images) != len(angles):
+        raise InputError(
+            f"{len(angles)} views of the arm are given {len(images)} depth images; give one for each."
+        )
     chosen = Settings(**settings)
     still = replace(camera, world_from_camera=poses.identity().numpy())
     renderers = [DepthRenderer(widened(robot.drawn(q), chosen.widening)) for q in angles]
-    return Scene(still.binned(chosen.bins), prior, renderers, chosen)
+    binned = _binned(images, still, chosen.bins)
+    backgrounds = [still_behind(binned, view) for view in range(len(binned))]
+    return Scene(still.binned(chosen.bins), prior, renderers, backgrounds, chosen)
+
+
+def _binned(images: Sequence[Array], camera: Camera, bins: int) -> list[Array]:
+    return [bin_depth(image, bins, near=camera.near, far=camera.far) for image in images]
+
+
+def still_behind(images: Sequence[Array], view: int) -> Array:
+    """What stands behind the arm in a view, (H, W) metres, NaN where unknown.
+
+    The second farthest reading of the other views: the arm may hide it in some of them, and the farthest is
+    often a reading that is wrong. Of two views it is the farther. The view itself has no say.
+    """
+    others = np.stack(
+        [image for k, image in enumerate(images) if k != view] or [np.full_like(images[0], np.nan)]
+    )
+    farthest = np.sort(np.where(others > 0.0, others, -np.inf), axis=0)[::-1]
+    second = farthest[min(1, len(others) - 1)]
+    found = np.where(np.isfinite(second), second, farthest[0])
+    return np.where(np.isfinite(found), found, np.nan)
 
 
 def widened(part: Part, by: float) -> Part:
@@ -125,8 +163,7 @@ def widened(part: Part, by: float) -> Part:
 
 def observations(scene: Scene, images: Sequence[Array]) -> Mapping[str, Tensor]:
     """The depth images (H, W) of the views, metres, NaN or 0 where missing, by address."""
-    near, far = scene.camera.near, scene.camera.far
-    binned = [bin_depth(image, scene.settings.bins, near=near, far=far) for image in images]
+    binned = _binned(images, scene.camera, scene.settings.bins)
     return {f"depth_{k}": torch.from_numpy(image) for k, image in enumerate(binned)}
 
 

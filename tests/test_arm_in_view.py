@@ -24,12 +24,14 @@ from bcppl.models.arm_in_view import (
     arm_in_view,
     observations,
     prepare,
+    still_behind,
     widened,
 )
 from bcppl.models.robots import load_robot
 from bcppl.parts import Part
 from bcppl.recordings.measurements import Guess
 from bcppl.simulators.camera import Camera, looking_at
+from bcppl.simulators.renderer import DepthRenderer
 from bcppl.simulators.robot import Robot
 from bcppl.traces import generate
 
@@ -50,12 +52,14 @@ def drawn(bias: float, **settings: float) -> tuple[Scene, dict[str, Tensor]]:
     """A scene, and what its camera at the truth would see before a wall 3 m away, without noise."""
     robot = load_robot("panda", tip="panda_hand")
     prior = prior_from_guess(near_the_truth(0.03, 0.05))
-    scene = prepare(robot, CAMERA, prior, [np.array(q) for q in POSTURES], bins=2, **settings)
+    angles = [np.array(q) for q in POSTURES]
     images = []
-    for renderer in scene.renderers:
-        small = renderer.images(scene.camera, poses.inverse(TRUTH)[None])[0]
+    for q in angles:
+        renderer = DepthRenderer(robot.drawn(q))
+        small = renderer.images(CAMERA.binned(2), poses.inverse(TRUTH)[None])[0]
         image = np.where(np.isfinite(small), small + bias, 3.0)
         images.append(np.kron(image, np.ones((2, 2))))  # read back by blocks
+    scene = prepare(robot, CAMERA, prior, angles, images, bins=2, **settings)
     return scene, dict(observations(scene, images))
 
 
@@ -109,7 +113,20 @@ def test_real_images_say_that_the_sensor_widens_what_stands_in_front() -> None:
     prior = prior_from_guess(Guess(there.numpy(), np.full(3, 0.05), angle=0.09))
     found = []
     for by in (0.0, 0.0055):
-        scene = prepare(robot, camera, prior, angles, widening=by, effective_pixels=None)
+        scene = prepare(robot, camera, prior, angles, images, widening=by, effective_pixels=None)
         seen = dict(observations(scene, images))
         found.append(log_likelihood(scene, seen, there[None], 0.01))
     assert float(found[1] - found[0]) > 50.0
+
+
+def test_what_stands_still_is_seen_by_the_other_views() -> None:
+    """Behind the arm stands what others see there, not what one of them misreads, nor what this view sees."""
+    views = [np.full((1, 4), 2.0) for _ in range(4)]
+    views[0][0, 0] = 1.0  # the arm, here only
+    views[1][0, 0] = 9.0  # a wrong reading
+    views[2][0, 1] = views[3][0, 1] = 1.0  # the arm, in two of the others
+    views[1][0, 2] = views[2][0, 2] = views[3][0, 2] = np.nan
+    views[1][0, 3] = views[2][0, 3] = np.nan
+    found = still_behind(views, 0)
+    assert found[0, 0] == 2.0 and found[0, 1] == 1.0 and np.isnan(found[0, 2]) and found[0, 3] == 2.0
+    assert np.isnan(still_behind(views[:1], 0)).all()

@@ -106,6 +106,17 @@ def test_a_bias_is_an_image_that_reads_less(kind: Kind, known: bool, each: bool)
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_a_measured_background_holds_the_bias_already(kind: Kind) -> None:
+    """So a particle of bias b says what an unmeasured background that is nearer by b says."""
+    seen = image(table())
+    found = kind(RENDERER, CAMERA, POSE, SCALE, table(), bias=BIAS, background_is_measured=True)
+    for k in range(N):
+        true = np.where(table() > 0.0, table() - float(BIAS[k]), table())
+        alone = kind(RENDERER, CAMERA, POSE[k : k + 1], SCALE, true, bias=float(BIAS[k]))
+        assert float(found.log_prob(seen)[k]) == pytest.approx(float(alone.log_prob(seen)), abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_no_error_and_no_bias_change_nothing(kind: Kind) -> None:
     seen = image(table())
     plain = kind(RENDERER, CAMERA, POSE, SCALE, table()).log_prob(seen)

@@ -34,8 +34,7 @@ class DepthDistribution(LazyDistribution):
         camera: where the image is said to be taken; its range says which pixels are missing.
         pose: (N, 7) `world_from_part`; (N, K, 7) for a renderer of K parts.
         scale: of the noise, metres; what it is exactly, the distribution says.
-        background: (H, W) metres, depth of what else stands in view; NaN, 0 or None where unknown. With a
-            bias it is taken for where things are: one that the same sensor measured holds its bias already.
+        background: (H, W) metres, depth of what else stands in view; NaN, 0 or None where unknown.
         effective_pixels: how many independent pixels the image is worth; None for all.
         region: (H, W) pixels that count at all; None for all.
         temperature: what the log-likelihood is divided by, instead of `effective_pixels`.
@@ -43,6 +42,8 @@ class DepthDistribution(LazyDistribution):
             where it is said to stand. What it moves, a background image does not say: render the background
             as a part of the scene.
         bias: (N,) or one for all, metres that are added to every rendered depth, the background's too.
+        background_is_measured: whether the same sensor measured the background, whose depths then hold the
+            bias already; otherwise they are where things are.
 
     Raises:
         InputError: a shape does not fit; the scale, effective_pixels, temperature or sensor's range is not
@@ -64,6 +65,7 @@ class DepthDistribution(LazyDistribution):
         temperature: float | None = None,
         camera_error: Tensor | None = None,
         bias: Tensor | float = 0.0,
+        background_is_measured: bool = False,
     ) -> None:
         shape = (camera.height, camera.width)
         _check_shapes(renderer, camera, pose, camera_error, bias)
@@ -108,6 +110,7 @@ class DepthDistribution(LazyDistribution):
         self.region = region
         self.camera_error = camera_error
         self.bias = bias
+        self.background_is_measured = background_is_measured
         self._log_uniform = -math.log(camera.far - camera.near)
 
     # ---- what a subclass says
@@ -166,18 +169,19 @@ class DepthDistribution(LazyDistribution):
         hits = self.renderer.hits(self.camera, self.seen_pose, counted=np.asarray(seen.valid.any(axis=0)))
         pixel = hits.pixel
         behind = seen.behind.take(pixel)
-        rendered = np.minimum(hits.depth, behind)
         several = len(seen.depth) > 1
         if several:
             pixel = pixel + hits.particle * seen.depth.shape[1]
         depth = torch.from_numpy(seen.depth.take(pixel))
-        if self._biases is None:
+        shift = 0.0 if self._biases is None else self._biases.take(hits.particle)
+        if self._biases is None or self.background_is_measured:
+            rendered = np.minimum(hits.depth + shift, behind)
             gain = self._log_density(depth, torch.from_numpy(rendered)).numpy()
             gain -= seen.empty.take(pixel)
             total = seen.emptiness
         else:
-            shift = self._biases.take(hits.particle)
-            gain = self._log_density(depth, torch.from_numpy(rendered + shift)).numpy()
+            rendered = np.minimum(hits.depth, behind) + shift
+            gain = self._log_density(depth, torch.from_numpy(rendered)).numpy()
             known = np.isfinite(behind)
             without = np.where(known, behind + shift, 0.0)
             gain -= np.where(
@@ -206,10 +210,13 @@ class DepthDistribution(LazyDistribution):
             )
         self._check_finite()
         images = torch.from_numpy(self.renderer.images(self.camera, self.seen_pose))
-        rendered = torch.minimum(images, torch.from_numpy(self._behind).reshape(self.event_shape))
+        bias = torch.zeros(1) if self._biases is None else torch.from_numpy(self._biases)
+        behind = torch.from_numpy(self._behind).reshape(self.event_shape)
+        if self.background_is_measured:
+            rendered = torch.minimum(images + bias[:, None, None], behind)
+        else:
+            rendered = torch.minimum(images, behind) + bias[:, None, None]
         unknown = torch.isinf(rendered)
-        if self._biases is not None:
-            rendered = rendered + torch.from_numpy(self._biases)[:, None, None]
         noisy = self._noisy(torch.where(unknown, 0.0, rendered))
         return torch.where(unknown, self._uniform(rendered), noisy)
 
