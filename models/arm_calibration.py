@@ -15,6 +15,7 @@ kinematics_calibration.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -176,10 +177,15 @@ def linearised(
 def read_seatings(folder: str | Path) -> list[Tensor]:
     """The joint angles (T, J) of each seating in a folder: files `hole_0.csv`, `hole_1.csv`, one row a stamp.
 
+    They come in the order of their numbers, `hole_10.csv` after `hole_9.csv`.
+
     Raises:
         InputError: there is no such file, or one holds something else than rows of numbers.
     """
-    files = sorted(Path(folder).glob("hole_[0-9].csv"))
+    numbered = (
+        (re.fullmatch(r"hole_(\d+)\.csv", file.name), file) for file in Path(folder).glob("hole_*.csv")
+    )
+    files = [file for _, file in sorted((int(found[1]), file) for found, file in numbered if found)]
     if not files:
         raise InputError(f"{folder} holds no hole_0.csv; give the folder of one tool position.")
     read = []

@@ -165,3 +165,10 @@ def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
             (tmp_path / "hole_0.csv").write_text(text)
         with pytest.raises(InputError, match=r"hole_0\.csv"):
             read_seatings(tmp_path)
+
+
+def test_seatings_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for number in range(12):
+        (tmp_path / f"hole_{number}.csv").write_text(f"{number},0\n{number},1\n")
+    (tmp_path / "hole_notes.csv").write_text("a,b\n")
+    assert [int(q[0, 0]) for q in read_seatings(tmp_path)] == list(range(12))

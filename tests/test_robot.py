@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -215,9 +216,31 @@ def test_meshes_of_a_package_are_found_in_its_folder(tmp_path: Path, folder: str
     assert robot.parts[0].extent == pytest.approx([0.0316, 0.102, 0.046], abs=1e-3)
 
 
+def test_a_mesh_in_another_format_is_used_unless_a_scale_tells_its_unit(tmp_path: Path) -> None:
+    (tmp_path / "hand.stl").write_bytes((FOLDER / "panda/meshes/hand.stl").read_bytes())
+    found = load_robot(written(tmp_path, shape='<mesh filename="hand.obj"/>'))
+    assert found.parts[0].extent == pytest.approx([0.0632, 0.204, 0.092], abs=2e-3)
+    scaled = written(tmp_path, shape='<mesh filename="hand.obj" scale="0.001 0.001 0.001"/>')
+    with pytest.raises(InputError) as error:
+        _ = load_robot(scaled).parts
+    assert str(tmp_path / "hand.stl") in said(error)
+    # The error's advice is taken by the function that most people call.
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "hand.stl").rename(tmp_path / "elsewhere/hand.stl")
+    file = written(tmp_path, shape='<mesh filename="package://arm/hand.stl"/>')
+    assert len(load_robot(file, mesh_folders=tmp_path / "elsewhere").parts) == 1
+
+
 @pytest.mark.parametrize(
     ("parts", "word"),
     [
+        ({"axis": '0 0 1"/><origin xyz="0 nan 0'}, "'elbow'"),
+        ({"shape": '<box size="1 1 1"/></geometry><origin rpy="0 nan 0"/><geometry>'}, "link 'hand'"),
+        ({"axis": '0 0 1"/><mimic joint="elbow" multiplier="nan'}, "mimics"),
+        (
+            {"parent": 'base"/><child link="x"/></joint><joint name="elbow" type="fixed"><parent link="base'},
+            "two",
+        ),
         ({"kind": "floating"}, "floating"),
         ({"parent": "shoulder"}, "'shoulder'"),
         ({"axis": "0 0 0"}, "axis"),
@@ -262,6 +285,9 @@ def test_what_a_robot_does_not_have_is_refused() -> None:
     for call in (
         lambda: load_robot("panda", tip="panda_foot"),
         lambda: load_robot("panda", held={"panda_joint9": 0.0}),
+        lambda: load_robot("panda", geometry="colliding"),  # type: ignore[arg-type]
+        lambda: panda.base_from_link("panda_hand", angles, link_from_tool=[0.0, 0, 0, 2, 0, 0, 0]),
+        lambda: panda.base_from_links(angles, [["a"] * 7]),  # type: ignore[list-item]
         lambda: panda.base_from_link("panda_foot", angles),
         lambda: panda.position("panda_foot", angles),
         lambda: panda.base_from_links(angles, torch.zeros(3, 6).double()),
@@ -272,3 +298,51 @@ def test_what_a_robot_does_not_have_is_refused() -> None:
         with pytest.raises(InputError) as error:
             call()
         said(error)
+
+
+@pytest.mark.parametrize(
+    ("held", "word"),
+    [
+        ({"panda_joint1": 90.0}, "degrees"),
+        ({"panda_finger_joint1": 30.0}, "millimetres"),
+        ({"panda_joint1": math.nan}, "panda_joint1"),
+        ([0.0], "{name: value}"),
+    ],
+)
+def test_what_joints_are_held_at_is_a_number_in_the_right_unit(held: Any, word: str) -> None:
+    with pytest.raises(InputError) as error:
+        load_robot("panda", held=held)
+    assert word in said(error)
+
+
+@pytest.mark.parametrize(
+    ("joint", "offset", "word"), [(0, math.nan, "panda_joint1"), (3, 5.0, "degrees"), (7, 0.5, "millimetres")]
+)
+def test_offsets_are_numbers_in_the_right_unit(joint: int, offset: float, word: str) -> None:
+    panda = load_robot("panda")
+    offsets = torch.zeros(4, 8, dtype=torch.float64)
+    offsets[:, joint] = offset
+    for call in (panda.base_from_links, lambda q, o: panda.position("panda_hand", q, o)):
+        with pytest.raises(InputError) as error:
+            call([0.0, 0, 0, -1, 0, 1, 0, 0.03], offsets)
+        assert word in said(error)
+
+
+def test_lists_arrays_and_single_precision_are_taken(robot: Robot) -> None:
+    angles, tip = postures(robot, 2), robot.links[-1]
+    offsets = torch.full((3, 7), 2.0**-6)
+    tool = torch.tensor([0.0, 0.0, 0.125, 0.0, 1.0, 0.0, 0.0])
+    expected = robot.base_from_link(tip, angles, offsets.double(), tool.double())
+    assert expected.dtype == torch.float64
+    for given in (offsets.tolist(), offsets.numpy(), offsets):
+        assert torch.equal(robot.base_from_link(tip, angles.tolist(), given, tool), expected)
+        assert torch.equal(
+            robot.position(tip, angles, given, tool[:3].tolist()),
+            robot.position(tip, angles, offsets.double(), tool[:3].double()),
+        )
+
+
+def test_an_arm_without_shapes_is_not_drawn(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        load_robot(written(tmp_path), geometry="collision").drawn([0.0])
+    assert 'geometry="visual"' in said(error)

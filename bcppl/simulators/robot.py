@@ -7,7 +7,6 @@ the base's is the root link's of the URDF file.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -21,11 +20,15 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.parts import Part
+from bcppl.simulators.joint_values import (
+    held_values,
+    refuse_far_angles,
+    refuse_far_offsets,
+    refuse_not_finite,
+)
 from bcppl.simulators.robot_description import MOVING, Joint, chain_of, part_of, read
 
 Angles = Tensor | npt.NDArray[np.float64] | Sequence[float]
-
-FAR = 1.0  # rad beyond a limit: no encoder is that wrong, so the angles are something else
 
 
 class Robot:
@@ -44,7 +47,7 @@ class Robot:
         tip: str | None = None,
         held: Mapping[str, float] | None = None,
         geometry: Literal["visual", "collision"] = "visual",
-        mesh_folders: Sequence[str | Path] = (),
+        mesh_folders: str | Path | Sequence[str | Path] = (),
     ) -> None:
         """Read a URDF file; its meshes are read when they are first asked for.
 
@@ -58,20 +61,22 @@ class Robot:
                 is looked for in each, with NAME and without.
 
         Raises:
-            InputError: the file is missing or no URDF, or a link or joint is unknown.
+            InputError: the file is missing or no URDF, a link or joint is unknown, or a joint is held at no
+                number or far outside its limits.
         """
+        if geometry not in ("visual", "collision"):
+            raise InputError(
+                f'a robot is to be drawn by its geometry {geometry!r}; give "visual" or "collision".'
+            )
         self._description = read(file)
         self._geometry = geometry
-        self._mesh_folders = [Path(folder) for folder in mesh_folders]
+        # One folder alone would be read letter by letter.
+        folders = [mesh_folders] if isinstance(mesh_folders, str | Path) else mesh_folders
+        self._mesh_folders = [Path(folder) for folder in folders]
         self.name = self._description.name
         self.links = self._description.links
         moving = {j.name: j for j in self._description.joints if j.kind in MOVING}
-        held = dict(held or {})
-        for name in held:
-            if name not in moving:
-                raise InputError(
-                    f"{self.name} has no joint {name!r} to hold; its joints are {', '.join(moving)}."
-                )
+        held = held_values(self.name, moving, {} if held is None else held)
         for joint in moving.values():
             if joint.mimics is not None and joint.mimics[0] not in moving:
                 raise InputError(
@@ -89,7 +94,7 @@ class Robot:
     # ---- poses
 
     def base_from_links(
-        self, angles: Angles, offsets: Tensor | None = None, links: Sequence[str] | None = None
+        self, angles: Angles, offsets: Angles | None = None, links: Sequence[str] | None = None
     ) -> Tensor:
         """Poses of links.
 
@@ -104,8 +109,8 @@ class Robot:
             and offsets.
 
         Raises:
-            InputError: the angles or offsets have another number of joints, the angles are not finite or lie
-                far outside the limits, or a link is unknown.
+            InputError: the angles or offsets have another number of joints, are not finite or so large that
+                they are in degrees or millimetres, or a link is unknown.
         """
         frames = (
             self._frames if links is None else [self._chain.frame_to_idx[self._known(link)] for link in links]
@@ -117,7 +122,7 @@ class Robot:
         return found.movedim(0, -2).reshape(*values.shape[:-1], len(frames), 7)
 
     def base_from_link(
-        self, link: str, angles: Angles, offsets: Tensor | None = None, link_from_tool: Tensor | None = None
+        self, link: str, angles: Angles, offsets: Angles | None = None, link_from_tool: Angles | None = None
     ) -> Tensor:
         """Poses of one link, or of what is mounted on it, such as a peg or a camera.
 
@@ -132,18 +137,20 @@ class Robot:
             (..., 7), or (N, ..., 7) with offsets.
 
         Raises:
-            InputError: as `base_from_links`.
+            InputError: as `base_from_links`, or the tool's pose is none.
         """
         pose = self.base_from_links(angles, offsets, [link])[..., 0, :]
-        return pose if link_from_tool is None else poses.compose(pose, link_from_tool)
+        if link_from_tool is None:
+            return pose
+        return poses.compose(pose, poses.as_pose(link_from_tool, f"the tool's pose on {link}"))
 
     def position(
         self,
         link: str,
         angles: Angles,
-        offsets: Tensor | None = None,
-        point: Tensor | None = None,
-        errors: Tensor | None = None,
+        offsets: Angles | None = None,
+        point: Angles | None = None,
+        errors: Angles | None = None,
     ) -> Tensor:
         """Where a point of a link is, in the base's frame, also for an arm that is not built as drawn.
 
@@ -165,6 +172,10 @@ class Robot:
             InputError: as `base_from_links`, or the point or the errors have another shape.
         """
         number = {joint.name: k for k, joint in enumerate(self.joints)}
+        offsets, point, errors = (
+            None if given is None else _numbers(f"the {what} of {self.name}", given)
+            for what, given in (("offsets", offsets), ("point", point), ("errors", errors))
+        )
         per_particle = [len(x) for x in (offsets, errors) if x is not None]
         per_particle += [len(point)] if point is not None and point.ndim == 2 else []
         if len(set(per_particle)) > 1:
@@ -214,7 +225,7 @@ class Robot:
             if any(s.link == link for s in shapes)
         )
 
-    def placed(self, angles: Angles, offsets: Tensor | None = None) -> Tensor:
+    def placed(self, angles: Angles, offsets: Angles | None = None) -> Tensor:
         """Poses of `parts`, (..., K, 7) or (N, ..., K, 7): what a renderer of several parts takes.
 
         Raises:
@@ -228,8 +239,14 @@ class Robot:
         While the arm stands still it is one part, and one part renders faster than eight.
 
         Raises:
-            InputError: as `base_from_links`, or a mesh is missing.
+            InputError: as `base_from_links`, a mesh is missing, or no link has a shape.
         """
+        if not self.parts:
+            other = "collision" if self._geometry == "visual" else "visual"
+            raise InputError(
+                f"no link of {self.name} has a {self._geometry} shape to draw; "
+                f'give geometry="{other}", or a URDF file with shapes.'
+            )
         base_from_parts = self.placed(self._values(angles, None).reshape(len(self.joints)))
         vertices = [
             poses.transform(pose, torch.from_numpy(part.vertices)).numpy()
@@ -278,10 +295,11 @@ class Robot:
                 rest[row] = factor * still + constant
         return spread, rest
 
-    def _values(self, angles: Angles, offsets: Tensor | None) -> Tensor:
+    def _values(self, angles: Angles, offsets: Angles | None) -> Tensor:
         """Angles with offsets, (..., J) or (N, ..., J), checked."""
         count = len(self.joints)
-        values = torch.as_tensor(angles, dtype=torch.float64)
+        values = _numbers(f"joint angles of {self.name}", angles)
+        offsets = None if offsets is None else _numbers(f"joint offsets of {self.name}", offsets)
         names = ", ".join(joint.name for joint in self.joints)
         for what, given in (("angles", values), ("offsets", offsets)):
             if given is None:
@@ -295,34 +313,23 @@ class Robot:
                     f"joint {what} of {self.name} have shape {tuple(given.shape)}; "
                     f"give {shape}, in the order {names}, or name a tip."
                 )
-        finite = torch.isfinite(values.detach()).reshape(-1, count).all(dim=0)
-        if not bool(finite.all()):
-            joint = self.joints[int(torch.nonzero(~finite)[0])]
-            raise InputError(
-                f"joint angles of {self.name} hold a number that is not finite, at {joint.name}; "
-                "leave such stamps out."
-            )
-        detached = values.detach().reshape(-1, count)
-        for k, joint in enumerate(self.joints):
-            if (
-                len(detached) == 0
-                or joint.kind == "prismatic"
-                or not math.isfinite(joint.upper - joint.lower)
-            ):
-                continue
-            low, high = float(detached[:, k].min()), float(detached[:, k].max())
-            if low < joint.lower - FAR or high > joint.upper + FAR:
-                worst = low if joint.lower - low > high - joint.upper else high
-                raise InputError(
-                    f"joint {joint.name} of {self.name} reads {worst:.4g} rad and its limits are "
-                    f"{joint.lower:.4g} to {joint.upper:.4g}: the angles are probably in degrees or in "
-                    f"another order; give radians in the order {names}."
-                )
+        refuse_not_finite(self.name, self.joints, "angles", values)
+        refuse_far_angles(self.name, self.joints, values)
         if offsets is None:
             return values
+        refuse_not_finite(self.name, self.joints, "offsets", offsets)
+        refuse_far_offsets(self.name, self.joints, offsets)
         if offsets.ndim == 2 and values.ndim > 1:
             offsets = offsets.reshape(len(offsets), *[1] * (values.ndim - 1), count)
         return values + offsets
+
+
+def _numbers(what: str, given: Angles) -> Tensor:
+    """Numbers as a tensor of float64, with the gradients they carry."""
+    try:
+        return torch.as_tensor(given, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"{what} are no table of numbers ({error}); give one row for each stamp.") from error
 
 
 def _pose(matrix: npt.NDArray[np.float64]) -> Tensor:

@@ -27,6 +27,7 @@ from bcppl.parts import Part
 Array = npt.NDArray[np.float64]
 
 MOVING = ("revolute", "continuous", "prismatic")
+MESHES = (".stl", ".obj", ".dae", ".ply")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +105,8 @@ def read(file: str | Path) -> Description:
         # The parser prints what it does not know (transmissions, xacro) to standard error.
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
             robot = urdf.URDF.from_xml_string(file.read_bytes())
+        for what, named in (("joint", robot.joints), ("link", robot.links)):
+            _refuse_twins(file, what, [each.name for each in named])
         links = {link.name: link for link in robot.links}
         joints = {j.child: _joint(j) for j in robot.joints}
     except InputError:
@@ -124,6 +127,12 @@ def read(file: str | Path) -> Description:
         visual=tuple(_shape(n, s) for n, link in named for s in link.visuals if s.geometry is not None),
         collision=tuple(_shape(n, s) for n, link in named for s in link.collisions if s.geometry is not None),
     )
+
+
+def _refuse_twins(file: Path, what: str, names: Sequence[str]) -> None:
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"{file} has two {what}s of the name {twice[0]!r}; give each a name of its own.")
 
 
 def _ordered(file: Path, links: Sequence[str], joints: Mapping[str, Joint], count: int) -> list[str]:
@@ -167,31 +176,43 @@ def _joint(parsed: Any) -> Joint:
             1.0 if mimic.multiplier is None else float(mimic.multiplier),
             0.0 if mimic.offset is None else float(mimic.offset),
         )
+    lower = float(parsed.limit.lower) if bounded else -math.inf
+    upper = float(parsed.limit.upper) if bounded else math.inf
+    if not lower <= upper or any(math.isnan(number) for number in (follows or ())[1:]):
+        raise InputError(
+            f"joint {parsed.name!r} has limits {lower:g} to {upper:g} and mimics {follows}; "
+            "give limits in ascending order, and numbers."
+        )
     return Joint(
         name=parsed.name,
         kind=parsed.type,
         parent=parsed.parent,
         child=parsed.child,
-        parent_from_child=_transformation(parsed.origin),
+        parent_from_child=_transformation(f"joint {parsed.name!r}", parsed.origin),
         axis=axis / length,
-        lower=float(parsed.limit.lower) if bounded else -math.inf,
-        upper=float(parsed.limit.upper) if bounded else math.inf,
+        lower=lower,
+        upper=upper,
         mimics=follows,
     )
 
 
-def _transformation(origin: Any) -> Array:
+def _transformation(whose: str, origin: Any) -> Array:
     matrix = np.eye(4)
     if origin is not None:
         matrix[:3, 3] = [0.0, 0.0, 0.0] if origin.xyz is None else origin.xyz
         # Roll, pitch and yaw are about the parent's fixed axes.
         turn = [0.0, 0.0, 0.0] if origin.rpy is None else origin.rpy
+        if not (np.isfinite(matrix[:3, 3]).all() and np.isfinite(turn).all()):
+            raise InputError(
+                f"the origin of {whose} has xyz {matrix[:3, 3].tolist()} and rpy {list(turn)}; "
+                "give finite numbers, metres and radians."
+            )
         matrix[:3, :3] = Rotation.from_euler("xyz", turn).as_matrix()
     return matrix
 
 
 def _shape(link: str, parsed: Any) -> Shape:
-    return Shape(link, _transformation(parsed.origin), parsed.geometry)
+    return Shape(link, _transformation(f"a shape of link {link!r}", parsed.origin), parsed.geometry)
 
 
 def chain_of(description: Description) -> Any:
@@ -253,11 +274,21 @@ def _mesh(description: Description, shape: Shape, folders: Sequence[Path]) -> An
         )
     tried = list(_candidates(description, geometry.filename, folders))
     file = next((path for path in tried if path.is_file()), None)
+    alike = [] if file is not None else list(dict.fromkeys(_alike(tried)))
+    # A scale tells the unit of the file that is named, and another format may well be in another unit.
+    if len(alike) == 1 and (geometry.scale is None or np.allclose(geometry.scale, 1.0)):
+        file = alike[0]
     if file is None:
         looked = ", ".join(dict.fromkeys(str(path.parent) for path in tried))
+        advice = "put it there, or name its folder with mesh_folders"
+        if alike:
+            advice = (
+                f"there lies {', '.join(map(str, alike))}: name that in the URDF file, with the scale that "
+                "makes it metres"
+            )
         raise InputError(
             f"link {shape.link!r} of {description.file} needs the mesh {geometry.filename}, "
-            f"which is in none of {looked}; put it there, or name its folder with mesh_folders."
+            f"which is in none of {looked}; {advice}."
         )
     try:
         # "mesh" also places the nodes of a scene (DAE) and converts its stated unit.
@@ -271,6 +302,17 @@ def _mesh(description: Description, shape: Shape, folders: Sequence[Path]) -> An
     if geometry.scale is not None:
         mesh.apply_scale(geometry.scale)
     return mesh
+
+
+def _alike(tried: Sequence[Path]) -> Iterator[Path]:
+    """Meshes that differ from those looked for in nothing but the extension."""
+    for path in tried:
+        if path.parent.is_dir():
+            yield from sorted(
+                other
+                for other in path.parent.iterdir()
+                if other.stem == path.stem and other.suffix.lower() in MESHES and other.is_file()
+            )
 
 
 def _candidates(description: Description, name: str, folders: Sequence[Path]) -> Iterator[Path]:
