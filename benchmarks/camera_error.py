@@ -84,7 +84,7 @@ def main() -> None:
         summary.append([name, len(runs), *middle[:3], median, most, held, *middle[4:]])
         honest = name == "latent errors"
         rows += [
-            Row(f"{name}: squared distance of the truth, median", median, "", 9.0 if honest else None),
+            Row(f"{name}: squared distance of the truth, median", median, "", 7.0 if honest else None),
             Row(f"{name}: squared distance of the truth, 90 %", most, ""),
             Row(f"{name}: 90 % regions that hold the truth", held, "%", 75.0 if honest else None, "min"),
             Row(f"{name}: position off, median", float(middle[0]), "mm"),
