@@ -96,7 +96,7 @@ def test_a_region_sees_along_the_same_rays(distortion: Sequence[float]) -> None:
     region = camera.cropped(10, 7, 21, 16)
     whole = camera.rays().reshape(48, 64, 3)
     np.testing.assert_allclose(region.rays().reshape(16, 21, 3), whole[7:23, 10:31], rtol=1e-12, atol=1e-14)
-    for bad in [(-1, 0, 5, 5), (60, 0, 5, 5), (0, 44, 5, 5), (0, 0, 0, 5)]:
+    for bad in [(-1, 0, 5, 5), (60, 0, 5, 5), (0, 44, 5, 5), (0, 0, 0, 5), (0.5, 0, 5, 5), (0, 0, 5, 2.5)]:
         with pytest.raises(InputError, match="region"):
             camera.cropped(*bad)
 

@@ -116,6 +116,7 @@ def test_one_image_for_each_particle(robust: bool) -> None:
     np.testing.assert_allclose(together.numpy(), torch.stack(alone).numpy(), rtol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:no pixel")
 @pytest.mark.parametrize("robust", [False, True])
 def test_missing_pixels_never_matter(robust: bool) -> None:
     """Whatever a missing pixel holds, the result is the same to the bit; were it counted, it would not be."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -190,6 +191,42 @@ def test_a_temperature_divides() -> None:
         RobustDepth(RENDERER, CAMERA, POSE, SCALE, temperature=0.0)
 
 
+@pytest.mark.parametrize("written", ["image", "background", "region"])
+@pytest.mark.parametrize("as_tensors", [False, True])
+def test_what_is_written_to_is_read_again(written: str, as_tensors: bool) -> None:
+    """What an image says is kept with it; whoever writes into an array must not get what it said before."""
+    arrays = {"image": image().numpy().copy(), "background": table(), "region": np.ones((18, 24), dtype=bool)}
+    value = torch.from_numpy(arrays["image"])
+    given = {name: torch.from_numpy(a) if as_tensors else a for name, a in arrays.items() if name != "image"}
+
+    def log_prob(value: Tensor, background: Array | Tensor, region: Array | Tensor) -> Tensor:
+        return RobustDepth(RENDERER, CAMERA, POSE, SCALE, background, region=region).log_prob(value)
+
+    before = log_prob(value, **given)
+    assert torch.equal(log_prob(value, **given), before)
+    arrays[written][3:15] = 0.0 if written == "region" else 1.02 * arrays[written][3:15]
+    fresh = {name: arrays[name].copy() for name in given}
+    after = log_prob(torch.from_numpy(arrays["image"].copy()), **fresh)
+    assert torch.equal(log_prob(value, **given), after) and not torch.allclose(after, before, atol=0.1)
+
+
+def test_an_image_of_which_no_pixel_counts_warns_once() -> None:
+    site = RobustDepth(RENDERER, CAMERA, POSE, SCALE)
+    millimetres = 1000.0 * image()
+    said = "no pixel .* 'above' .* median is .* range 0.05 to 0.6 m: probably millimetres"
+    with pytest.warns(UserWarning, match=said):
+        site.log_prob(millimetres)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        site.log_prob(millimetres)
+        site.log_prob(image())
+    with pytest.warns(UserWarning, match="'above' .* every pixel is missing"):
+        site.log_prob(torch.zeros(18, 24, dtype=torch.float64))
+    with pytest.warns(UserWarning, match="region"):
+        RobustDepth(RENDERER, CAMERA, POSE, SCALE, region=np.zeros((18, 24), dtype=bool)).log_prob(image())
+
+
+@pytest.mark.filterwarnings("ignore:no pixel")
 def test_an_empty_image_says_nothing() -> None:
     nothing = torch.full((18, 24), math.nan, dtype=torch.float64)
     for kind in KINDS:

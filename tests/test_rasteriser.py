@@ -270,6 +270,10 @@ def test_each_is_chosen_for_what_suits_it() -> None:
     assert isinstance(renderer_for(part_of(RING), [camera()]), DepthRasteriser)
     assert isinstance(renderer_for(part_of(RING), [camera(), lens]), DepthRenderer)
     assert isinstance(renderer_for(part_of(fine)), DepthRenderer)
+    later = renderer_for(part_of(RING))
+    pose = random_poses(3, 5, 0.02)
+    assert np.array_equal(later.images(camera(), pose), DepthRasteriser(part_of(RING)).images(camera(), pose))
+    assert np.array_equal(later.images(lens, pose), DepthRenderer(part_of(RING)).images(lens, pose))
     with pytest.raises(InputError, match="distorts"):
         DepthRasteriser(part_of(RING)).images(lens, poses.identity(1))
 

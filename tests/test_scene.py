@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +17,9 @@ from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.simulators import scene as module
 from bcppl.simulators.camera import Camera, looking_at
+from bcppl.simulators.rasteriser import DepthRasteriser
 from bcppl.simulators.renderer import DepthRenderer
+from bcppl.simulators.rendering import renderer_for
 from bcppl.simulators.scene import SceneRenderer, background_part, placed
 
 Array = npt.NDArray[np.float64]
@@ -139,6 +143,7 @@ def test_bad_input_is_named() -> None:
     renderer = SceneRenderer(PARTS)
     with pytest.raises(InputError, match="no parts"):
         SceneRenderer([])
+    assert renderer.images(CAMERA, poses.identity(0, 3)).shape == (0, 30, 40)
     for shape in ((4, 2, 7), (2, 7), (4, 7)):
         with pytest.raises(InputError, match="3 parts"):
             renderer.hits(CAMERA, poses.identity(*shape[:-1]))
@@ -152,4 +157,52 @@ def test_bad_input_is_named() -> None:
         background_part(CAMERA, np.full((30, 40), np.nan))
     with pytest.raises(InputError, match="shape"):
         background_part(CAMERA, np.ones((40, 30)))
-    assert renderer.images(CAMERA, poses.identity(0, 3)).shape == (0, 30, 40)
+    for wrong in (0, -2, 1.5):
+        with pytest.raises(InputError, match=f"stride {wrong}; give a whole number"):
+            background_part(CAMERA, np.ones((30, 40)), stride=wrong)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="jump nan"):
+        background_part(CAMERA, np.ones((30, 40)), jump=float("nan"))
+
+
+@pytest.mark.parametrize("make", [DepthRenderer, DepthRasteriser, lambda part: SceneRenderer([part])])
+def test_who_looks_through_a_bad_camera_is_told(make: Callable[[Part], Any]) -> None:
+    renderer, pose = make(BOX), around(4, 0)
+    pose = pose[:, None] if isinstance(renderer, SceneRenderer) else pose
+    seen = renderer.images(CAMERA, pose)
+    standing = np.asarray(CAMERA.world_from_camera)
+
+    def turned(length: float) -> Array:
+        return np.concatenate([standing[:3], length * standing[3:]])
+
+    rounded = renderer.images(replace(CAMERA, world_from_camera=turned(1.0 + 1e-5)), pose)
+    np.testing.assert_allclose(rounded, seen, rtol=1e-6)
+    for wrong, said in [
+        ({"world_from_camera": turned(2.0)}, "world_from_camera of 'above' .* length 2"),
+        ({"world_from_camera": turned(0.5)}, "length 0.5"),
+        ({"world_from_camera": np.full(7, np.nan)}, "not finite"),
+        ({"world_from_camera": np.stack([standing, standing])}, "one pose"),
+        ({"fx": -45.0}, "fx -45.0"),
+        ({"fy": np.nan}, "fy nan"),
+        ({"cx": np.inf}, "cx inf"),
+        ({"width": 0}, "0×30 pixels"),
+    ]:
+        with pytest.raises(InputError, match=said):
+            renderer.images(replace(CAMERA, **wrong), pose)
+        with pytest.raises(InputError, match=said):
+            renderer.hits(replace(CAMERA, **wrong), pose)
+    for counted in (np.ones((10, 40), dtype=bool), np.arange(7), np.ones((40, 30), dtype=bool)):
+        with pytest.raises(InputError, match="give a mask of all its pixels"):
+            renderer.hits(CAMERA, pose, counted=counted)
+
+
+def test_a_scene_of_either_renderer_sees_through_any_lens() -> None:
+    pose = placed(around(5, 1, 0.01), UNDER)
+    drawn, cast = SceneRenderer([BOX, TABLE], renderer=renderer_for), SceneRenderer([BOX, TABLE])
+    lens = replace(CAMERA, distortion=(-0.15, 0.05, 0.002, -0.001, 0.0))
+    through = drawn.images(lens, pose)
+    assert np.array_equal(through, cast.images(lens, pose))
+    straight, other = drawn.images(CAMERA, pose), cast.images(CAMERA, pose)
+    both = np.isfinite(straight) & np.isfinite(other)
+    assert both.mean() > 0.9 and np.median(np.abs(straight - other)[both]) < 1e-6
+    assert not np.array_equal(straight, other), "rays are cast in single precision, triangles drawn in double"
+    assert drawn.effort.amount > cast.effort.amount // 2 > 0

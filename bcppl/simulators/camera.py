@@ -9,8 +9,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from bcppl import poses
+from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.simulators.distortion import LARGEST, distorted, undistorted_rays, unfolded
 
@@ -65,6 +67,43 @@ class Camera:
         intrinsics = (float(self.fx), float(self.fy), float(self.cx), float(self.cy))
         return self.width, self.height, intrinsics, tuple(self.distortion)
 
+    def stated_pose(self) -> Tensor:
+        """Its `world_from_camera` (7,) once its pose and optics have been looked at, quaternion normalised.
+
+        A camera may be made with any numbers, so that a recording that holds a wrong one can be read and
+        reported; whoever looks through it asks here.
+
+        Raises:
+            InputError: the pose is none or has no unit quaternion; there are no pixels; a focal length is not
+                positive or the principal point is not finite.
+        """
+        self._refuse_optics()
+        pose = poses.as_pose(
+            np.asarray(self.world_from_camera, dtype=np.float64), f"the world_from_camera of {self.name!r}"
+        )
+        if pose.ndim != 1:
+            raise InputError(
+                f"the world_from_camera of {self.name!r} has shape {tuple(pose.shape)}; a camera stands at "
+                "one pose (7,): make one camera for each place it looks from."
+            )
+        return pose
+
+    def _refuse_optics(self) -> None:
+        if not (self.width >= 1 and self.height >= 1):
+            raise InputError(
+                f"camera {self.name!r} has {self.width}×{self.height} pixels; give at least one of each."
+            )
+        if not (0.0 < self.fx < np.inf and 0.0 < self.fy < np.inf):
+            raise InputError(
+                f"camera {self.name!r} has focal lengths fx {self.fx} and fy {self.fy}; give positive "
+                "numbers, in pixels; turn a mirrored image back before."
+            )
+        if not (abs(self.cx) < np.inf and abs(self.cy) < np.inf):
+            raise InputError(
+                f"camera {self.name!r} has its principal point at cx {self.cx} and cy {self.cy}; give finite "
+                "numbers, in pixels."
+            )
+
     @property
     def instrument(self) -> str:
         """What it shares its errors with: its device, or its name where no device is stated."""
@@ -74,8 +113,10 @@ class Camera:
         """Directions (height * width, 3) of the pixels in the optical frame, z = 1 (lengths are depths).
 
         Raises:
-            InputError: the distortion folds the image over, so that a pixel sees along no ray or several.
+            InputError: there are no pixels, a focal length is not positive, the principal point is not
+                finite, or the distortion folds the image over, so that a pixel sees along no ray or several.
         """
+        self._refuse_optics()
         if self.is_distorted:
             return undistorted_rays(*self.optics).copy()
         u, v = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
@@ -104,10 +145,14 @@ class Camera:
         It keeps its name: crop every image of a camera, and its background, alike.
 
         Raises:
-            InputError: the region is empty or reaches out of the image.
+            InputError: the region is not of whole pixels, is empty or reaches out of the image.
         """
-        inside = min(left, top) >= 0 and left + width <= self.width and top + height <= self.height
-        if not (inside and width > 0 and height > 0):
+        of = f"a region of camera {self.name!r} is given"
+        left = whole_number(f"{of} left {{}}", left, least=0)
+        top = whole_number(f"{of} top {{}}", top, least=0)
+        width = whole_number(f"{of} width {{}}", width)
+        height = whole_number(f"{of} height {{}}", height)
+        if left + width > self.width or top + height > self.height:
             raise InputError(
                 f"a region of {width}×{height} pixels from column {left}, row {top} does not lie within "
                 f"camera {self.name!r} of {self.width}×{self.height} pixels; give one that does."

@@ -1,7 +1,8 @@
 """Depth images of a part at many poses, by drawing its triangles into a depth buffer.
 
-Everything is in double precision. The work goes with the number of triangles and of pixels drawn into, so it
-suits all but the finest meshes; `bcppl.simulators.rendering` says when it is used.
+Everything is in double precision, where `bcppl.simulators.renderer.DepthRenderer` casts rays in single. The
+work goes with the number of triangles and of pixels drawn into, so it suits all but the finest meshes;
+`bcppl.simulators.rendering` says when it is used.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from typing import TypeVar
 import igl
 import numpy as np
 import numpy.typing as npt
-import torch
 from torch import Tensor
 
 from bcppl import poses
@@ -24,7 +24,7 @@ from bcppl.simulators.camera import Camera
 from bcppl.simulators.drawing import collect, draw_images, draw_regions
 from bcppl.simulators.effort import Effort
 from bcppl.simulators.placement import Grid, Placed
-from bcppl.simulators.renderer import Hits
+from bcppl.simulators.renderer import Hits, counted_pixels
 from bcppl.simulators.scan_conversion import bound
 
 Array = npt.NDArray[np.float64]
@@ -93,19 +93,21 @@ class DepthRasteriser:
             The hits. A surface nearer than `camera.near` is a hit too; one behind the camera is none.
 
         Raises:
-            InputError: a pose is not finite or has no unit quaternion, or the camera's lens distorts.
+            InputError: a pose, the camera's too, is not finite or has no unit quaternion; the camera's
+                intrinsics are none or its lens distorts; the counted pixels are not those of its image.
         """
         pose = poses.as_pose(world_from_part, "world_from_part").reshape(-1, 7)
+        camera_from_world = self._camera_from_world(camera)
         with self.effort.measure(items=len(pose)) as effort:
             rows, columns = np.arange(camera.height), np.arange(camera.width)
             mask = np.empty((0, 0), dtype=bool)
             if counted is not None:
-                mask = np.asarray(counted, dtype=bool).reshape(camera.height, camera.width)
+                mask = counted_pixels(camera, counted).reshape(camera.height, camera.width)
                 rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
                 mask = mask[np.ix_(rows, columns)]
                 if mask.all():
                     mask = np.empty((0, 0), dtype=bool)
-            placed = self._placed(camera, pose, rows, columns)
+            placed = self._placed(camera, poses.compose(camera_from_world, pose), rows, columns)
             first_row, last_row, first_column, last_column = placed.bounds.T
             start = np.concatenate([[0], np.cumsum((last_row - first_row) * (last_column - first_column))])
             found = _Found(int(start[-1]), faces)
@@ -117,11 +119,13 @@ class DepthRasteriser:
         """Depth images (N, H, W) in metres, +inf where a pixel does not see the part.
 
         Raises:
-            InputError: a pose is not finite or has no unit quaternion, or the camera's lens distorts.
+            InputError: a pose, the camera's too, is not finite or has no unit quaternion, or the camera's
+                intrinsics are none or its lens distorts.
         """
         pose = poses.as_pose(world_from_part, "world_from_part").reshape(-1, 7)
+        seen = poses.compose(self._camera_from_world(camera), pose)
         with self.effort.measure(items=len(pose)) as effort:
-            placed = self._placed(camera, pose, np.arange(camera.height), np.arange(camera.width))
+            placed = self._placed(camera, seen, np.arange(camera.height), np.arange(camera.width))
             images = np.empty((len(pose), camera.height, camera.width))
 
             def draw(begin: int, end: int) -> int:
@@ -130,8 +134,8 @@ class DepthRasteriser:
             effort.amount += self._shared(draw, 0, len(pose))
         return images
 
-    def _placed(self, camera: Camera, pose: Tensor, rows: Indices, columns: Indices) -> Placed:
-        """The mesh at poses (N, 7), before a camera of which these rows and columns matter."""
+    def _camera_from_world(self, camera: Camera) -> Tensor:
+        """The inverse (7,) of where a camera stands that triangles can be drawn for."""
         if camera.is_distorted:
             raise InputError(
                 f"camera {camera.name!r} has a lens that distorts, which triangles cannot be drawn through; "
@@ -142,7 +146,10 @@ class DepthRasteriser:
                 f"camera {camera.name!r} has images of {camera.width} by {camera.height} pixels; "
                 f"at most {LARGEST} in a row or column can be drawn."
             )
-        camera_from_part = poses.compose(poses.inverse(torch.as_tensor(camera.world_from_camera)), pose)
+        return poses.inverse(camera.stated_pose())
+
+    def _placed(self, camera: Camera, camera_from_part: Tensor, rows: Indices, columns: Indices) -> Placed:
+        """The mesh at poses (N, 7), before a camera of which these rows and columns matter."""
         rotation = np.ascontiguousarray(poses.rotation_matrix(camera_from_part).numpy())
         offset = np.ascontiguousarray(camera_from_part[:, :3].numpy())
         eye = -np.einsum("nji,nj->ni", rotation, offset)
@@ -154,7 +161,7 @@ class DepthRasteriser:
             columns.astype(np.float64),
         )
         lens, near = np.array([camera.fx, camera.fy, camera.cx, camera.cy]), NEAREST * self._diagonal
-        bounds, cull = np.zeros((len(pose), 4), dtype=np.int64), outside & self._solid
+        bounds, cull = np.zeros((len(eye), 4), dtype=np.int64), outside & self._solid
         mesh = (self._vertices, self._faces)
         placed = Placed(*mesh, rotation, offset, lens, near, cull, grid, bounds)
         bound(self._corners, placed)

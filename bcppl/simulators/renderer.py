@@ -2,6 +2,8 @@
 
 The tree of triangles is built once, in the part's frame, and the rays are brought there. Most pixels never
 see the part, so only those within its projected outline are cast, and only what they hit is returned.
+Triangles and rays are rounded to single precision, and so are depths;
+`bcppl.simulators.rasteriser.DepthRasteriser` draws in double precision.
 """
 
 from __future__ import annotations
@@ -11,13 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.simulators.camera import Camera
 from bcppl.simulators.distortion import pinhole_shifts, undistorted_rays
@@ -118,16 +120,17 @@ class DepthRenderer:
             The hits. A surface nearer than `camera.near` is a hit too; one behind the camera is none.
 
         Raises:
-            InputError: a pose is not finite or has no unit quaternion.
+            InputError: a pose, the camera's too, is not finite or has no unit quaternion; the camera's
+                intrinsics are none; the counted pixels are not those of its image.
         """
         pose = poses.as_pose(world_from_part, "world_from_part").reshape(-1, 7)
+        camera_from_world = poses.inverse(camera.stated_pose())
+        counted = None if counted is None else counted_pixels(camera, counted)
         with self.effort.measure(items=len(pose)) as effort:
-            camera_from_part = poses.compose(poses.inverse(torch.as_tensor(camera.world_from_camera)), pose)
+            camera_from_part = poses.compose(camera_from_world, pose)
             rotation = poses.rotation_matrix(camera_from_part).numpy()
             offset = camera_from_part[:, :3].numpy() + rotation @ self._center
             spans = self._spans(camera, rotation, offset)
-            if counted is not None:
-                counted = np.ascontiguousarray(counted, dtype=bool).reshape(-1)
             ends = np.cumsum(spans.length)
             rays = int(ends[-1]) if len(ends) else 0
             particle, pixel, depth = np.empty(rays, np.int64), np.empty(rays, np.int64), np.empty(rays)
@@ -148,9 +151,11 @@ class DepthRenderer:
         """Depth images (N, H, W) in metres, +inf where a pixel does not see the part.
 
         Raises:
-            InputError: a pose is not finite or has no unit quaternion.
+            InputError: a pose, the camera's too, is not finite or has no unit quaternion, or the camera's
+                intrinsics are none.
         """
         pose = poses.as_pose(world_from_part, "world_from_part").reshape(-1, 7)
+        camera.stated_pose()  # before an image of its size is made
         image = np.full((len(pose), camera.height * camera.width), np.inf)
         found = self.hits(camera, pose)
         image[found.particle, found.pixel] = found.depth
@@ -241,6 +246,21 @@ class DepthRenderer:
         np.add(first_pixel.take(span), along.take(hit), out=free.pixel[: len(hit)])
         free.depth[: len(hit)] = depth.take(hit)
         return len(hit), len(depth)
+
+
+def counted_pixels(camera: Camera, counted: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """Which pixels count, (H * W,), from a mask (H * W,) or (H, W).
+
+    Raises:
+        InputError: it is no mask of the camera's image.
+    """
+    mask = np.asarray(counted)
+    if mask.shape not in ((camera.height, camera.width), (camera.height * camera.width,)):
+        raise InputError(
+            f"the counted pixels of camera {camera.name!r} have shape {mask.shape}; give a mask of all its "
+            f"pixels, {(camera.height, camera.width)}, true where a pixel counts, and no indices."
+        )
+    return np.ascontiguousarray(mask, dtype=bool).reshape(-1)
 
 
 def _shifted(camera: Camera, across: float, down: float) -> tuple[Array | float, Array | float]:

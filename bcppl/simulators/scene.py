@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.simulators.camera import Camera
 from bcppl.simulators.effort import Effort
-from bcppl.simulators.renderer import DepthRenderer
+from bcppl.simulators.renderer import DepthRenderer, counted_pixels
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -34,6 +35,9 @@ class RendersPart(Protocol):
 
     def hits(self, camera: Camera, world_from_part: Tensor | Array, counted: Mask | None = None) -> Any:
         """The pixels that see the part at poses (N, 7): particle, pixel and depth."""
+
+    def images(self, camera: Camera, world_from_part: Tensor | Array) -> Array:
+        """Depth images (N, H, W) in metres, +inf where a pixel does not see the part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +75,9 @@ class SceneRenderer:
 
         Args:
             parts: what is rendered, for example `[part, *robot.parts]`.
-            renderer: makes the renderer of one part.
+            renderer: makes the renderer of one part: `DepthRenderer` casts rays, which is fastest to begin
+                with and sees through any lens; `bcppl.simulators.rendering.renderer_for` draws the triangles
+                of meshes that are not too fine, for every camera whose lens does not distort.
 
         Raises:
             InputError: there is no part, or the mesh of one is empty or not finite.
@@ -94,9 +100,12 @@ class SceneRenderer:
             counted: (H * W,) or (H, W) the pixels that matter; None for all.
 
         Raises:
-            InputError: there are not K poses, or a pose is not finite or has no unit quaternion.
+            InputError: there are not K poses; a pose, the camera's too, is not finite or has no unit
+                quaternion; the camera's intrinsics are none; the counted pixels are not those of its image.
         """
         pose = self._poses(world_from_parts)
+        camera.stated_pose()
+        counted = None if counted is None else counted_pixels(camera, counted)
         with self.effort.measure(items=len(pose)) as effort:
             before = [r.effort.amount for r in self._renderers]
             rows = max(1, AT_ONCE // max(camera.width * camera.height, 1))
@@ -118,6 +127,7 @@ class SceneRenderer:
             InputError: as `hits`.
         """
         pose = self._poses(world_from_parts)
+        camera.stated_pose()
         image = np.full((len(pose), camera.height * camera.width), np.inf)
         found = self.hits(camera, pose)
         image[found.particle, found.pixel] = found.depth
@@ -153,7 +163,7 @@ class SceneRenderer:
     def _composed(self, camera: Camera, pose: Tensor, counted: Mask | None, first: int) -> SceneHits:
         """The nearest hits for some particles (n, K, 7), which are numbered from `first` on."""
         everything = camera.width * camera.height
-        pixels = np.arange(everything) if counted is None else np.flatnonzero(np.asarray(counted).reshape(-1))
+        pixels = np.arange(everything) if counted is None else np.flatnonzero(counted)
         count, size = len(pose), len(pixels)
         column = np.zeros(everything, dtype=np.int64)
         column[pixels] = np.arange(size)
@@ -198,8 +208,11 @@ def background_part(
         name: of the part.
 
     Raises:
-        InputError: the image is not the camera's, or too little of it is known to make a triangle.
+        InputError: the image is not the camera's, the camera's intrinsics are none, the stride is no whole
+            number of pixels, the jump is not positive, or too little is known to make a triangle.
     """
+    stride = whole_number("background_part is given stride {}", stride)
+    jump = number_within("background_part is given jump {}", jump, above=0.0)
     image = np.asarray(depth, dtype=np.float64)
     if image.shape != (camera.height, camera.width):
         raise InputError(

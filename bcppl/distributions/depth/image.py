@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import warnings
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -40,7 +42,10 @@ class DepthDistribution(LazyDistribution):
         temperature: what the log-likelihood is divided by, instead of `effective_pixels`.
         camera_error: (N, 7) or (7,) `stated_camera_from_camera`: where the camera really stands, seen from
             where it is said to stand. What it moves, a background image does not say: render the background
-            as a part of the scene.
+            as a part of the scene. Sampled plainly beside the pose it mixes badly: the image tells how the
+            two together place the part before the camera, far more sharply than either, so particles would
+            have to follow a narrow ridge. `bcppl.models.camera_error` samples where the camera sees the part
+            instead, which is the same model, and moves both at once.
         bias: (N,) or one for all, metres that are added to every rendered depth, the background's too.
         background_is_measured: whether the same sensor measured the background, whose depths then hold the
             bias already; otherwise they are where things are.
@@ -131,7 +136,7 @@ class DepthDistribution(LazyDistribution):
 
     # ---- what is the same for all
 
-    @cached_property
+    @property
     def _behind(self) -> Array:
         """The depth of the background, (H * W,): +inf where unknown, so that the nearer is the minimum."""
         if self.background is None:
@@ -145,7 +150,7 @@ class DepthDistribution(LazyDistribution):
         pose = self.pose.detach()
         if self.camera_error is None:
             return pose
-        stated = torch.as_tensor(self.camera.world_from_camera, dtype=torch.float64)
+        stated = self.camera.stated_pose()
         error = poses.inverse(self.camera_error.detach().to(torch.float64))
         moved = poses.compose(poses.compose(stated, error), poses.inverse(stated))
         return poses.compose(moved if pose.ndim == 2 else moved[..., None, :], pose)
@@ -226,17 +231,16 @@ class DepthDistribution(LazyDistribution):
     def observed(self, value: Tensor) -> Observed:
         """What a depth image (H, W), or one for each particle (N, H, W), says without any pose.
 
+        It is kept with the image for as long as image, background and region hold the same numbers. Warns
+        where no pixel of it counts, for it then says nothing.
+
         Raises:
             InputError: the image has another shape.
         """
+        image = value.detach().numpy()
+        background, region = _plain(self.background), _plain(self.region)
         cached: Observed | None = KEPT.get(value)
-        if (
-            cached is not None
-            and cached.version == value._version
-            and cached.parameters == self._parameters
-            and cached.background is self.background
-            and cached.region is self.region
-        ):
+        if cached is not None and cached.was_read_from(self._parameters, image, background, region):
             return cached
         batch = (self.batch_shape[0], *self.event_shape)
         if value.shape not in (self.event_shape, torch.Size(batch)):
@@ -244,12 +248,16 @@ class DepthDistribution(LazyDistribution):
                 f"a depth image of camera {self.camera.name!r} has shape {tuple(value.shape)}; "
                 f"give {tuple(self.event_shape)}, or {batch} for one image per particle."
             )
-        depth = value.detach().to(torch.float64).reshape(-1, self._behind.size).numpy()
+        image = np.array(image)
+        depth = image.astype(np.float64, copy=False).reshape(-1, self.event_shape.numel())
         valid = np.isfinite(depth) & (depth > 0.0) & (depth >= self.camera.near) & (depth <= self.camera.far)
         if self.region is not None:
             valid &= np.asarray(self.region, dtype=bool).reshape(-1)
-        known = np.isfinite(self._behind)
-        behind = torch.from_numpy(np.where(known, self._behind, 0.0))
+        if not valid.any():
+            self._warn_of_silence(depth)
+        beyond = self._behind
+        known = np.isfinite(beyond)
+        behind = torch.from_numpy(np.where(known, beyond, 0.0))
         shown = self._log_density(torch.from_numpy(depth), behind).numpy()
         empty = np.where(valid, np.where(known, shown, self._log_uniform), 0.0)
         power = np.ones(len(depth))
@@ -257,10 +265,28 @@ class DepthDistribution(LazyDistribution):
             power = np.minimum(1.0, self.effective_pixels / np.maximum(valid.sum(axis=1), 1))
         elif self.temperature is not None:
             power = power / self.temperature
-        read = (self._parameters, self.background, self.region)
-        observed = Observed(value._version, *read, self._behind, depth, valid, empty, power)
+        background, region = _copy(background), _copy(region)
+        observed = Observed(image, self._parameters, background, region, beyond, depth, valid, empty, power)
         KEPT[value] = observed
         return observed
+
+    def _warn_of_silence(self, depth: Array) -> None:
+        """Say that no pixel of an image (1 or N, H * W) counts, and what may be wrong."""
+        camera, read = self.camera, depth[np.isfinite(depth) & (depth > 0.0)]
+        if not read.size:
+            why = "every pixel is missing"
+        elif not ((read >= camera.near) & (read <= camera.far)).any():
+            median = float(np.median(read))
+            why = f"their median is {median:.4g} m and its range {camera.near:.4g} to {camera.far:.4g} m"
+            if camera.near <= 0.001 * median <= camera.far:
+                why += ": probably millimetres, scale the image by 0.001"
+        else:
+            why = "none within its range lies in the region"
+        warnings.warn(
+            f"no pixel of a depth image of camera {camera.name!r} counts and it says nothing of the pose; "
+            f"{why}.",
+            stacklevel=3,
+        )
 
     def _check_finite(self) -> None:
         count = len(self.pose)
@@ -278,6 +304,15 @@ class DepthDistribution(LazyDistribution):
                     f"(particles {shown}) and cannot be seen by camera {self.camera.name!r}; "
                     "look at what proposed them."
                 )
+
+
+def _plain(values: npt.NDArray[Any] | Tensor | None) -> npt.NDArray[Any] | None:
+    """The numbers themselves, not copied."""
+    return values.detach().numpy() if isinstance(values, Tensor) else values
+
+
+def _copy(values: npt.NDArray[Any] | None) -> npt.NDArray[Any] | None:
+    return None if values is None else np.array(values)
 
 
 def _check_shapes(

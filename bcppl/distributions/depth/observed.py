@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
@@ -23,10 +24,10 @@ class Observed:
     """What an observation alone says, computed once for all particles.
 
     Attributes:
-        version: of the observation, (H, W) or (N, H, W); changes when the tensor is written to.
+        image: a copy of the observation, (H, W) or (N, H, W).
         parameters: those of the distribution that read it; so are background and region.
-        background: (H, W) metres as it was given, or None.
-        region: (H, W) as it was given, or None.
+        background: a copy, (H, W) metres, or None.
+        region: a copy, (H, W), or None.
         behind: the depth of the background, +inf where unknown, (H * W,).
         depth: its pixels, (1 or N, H * W).
         valid: which of them count, (1 or N, H * W).
@@ -35,16 +36,34 @@ class Observed:
         totals: log-density of one image without the part, by the bias of the range.
     """
 
-    version: int
+    image: npt.NDArray[Any]
     parameters: tuple[Any, ...]
-    background: Array | Tensor | None
-    region: Mask | Tensor | None
+    background: npt.NDArray[Any] | None
+    region: npt.NDArray[Any] | None
     behind: Array
     depth: Array
     valid: Mask
     empty: Array
     power: Array
     totals: dict[float, float] = field(default_factory=dict)
+
+    def was_read_from(
+        self,
+        parameters: tuple[Any, ...],
+        image: npt.NDArray[Any],
+        background: npt.NDArray[Any] | None,
+        region: npt.NDArray[Any] | None,
+    ) -> bool:
+        """Whether it says what would be read now: whoever holds these arrays may have written to them.
+
+        All numbers are compared, which takes 15 us for 160 x 120 pixels, half as long as hashing them.
+        """
+        return (
+            self.parameters == parameters
+            and _alike(self.image, image)
+            and _alike(self.background, background)
+            and _alike(self.region, region)
+        )
 
     @cached_property
     def emptiness(self) -> Array:
@@ -88,6 +107,16 @@ class Observed:
             shift = torch.tensor(biases[first : first + rows], dtype=torch.float64)[:, None]
             totals += (log_density(depth, behind + shift).sum(dim=1) + nothing).tolist()
         return totals
+
+
+def _alike(first: npt.NDArray[Any] | None, second: npt.NDArray[Any] | None) -> bool:
+    """Whether two arrays are the same to the bit, so that NaN equals NaN."""
+    if first is None or second is None:
+        return first is second
+    if first.shape != second.shape or first.dtype != second.dtype:
+        return False
+    bits = np.dtype(f"u{first.itemsize}")
+    return np.array_equal(np.ascontiguousarray(first).view(bits), np.ascontiguousarray(second).view(bits))
 
 
 # Every run of a program makes its distributions anew, at other poses: what an image says is kept with it.
