@@ -21,6 +21,7 @@ import pyro
 import torch
 
 from bcppl import poses
+from bcppl.arguments import number_within
 from bcppl.distributions.contact import ChamferContacts, PegPose
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import NormalPose
@@ -77,16 +78,25 @@ def prepare(
         recording: what was measured.
         grip_shift: how far the peg may sit off in the hand along each axis of the grip, metres.
         grip_turn: likewise about each axis, radians; both are standard deviations.
-        settings: fields of `peg_in_hole.Settings`.
+        settings: fields of `peg_in_hole.Settings`, or `renderer`.
 
     Raises:
-        InputError: a spread is not positive, there are probe windows and no peg, or the part cannot be
-            touched.
+        InputError: a spread is not positive, grip_shift is longer than the peg or grip_turn beyond pi; or as
+            `peg_in_hole.prepare`.
     """
-    if not (grip_shift > 0 and grip_turn > 0):
+    for name, value in (("grip_shift", grip_shift), ("grip_turn", grip_turn)):
+        number_within(
+            "a site's spread must be positive (for a peg that is held as planned choose peg_in_hole) and "
+            f"{name} is {{}}",
+            value,
+            above=0.0,
+        )
+    if grip_turn > math.pi:
+        raise InputError(f"grip_turn is {grip_turn:g} rad, probably degrees; give radians below pi.")
+    if recording.peg is not None and grip_shift > (longest := float(recording.peg.extent.max())):
         raise InputError(
-            f"grasped_peg has grip_shift {grip_shift!r} and grip_turn {grip_turn!r}; give two numbers "
-            "greater than 0, or choose peg_in_hole for a peg that is held as planned."
+            f"grip_shift is {grip_shift:g} m and peg {recording.peg.name!r} only {longest:.3g} m long: "
+            "probably millimetres; scale it by 0.001."
         )
     spread = torch.tensor([grip_shift] * 3 + [grip_turn] * 3, dtype=torch.float64)
     known = peg_in_hole.prepare(recording, **settings)

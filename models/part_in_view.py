@@ -6,7 +6,7 @@ meets the part, any depth at all where it does not or where something stands in 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +16,7 @@ import pyro
 import torch
 from torch import Tensor
 
+from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.errors import InputError
@@ -24,6 +25,7 @@ from bcppl.recordings.measurements import DepthImage, Measurement, Recording, Vi
 from bcppl.simulators.camera import Camera
 from bcppl.simulators.effort import Effort
 from bcppl.simulators.renderer import DepthRenderer
+from bcppl.simulators.scene import RendersPart
 from bcppl.traces import Model
 
 
@@ -44,6 +46,10 @@ class Settings:
     effective_pixels: float | None = 500.0
     stride: int = 4
 
+    def __post_init__(self) -> None:
+        number_within("a site's spread must be positive and scale is {}", self.scale, above=0.0)
+        whole_number("part_in_view is given stride {}", self.stride)
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -51,7 +57,7 @@ class Scene:
 
     part: Part
     prior: Any
-    renderer: DepthRenderer
+    renderer: RendersPart
     background: Mapping[str, npt.NDArray[np.float64]]
     settings: Settings
     regions: dict[str, npt.NDArray[np.bool_]] = field(default_factory=dict)
@@ -87,12 +93,23 @@ def part_in_view(scene: Scene, actions: Sequence[View]) -> None:
         pyro.sample(f"depth_{k}", depth)
 
 
-def prepare(recording: Recording, **settings: Any) -> Scene:
-    """The scene of a recording; `settings` are fields of `Settings`."""
+def prepare(
+    recording: Recording, renderer: Callable[[Part], RendersPart] = DepthRenderer, **settings: Any
+) -> Scene:
+    """The scene of a recording.
+
+    Args:
+        recording: what was measured.
+        renderer: makes the renderer of the part, such as `bcppl.simulators.rendering.renderer_for`.
+        settings: fields of `Settings`.
+
+    Raises:
+        InputError: a spread is not positive, or the stride is no whole number of pixels.
+    """
     return Scene(
         recording.part,
         prior_from_guess(recording.guess),
-        DepthRenderer(recording.part),
+        renderer(recording.part),
         recording.background,
         Settings(**settings),
     )

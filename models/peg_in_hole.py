@@ -8,7 +8,7 @@ nothing was in the way.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -19,15 +19,18 @@ import pyro
 import torch
 from torch import Tensor
 
+from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.contact import ChamferContacts, PegPose
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.errors import InputError
+from bcppl.parts import Part
 from bcppl.recordings.measurements import DepthImage, Measurement, ProbeWindow, Recording, Touch, View
 from bcppl.simulators.effort import Effort
 from bcppl.simulators.peg_model import ContactParameters
 from bcppl.simulators.physics import PegPhysics
 from bcppl.simulators.renderer import DepthRenderer
+from bcppl.simulators.scene import RendersPart
 from bcppl.simulators.track import ContactTrack
 from bcppl.simulators.wrench import Sensing
 from bcppl.traces import Model, carried
@@ -63,13 +66,21 @@ class Settings:
     pose_every: int = 25
     contact: ContactParameters = CONTACT
 
+    def __post_init__(self) -> None:
+        for name in ("depth_scale", "contact_scale", "translation_scale", "rotation_scale"):
+            number_within(
+                f"a site's spread must be positive and {name} is {{}}", getattr(self, name), above=0.0
+            )
+        number_within("peg_in_hole is given one_empty {}", self.one_empty, least=0.0)
+        whole_number("peg_in_hole is given pose_every {}", self.pose_every)
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
     """What stays the same over a run: the prior, the renderer, the physics, and how wrenches are read."""
 
     prior: Any
-    renderer: DepthRenderer
+    renderer: RendersPart
     physics: PegPhysics | None
     sensing: Sensing | None
     background: Mapping[str, npt.NDArray[np.float64]]
@@ -110,11 +121,19 @@ def peg_in_hole(scene: Scene, actions: Sequence[View | ProbeWindow]) -> None:
             pyro.sample(f"peg_{k}", peg)
 
 
-def prepare(recording: Recording, **settings: Any) -> Scene:
-    """The scene of a recording; `settings` are fields of `Settings`.
+def prepare(
+    recording: Recording, renderer: Callable[[Part], RendersPart] = DepthRenderer, **settings: Any
+) -> Scene:
+    """The scene of a recording.
+
+    Args:
+        recording: what was measured.
+        renderer: makes the renderer of the part, such as `bcppl.simulators.rendering.renderer_for`.
+        settings: fields of `Settings`.
 
     Raises:
-        InputError: there are probe windows and no peg, or the part cannot be touched.
+        InputError: a spread is not positive, there are probe windows and no peg, or the part cannot be
+            touched.
     """
     chosen = Settings(**settings)
     windows = [m.action for m in recording.measurements if isinstance(m.action, ProbeWindow)]
@@ -126,7 +145,7 @@ def prepare(recording: Recording, **settings: Any) -> Scene:
         sensing = Sensing(recording.peg, rate=1.0 / float(np.median(np.diff(windows[0].probe.stamps))))
     return Scene(
         prior_from_guess(recording.guess),
-        DepthRenderer(recording.part),
+        renderer(recording.part),
         physics,
         sensing,
         recording.background,

@@ -80,18 +80,31 @@ def prepare(recording: Recording, holes: Sequence[tuple[float, float]] = HOLES, 
     Args:
         recording: what was measured; its part's frame sits in the first hole.
         holes: where the holes are, x and y in the part's frame, metres.
-        settings: fields of `peg_in_hole.Settings`.
+        settings: fields of `peg_in_hole.Settings`, or `renderer`.
 
     Raises:
-        InputError: there are fewer than two holes or the first is not at the origin, there are probe windows
-            and no peg, or the part cannot be touched.
+        InputError: there are fewer than two holes, the first is not at the origin, two are at one place or
+            one beside the part; or as `peg_in_hole.prepare`.
     """
-    places = np.asarray(holes, dtype=np.float64)
+    try:
+        places = np.asarray(holes, dtype=np.float64)
+    except (TypeError, ValueError):
+        places = np.zeros(0)
     if places.ndim != 2 or places.shape[1] != 2 or len(places) < 2 or places[0].any():
         raise InputError(
-            f"which_hole is given holes at {places.tolist()}; give x and y of two or more in the part's "
+            f"which_hole is given holes at {holes}; give x and y of two or more in the part's "
             "frame, the first (0, 0)."
         )
+    low, high = recording.part.vertices[:, :2].min(axis=0), recording.part.vertices[:, :2].max(axis=0)
+    within = ((low <= places) & (places <= high)).all(axis=1)
+    if not within.all():
+        k = int(np.argmin(within))
+        raise InputError(
+            f"hole {k} is at {places[k].tolist()}, beside part {recording.part.name!r}, which reaches from "
+            f"{low.tolist()} to {high.tolist()} m; give metres in the part's frame."
+        )
+    if len(np.unique(places, axis=0)) < len(places):
+        raise InputError(f"which_hole is given one hole twice, {places.tolist()}; give each once.")
     hole_from_part = poses.identity(len(places))
     hole_from_part[:, :2] = -torch.from_numpy(places)
     return Scene(**peg_in_hole.prepare(recording, **settings).__dict__, hole_from_part=hole_from_part)

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
+from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
 from bcppl import poses
 from bcppl.cli import loading
-from bcppl.models import grasped_peg, peg_in_hole
+from bcppl.errors import InputError
+from bcppl.models import grasped_peg, part_in_view, peg_in_hole
 from bcppl.models.worlds import grasped_peg as world
-from bcppl.recordings import Recording
+from bcppl.recordings import Recording, View
+from bcppl.simulators.rasteriser import DepthRasteriser
+from bcppl.simulators.renderer import DepthRenderer
+from bcppl.simulators.rendering import renderer_for
 from bcppl.traces import Trace, extend, generate, simulate, update
 
 
@@ -77,6 +84,45 @@ def test_a_peg_held_as_planned_is_that_of_peg_in_hole() -> None:
     plain, _ = extend(moved, (plain_scene, [m.action for m in measurements]), values)
     for address in values:
         assert torch.equal(held.log_prob(address), plain.log_prob(address)), address
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"grip_shift": 1.5}, "grip_shift is 1.5 m .* probably millimetres"),
+        ({"grip_turn": 5.0}, "grip_turn is 5 rad, probably degrees"),
+        ({"grip_shift": 0.0}, "a site's spread must be positive .*choose peg_in_hole.* grip_shift is 0.0"),
+        ({"grip_turn": float("nan")}, "grip_turn is nan"),
+        ({"grip_shift": "1"}, "grip_shift is '1'"),
+        ({"depth_scale": 0.0}, "a site's spread must be positive and depth_scale is 0.0"),
+        ({"contact_scale": -0.003}, "contact_scale is -0.003"),
+        ({"pose_every": 0}, "pose_every 0"),
+    ],
+)
+def test_what_cannot_be_a_spread_is_refused_before_anything_is_built(settings: Any, said: str) -> None:
+    with pytest.raises(InputError, match=said) as caught:
+        grasped_peg.prepare(recorded(), **settings)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("model", [part_in_view, peg_in_hole, grasped_peg])
+def test_a_model_takes_another_renderer(model: Any) -> None:
+    """The same scene drawn in place of cast: the depth's density agrees to single precision."""
+    views = [m for m in recorded().measurements if isinstance(m.action, View)]
+    seen = replace(recorded(), measurements=views)
+    found = []
+    for options in ({}, {"renderer": renderer_for}):
+        prepared = model.prepare(seen, **options)
+        site = model.model.pose
+        truth = torch.from_numpy(seen.truth).expand(2, 7).clone()
+        empty, _ = generate(model.model.program, (prepared, []), {}, 2)
+        trace = update(empty, {site: truth}).trace
+        values = model.model.observe(prepared, views)
+        trace, _ = extend(trace, (prepared, [m.action for m in views]), values)
+        found.append((type(prepared.renderer), trace.log_prob(*values)))
+    (cast, rays), (drawn, triangles) = found
+    assert cast is DepthRenderer and issubclass(drawn, DepthRasteriser)
+    torch.testing.assert_close(rays, triangles, rtol=0.0, atol=0.5)
 
 
 def test_it_is_offered_by_name_and_invents_what_it_explains() -> None:

@@ -59,3 +59,12 @@ def test_it_is_offered_by_name_and_refuses_what_cannot_be_chosen_from() -> None:
     assert loading.model("which_hole") is which_hole.model
     with pytest.raises(InputError, match="two or more"):
         which_hole.prepare(world.record(0), holes=[(0.0, 0.0)])
+    recording = world.record(0)
+    for holes, said in [
+        ([(0, 0), (34, 0)], r"hole 1 is at \[34.0, 0.0\], beside part .* give metres"),
+        ([(0, 0), (float("nan"), 0)], "hole 1 is at .nan"),
+        ([(0, 0), (0.034,)], "two or more"),
+        ([(0, 0), (0.034, 0), (0.034, 0)], "twice"),
+    ]:
+        with pytest.raises(InputError, match=said):
+            which_hole.prepare(recording, holes=holes)
