@@ -9,7 +9,14 @@ from typing import TypeVar
 
 from rich import get_console
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 T = TypeVar("T")
 
@@ -24,7 +31,15 @@ def sole_bar(console: Console | None = None) -> Iterator[Progress]:
     # Without ipywidgets rich warns at every turn and leaves a bar behind for each.
     notebook = console.is_jupyter and find_spec("ipywidgets") is not None
     seen = (console.is_terminal or notebook) and not _shown
-    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description:>12}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("about"),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+    )
     # Between two steps the caller prints: in a notebook that shall stay ordinary output.
     bar = Progress(
         *columns,

@@ -79,6 +79,14 @@ class StepInfo(NamedTuple):
     ancestors: Tensor | None = None
     displacement: float = float("nan")
 
+    def __repr__(self) -> str:
+        shown = {name: f"{value:.4g}" for name, value in self._asdict().items() if isinstance(value, float)}
+        shown["exponents"] = f"<{len(self.exponents)} steps>"
+        shown["resampled"] = f"{self.resampled}"
+        if self.ancestors is not None:
+            shown["ancestors"] = f"<{len(self.ancestors.unique())} of {len(self.ancestors)}>"
+        return f"StepInfo({', '.join(f'{name}={shown[name]}' for name in self._fields if name in shown)})"
+
 
 class Stepped(NamedTuple):
     """A population that has taken something in, and what happened."""

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+import torch
 
+from bcppl.beliefs import Belief
+from bcppl.cli.run import next_label
+from bcppl.errors import InputError
 from bcppl.recordings import save
+from bcppl.recordings.beliefs import load_belief, load_latent
 from tests.command_line import PROBE, SHIPPED, Ran, short
 
 
@@ -91,3 +98,85 @@ def test_an_earlier_runs_beliefs_do_not_lie_among_the_new(bcppl: Callable[..., R
     assert bcppl("run", "short.h5", "--particles", 4, "--out", "out").code == 0
     found = {p.name for p in (tmp_path / "out").iterdir()}
     assert "notes.txt" in found and "belief_007.h5" not in found
+
+
+MANY = """
+import pyro
+import torch
+from pyro.distributions import Categorical, Normal
+from bcppl import poses
+from bcppl.distributions.poses import NormalPose
+from bcppl.models import point_probe
+from bcppl.traces import Model
+
+def many(scene, actions):
+    pyro.sample("slot", Categorical(torch.tensor([0.1, 0.3, 0.6])))
+    pyro.sample("wear/mm", Normal(torch.tensor([0.25, -4.0]), torch.tensor([0.1, 2.0])).to_event(1))
+    turned = torch.tensor([0.1, 0.0, -0.2, 0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    spread = torch.tensor([0.001] * 3 + [0.01] * 3, dtype=torch.float64)
+    pyro.sample("grip", NormalPose(turned, spread))
+    point_probe.point_probe(scene, actions)
+
+model = Model(program=many, prepare=point_probe.prepare, observe=point_probe.observe, pose="part")
+"""
+
+
+def test_every_latent_site_comes_out(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    (tmp_path / "many.py").write_text(MANY)
+    save(short(1), tmp_path / "short.h5")
+    ran = bcppl("run", "short.h5", "--model", "many.py", "--particles", 8, "--out", "out")
+    assert ran.code == 0, ran.err
+    path = tmp_path / "out/belief_001.h5"
+    belief, values = load_belief(path), load_latent(path)
+    assert set(values) == {"part", "slot", "wear/mm", "grip"}
+    assert torch.equal(values["part"], belief.world_from_part)
+    said = json.loads((tmp_path / "out/run.json").read_text())["latent"]
+
+    weights, slot = belief.weights.numpy(), values["slot"].numpy()
+    shares = {k: float(weights[slot == k].sum()) for k in range(3) if (slot == k).any()}
+    ordered = sorted(shares.items(), key=lambda pair: -pair[1])
+    assert said["slot"]["values"] == [k for k, _ in ordered]
+    assert said["slot"]["probabilities"] == pytest.approx([share for _, share in ordered])
+    assert ", ".join(f"{k}: {100 * share:.1f} %" for k, share in ordered) in ran.out
+
+    wear = values["wear/mm"].numpy()
+    assert said["wear/mm"]["mean"] == pytest.approx(weights @ wear)
+    for k in range(2):
+        low, high = said["wear/mm"]["from"][k], said["wear/mm"]["to"][k]
+        assert low <= said["wear/mm"]["mean"][k] <= high
+        assert weights[wear[:, k] < low].sum() <= 0.05 and weights[wear[:, k] > high].sum() <= 0.05
+        assert f"wear/mm[{k}]" in ran.out and f"{low:.4g} to {high:.4g}" in ran.out
+
+    grip = Belief(values["grip"], belief.log_weights)
+    assert said["grip"]["mean"] == pytest.approx(grip.mean.tolist())
+    assert said["grip"]["spread"] == pytest.approx(grip.spread.tolist())
+    assert " ".join(f"{1e3 * x:.3f}" for x in grip.mean[:3].tolist()) + " mm" in ran.out
+    assert "truth gap: empty" in ran.out and "slot, wear/mm, grip besides" in ran.out
+
+
+def test_a_model_of_the_pose_alone_prints_no_other_sites(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    for name, truth in (("known", short(1).truth), ("unknown", None)):
+        save(dataclasses.replace(short(1), truth=truth), tmp_path / f"{name}.h5")
+        ran = bcppl("run", f"{name}.h5", "--particles", 4)
+        assert ran.code == 0 and "other latent values" not in ran.out
+        assert ("the recording does not know the truth" in ran.out) == (name == "unknown")
+    path = tmp_path / "runs/known/belief_001.h5"
+    with h5py.File(path, "r+") as file:
+        del file["latent"]  # as earlier versions wrote it
+    assert len(load_belief(path)) == 4
+    with pytest.raises(InputError, match="the pose alone"):
+        load_latent(path)
+
+
+def test_what_cannot_be_run_or_simulated_is_told_from_what_can(bcppl: Callable[..., Ran]) -> None:
+    ran = bcppl("simulate", "part_in_view")
+    assert ran.code == 2 and "camera_error, grasped_peg, peg_in_hole" in ran.err
+    for name in ("arm_in_view", str(PROBE.with_name("arm_in_view.py"))):
+        ran = bcppl("run", SHIPPED, "--model", name)
+        assert ran.code == 2 and "help(bcppl.models.arm_in_view)" in ran.err, ran.err
+        assert len(ran.err.strip().splitlines()) == 1
+    assert "no model 'arm'" in bcppl("run", SHIPPED, "--model", "arm").err
+
+
+def test_the_bar_names_the_measurement_in_progress() -> None:
+    assert [next_label(short(3), taken) for taken in range(1, 5)] == ["push 1", "push 2", "push 3", "push 3"]

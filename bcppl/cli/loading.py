@@ -17,6 +17,12 @@ from bcppl.errors import InputError
 from bcppl.recordings import Recording, load, validate
 from bcppl.traces import Model
 
+# Where a program that the command line cannot run is run from Python.
+EXAMPLES = {
+    f"bcppl.models.{name}": ", and benchmarks/arm.py runs it on recordings"
+    for name in ("arm_calibration", "arm_in_view")
+}
+
 
 def recording(name: str) -> Recording:
     """The recording in a file, or a shipped one by name, checked.
@@ -78,15 +84,25 @@ def refuse_seed(seed: int) -> None:
 
 def offered(package: ModuleType, attribute: str) -> list[str]:
     """The names of a package's files that define `attribute`."""
-    names = [info.name for info in pkgutil.iter_modules(package.__path__) if not info.ispkg]
-    return [n for n in names if hasattr(importlib.import_module(f"{package.__name__}.{n}"), attribute)]
+    return [
+        n for n in _files(package) if hasattr(importlib.import_module(f"{package.__name__}.{n}"), attribute)
+    ]
+
+
+def _files(package: ModuleType) -> list[str]:
+    return [info.name for info in pkgutil.iter_modules(package.__path__) if not info.ispkg]
+
+
+def inventing() -> list[str]:
+    """The names of the shipped models that make recordings up."""
+    return [n for n in offered(bcppl.models, "model") if model(n).invent is not None]
 
 
 def _defined(name: str, package: ModuleType, attribute: str, kind: type | None) -> Any:
     word = "model" if attribute == "model" else "inference program"
     if name.endswith(".py") or "/" in name:
         module = _from_file(Path(name), package, word)
-    elif name in offered(package, attribute):
+    elif name in _files(package):
         module = importlib.import_module(f"{package.__name__}.{name}")
     else:
         raise InputError(
@@ -95,6 +111,13 @@ def _defined(name: str, package: ModuleType, attribute: str, kind: type | None) 
         )
     found = getattr(module, attribute, None)
     if found is None or (kind is not None and not isinstance(found, kind)) or not (kind or callable(found)):
+        if module.__name__.startswith(f"{package.__name__}."):
+            place = module.__name__
+            raise InputError(
+                f"{place.rpartition('.')[2]} is used from Python, the command line cannot run it as its "
+                f"{word}: `import {place}` and `help({place})` say how"
+                f"{EXAMPLES.get(place, '')}; the command line has {', '.join(offered(package, attribute))}."
+            )
         what = "a bcppl.traces.Model named `model`" if attribute == "model" else "a function named `infer`"
         raise InputError(f"{name} defines no {word}: it needs {what}.")
     return found

@@ -50,7 +50,8 @@ def simulate(
     chosen = loading.model(model)
     if chosen.invent is None:
         raise InputError(
-            f"model {model!r} invents no recordings; give one that has `invent`, such as peg_in_hole."
+            f"model {model!r} invents no recordings; these do: {', '.join(loading.inventing())}. A model of "
+            "your own does once it has an `invent(seed)`."
         )
     _write(chosen.invent(seed), out)
 

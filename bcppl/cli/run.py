@@ -18,12 +18,13 @@ from rich.table import Table
 
 from bcppl import poses
 from bcppl.beliefs import average_distance, average_nearest_distance
-from bcppl.cli import loading
+from bcppl.cli import latent_sites, loading
 from bcppl.errors import InputError
 from bcppl.figures import add_over_time, belief_in_3d
 from bcppl.inference.progress import sole_bar
 from bcppl.recordings import Recording
 from bcppl.recordings.beliefs import save_belief
+from bcppl.traces import Model
 
 HEADER = (
     "measurement",
@@ -102,7 +103,8 @@ def run(
                 steps.append(step)
                 _write_record(folder, made, steps, found)
                 progress.console.print(_row(_cells(step, found)), soft_wrap=True)
-                progress.update(task, completed=len(steps) - 1, description=step.info.label)
+                doing = next_label(found, len(steps))
+                progress.update(task, completed=len(steps) - 1, description=doing)
     finally:
         # Whatever stopped the run, what was computed is shown and kept.
         if steps:
@@ -112,9 +114,15 @@ def run(
                     "measurements were taken in.",
                     style="yellow",
                 )
-            _report(console, found, steps)
+            _report(console, found, chosen, steps)
             _draw(folder, found, steps)
             console.print(f"beliefs and figures are in {folder}")
+
+
+def next_label(recording: Recording, taken: int) -> str:
+    """The measurement after so many, as the table names it: what is being worked on."""
+    last = min(taken, len(recording.measurements))
+    return f"{recording.measurements[last - 1].kind} {last}"
 
 
 def _start(folder: Path) -> None:
@@ -130,14 +138,16 @@ def _keep(folder: Path, number: int, step: Any) -> None:
         label=step.info.label,
         log_evidence=step.info.log_evidence,
         random_state=step.random_state,
+        latent=latent_sites.values_of(step),
     )
 
 
 def _write_record(folder: Path, made: dict[str, Any], steps: Sequence[Any], recording: Recording) -> None:
-    """What was run, and the table so far, as JSON."""
+    """What was run, the table so far, and what the last step says of every latent site, as JSON."""
     rows = [dict(zip(HEADER, _cells(step, recording), strict=True)) for step in steps]
     unfinished = folder / "run.json.part"
-    unfinished.write_text(json.dumps({**made, "rows": rows}, indent=1), encoding="utf-8")
+    whole = {**made, "rows": rows, "latent": latent_sites.summarised(steps[-1])}
+    unfinished.write_text(json.dumps(whole, indent=1), encoding="utf-8")
     unfinished.replace(folder / "run.json")
 
 
@@ -170,8 +180,12 @@ def _cells(step: Any, recording: Recording) -> list[str]:
     ]
 
 
-def _report(console: Console, recording: Recording, steps: Sequence[Any]) -> None:
+def _report(console: Console, recording: Recording, model: Model, steps: Sequence[Any]) -> None:
     belief = steps[-1].belief
+    sites = latent_sites.summarised(steps[-1])
+    why = latent_sites.why_no_truth_gap(model, recording.truth is not None, sites)
+    if why is not None and all(math.isnan(step.info.truth_gap) for step in steps):
+        console.print(why, style="dim", markup=False)
     guess = torch.as_tensor(recording.guess.world_from_part, dtype=torch.float64)
     turned = torch.rad2deg(poses.local(guess, belief.mean)[3:]).tolist()
     mean, spread = belief.mean.tolist(), belief.spread.tolist()
@@ -190,6 +204,9 @@ def _report(console: Console, recording: Recording, steps: Sequence[Any]) -> Non
     # q and -q are one rotation: the one with w >= 0 is what people compare.
     sign = -1.0 if mean[3] < 0 else 1.0
     console.print("quaternion w x y z: " + " ".join(f"{sign * q:.6f}" for q in mean[3:]))
+    rows = latent_sites.rows(sites, model.pose)
+    if rows:
+        console.print(latent_sites.table(rows))
     if recording.truth is not None:
         points = recording.part.surface_points()
         console.print(

@@ -1,9 +1,20 @@
-"""Beliefs on disk: one small HDF5 file after each measurement of a run."""
+"""Beliefs on disk: one small HDF5 file after each measurement of a run.
+
+Beside the sought pose's particles, the group `latent` holds what each particle has at every latent address
+of the model, (N, *event) each and in the particles' order, so that one set of weights is for all:
+
+    belief, values = load_belief(path), load_latent(path)
+    share = belief.weights[values["which"] == 2].sum()  # how likely it is the third hole
+    grip = Belief(values["grip_from_peg"], belief.log_weights)  # a pose: its mean, spread, modes
+"""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from urllib.parse import quote
 
 import h5py
 import torch
@@ -15,10 +26,18 @@ from bcppl.poses import Freedom
 
 FORMAT = "bcppl belief"
 SCHEMA_VERSION = 1
+LATENT = "latent"
+SAFE = " !#$&'()*+,:;=?@[]"  # left as they are in an address; a slash is not
 
 
 def save_belief(
-    belief: Belief, path: str | os.PathLike[str], *, label: str, log_evidence: float, random_state: Tensor
+    belief: Belief,
+    path: str | os.PathLike[str],
+    *,
+    label: str,
+    log_evidence: float,
+    random_state: Tensor,
+    latent: Mapping[str, Tensor] | None = None,
 ) -> None:
     """Write a belief, whole or not at all.
 
@@ -28,6 +47,7 @@ def save_belief(
         label: the measurement after which it stands.
         log_evidence: of all measurements so far.
         random_state: torch's generator, so that a run can be gone on with.
+        latent: values (N, *event) at the latent addresses, the pose's own among them if you like.
     """
     path = Path(path)
     unfinished = path.with_name(path.name + ".part")
@@ -43,6 +63,11 @@ def save_belief(
             poses.attrs["units"] = "m, unit quaternion: x y z qw qx qy qz"
             file.create_dataset("log_weights", data=belief.log_weights.numpy())
             file.create_dataset("random_state", data=random_state.numpy())
+            group = file.create_group(LATENT)
+            for address, values in (latent or {}).items():
+                # A slash would make groups of groups, and "a" could not stand beside "a/b".
+                site = group.create_dataset(quote(address, safe=SAFE), data=values.detach().numpy())
+                site.attrs["address"] = address
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -54,6 +79,33 @@ def load_belief(path: str | os.PathLike[str]) -> Belief:
     Raises:
         InputError: there is no such file, or it holds no belief that this version reads.
     """
+    with _opened(path) as file:
+        freedom = Freedom(str(file.attrs["free_translation"]), str(file.attrs["free_rotation"]))
+        poses, log_weights = (
+            torch.from_numpy(file["world_from_part"][:]),
+            torch.from_numpy(file["log_weights"][:]),
+        )
+    return Belief(poses, log_weights, freedom)
+
+
+def load_latent(path: str | os.PathLike[str]) -> dict[str, Tensor]:
+    """Read what the particles of a belief that `save_belief` wrote have at the model's latent addresses.
+
+    Returns:
+        Values (N, *event) by address, in the particles' order: `load_belief(path).weights` weighs them.
+
+    Raises:
+        InputError: there is no such file, it holds no belief that this version reads, or it is of a version
+            of bcppl that kept the pose alone.
+    """
+    with _opened(path) as file:
+        if LATENT not in file:
+            raise InputError(f"{path} holds the pose alone, as earlier versions of bcppl did; run it again.")
+        return {str(site.attrs["address"]): torch.from_numpy(site[()]) for site in file[LATENT].values()}
+
+
+@contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"there is no belief at {path}; `bcppl run` writes them into its --out folder.")
@@ -61,11 +113,6 @@ def load_belief(path: str | os.PathLike[str]) -> Belief:
         with h5py.File(path) as file:
             if file.attrs.get("format") != FORMAT or int(file.attrs["schema_version"]) > SCHEMA_VERSION:
                 raise InputError(f"{path} holds no belief that this version of bcppl reads; run it again.")
-            freedom = Freedom(str(file.attrs["free_translation"]), str(file.attrs["free_rotation"]))
-            poses, log_weights = (
-                torch.from_numpy(file["world_from_part"][:]),
-                torch.from_numpy(file["log_weights"][:]),
-            )
+            yield file
     except (OSError, KeyError) as error:
         raise InputError(f"{path} is no whole belief file ({error}); run it again.") from error
-    return Belief(poses, log_weights, freedom)

@@ -1,0 +1,148 @@
+"""What a run says of all that its model leaves open: which hole it is, how a peg sits in the hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from rich.markup import escape
+from rich.table import Table
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.support import freedom_of, support_of
+from bcppl.inference.population import Population
+from bcppl.inference.summaries import mean, probabilities, quantiles
+from bcppl.traces import Series
+
+LIKELIEST = 5  # of a discrete site's values
+ROWS = 12  # of one site's numbers; run.json holds them all
+INTERVAL = (0.05, 0.95)
+
+
+class Row(NamedTuple):
+    """One row of the table: the site, what is most likely of it, and how sure that is."""
+
+    name: str
+    middle: str
+    spread: str
+
+
+def values_of(step: Any) -> Mapping[str, Tensor]:
+    """The values (N, *event) at every latent address after a step; none where it shows no population."""
+    population = getattr(step, "population", None)
+    return dict(population.trace.choices) if isinstance(population, Population) else {}
+
+
+def summarised(step: Any) -> dict[str, dict[str, Any]]:
+    """A summary of every latent site after a step by its address, made of plain lists and numbers.
+
+    A pose has its `mean` (7 numbers) and `spread` (6: metres, radians); a discrete site its likeliest
+    `values`, their `probabilities`, and that of all `others` together; any other site its `mean` and the ends
+    of the interval that holds 90 % of the weight, `from` and `to`, each number by itself.
+    """
+    population = getattr(step, "population", None)
+    if not isinstance(population, Population):
+        return {}
+    return {a: _summary(population, a) for a in population.trace.choices}
+
+
+def _summary(population: Population, address: str) -> dict[str, Any]:
+    values, distribution = population.trace.choices[address], population.trace.distributions[address]
+    if freedom_of(distribution) is not None:
+        if values.ndim != 2:
+            return {"kind": "several poses"}
+        belief = population.belief(address)
+        return {"kind": "pose", "mean": belief.mean.tolist(), "spread": belief.spread.tolist()}
+    if _is_discrete(values, distribution):
+        found = probabilities(population, address)
+        order = found.probabilities.argsort(descending=True, stable=True)[:LIKELIEST]
+        kept = found.probabilities[order]
+        others = max(0.0, 1.0 - float(kept.sum())) if len(order) < len(found.probabilities) else 0.0
+        return {
+            "kind": "discrete",
+            "values": found.values[order].tolist(),
+            "probabilities": kept.tolist(),
+            "others": others,
+        }
+    low, high = quantiles(population, address, list(INTERVAL))
+    middle = mean(population, address)
+    return {"kind": "real", "mean": middle.tolist(), "from": low.tolist(), "to": high.tolist()}
+
+
+def _is_discrete(values: Tensor, distribution: Any) -> bool:
+    if not values.is_floating_point():
+        return True
+    try:
+        return bool(support_of(distribution).is_discrete)
+    except (NotImplementedError, AttributeError):
+        return False
+
+
+def rows(summaries: Mapping[str, Mapping[str, Any]], pose: str) -> list[Row]:
+    """The rows of the table, of all sites but the sought pose."""
+    return [row for address, said in summaries.items() if address != pose for row in _rows(address, said)]
+
+
+def _rows(address: str, said: Mapping[str, Any]) -> Iterator[Row]:
+    if said["kind"] == "pose":
+        center, spread = torch.tensor(said["mean"], dtype=torch.float64), said["spread"]
+        turn = poses.local(poses.identity(), center)[3:].tolist()
+        millimetres = (_numbers([1e3 * x for x in part], 3) for part in (center[:3].tolist(), spread[:3]))
+        degrees = (_numbers([math.degrees(x) for x in part], 3) for part in (turn, spread[3:]))
+        yield Row(f"{address} x y z", f"{next(millimetres)} mm", f"± {next(millimetres)} mm")
+        yield Row(f"{address} turn", f"{next(degrees)}°", f"± {next(degrees)}°")
+    elif said["kind"] == "discrete":
+        pairs = zip(said["values"], said["probabilities"], strict=True)
+        likely = [f"{_value(value)}: {100 * share:.1f} %" for value, share in pairs]
+        if said["others"] > 0.0:
+            likely.append(f"others: {100 * said['others']:.1f} %")
+        yield Row(address, ", ".join(likely), "")
+    elif said["kind"] == "real":
+        middle, low, high = (torch.tensor(said[k], dtype=torch.float64) for k in ("mean", "from", "to"))
+        places = list(np.ndindex(*middle.shape))
+        for at in places[:ROWS]:
+            name = f"{address}[{', '.join(map(str, at))}]" if at else address
+            yield Row(name, f"{float(middle[at]):.4g}", f"{float(low[at]):.4g} to {float(high[at]):.4g}")
+        if len(places) > ROWS:
+            yield Row(f"{address}: {len(places) - ROWS} more", "in run.json", "")
+    else:
+        yield Row(address, said["kind"], "in the belief files")
+
+
+def _numbers(values: list[float], digits: int) -> str:
+    return " ".join(f"{value:.{digits}f}" for value in values)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list):
+        return f"({' '.join(map(_value, value))})"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def table(found: list[Row]) -> Table:
+    """The rows for a terminal."""
+    shown = Table(title="other latent values", title_justify="left", box=None, pad_edge=False)
+    for name in ("site", "mean (SI units) or probability", "90 % interval, or standard deviation"):
+        shown.add_column(name, justify="left")
+    for row in found:
+        shown.add_row(*map(escape, row))
+    return shown
+
+
+def why_no_truth_gap(model: Any, truth_is_known: bool, sites: Mapping[str, Any]) -> str | None:
+    """A line that says why the column is empty; None where it is not for want of the truth."""
+    if not truth_is_known:
+        return "ADD, truth gap: empty, for the recording does not know the truth."
+    if isinstance(model.program, Series):
+        return "truth gap: empty, for one true pose is known, and in this model the pose moves."
+    others = [address for address in sites if address != model.pose]
+    if others:
+        return (
+            "truth gap: empty, for only the pose's truth is known, and this model has "
+            f"{', '.join(others)} besides."
+        )
+    return None
