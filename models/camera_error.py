@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import NormalPose, prior_from_guess
 from bcppl.errors import InputError
@@ -59,6 +60,13 @@ class Settings:
     outlier: float = 0.1
     effective_pixels: float | None = 100.0
     bins: int = 3
+
+    def __post_init__(self) -> None:
+        for name in ("camera_shift", "camera_turn", "bias", "scale"):
+            number_within(
+                f"a site's spread must be positive and {name} is {{}}", getattr(self, name), above=0.0
+            )
+        whole_number("camera_error is given bins {}", self.bins)
 
 
 class Look(NamedTuple):
@@ -182,14 +190,18 @@ def seen_and_part(trace: Trace, spreads: Mapping[str, Tensor]) -> None:
 
 
 def prepare(recording: Recording, **settings: Any) -> Scene:
-    """The scene of a recording; `settings` are fields of `Settings`."""
+    """The scene of a recording; `settings` are fields of `Settings`.
+
+    Raises:
+        InputError: a spread is not positive, or a camera cannot see the part near its guess.
+    """
     chosen = Settings(**settings)
     guess = recording.guess
     within = float(np.linalg.norm(guess.translation))
     looks: dict[str, Look] = {}
     for camera in (m.action.camera for m in recording.measurements if isinstance(m.action, View)):
         if camera.name not in looks:
-            region = region_of(camera, recording.part, guess.world_from_part, within)
+            region = region_of(camera, recording.part, guess.world_from_part, within, chosen.bins)
             looks[camera.name] = Look(region, camera.cropped(*region).binned(chosen.bins))
     return Scene(prior_from_guess(guess), DepthRenderer(recording.part), looks, chosen)
 

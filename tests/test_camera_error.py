@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from scipy.stats import chi2
@@ -11,6 +13,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.depth import RobustDepth
+from bcppl.errors import InputError
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.kernels.kernel import takes
 from bcppl.inference.proposals import spread_of
@@ -92,6 +95,19 @@ def test_moving_the_part_alone_renders_nothing(recording: Recording) -> None:
     assert moved.known.keys() >= set(images)
     assert bool((moved.log_prob(*images) == before).all())
     assert trace.args[0].renderer.effort.items == rendered
+
+
+def test_what_makes_no_scene_is_refused_in_a_sentence(recording: Recording) -> None:
+    for settings, said in [
+        ({"bias": 0.0}, "a site's spread must be positive and bias is 0.0"),
+        ({"camera_shift": -0.002}, "camera_shift is -0.002"),
+        ({"bins": 0}, "bins 0"),
+    ]:
+        with pytest.raises(InputError, match=said):
+            camera_error.prepare(recording, **settings)
+    away = recording.guess.world_from_part + np.array([0.0, 5.0, 0, 0, 0, 0, 0])
+    with pytest.raises(InputError, match=r"cannot see part .* beside its image"):
+        camera_error.prepare(replace(recording, guess=replace(recording.guess, world_from_part=away)))
 
 
 def test_several_views_share_one_error() -> None:

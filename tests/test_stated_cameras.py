@@ -7,8 +7,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bcppl import poses
+from bcppl.errors import InputError
 from bcppl.simulators.camera import Camera, looking_at
 from bcppl.simulators.region import region_of
+from bcppl.simulators.renderer import DepthRenderer
 from bcppl.simulators.shapes import block_with_square_hole
 from bcppl.simulators.stated_cameras import apparent_covariance, line_of_sight, seen_elsewhere
 
@@ -73,6 +75,28 @@ def test_a_part_that_may_be_anywhere_within_reach_stays_in_its_region() -> None:
         inside = (left <= u) & (u <= left + width) & (top <= v) & (v <= top + height)
         outside = (u < 0) | (u > CAMERA.width - 1) | (v < 0) | (v > CAMERA.height - 1)
         assert (inside | outside).all()
+
+
+def test_a_part_at_the_image_s_edge_fills_as_many_pixels_as_asked_for_and_none_beside_it() -> None:
+    part, hidden, edge = block_with_square_hole(hole=0.016), 0, 0
+    renderer = DepthRenderer(part)
+    beside = poses.as_pose([0.0, 0, 0, 1, 0, 0, 0])
+    for away in np.linspace(0.1, 0.4, 61):
+        beside[:2] = torch.tensor([0.2, 0.3], dtype=torch.float64) * float(away) / 0.36
+        try:
+            left, top, width, height = region_of(CAMERA, part, beside, within=0.02, least=9)
+        except InputError as error:
+            assert "beside its image" in str(error)
+            assert not np.isfinite(renderer.images(CAMERA, beside[None])).any()
+            hidden += 1
+            continue
+        assert not hidden and min(width, height) >= 9
+        CAMERA.cropped(left, top, width, height).binned(9)
+        rows, columns = np.nonzero(np.isfinite(renderer.images(CAMERA, beside[None])[0]))
+        assert ((left <= columns) & (columns < left + width)).all()
+        assert ((top <= rows) & (rows < top + height)).all()
+        edge += width == 9
+    assert hidden > 5 and edge > 0
 
 
 def test_the_whole_image_where_the_part_may_be_behind_the_camera() -> None:
