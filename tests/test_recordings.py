@@ -461,7 +461,11 @@ WRONG: dict[str, tuple[Recording, str]] = {
     "peg poses short": (with_measurement(5, world_from_peg=np.zeros((2, 7))), "measurement 5's peg pose"),
     "wrench NaN": (
         with_measurement(1, wrench=changed(at(1, "wrench"), 4, 2, to=np.nan)),
-        "measurement 1 has a wrench that is not finite at row 4",
+        "measurement 1 has a wrench that is not finite at row 4; fill it by interpolation, or cut",
+    ),
+    "wrench NaN in a push": (
+        with_measurement(3, wrench=changed(at(3, "wrench"), 9, 2, to=np.nan)),
+        "measurement 3 has a wrench that is not finite at row 9; leave that row out",
     ),
     "wrench too large": (
         with_measurement(3, wrench=changed(at(3, "wrench"), 9, 2, to=-2e4)),

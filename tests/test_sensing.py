@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import doctest
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +14,7 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
+import bcppl.simulators.sensing
 from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.parts import Part, Piece
@@ -142,7 +145,90 @@ def test_a_simulated_wrench_with_the_tools_weight_and_a_bias_reads_as_without() 
     assert not torch.allclose(without, felt[0], atol=1e-3, equal_nan=True)
 
 
+def test_weights_in_no_orientation_are_refused() -> None:
+    for bad in (np.zeros(7), np.array([0, 0, 0, 2.0, 0, 0, 0]), np.full(7, np.nan)):
+        with pytest.raises(InputError, match="unit"):
+            LOAD.weight(bad)
+        with pytest.raises(InputError, match="unit"):
+            in_frame(np.ones(6), bad)
+
+
+def test_the_packages_example_does_what_it_says() -> None:
+    failed, tried = doctest.testmod(bcppl.simulators.sensing)
+    assert failed == 0 and tried > 20
+
+
 # ---------------------------------------------------------------- onset
+
+
+@pytest.mark.parametrize(("size", "slope"), [(3.0, 0.0), (4.0, 0.0), (8.0, 0.0), (0.0, 0.3), (0.0, 0.04)])
+def test_a_force_that_lasts_is_one_contact(size: float, slope: float) -> None:
+    times = np.arange(1000) / 100.0
+    for seed in range(3):
+        force = np.random.default_rng(seed).normal(size=(1000, 3))
+        force[300:, 2] += size + slope * np.arange(700)
+        (found,) = OnsetDetector().onsets(times, force)
+        assert 300 <= found.alarm < 500 and found.end == 1000
+
+
+def test_contact_is_over_soon_after_it_ends() -> None:
+    late, times = [], np.arange(800) / 100.0
+    for seed in range(20):
+        force = np.random.default_rng(seed).normal(size=(800, 3))
+        force[300:500, 0] += 4.0
+        force[650:700, 1] -= 8.0
+        first, second = OnsetDetector(rest=30).onsets(times, force)
+        assert first.alarm < first.end < second.alarm < second.end
+        late += [first.end - 500, second.end - 700]
+    assert min(late) >= -3 and np.quantile(late, 0.9) <= 6 and max(late) <= 30
+
+
+def test_the_onset_of_a_step_or_a_slow_rise_is_no_surer_than_it_is() -> None:
+    """A step is seen only at samples: what it is said to lie off by is a third of their distance."""
+    rng, times = np.random.default_rng(5), np.arange(250.0)
+    for step, slope in ((20.0, 0.0), (0.0, 0.3)):
+        scores, spreads = [], []
+        for _ in range(100):
+            began = 150.0 + rng.uniform()
+            height = np.where(times > began, step + slope * (times - began), 0.0)
+            force = rng.normal(size=(250, 3)) + height[:, None] * np.array([0.6, 0.0, 0.8])
+            (found,) = OnsetDetector().onsets(times, force)
+            scores.append((found.time - began) / found.spread)
+            spreads.append(found.spread)
+        assert abs(np.mean(scores)) < 0.6 and 0.75 < np.std(scores) < 1.3
+        assert step == 0.0 or np.median(spreads) == pytest.approx(12.0**-0.5, abs=0.06)
+
+
+def test_rows_that_are_missing_at_the_start_are_passed_over() -> None:
+    times, force = np.arange(300) / 100.0, np.random.default_rng(6).normal(size=(300, 3))
+    force[150:, 0] += 20.0
+    (plain,) = OnsetDetector().onsets(times[20:], force[20:])
+    (padded,) = OnsetDetector().onsets(times, np.where(np.arange(300)[:, None] < 20, np.nan, force))
+    assert (padded.alarm, padded.end) == (plain.alarm + 20, plain.end + 20)
+    assert (padded.time, padded.spread) == (plain.time, plain.spread)
+    force[200, 1] = np.inf
+    with pytest.raises(InputError, match="not finite at row 200"):
+        OnsetDetector().onsets(times, force)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"limit": math.nan},
+        {"drift": math.inf},
+        {"rest": 10.5},
+        {"rest": 4},
+        {"before": math.nan},
+        {"after": -1},
+        {"quiet": 0},
+        {"threshold": math.nan},
+        {"release": 1.5},
+        {"resolution": -1.0},
+    ],
+)
+def test_settings_that_find_no_onset_are_refused(bad: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=f"{next(iter(bad))} = "):
+        OnsetDetector(**bad)
 
 
 def test_an_onset_is_found_when_it_was_as_surely_as_it_says() -> None:
@@ -329,6 +415,16 @@ def test_wrenches_that_say_nothing_have_no_candidates_and_bad_ones_are_refused()
         sensing.candidates(seen, np.zeros((6, 6)))
     with pytest.raises(InputError, match=r"\(wrenches, 6\)"):
         sensing.candidates(seen[0], COVARIANCE)
+    with pytest.raises(InputError, match="not symmetric"):
+        sensing.candidates(seen, COVARIANCE + np.triu(np.full((6, 6), 1e-4), 1))
+    for most, least in ((0, 0.1), (2.5, 0.1), (8, math.nan), (8, 1.0)):
+        with pytest.raises(InputError, match="candidates are asked for"):
+            sensing.candidates(seen, COVARIANCE, most, least)
+    # The noise of single samples stands for its covariance.
+    noise = WrenchNoise(0.05, 0.002)
+    np.testing.assert_array_equal(
+        sensing.candidates(seen, noise).location, sensing.candidates(seen, noise.covariance()).location
+    )
 
 
 def test_noise_is_what_is_left_of_it() -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -151,6 +154,63 @@ def test_a_measured_recording_is_read_by_the_same_code() -> None:
         Sensing(PEG, rate=500.0).measure(touches)
     with pytest.raises(InputError, match="cutoff"):
         Sensing(PEG, rate=30.0)
+
+
+def test_a_missing_wrench_is_refused_where_a_filter_would_carry_it_on() -> None:
+    sensing, times = Sensing(PEG, rate=100.0), np.arange(80) / 100.0
+    pose, signal = np.tile([0.0, 0, 0, 1, 0, 0, 0], (80, 1)), np.zeros((80, 6))
+    signal[20:] = wrench(np.array([0.003, -0.002, -0.05]), np.array([0.5, 0, 8.0]))
+
+    def windows(row: int, column: int) -> list[Touch]:
+        bad = signal.copy()
+        bad[row, column] = np.nan if column else np.inf
+        return [Touch(times[a:b], bad[a:b], pose[a:b]) for a, b in ((0, 30), (30, 80))]
+
+    for row, column, said in ((50, 4, "window 1 .* row 20"), (4, 0, "window 0 .* row 4")):
+        with pytest.raises(InputError, match=f"{said}; fill it by interpolation, or cut the recording there"):
+            sensing.measure(windows(row, column))
+    # Nothing carries it on where nothing is filtered, unless it is in the zero.
+    tared = torch.cat(sensing.tared(windows(50, 4)))
+    assert torch.isnan(tared).any(dim=1).nonzero().flatten().tolist() == [*range(10), 50]
+    with pytest.raises(InputError, match=r"window 0 .* row 4"):
+        sensing.tared(windows(4, 0))
+    # What was simulated and diverged is no contact, as it was.
+    lost, _ = sensing.contacts(np.where(np.arange(80)[:, None] < 50, signal, np.nan)[None], sensing.start(1))
+    assert torch.from_numpy(lost[0]).isfinite().all(dim=-1).nonzero().max() == 49
+    pose[7, 2] = np.nan
+    with pytest.raises(InputError, match="window 0 has a peg pose that is not finite at row 7"):
+        sensing.measure(windows(50, 4))
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"friction": math.nan},
+        {"friction": -1.0},
+        {"miss_tolerance": math.nan},
+        {"force": math.inf},
+        {"tare": 2.5},
+        {"tare": -1},
+        {"rate": math.nan},
+    ],
+)
+def test_settings_that_read_no_contact_are_refused(bad: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=f"sensing has {next(iter(bad))} = "):
+        Sensing(PEG, **({"rate": 100.0} | bad))
+
+
+def test_a_peg_may_be_doubled_at_its_seams_but_not_open() -> None:
+    with pytest.raises(InputError, match="open mesh"):
+        Sensing(replace(PEG, faces=PEG.faces[:-2]), rate=100.0)
+    seams = replace(
+        PEG, vertices=PEG.vertices[PEG.faces].reshape(-1, 3), faces=np.arange(PEG.faces.size).reshape(-1, 3)
+    )
+    points, force = random_contacts()
+    np.testing.assert_allclose(
+        Sensing(seams, rate=100.0).locate(wrench(points, force)),
+        PLAIN.locate(wrench(points, force)),
+        atol=1e-12,
+    )
 
 
 def test_the_wrench_of_a_window_is_what_contacts_are_read_from() -> None:

@@ -105,12 +105,22 @@ def test_diverged_particles_are_impossible_and_bad_settings_refused() -> None:
         {"relative": -1.0},
         {"outlier": 0.0},
         {"every": 0},
+        {"every": 2.5},
+        {"last": 1.0},
         {"bias": torch.zeros(6)},
         {"first": 2},
     ):
         given = {"first": 0, "last": 1, "force_scale": 0.3, "torque_scale": 0.02} | bad
         with pytest.raises(InputError, match="Wrench"):
             Wrench(track, **given)
+
+
+def test_an_observation_of_other_stamps_is_refused() -> None:
+    likelihood = Wrench(told(3, stamps=100), 0, 100, 0.3, 0.02)
+    for shape in ((1, 6), (90, 6), (100, 3), (3, 1, 6), (6,)):
+        with pytest.raises(InputError, match="100 stamps but its observation"):
+            likelihood.log_prob(torch.zeros(shape, dtype=torch.float64))
+    assert likelihood.log_prob(torch.zeros(3, 100, 6, dtype=torch.float64)).shape == (3,)
 
 
 def test_the_truth_explains_its_own_wrench_best() -> None:

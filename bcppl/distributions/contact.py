@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arguments import whole_number
 from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.stamps import checked_event, checked_stamps
 from bcppl.errors import InputError
 
 
@@ -51,11 +53,6 @@ def chamfer(a: Tensor, b: Tensor, one_empty: float) -> Tensor:
     distance = mean_to_nearest(-1, in_a, count_a) + mean_to_nearest(-2, in_b, count_b)
     distance = torch.where((count_a == 0) != (count_b == 0), one_empty, distance)
     return torch.where((count_a == 0) & (count_b == 0), 0.0, distance)
-
-
-def _check_window(name: str, first: int, last: int) -> None:
-    if not 0 <= first < last:
-        raise InputError(f"{name} is given stamps {first} to {last}; the first must come before the last.")
 
 
 def _check_positive(name: str, **settings: float) -> None:
@@ -101,7 +98,7 @@ class ChamferContacts(LazyDistribution):
         one_empty: float,
         noise: tuple[float, float] = (0.0005, 0.02),
     ) -> None:
-        _check_window("ChamferContacts", first, last)
+        first, last = checked_stamps("ChamferContacts", first, last)
         _check_positive("ChamferContacts", scale=scale, one_empty=one_empty)
         if noise[0] < 0 or not 0 <= noise[1] <= 1:
             raise InputError(
@@ -117,7 +114,12 @@ class ChamferContacts(LazyDistribution):
         return 0.0
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log of the surrogate (N,) of locations (T, 3), or (N, T, 3)."""
+        """Log of the surrogate (N,) of locations (T, 3), or (N, T, 3).
+
+        Raises:
+            InputError: there are not as many rows as stamps.
+        """
+        value = checked_event("ChamferContacts", value, self.last - self.first, 3)
         contacts, _ = self.track.window(self.first, self.last)
         log_prob = -chamfer(contacts, value, self.one_empty) / (2.0 * self.scale**2)
         return torch.where(self.track.diverged, -math.inf, log_prob)
@@ -169,8 +171,9 @@ class ContactsInTime(LazyDistribution):
         reach: float = 0.05,
         every: int = 10,
     ) -> None:
-        _check_window("ContactsInTime", first, last)
-        _check_positive("ContactsInTime", scale=scale, reach=reach, every=every)
+        first, last = checked_stamps("ContactsInTime", first, last)
+        every = whole_number("ContactsInTime has every = {}", every)
+        _check_positive("ContactsInTime", scale=scale, reach=reach)
         for name, value in (("missed", missed), ("invented", invented), ("outlier", outlier)):
             if not 0 < value < 1:
                 raise InputError(
@@ -182,7 +185,12 @@ class ContactsInTime(LazyDistribution):
         super().__init__(len(track), (last - first, 3), track.inputs)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-probability (N,) of locations (T, 3), or (N, T, 3)."""
+        """Log-probability (N,) of locations (T, 3), or (N, T, 3).
+
+        Raises:
+            InputError: there are not as many rows as stamps.
+        """
+        value = checked_event("ContactsInTime", value, self.last - self.first, 3)
         contacts, _ = self.track.window(self.first, self.last)
         chosen = slice(-self.first % self.every, None, self.every)
         contacts = contacts[:, chosen]
@@ -252,10 +260,9 @@ class PegPose(LazyDistribution):
         rotation_scale: float,
         every: int = 10,
     ) -> None:
-        _check_window("PegPose", first, last)
-        _check_positive(
-            "PegPose", translation_scale=translation_scale, rotation_scale=rotation_scale, every=every
-        )
+        first, last = checked_stamps("PegPose", first, last)
+        every = whole_number("PegPose has every = {}", every)
+        _check_positive("PegPose", translation_scale=translation_scale, rotation_scale=rotation_scale)
         self.track, self.first, self.last = track, first, last
         self.translation_scale, self.rotation_scale, self.every = translation_scale, rotation_scale, every
         super().__init__(len(track), (last - first, 7), track.inputs)
@@ -271,7 +278,12 @@ class PegPose(LazyDistribution):
         return stamps * float(self._log_translation(none) + self._log_rotation(none))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-probability (N,) of poses (T, 7), or (N, T, 7)."""
+        """Log-probability (N,) of poses (T, 7), or (N, T, 7).
+
+        Raises:
+            InputError: there are not as many rows as stamps.
+        """
+        value = checked_event("PegPose", value, self.last - self.first, 7)
         _, simulated = self.track.window(self.first, self.last)
         chosen = slice(-self.first % self.every, None, self.every)
         lost = self.track.diverged

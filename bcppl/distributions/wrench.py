@@ -8,7 +8,9 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from bcppl.arguments import whole_number
 from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.stamps import checked_event, checked_stamps
 from bcppl.errors import InputError
 
 WIDER = 10.0  # the wide component's scale over the narrow one's
@@ -64,6 +66,9 @@ class Wrench(LazyDistribution):
         every: stamps whose number is a multiple of this are looked at, for errors of neighbours go together.
         bias: (N, 6) what the sensor reads without contact; None for zero. It may be latent, and differ from
             window to window where the sensor drifts.
+
+    Raises:
+        InputError: a setting is out of range, or a stamp or `every` no whole number.
     """
 
     cost = 2
@@ -80,11 +85,9 @@ class Wrench(LazyDistribution):
         every: int = 10,
         bias: Tensor | None = None,
     ) -> None:
-        if not 0 <= first < last:
-            raise InputError(
-                f"Wrench is given stamps {first} to {last}; the first must come before the last."
-            )
-        for name, value in (("force_scale", force_scale), ("torque_scale", torque_scale), ("every", every)):
+        first, last = checked_stamps("Wrench", first, last)
+        every = whole_number("Wrench has every = {}", every)
+        for name, value in (("force_scale", force_scale), ("torque_scale", torque_scale)):
             if not (math.isfinite(value) and value > 0):
                 raise InputError(f"Wrench has {name} = {value!r}; give a number greater than 0.")
         if not (math.isfinite(relative) and relative >= 0):
@@ -132,7 +135,12 @@ class Wrench(LazyDistribution):
         return torch.logaddexp(narrow, gaussian(WIDER * scale) + math.log(self.outlier))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-density (N,) of wrenches (T, 6), or (N, T, 6)."""
+        """Log-density (N,) of wrenches (T, 6), or (N, T, 6).
+
+        Raises:
+            InputError: there are not as many rows as stamps.
+        """
+        value = checked_event("Wrench", value, self.last - self.first, 6)
         chosen = slice(-self.first % self.every, None, self.every)
         expected, force, torque = (each[:, chosen] for each in self._simulated())
         value = value.to(torch.float64)[..., chosen, :]

@@ -21,6 +21,7 @@ Array = npt.NDArray[np.float64]
 MOST_FORCE = 1e4  # N or N m: beyond it a sensor would have been torn off, so the units are wrong
 MOST_DEPTH = 100.0  # m: beyond it a median depth is in millimetres
 SAME_TIME = 1e-6  # s: two clocks that were copied agree to this
+LEAVE_OUT, FILL = "leave that row out", "fill it by interpolation, or cut the recording there"
 
 
 def problems(recording: Recording) -> list[str]:
@@ -230,11 +231,11 @@ def _depth(where: str, depth: Array, camera: Camera) -> Iterator[str]:
         )
 
 
-def _times(what: str, times: Array) -> Iterator[str]:
+def _times(what: str, times: Array, remedy: str = LEAVE_OUT) -> Iterator[str]:
     if times.ndim != 1 or times.size == 0:
         yield f"{what} has times of shape {times.shape}; give at least one time (T,), in seconds."
     elif not (finite := np.isfinite(times)).all():
-        yield f"{what} has a time that is not finite at row {_first(~finite)}; leave that row out."
+        yield f"{what} has a time that is not finite at row {_first(~finite)}; {remedy}."
     elif (np.diff(times) <= 0).any():
         row = _first(np.diff(times) <= 0) + 1
         verb = "stand still" if times[row] == times[row - 1] else "run backwards"
@@ -248,14 +249,14 @@ def _first(where: npt.ArrayLike) -> int:
     return int(np.argmax(where))
 
 
-def _rows(what: str, poses: Array, times: Array) -> Iterator[str]:
+def _rows(what: str, poses: Array, times: Array, remedy: str = LEAVE_OUT) -> Iterator[str]:
     """Poses (R, 7), one for each of R times."""
     if poses.shape != (*times.shape, 7):
         yield f"{what} has {poses.shape} for {times.shape} times; give x y z qw qx qy qz for each time."
         return
     finite = np.isfinite(poses).all(axis=1)
     if not finite.all():
-        yield f"{what} has a number that is not finite at row {_first(~finite)}; leave that row out."
+        yield f"{what} has a number that is not finite at row {_first(~finite)}; {remedy}."
         return
     length = np.linalg.norm(poses[:, 3:], axis=1)
     if (np.abs(length - 1) > 1e-3).any():
@@ -266,7 +267,7 @@ def _rows(what: str, poses: Array, times: Array) -> Iterator[str]:
 def _probe(what: str, probe: Probe) -> Iterator[str]:
     yield from _times(f"{what}'s command", probe.command_times)
     yield from _rows(f"{what}'s command (world_from_peg)", probe.command, probe.command_times)
-    yield from _times(f"{what}'s stamps", probe.stamps)
+    yield from _times(f"{what}'s stamps", probe.stamps, FILL)
     for name, values in (("stiffness", probe.stiffness), ("damping", probe.damping)):
         if values.shape != (6,) or not np.isfinite(values).all() or (values < 0).any():
             yield f"{what} has a {name} that is not six finite numbers of at least 0; give one for each axis."
@@ -313,9 +314,11 @@ def _push_covers(where: str, push: Push, touch: Touch) -> Iterator[str]:
 
 
 def _touch(where: str, touch: Touch, poses: bool) -> Iterator[str]:
-    yield from _times(f"{where}'s wrench", touch.times)
+    # A window is read at an even rate, at its probe's stamps: without a row it would fit neither.
+    remedy = FILL if poses else LEAVE_OUT
+    yield from _times(f"{where}'s wrench", touch.times, remedy)
     if poses:
-        yield from _rows(f"{where}'s peg pose (world_from_peg)", touch.world_from_peg, touch.times)
+        yield from _rows(f"{where}'s peg pose (world_from_peg)", touch.world_from_peg, touch.times, remedy)
     if touch.wrench.shape != (*touch.times.shape, 6):
         yield (
             f"{where} has wrenches {touch.wrench.shape} for {touch.times.shape} times; "
@@ -324,7 +327,7 @@ def _touch(where: str, touch: Touch, poses: bool) -> Iterator[str]:
         return
     finite = np.isfinite(touch.wrench).all(axis=1)
     if not finite.all():
-        yield f"{where} has a wrench that is not finite at row {_first(~finite)}; leave that row out."
+        yield f"{where} has a wrench that is not finite at row {_first(~finite)}; {remedy}."
         return
     largest = np.abs(touch.wrench).max(axis=1)
     if (largest > MOST_FORCE).any():

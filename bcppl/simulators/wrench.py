@@ -20,10 +20,12 @@ from embreex.rtcore_scene import EmbreeScene
 from scipy.signal import butter, sosfilt
 from torch import Tensor
 
+from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.recordings.measurements import Touch
 from bcppl.simulators.sensing.load import ToolLoad
+from bcppl.simulators.sensing.surface import closed_mesh
 from bcppl.simulators.sensing.units import refuse_millimetres
 
 Array = npt.NDArray[np.float64]
@@ -73,6 +75,9 @@ class Sensing:
             the nearest point of the peg's convex hull is the contact; beyond it there is none.
         load: the tool's mass and centre, whose weight a measured wrench holds; None where the sensor or the
             arm has taken it off already. A simulated wrench never holds it.
+
+    Raises:
+        InputError: the peg's mesh is empty, open, not finite or in millimetres, or a setting is out of range.
     """
 
     peg: Part
@@ -85,16 +90,16 @@ class Sensing:
     load: ToolLoad | None = None
 
     def __post_init__(self) -> None:
-        if not self.rate > 0 or self.tare < 0 or not self.force > 0 or self.miss_tolerance < 0:
-            raise InputError(
-                f"sensing has rate {self.rate}, tare {self.tare}, force {self.force}, miss_tolerance "
-                f"{self.miss_tolerance}; rate and force must be positive, the others not negative."
-            )
+        for name in ("rate", "force", "friction"):
+            number_within(f"sensing has {name} = {{}}", getattr(self, name), above=0.0)
+        number_within("sensing has miss_tolerance = {}", self.miss_tolerance, least=0.0)
+        whole_number("sensing has tare = {}", self.tare, least=0)
         if self.cutoff is not None and not 0 < self.cutoff < 0.5 * self.rate:
             raise InputError(
                 f"the low-pass cutoff is {self.cutoff} Hz at {self.rate} samples per second; "
                 "give less than half the rate, or None."
             )
+        closed_mesh(self.peg)
 
     @cached_property
     def sections(self) -> Array:
@@ -268,12 +273,15 @@ class Sensing:
         from; the filter is carried from window to window. The tool's weight is taken off first.
 
         Raises:
-            InputError: a window's samples are not `rate` per second within 2 %, its arrays do not fit, or its
-                torques are in N mm.
+            InputError: a window's samples are not `rate` per second within 2 %, its arrays do not fit, a
+                wrench is not finite (the filter would carry it into all that come after), or its torques are
+                in N mm.
         """
         state, measured = self.start(1), []
         for k, touch in enumerate(touches):
-            cleaned, state = self.clean(self._weightless(touch, f"window {k}")[None], state)
+            wrench = self._weightless(touch, f"window {k}")
+            _refuse_missing(wrench, f"window {k}")
+            cleaned, state = self.clean(wrench[None], state)
             refuse_millimetres(
                 cleaned[self._touching(cleaned)], float(np.linalg.norm(self._ball[0])) + self._ball[1]
             )
@@ -284,15 +292,20 @@ class Sensing:
     def tared(self, touches: Sequence[Touch]) -> list[Tensor]:
         """The wrench (T, 6) of the same windows, free of the tool's weight and tared but not filtered.
 
-        NaN while taring: what `bcppl.distributions.wrench.Wrench` compares with the simulated one.
+        NaN while taring: what `bcppl.distributions.wrench.Wrench` compares with the simulated one, and
+        `bcppl.simulators.sensing.onset.OnsetDetector` passes over. A later wrench that is not finite stays
+        so, for nothing carries it on.
 
         Raises:
-            InputError: as for `measure`.
+            InputError: a window's samples are not `rate` per second within 2 %, its arrays do not fit, or a
+                wrench is not finite while taring.
         """
         plain = replace(self, cutoff=None)
         state, measured = plain.start(1), []
         for k, touch in enumerate(touches):
-            cleaned, state = plain.clean(self._weightless(touch, f"window {k}")[None], state)
+            wrench = self._weightless(touch, f"window {k}")
+            _refuse_missing(wrench[: self.tare - state.tare.shape[1]], f"window {k}")
+            cleaned, state = plain.clean(wrench[None], state)
             measured.append(torch.from_numpy(cleaned[0]))
         return measured
 
@@ -304,6 +317,22 @@ class Sensing:
                 f"{name} has {count} times, wrenches {touch.wrench.shape} and peg poses "
                 f"{touch.world_from_peg.shape}; give (T,), (T, 6) and (T, 7)."
             )
+        if not np.isfinite(touch.world_from_peg).all():
+            row = int((~np.isfinite(touch.world_from_peg).all(axis=1)).argmax())
+            raise InputError(
+                f"{name} has a peg pose that is not finite at row {row}; fill it by interpolation, "
+                "or cut the recording there."
+            )
         self.check_rate(touch.times, name)
         wrench = touch.wrench.astype(np.float64)
         return wrench if self.load is None else wrench - self.load.weight(touch.world_from_peg)
+
+
+def _refuse_missing(wrench: Array, name: str) -> None:
+    """Refuse measured wrenches (T, 6) of which one is not finite."""
+    missing = ~np.isfinite(wrench).all(axis=1)
+    if missing.any():
+        raise InputError(
+            f"{name} has a wrench that is not finite at row {int(missing.argmax())}; fill it by "
+            "interpolation, or cut the recording there."
+        )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 
 Array = npt.NDArray[np.float64]
@@ -151,7 +152,12 @@ class SurfacePosterior:
         Args:
             most: K, how many are kept.
             least: probability below which a stretch is left out.
+
+        Raises:
+            InputError: `most` is no whole number above 0, or `least` no probability below 1.
         """
+        most = whole_number("candidates are asked for with most = {}", most)
+        least = number_within("candidates are asked for with least = {}", least, least=0.0, below=1.0)
         nodes, mass, rows = self.nodes, self.mass, len(self)
         empty = Candidates(
             np.full((rows, most, 3), np.nan),

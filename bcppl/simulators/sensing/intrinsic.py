@@ -25,6 +25,7 @@ from scipy.special import log_ndtr
 from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.simulators.sensing.candidates import CORNER, EDGE, FACE, Candidates, Nodes, SurfacePosterior
+from bcppl.simulators.sensing.noise import WrenchNoise, checked_covariance
 from bcppl.simulators.sensing.surface import PegSurface
 from bcppl.simulators.sensing.units import refuse_millimetres
 
@@ -75,17 +76,20 @@ class IntrinsicSensing:
         """The peg's, prepared."""
         return PegSurface(self.peg)
 
-    def candidates(self, wrench: Array, covariance: Array, most: int = 8, least: float = 0.005) -> Candidates:
+    def candidates(
+        self, wrench: Array, covariance: Array | WrenchNoise, most: int = 8, least: float = 0.005
+    ) -> Candidates:
         """The candidates of wrenches (M, 6): see `posterior` and `SurfacePosterior.candidates`."""
         return self.posterior(wrench, covariance).candidates(most, least)
 
-    def posterior(self, wrench: Array, covariance: Array) -> SurfacePosterior:
+    def posterior(self, wrench: Array, covariance: Array | WrenchNoise) -> SurfacePosterior:
         """What wrenches say of where the peg is touched.
 
         Args:
             wrench: (M, 6) force (N) and torque (N m) on the peg, in its frame about its origin: tared, free
                 of the tool's weight, averaged or filtered.
-            covariance: (6, 6), or (M, 6, 6), of their noise: `WrenchNoise.covariance`.
+            covariance: (6, 6), or (M, 6, 6), of their noise: `WrenchNoise.covariance`. A `WrenchNoise` itself
+                is that of wrenches that are single samples, neither averaged nor filtered.
 
         Returns:
             The posterior of each wrench. It has no nodes for a wrench that is not finite, or whose force is
@@ -94,12 +98,13 @@ class IntrinsicSensing:
             enough?), a torque about the line that only several contacts can make.
 
         Raises:
-            InputError: shapes do not fit, a covariance is not positive definite, or torques are in N mm.
+            InputError: shapes do not fit, a covariance is not symmetric and positive definite, or torques are
+                in N mm.
         """
         wrench = np.asarray(wrench, dtype=np.float64)
         if wrench.ndim != 2 or wrench.shape[1] != 6:
             raise InputError(f"wrenches have shape {wrench.shape}; give (wrenches, 6).")
-        covariance = _checked(covariance, len(wrench))
+        covariance = checked_covariance(covariance, len(wrench))
         rows = np.flatnonzero(np.isfinite(wrench).all(axis=1))
         noise = np.linalg.eigvalsh(_of_rows(covariance, rows)[..., :3, :3])[..., -1]
         clear = np.linalg.norm(wrench[rows, :3], axis=1) > _WEAKEST * np.sqrt(noise)
@@ -114,18 +119,23 @@ class IntrinsicSensing:
         return SurfacePosterior.of(Nodes.joined(parts), len(wrench))
 
     def credible_level(
-        self, posterior: SurfacePosterior, wrench: Array, covariance: Array, point: Array, normals: Array
+        self,
+        posterior: SurfacePosterior,
+        wrench: Array,
+        covariance: Array | WrenchNoise,
+        point: Array,
+        normals: Array,
     ) -> Array:
         """The level (M,) of the smallest credible region that holds a point (M, 3) on the surface.
 
         Args:
             posterior: of these wrenches.
             wrench: (M, 6).
-            covariance: (6, 6) or (M, 6, 6).
+            covariance: (6, 6) or (M, 6, 6), or a `WrenchNoise`.
             point: (M, 3) in the peg's frame.
             normals: (M, K, 3) outward, of the face there, or of those that meet there and between.
         """
-        covariance = _checked(covariance, len(wrench))
+        covariance = checked_covariance(covariance, len(wrench))
         score, *_ = self._log_likelihood(wrench, covariance, point, normals)
         level = posterior.mass_above(score)
         return np.where(np.isfinite(posterior.log_evidence), level, 1.0)
@@ -312,20 +322,6 @@ def _of_residual(point: Array, covariance: Array) -> Array:
     moved = lever @ mixed
     # The transpose of a cross matrix is its negative.
     return np.asarray(torque - moved - np.swapaxes(moved, 1, 2) - lever @ force @ lever)
-
-
-def _checked(covariance: Array, wrenches: int) -> Array:
-    """Covariances (6, 6) or (M, 6, 6), as float64."""
-    covariance = np.asarray(covariance, dtype=np.float64)
-    if covariance.shape not in ((6, 6), (wrenches, 6, 6)):
-        raise InputError(
-            f"the wrenches' covariance has shape {covariance.shape} for {wrenches} wrenches; "
-            "give (6, 6) or (wrenches, 6, 6)."
-        )
-    least = np.linalg.eigvalsh(covariance).min(initial=1.0) if np.isfinite(covariance).all() else -1.0
-    if not least > 0:
-        raise InputError("the wrenches' covariance is not positive definite; give every axis some noise.")
-    return covariance
 
 
 def _of_rows(covariance: Array, rows: Indices) -> Array:

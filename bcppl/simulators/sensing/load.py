@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from bcppl.errors import InputError
+from bcppl.poses import as_pose
 
 Array = npt.NDArray[np.float64]
 
@@ -52,7 +53,7 @@ class ToolLoad:
         the wrench.
 
         Raises:
-            InputError: the poses do not end in seven finite numbers.
+            InputError: a pose is not seven finite numbers with a unit quaternion.
         """
         force = self.mass * gravity_in(world_from_sensor, self.gravity)
         center = np.asarray(self.center, dtype=np.float64)
@@ -63,14 +64,9 @@ def gravity_in(world_from_sensor: Array, gravity: tuple[float, float, float] = S
     """Gravity (..., 3) in the axes of sensors at poses (..., 7), m/s^2.
 
     Raises:
-        InputError: the poses do not end in seven finite numbers.
+        InputError: a pose is not seven finite numbers with a unit quaternion.
     """
-    pose = np.asarray(world_from_sensor, dtype=np.float64)
-    if pose.ndim == 0 or pose.shape[-1] != 7 or not np.isfinite(pose).all():
-        raise InputError(
-            f"the sensor's poses have shape {pose.shape} or are not finite; "
-            "give x y z qw qx qy qz in the last dimension."
-        )
+    pose = as_pose(world_from_sensor, "a sensor's pose").numpy()
     if pose.size == 0:
         return np.empty((*pose.shape[:-1], 3))
     turn = Rotation.from_quat(pose.reshape(-1, 7)[:, [4, 5, 6, 3]])
@@ -85,9 +81,10 @@ def in_frame(wrench: Array, to_from_from: Array) -> Array:
         to_from_from: (7,) the pose that takes from the wrench's frame to the other: `peg_from_sensor`.
 
     Raises:
-        InputError: the shapes do not fit.
+        InputError: the shapes do not fit, or the pose holds no unit quaternion.
     """
-    wrench, pose = np.asarray(wrench, dtype=np.float64), np.asarray(to_from_from, dtype=np.float64)
+    wrench = np.asarray(wrench, dtype=np.float64)
+    pose = as_pose(to_from_from, "the pose from one wrench's frame to the other").numpy()
     if wrench.ndim == 0 or wrench.shape[-1] != 6 or pose.shape != (7,):
         raise InputError(
             f"wrenches have shape {wrench.shape} and the pose {pose.shape}; give (..., 6) and (7,)."

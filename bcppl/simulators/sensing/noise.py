@@ -43,6 +43,29 @@ class WrenchNoise:
         return share * np.diag([self.force**2] * 3 + [self.torque**2] * 3)
 
 
+def checked_covariance(given: Array | WrenchNoise, wrenches: int) -> Array:
+    """Covariances (6, 6) or (M, 6, 6) of M wrenches, as float64.
+
+    Raises:
+        InputError: the shape does not fit, or one is not symmetric and positive definite.
+    """
+    covariance = given.covariance() if isinstance(given, WrenchNoise) else np.asarray(given, np.float64)
+    if covariance.shape not in ((6, 6), (wrenches, 6, 6)):
+        raise InputError(
+            f"the wrenches' covariance has shape {covariance.shape} for {wrenches} wrenches; "
+            "give (6, 6) or (wrenches, 6, 6)."
+        )
+    turned = np.swapaxes(covariance, -1, -2)
+    scale = np.sqrt(np.abs(np.diagonal(covariance, axis1=-2, axis2=-1)))
+    if (np.abs(covariance - turned) > 1e-6 * scale[..., None] * scale[..., None, :]).any():
+        raise InputError("the wrenches' covariance is not symmetric; give one that equals its transpose.")
+    covariance = 0.5 * (covariance + turned)
+    least = np.linalg.eigvalsh(covariance).min(initial=1.0) if np.isfinite(covariance).all() else -1.0
+    if not least > 0:
+        raise InputError("the wrenches' covariance is not positive definite; give every axis some noise.")
+    return covariance
+
+
 def noise_at_rest(wrench: Array) -> WrenchNoise:
     """The noise of samples (n, 6) without contact: their scatter about their mean, all axes alike.
 

@@ -53,6 +53,20 @@ class Edges(NamedTuple):
     chain: Indices
 
 
+def closed_mesh(part: Part) -> trimesh.Trimesh:
+    """A part's mesh, its doubled vertices merged and its empty triangles left out.
+
+    Raises:
+        InputError: it is empty, open, not finite or in millimetres.
+    """
+    mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+    if len(part.vertices) and len(part.faces):
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        mesh.update_faces(mesh.nondegenerate_faces())
+    Part(part.name, np.asarray(mesh.vertices), np.asarray(mesh.faces)).check()
+    return mesh
+
+
 class PegSurface:
     """The surface of a part that is touched, in its frame.
 
@@ -71,11 +85,7 @@ class PegSurface:
         Raises:
             InputError: its mesh is empty, open, not finite or in millimetres.
         """
-        mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
-        mesh.merge_vertices(merge_tex=True, merge_norm=True)
-        mesh.update_faces(mesh.nondegenerate_faces())
-        Part(part.name, np.asarray(mesh.vertices), np.asarray(mesh.faces)).check()
-        self.mesh = mesh
+        self.mesh = mesh = closed_mesh(part)
         vertices = np.asarray(mesh.vertices, dtype=np.float64)
         self.center = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         self.radius = float(np.linalg.norm(vertices - self.center, axis=1).max())
