@@ -66,7 +66,7 @@ def number_within(
     """
     try:
         number = math.nan if isinstance(value, str | bytes | bool) else float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         number = math.nan
     if math.isfinite(number) and above < number < below and least <= number <= most:
         return number
@@ -76,4 +76,8 @@ def number_within(
 
 
 def _said(what: str, value: object) -> str:
-    return what.replace("{}", repr(value))
+    try:
+        said = repr(value)
+    except ValueError:  # Python spells no whole number of more than 4300 digits
+        said = "a number too long to print"
+    return what.replace("{}", said if len(said) <= 200 else f"{said[:30]}... ({len(said)} characters)")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 import trimesh
 
+from bcppl import poses
 from bcppl.errors import InputError
 
 Array = npt.NDArray[np.float64]
@@ -74,11 +75,37 @@ class Part:
         points, _ = trimesh.sample.sample_surface(self.mesh, count, seed=seed)
         return np.ascontiguousarray(points, dtype=np.float64)
 
+    def moved(self, new_from_old: object, name: str | None = None) -> Part:
+        """The same solid seen from another frame: what stood at p in the old one stands at new_from_old p.
+
+        A peg whose mesh begins at its lower end gets its frame at the wrench sensor, 50 mm above the tip,
+        with `peg.moved([0, 0, -0.05, 1, 0, 0, 0])`. A box that ends up askew becomes the hull of its corners.
+
+        Args:
+            new_from_old: (7,) pose of the old frame in the new one.
+            name: of the new part; None for this one's.
+
+        Raises:
+            InputError: it is no pose, or tilts a cylinder, which must stay along z.
+        """
+        pose = poses.as_pose(new_from_old, f"the new frame of part {self.name!r}").detach().cpu()
+        if pose.shape != (7,):
+            raise InputError(
+                f"the new frame of part {self.name!r} has shape {tuple(pose.shape)}; give one pose (7,)."
+            )
+        rotation, shift = poses.rotation_matrix(pose).numpy(), pose[:3].numpy()
+        return replace(
+            self,
+            name=self.name if name is None else name,
+            vertices=self.vertices @ rotation.T + shift,
+            pieces=tuple(_moved(piece, rotation, shift, self.name) for piece in self.pieces),
+        )
+
     def check(self, closed: bool = True) -> None:
         """Refuse a mesh that cannot be rendered or touched.
 
         Raises:
-            InputError: the mesh is empty, not finite, larger than 5 m, or (with `closed`) open.
+            InputError: the mesh is empty, not finite, larger than 5 m, or (with `closed`) open or inside out.
         """
         if len(self.faces) == 0 or len(self.vertices) == 0:
             raise InputError(f"part {self.name!r} has an empty mesh; export it again with its triangles.")
@@ -99,3 +126,27 @@ class Part:
                 f"part {self.name!r} has an open mesh ({edges} open edges); close its holes, "
                 "or merge vertices that are doubled at seams."
             )
+        if closed and self.mesh.volume < -1e-9 * self.extent.max() ** 3:
+            raise InputError(
+                f"part {self.name!r} has a mesh that is inside out (its volume is {self.mesh.volume:.3g} "
+                "m^3); turn its faces with faces[:, ::-1]."
+            )
+
+
+def _moved(piece: Piece, rotation: Array, shift: Array, name: str) -> Piece:
+    """A piece in another frame, exactly."""
+    if piece.kind == "hull":
+        return replace(piece, size=piece.size @ rotation.T + shift)
+    center = rotation @ piece.center + shift
+    if piece.kind == "cylinder":
+        if abs(rotation[2, 2]) < 1.0 - 1e-14:
+            raise InputError(
+                f"part {name!r} has a cylinder among its pieces, which must stay along z; turn it about z "
+                "only, or draw the part with `extruded`."
+            )
+        return replace(piece, center=center)
+    steps = np.abs(rotation)
+    if np.allclose(steps, np.rint(steps), rtol=0.0, atol=1e-14):  # the axes change places
+        return replace(piece, size=np.rint(steps) @ piece.size, center=center)
+    signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    return Piece("hull", (signs * piece.size + piece.center) @ rotation.T + shift)

@@ -75,15 +75,28 @@ def test_pieces_are_kept_by_content_and_damage_is_told(
     assert not calls and again.error == made.error and again.part.name == "another name"
     for a, b in zip(made.part.pieces, again.part.pieces, strict=True):
         np.testing.assert_array_equal(a.size, b.size)
-    for damage in (b"", file.read_bytes()[:-40], b"PK" + bytes(200)):
+    with np.load(file) as stored:
+        content = dict(stored)
+    wrong = tmp_path.parent / "wrong.npz"  # of the right shapes, with corners that are none
+    np.savez_compressed(
+        wrong, **content | {"corners": np.zeros_like(content["corners"]), "error": np.zeros(2)}
+    )
+    counts = tmp_path.parent / "counts.npz"
+    np.savez_compressed(counts, **content | {"counts": content["counts"].astype(float)})
+    for damage in (wrong.read_bytes(), counts.read_bytes(), b"", file.read_bytes()[:-40], b"PK" + bytes(200)):
         file.write_bytes(damage)
         calls.clear()
         with pytest.warns(RuntimeWarning, match="damaged"):
             mended = decomposed(angle(), clearance=0.0002, cache=tmp_path)
         assert len(calls) == 1 and mended.error == made.error
     assert list(tmp_path.iterdir()) == [file]  # nothing half written is left
+    calls.clear()
+    same = decomposed(
+        angle(), 0.0002, thresholds=np.array([0.05], np.float32), seed=np.int64(0), cache=str(tmp_path)
+    )
+    assert same.error == made.error and len(calls) == 1  # single precision has another 0.05
     decomposed(angle(tall=0.011), clearance=0.0002, cache=tmp_path)
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_a_decomposition_coarser_than_the_clearance_allows_is_refused(tmp_path: Path) -> None:
@@ -94,13 +107,47 @@ def test_a_decomposition_coarser_than_the_clearance_allows_is_refused(tmp_path: 
     coarse = decomposed(ring(), clearance=0.01, thresholds=(0.1,), cache=tmp_path)
     # What the pieces add stands in the hole: a ring of 10.2 mm that lets no peg of 10 mm through.
     assert coarse.error.added > 0.0001
-    with pytest.raises(InputError, match="greater than 0"):
+    with pytest.raises(InputError, match="above 0"):
         decomposed(ring(), clearance=0.0, cache=tmp_path)
 
 
-def test_a_cache_that_cannot_be_written_is_told_and_does_not_stop(tmp_path: Path) -> None:
+def test_a_rounded_hole_is_refused_after_the_first_threshold_and_bodies_stay(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("coacd")
+    tried: list[float] = []
+    real = decomposition._coacd
+    monkeypatch.setattr(decomposition, "_coacd", lambda *given: tried.append(given[1]) or real(*given))
+    with pytest.raises(InputError, match=r"would still be by about .* all the same\.") as told:
+        decomposed(ring(), 0.0001, thresholds=(0.1, 0.05), cache=tmp_path, progress=True)
+    assert tried == [0.1] and "\n" not in str(told.value)
+    assert "CoACD at threshold 0.1" in capsys.readouterr().err
+    boxes = [trimesh.creation.box([0.02, 0.01, 0.01]) for _ in range(2)]
+    boxes[1].apply_translation([0.005, 0.005, 0.002])
+    both = trimesh.util.concatenate(boxes)
+    made = decomposed(Part("two", np.asarray(both.vertices), np.asarray(both.faces)), 0.0001, cache=tmp_path)
+    assert len(made.part.pieces) == 2 and made.error.largest < 1e-9 and tried == [0.1]
+    # Halves of the first box: their common face lies deep in the solid, next to the other box's surface.
+    halves = [Piece("box", np.array([0.005, 0.005, 0.005]), np.array([x, 0.0, 0.0])) for x in (-0.005, 0.005)]
+    second = Piece("box", np.array([0.01, 0.005, 0.005]), np.array([0.005, 0.005, 0.002]))
+    assert geometric_error(replace(made.part, pieces=(*halves, second)), count=5000).largest < 1e-9
+    with pytest.raises(InputError, match="no convex pieces"):
+        geometric_error(angle())
+
+
+def test_a_cache_that_cannot_be_written_is_told_and_does_not_stop(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     pytest.importorskip("coacd")
     (tmp_path / "file").write_text("in the way")
     with pytest.warns(RuntimeWarning, match="cannot be kept"):
         made = decomposed(angle(), clearance=0.001, cache=tmp_path / "file")
     assert made.error.largest < 0.0002
+
+    def full(*given: Any, **arrays: Any) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.warns(RuntimeWarning, match="no space left"):
+        decomposed(angle(), clearance=0.001, cache=tmp_path / "other")
+    assert not list((tmp_path / "other").iterdir())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ import shapely
 import torch
 import trimesh
 from scipy.signal import butter, sosfiltfilt
+from scipy.spatial.transform import Rotation
+from shapely.affinity import translate
 
 from bcppl.errors import InputError
 from bcppl.models.parts import SHAPES, insert_peg, insert_tray
@@ -25,6 +28,7 @@ from bcppl.simulators.outlines import (
     NAMED,
     block_with_hole,
     check_fit,
+    cylinder_peg,
     named_outline,
     peg_for,
     round_outline,
@@ -33,8 +37,11 @@ from bcppl.simulators.outlines import (
 from bcppl.simulators.peg_model import ContactParameters
 from bcppl.simulators.physics import PegPhysics
 from bcppl.simulators.shapes import block, box_peg
+from bcppl.simulators.unknowns import Unknowns
 
 NIST = Path(__file__).parents[2] / "shared/data/nist_insertion"
+BORDER = [(0, -0.05), (0.06, -0.05), (0.06, 0.05), (0, 0.05)]
+SOLID = block((0.06, 0.06, 0.025))
 nist_needed = pytest.mark.skipif(not NIST.is_dir(), reason=f"the published insertion parts are not in {NIST}")
 
 
@@ -144,6 +151,16 @@ def test_a_mesh_in_millimetres_is_refused_and_scaled_on_request(tmp_path: Path) 
     trimesh.creation.box([60.0, 60.0, 25.0]).export(path)
     with pytest.raises(InputError, match="in millimetres"):
         load_mesh(path)
+    small = tmp_path / "cube.stl"
+    trimesh.creation.box([2.0, 2.0, 2.0]).export(small)
+    with pytest.raises(InputError, match=r"2 m long.*scale=0\.001"):
+        load_mesh(small)
+    assert load_mesh(small, scale=1.0).extent.max() == 2.0
+    turned = trimesh.creation.box([0.06, 0.06, 0.025])
+    turned.invert()
+    turned.export(tmp_path / "turned.stl")
+    with pytest.warns(RuntimeWarning, match="inside out"):
+        assert load_mesh(tmp_path / "turned.stl").mesh.volume > 0
     part = load_mesh(path, scale=0.001)
     np.testing.assert_allclose(part.extent, [0.06, 0.06, 0.025])
     assert len(part.vertices) == 8
@@ -165,6 +182,27 @@ def test_outlines_that_cannot_be_drawn_are_refused_in_a_sentence() -> None:
         "does not lie inside": lambda: block_with_hole(square, offset=(0.025, 0.0)),
         "no peg": lambda: peg_for(square, 0.017, 0.05),
         "clearance": lambda: peg_for(square, -0.001, 0.05),
+        "touches its border at": lambda: extruded(
+            "rim", shapely.Polygon(BORDER, [[(0, 0), (0.01, -0.01), (0.01, 0.01)]]), 0, 0.1
+        ),
+        "touches another at": lambda: extruded(
+            "pair",
+            shapely.Polygon(
+                BORDER,
+                [
+                    [(0.01, 0.0), (0.02, -0.01), (0.02, 0.01)],
+                    [(0.02, 0.0), (0.03, -0.01), (0.03, 0.01)],
+                ],
+            ),
+            0,
+            0.1,
+        ),
+        "turn nan": lambda: block_with_hole(square, turn=math.nan),
+        "offset nan along y": lambda: block_with_hole(square, offset=(0.0, math.nan)),
+        "tolerance nan": lambda: prismatic(block((0.06, 0.06, 0.025)), tolerance=math.nan),
+        "stands up to 0.95 mm": lambda: check_fit(square, translate(named_outline("square", 0.0159), 0.001)),
+        "no clearance": lambda: check_fit(square, square),
+        "inside out": lambda: prismatic(replace(SOLID, faces=SOLID.faces[:, ::-1])),
         "stands up to 0.707 mm": lambda: check_fit(square, named_outline("square", 0.017)),
         "no outline 'star'": lambda: named_outline("star"),
         "no insert tray": lambda: insert_tray("oval"),
@@ -173,3 +211,40 @@ def test_outlines_that_cannot_be_drawn_are_refused_in_a_sentence() -> None:
         with pytest.raises(InputError, match=words) as told:
             draw()
         assert "\n" not in str(told.value) and str(told.value).endswith(".")
+
+
+def test_a_moved_part_is_the_same_solid_in_another_frame() -> None:
+    hole = block_with_hole(named_outline("hexagon"))
+    pegs = [box_peg(0.004, 0.05), cylinder_peg(0.004, 0.05)]
+    askew = [0.01, -0.02, 0.03, *Rotation.from_rotvec([0.3, -0.7, 0.2]).as_quat()[[3, 0, 1, 2]]]
+    quarter = [0.0, 0.0, -0.05, math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+    for part, pose in ((hole, askew), (pegs[0], askew), (pegs[0], quarter), (pegs[1], quarter)):
+        moved = part.moved(pose)
+        before, after = geometric_error(part, count=500).largest, geometric_error(moved, count=500).largest
+        assert after == pytest.approx(before, abs=1e-9)
+        expected = Rotation.from_quat(np.array(pose)[[4, 5, 6, 3]]).apply(part.vertices) + pose[:3]
+        np.testing.assert_allclose(moved.vertices, expected, atol=1e-12)
+    assert [pegs[0].moved(p).pieces[0].kind for p in (quarter, askew)] == ["box", "hull"]
+    with pytest.raises(InputError, match="cylinder among its pieces"):
+        pegs[1].moved(askew)
+    raised = pegs[0].moved([0, 0, 0.05, 1, 0, 0, 0])  # as a file has it: its origin at the lower end
+    with pytest.warns(RuntimeWarning, match=r"wholly above its origin.*Part\.moved"):
+        PegPhysics(hole, raised)
+
+
+def test_contact_parameters_and_poses_that_are_no_numbers_are_refused() -> None:
+    for wrong in ({"friction": math.nan}, {"impedance": (math.nan,) * 5}, {"time_step": math.inf}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            ContactParameters(**wrong)
+    with pytest.raises(InputError, match="finite number above 0"):
+        ContactParameters(time_step=10**400)
+    physics = PegPhysics(SOLID, box_peg(0.004, 0.05))
+    times, command = np.array([0.0, 0.01]), np.tile([0.0, 0, 0.1, 1, 0, 0, 0], (2, 1))
+    probe = Probe("still", times, command, np.full(6, 100.0), np.full(6, 10.0), times)
+    with pytest.raises(InputError, match="quaternion of length 0"):
+        physics.start(np.zeros((2, 7)), probe)
+    place = np.tile([0.0, 0, 0, 1, 0, 0, 0], (2, 1))
+    rollout = physics.start(place, probe, Unknowns(friction=np.array([0.2, 0.4])))
+    np.testing.assert_array_equal(rollout.unknowns["friction"], [0.2, 0.4])
+    with pytest.raises(InputError, match="not made of numbers"):
+        Unknowns(friction="slippery")  # type: ignore[arg-type]

@@ -6,27 +6,37 @@ concavity and tree search". What has an exact outline is better drawn by `extrus
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 import json
 import os
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from bcppl.arguments import number_within, seed_number
 from bcppl.errors import InputError
 from bcppl.parts import Part, Piece
-from bcppl.simulators.fidelity import GeometricError, geometric_error
+from bcppl.simulators.fidelity import GeometricError, bodies_of, geometric_error
 
 Array = npt.NDArray[np.float64]
 
 THRESHOLDS = (0.05, 0.02, 0.01)  # CoACD's concavity, of a mesh scaled to a box of side 2
-_FORM = 1  # of the cached files
+# Of CoACD's tree search, by default 150 iterations and 2000 points: in half the time as many pieces, as good.
+_SEARCH = {"mcts_iterations": 60, "resolution": 1000}
+_FINEST = 0.01  # that CoACD takes
+_FORM = 2  # of the cached files
+_HOPELESS = 1.25  # times the bound: from 0.05 to 0.02 a torus's error fell to 0.36 of it, not 0.4
+_GENTLE = np.deg2rad(30.0)  # an inner edge that bends less is of a rounded surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +46,7 @@ class Decomposition:
     Attributes:
         part: the part with its pieces.
         error: between the pieces and the mesh, metres, over points on both surfaces.
-        threshold: CoACD's concavity threshold that gave it; 0 for a convex part, which is one piece.
+        threshold: CoACD's concavity threshold that gave it; 0 where the mesh's bodies are convex already.
     """
 
     part: Part
@@ -50,40 +60,68 @@ def decomposed(
     fraction: float = 0.2,
     thresholds: Sequence[float] = THRESHOLDS,
     seed: int = 0,
-    cache: Path | None = None,
+    cache: str | Path | None = None,
+    progress: bool | None = None,
 ) -> Decomposition:
     """A part taken apart into convex pieces that are off its mesh by a fraction of a clearance at most.
 
-    Thresholds are tried in order until one is fine enough. Results are kept on disk under a hash of the mesh,
-    the settings and CoACD's version.
+    Bodies of the mesh that are convex already stay as they are, be it that they overlap. For the others,
+    thresholds are tried in order until one is fine enough. On rounded inner surfaces the error is about the
+    threshold times half the longest side; where an error, brought down in proportion to the finest
+    threshold, would still be more than 1.25 times too large, no finer one is tried. Flat inner walls may
+    become exact at any threshold, and all are tried.
+
+    CoACD's search takes the time, the finer the longer; the error's measurement takes about a second. On
+    two busy cores a torus of 1024 faces took 5 s down to a threshold of 0.05 and 17 s down to 0.02; a drill
+    of nine overlapping bodies, 342 faces, took 0.6 s where their hulls will do, 7 s down to 0.02, two
+    minutes down to 0.01.
+
+    Results are kept on disk under a hash of the mesh, the settings and CoACD's version.
 
     Args:
         part: with a closed mesh.
         clearance: of what is to be inserted or to receive, metres, of the diameter.
         fraction: of the clearance that the error may come to, on either side.
-        thresholds: CoACD's, from coarse to fine.
+        thresholds: CoACD's, from coarse to fine, 0.01 to 1; a single one is always tried.
         seed: of CoACD's tree search, and of the points that measure the error.
         cache: the folder of results; None for `bcppl/decompositions` in the user's cache folder.
+        progress: show on standard error what is being done and for how long; None where that is a terminal.
 
     Raises:
-        InputError: the mesh is empty, open or in millimetres; CoACD is not installed; or the finest pieces
-            are coarser than the fraction of the clearance.
+        InputError: the mesh is empty, open, inside out or in millimetres; a number is out of range; CoACD is
+            not installed; or the finest pieces are coarser than the fraction of the clearance.
     """
     part.check()
-    if not (clearance > 0 and fraction > 0 and len(thresholds)):
-        raise InputError(
-            f"part {part.name!r} is to be taken apart for a clearance of {clearance!r} m, a fraction of "
-            f"{fraction!r} and {len(thresholds)} thresholds; give numbers greater than 0."
-        )
-    hull = part.mesh.convex_hull
-    if hull.volume - part.mesh.volume <= 1e-6 * hull.volume:
-        whole = replace(part, pieces=(Piece("hull", np.asarray(hull.vertices)),))
-        return Decomposition(whole, geometric_error(whole, seed=seed), 0.0)
-    found = []
-    for threshold in thresholds:
-        found.append(_kept(part, threshold, seed, cache))
-        if found[-1].error.largest <= fraction * clearance:
-            return found[-1]
+    task = f"part {part.name!r} is to be taken apart"
+    bound = number_within(f"{task} for clearance {{}} m", clearance, above=0.0)
+    bound *= number_within(f"{task} to fraction {{}} of the clearance", fraction, above=0.0)
+    levels = [
+        number_within(f"{task} with threshold {{}}", level, least=_FINEST, most=1.0) for level in thresholds
+    ]
+    if not levels:
+        raise InputError(f"{task} without thresholds; give at least one, such as 0.05.")
+    seed, folder = seed_number(seed), _user_cache() if cache is None else Path(cache)
+    hulls = [np.asarray(body.convex_hull.vertices) for body in bodies_of(part.mesh)]
+    whole = replace(part, pieces=tuple(Piece("hull", corners) for corners in hulls))
+    error = geometric_error(whole, seed=seed)
+    if error.largest <= bound:
+        return Decomposition(whole, error, 0.0)
+    found: list[Decomposition] = []
+    with _told(part, progress) as tell:
+        for threshold in levels:
+            tell(f"CoACD at threshold {threshold:g}")
+            found.append(_kept(part, threshold, seed, folder))
+            if found[-1].error.largest <= bound:
+                return found[-1]
+            expected = found[-1].error.largest * min(levels) / threshold
+            if threshold > min(levels) and expected > _HOPELESS * bound and _rounded_inside(part):
+                raise InputError(
+                    f"part {part.name!r} at threshold {threshold:g} is off by "
+                    f"{1000 * found[-1].error.largest:.2g} mm, and at {min(levels):g} would still be by "
+                    f"about {1000 * expected:.2g} mm, more than {fraction:g} of its clearance of "
+                    f"{1000 * clearance:g} mm; draw it from its exact outline, or try thresholds="
+                    f"({min(levels):g},) all the same."
+                )
     best = min(found, key=lambda result: result.error.largest)
     raise InputError(
         f"part {part.name!r} in {len(best.part.pieces)} convex pieces gains {1000 * best.error.added:.2g} mm "
@@ -92,14 +130,32 @@ def decomposed(
     )
 
 
-def _kept(part: Part, threshold: float, seed: int, cache: Path | None) -> Decomposition:
+def _rounded_inside(part: Part) -> bool:
+    """Whether most of a mesh's inner edges are those of facets of a rounded surface."""
+    angles = part.mesh.face_adjacency_angles[~part.mesh.face_adjacency_convex]
+    angles = angles[angles > 1e-3]
+    return bool(len(angles) and (angles < _GENTLE).mean() > 0.5)
+
+
+@contextlib.contextmanager
+def _told(part: Part, progress: bool | None) -> Iterator[Callable[[str], None]]:
+    """A line on standard error with what is being done, and for how long."""
+    console = Console(stderr=True, force_terminal=True if progress else None)
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    shown = console.is_terminal if progress is None else progress
+    with Progress(*columns, console=console, transient=True, disable=not shown) as bar:
+        task = bar.add_task("")
+        yield lambda what: bar.update(task, description=f"{part.name}: {what}")
+
+
+def _kept(part: Part, threshold: float, seed: int, folder: Path) -> Decomposition:
     """A decomposition from the cache, or made anew and put there."""
     version = _version(part)
-    settings = {"form": _FORM, "coacd": version, "threshold": threshold, "seed": seed}
+    settings = {"form": _FORM, "coacd": version, "threshold": threshold, "seed": seed, **_SEARCH}
     content = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for array in (part.vertices.astype("<f8"), part.faces.astype("<i8")):
         content.update(np.ascontiguousarray(array).tobytes())
-    path = (_user_cache() if cache is None else cache) / f"{content.hexdigest()}.npz"
+    path = folder / f"{content.hexdigest()}.npz"
     known = _read(path)
     if known is None:
         hulls = _coacd(part, threshold, seed)
@@ -126,9 +182,15 @@ def _coacd(part: Part, threshold: float, seed: int) -> list[Array]:
     import coacd
 
     coacd.set_log_level("error")
-    mesh = coacd.Mesh(part.vertices, part.faces)
-    pieces = coacd.run_coacd(mesh, threshold=threshold, preprocess_mode="off", seed=seed)
-    return [np.asarray(vertices, dtype=np.float64) for vertices, _ in pieces]
+    found = []
+    for body in bodies_of(part.mesh):
+        hull = body.convex_hull
+        if hull.volume - body.volume <= 1e-6 * hull.volume:
+            found.append((hull.vertices, hull.faces))
+        else:
+            mesh = coacd.Mesh(np.array(body.vertices), np.array(body.faces))
+            found += coacd.run_coacd(mesh, threshold=threshold, preprocess_mode="off", seed=seed, **_SEARCH)
+    return [np.asarray(vertices, dtype=np.float64) for vertices, _ in found]
 
 
 def _user_cache() -> Path:
@@ -144,9 +206,11 @@ def _read(path: Path) -> tuple[list[Array], GeometricError] | None:
     try:
         with np.load(path, allow_pickle=False) as stored:
             corners, counts, error = stored["corners"], stored["counts"], stored["error"]
-        sound = corners.shape == (counts.sum(), 3) and (counts > 3).all() and error.shape == (2,)
-        if not (sound and np.isfinite(corners).all() and np.isfinite(error).all()):
-            raise ValueError("its arrays do not fit together")
+            checksum = stored["checksum"]
+        if not np.array_equal(checksum, _checksum(corners, counts, error)):
+            raise ValueError("its checksum is wrong")
+        hulls = np.split(corners, np.cumsum(counts)[:-1])
+        return hulls, GeometricError(float(error[0]), float(error[1]))
     except Exception as damage:  # zip, numpy and the file system each have errors of their own
         warnings.warn(
             f"the cached decomposition {path} is damaged ({damage}) and is made again.",
@@ -154,21 +218,34 @@ def _read(path: Path) -> tuple[list[Array], GeometricError] | None:
             stacklevel=5,
         )
         return None
-    return np.split(corners, np.cumsum(counts)[:-1]), GeometricError(float(error[0]), float(error[1]))
+
+
+def _checksum(*arrays: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8]:
+    """SHA-256 (32,) of some arrays, their shapes and types."""
+    content = hashlib.sha256()
+    for array in arrays:
+        content.update(f"{array.dtype.str} {array.shape} ".encode())
+        content.update(np.ascontiguousarray(array).tobytes())
+    return np.frombuffer(content.digest(), dtype=np.uint8)
 
 
 def _write(path: Path, hulls: list[Array], error: GeometricError) -> None:
     """Write a cached file whole or not at all."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        stored: dict[str, Any] = {
+            "corners": np.concatenate(hulls),
+            "counts": np.array([len(hull) for hull in hulls]),
+            "error": np.array([error.added, error.lost]),
+        }
         with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-            np.savez_compressed(
-                file,
-                corners=np.concatenate(hulls),
-                counts=np.array([len(hull) for hull in hulls]),
-                error=np.array([error.added, error.lost]),
-            )
-        os.replace(file.name, path)
+            try:
+                np.savez_compressed(file, checksum=_checksum(*stored.values()), **stored)
+                file.close()
+                os.replace(file.name, path)
+            except BaseException:
+                Path(file.name).unlink()
+                raise
     except OSError as refusal:
         warnings.warn(
             f"the decomposition cannot be kept at {path} ({refusal}); it will be made again next time.",

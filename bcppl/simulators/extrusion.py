@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import numpy.typing as npt
 import shapely
@@ -14,6 +16,7 @@ from bcppl.simulators.cover import Cell, convex_cells, straightened
 Array = npt.NDArray[np.float64]
 
 REACH = 0.002  # m by which prisms overlap, at most
+_TOUCHING = 1e-9  # m: a wall thinner than this is none in MuJoCo's single precision
 RAMP = 0.0001  # m below the end faces at which they overlap so far; more than a contact sinks in
 
 
@@ -54,7 +57,8 @@ def check_outline(outline: shapely.Polygon, name: str) -> None:
     """Refuse an outline that cannot be drawn out.
 
     Raises:
-        InputError: it is empty, crosses itself, is in several pieces, or is probably in millimetres.
+        InputError: it is empty, crosses itself, has a hole that touches its border or another hole, is in
+            several pieces, or is probably in millimetres.
     """
     if not isinstance(outline, shapely.Polygon):
         kind = getattr(outline, "geom_type", type(outline).__name__)
@@ -70,6 +74,15 @@ def check_outline(outline: shapely.Polygon, name: str) -> None:
             f"the outline of {name!r} is no simple polygon ({shapely.is_valid_reason(outline)}); "
             "draw sides that do not cross and holes that lie inside."
         )
+    border = outline.exterior
+    for a, b in itertools.combinations([border, *outline.interiors], 2):
+        if shapely.distance(a, b) < _TOUCHING:
+            x, y = shapely.get_coordinates(shapely.shortest_line(a, b))[0]
+            beside = "its border" if a is border else "another"
+            raise InputError(
+                f"the outline of {name!r} has a hole that touches {beside} at ({x:.6g}, {y:.6g}) m; move the "
+                "hole, or cut the wall open there."
+            )
     low, high = np.reshape(outline.bounds, (2, 2))
     if (high - low).max() > LARGEST_EXTENT:
         raise InputError(

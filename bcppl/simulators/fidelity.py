@@ -10,6 +10,8 @@ import numpy.typing as npt
 import torch
 import trimesh
 
+from bcppl.arguments import whole_number
+from bcppl.errors import InputError
 from bcppl.parts import Part, Piece
 from bcppl.simulators.distance import SignedDistance
 
@@ -45,16 +47,34 @@ def geometric_error(part: Part, count: int = 20000, seed: int = 0) -> GeometricE
         seed: of the points.
 
     Raises:
-        InputError: the mesh is empty, open or not finite.
+        InputError: the mesh is empty, open or not finite, there are no pieces, or the count is none.
     """
+    if not part.pieces:
+        raise InputError(
+            f"part {part.name!r} has no convex pieces whose error could be measured; make them with "
+            "`extruded`, `prismatic` or `decomposed`."
+        )
+    whole_number("geometric_error is asked for {} points", count)
     solids = [solid_of(piece) for piece in part.pieces]
     corners = np.concatenate([solid.vertices for solid in solids])
     whole = trimesh.util.concatenate(solids)
     spread, _ = trimesh.sample.sample_surface(whole, count, seed=seed)
     on_pieces = torch.from_numpy(np.concatenate([corners, spread]))
-    added = float(SignedDistance(part)(on_pieces).distance.max())
+    # Where bodies overlap, the nearest surface may be one that lies inside another body.
+    beyond = torch.full((len(on_pieces),), torch.inf, dtype=torch.float64)
+    for body in bodies_of(part.mesh):
+        single = Part(part.name, np.asarray(body.vertices), np.asarray(body.faces, dtype=np.int64))
+        beyond = torch.minimum(beyond, SignedDistance(single)(on_pieces).distance)
+    added = float(beyond.max())
     on_mesh = np.concatenate([part.vertices, part.surface_points(count, seed)])
     return GeometricError(max(0.0, added), float(_outside(on_mesh, solids).max()))
+
+
+def bodies_of(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """A mesh's bodies, which may overlap; the whole mesh where one is open or a cavity."""
+    bodies = list(mesh.split(only_watertight=False))
+    sound = len(bodies) > 1 and all(body.is_watertight and body.volume > 0 for body in bodies)
+    return bodies if sound else [mesh]
 
 
 def solid_of(piece: Piece) -> trimesh.Trimesh:

@@ -11,6 +11,7 @@ import shapely
 import trimesh
 from scipy.spatial import cKDTree
 
+from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.parts import Part, Piece
 from bcppl.simulators.cover import Cell, convex_cells, grown_in, polygons_of, straightened
@@ -60,10 +61,12 @@ def prismatic(part: Part, axis: str = "z", tolerance: float = 5e-6) -> Part:
         tolerance: metres by which an outline may be off the mesh's. At 5 um a bore of 9 mm has 72 sides.
 
     Raises:
-        InputError: the mesh is empty, open, in millimetres, or has faces that are neither walls, levels nor
-            chamfers, so that pieces are off by more than twice the tolerance.
+        InputError: the mesh is empty, open, inside out, in millimetres, or has faces that are neither
+            walls, levels nor chamfers, so that pieces are off by more than twice the tolerance; or the
+            tolerance is not above 0.
     """
     part.check()
+    number_within(f"part {part.name!r} is to be made of prisms with tolerance {{}}", tolerance, above=0.0)
     if axis not in _ROTATIONS:
         raise InputError(f"the axis of part {part.name!r} is {axis!r}; give 'x', 'y' or 'z'.")
     rotation = _ROTATIONS[axis]

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import shapely
 from shapely.affinity import rotate, translate
 
+from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.parts import Part, Piece
 from bcppl.simulators.extrusion import check_outline, extruded
@@ -144,10 +145,16 @@ def block_with_hole(
         name: the part's name.
 
     Raises:
-        InputError: the outline is not valid, or does not lie inside the block.
+        InputError: the outline is not valid, a number is not finite, or the hole does not lie inside the
+            block.
     """
     _positive(name, size_x=size[0], size_y=size[1], size_z=size[2])
     check_outline(hole, f"hole of {name}")
+    number_within(f"the hole of {name!r} has turn {{}}", turn)
+    if len(offset) != 2:
+        raise InputError(f"the hole of {name!r} has offset {offset!r}; give its x and y in metres.")
+    for axis, value in zip("xy", offset, strict=True):
+        number_within(f"the hole of {name!r} has offset {{}} along {axis}", value)
     placed = translate(rotate(hole, turn, origin=(0.0, 0.0), use_radians=True), *offset)
     outer = rectangular_outline(size[0], size[1])
     if not outer.contains_properly(placed):
@@ -188,10 +195,17 @@ def check_fit(hole: shapely.Polygon, peg: shapely.Polygon) -> float:
     """The clearance (m) that a peg's outline has in a hole's, both in one frame: twice the narrowest gap.
 
     Raises:
-        InputError: the peg does not fit.
+        InputError: the peg does not fit, or an outline is not valid.
     """
+    check_outline(hole, "hole")
+    check_outline(peg, "peg")
     if not hole.contains_properly(peg):
-        excess = max(float(shapely.hausdorff_distance(shapely.difference(peg, hole), hole)), 0.0)
+        beyond = shapely.difference(peg, hole)
+        spacing = max(0.002 * beyond.length, 1e-6)
+        points = shapely.points(shapely.get_coordinates(shapely.segmentize(beyond, spacing)))
+        excess = float(shapely.distance(points, hole).max(initial=0.0))
+        if excess < 1e-9:
+            raise InputError("the peg's outline touches the hole's, so it has no clearance; make it smaller.")
         raise InputError(
             f"the peg's outline stands up to {1000 * excess:.3g} mm out of the hole's; make it smaller."
         )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -10,11 +11,21 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.parts import Part, Piece
 from bcppl.recordings.measurements import Probe
 
 Array = npt.NDArray[np.float64]
+
+# MuJoCo's solimp, in its order, and what each may be.
+_IMPEDANCE: Mapping[str, dict[str, float]] = {
+    "dmin": {"least": 0.0, "most": 1.0},
+    "dmax": {"least": 0.0, "most": 1.0},
+    "width": {"least": 0.0},
+    "midpoint": {"least": 0.0, "most": 1.0},
+    "power": {"least": 1.0},
+}
 
 SENSED = 13  # numbers sensed at each step: position 3, quaternion 4, force 3, torque 3
 
@@ -53,16 +64,22 @@ class ContactParameters:
 
     def __post_init__(self) -> None:
         for field in ("time_step", "time_constant", "damping_ratio", "arm_mass", "arm_inertia", "tool_mass"):
-            if not getattr(self, field) > 0:
-                raise InputError(
-                    f"contact parameter {field} is {getattr(self, field)!r}; give a number greater than 0."
-                )
-        if self.friction < 0:
-            raise InputError(f"contact parameter friction is {self.friction!r}; give 0 or more.")
+            number_within(f"contact parameter {field} is {{}}", getattr(self, field), above=0.0)
+        number_within("contact parameter impratio is {}", self.impratio, above=0.0)
+        number_within("contact parameter friction is {}", self.friction, least=0.0)
+        if len(self.impedance) != 5:
+            raise InputError(
+                f"contact parameter impedance has {len(self.impedance)} numbers; give the five of solimp."
+            )
+        for (field, bounds), value in zip(_IMPEDANCE.items(), self.impedance, strict=True):
+            number_within(f"contact parameter impedance has {field} {{}}", value, **bounds)
 
 
 def pieces_of(part: Part) -> Sequence[Piece]:
     """The convex pieces that a part is touched by: its own, or its hull where its mesh is convex.
+
+    Few pieces are fast: in the hole, one simulated second took 19 ms with 4 pieces of the part, 51 with 16,
+    and 217 with 64.
 
     Raises:
         InputError: the part has no pieces and its mesh is not convex.
@@ -72,7 +89,9 @@ def pieces_of(part: Part) -> Sequence[Piece]:
     if not part.mesh.is_convex:
         raise InputError(
             f"part {part.name!r} has no convex pieces and its mesh is not convex, so it cannot be touched in "
-            "simulation; give it convex pieces made from its exact outline."
+            "simulation; give it convex pieces with `bcppl.simulators.extrusion.extruded` (from its "
+            "outline), `bcppl.simulators.layers.prismatic` (upright walls) or "
+            "`bcppl.simulators.decomposition.decomposed` (any mesh)."
         )
     return [Piece("hull", np.asarray(part.mesh.convex_hull.vertices, dtype=np.float64))]
 
@@ -118,6 +137,13 @@ def build_model(part: Part, peg: Part, parameters: ContactParameters) -> mujoco.
     Raises:
         InputError: the part or the peg has no convex pieces and is not convex.
     """
+    if peg.vertices[:, 2].min() >= 0.0:
+        warnings.warn(
+            f"peg {peg.name!r} lies wholly above its origin, the wrench sensor; a peg hangs below it, so "
+            "move it with `Part.moved` unless the sensor's z axis points down to the tip.",
+            RuntimeWarning,
+            stacklevel=3,
+        )
     spec = mujoco.MjSpec()
     option = spec.option
     option.timestep = parameters.time_step

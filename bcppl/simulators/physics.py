@@ -15,6 +15,7 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.parts import Part
+from bcppl.poses import as_pose
 from bcppl.recordings.measurements import Probe
 from bcppl.simulators.approach import Approach, first_possible_touch, free_approach
 from bcppl.simulators.effort import Effort
@@ -78,8 +79,8 @@ class PegPhysics:
             unknowns: what else differs between the particles; None for nothing.
 
         Raises:
-            InputError: the poses are not (N, 7) and finite, the probe cannot be simulated, or an unknown
-                does not fit or is physically impossible.
+            InputError: the poses are not (N, 7), finite and with unit quaternions, the probe cannot be
+                simulated, or an unknown does not fit or is physically impossible.
         """
         poses = torch.as_tensor(world_from_part).detach().cpu().numpy().astype(np.float64)
         if poses.ndim != 2 or poses.shape[1] != 7 or not np.isfinite(poses).all():
@@ -87,6 +88,7 @@ class PegPhysics:
                 f"the part's poses have shape {poses.shape} or are not finite; "
                 "give (N, 7) numbers x y z qw qx qy qz."
             )
+        as_pose(poses, "the part's pose")
         rows = {} if unknowns is None else unknowns.rows(len(poses))
         if probe not in self._sessions:
             self._sessions[probe] = Session(self, probe)

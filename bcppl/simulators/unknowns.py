@@ -54,6 +54,23 @@ class Unknowns:
     grasp_compliance: Tensor | None = None
     grip_from_peg: Tensor | None = None
 
+    def __post_init__(self) -> None:
+        """Take arrays and lists as tensors.
+
+        Raises:
+            InputError: a value is not made of numbers.
+        """
+        for name, value in self.given.items():
+            if not isinstance(value, Tensor):
+                try:
+                    tensor = torch.as_tensor(np.asarray(value, dtype=np.float64))
+                except (TypeError, ValueError):
+                    raise InputError(
+                        f"the unknown {name} of a touch is {type(value).__name__} and not made of numbers; "
+                        "give a tensor with one row for each particle."
+                    ) from None
+                object.__setattr__(self, name, tensor)
+
     @property
     def given(self) -> Mapping[str, Tensor]:
         """What is not None, by name."""
