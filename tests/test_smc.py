@@ -23,7 +23,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import adaptive, always, never, systematic
 from bcppl.inference.smc import Step, smc
-from bcppl.inference.step import Observed, StepFunction
+from bcppl.inference.step import Observed, StepFunction, StepInfo
 from bcppl.inference.tempering import tempered
 from bcppl.models.point_probe import model
 from bcppl.recordings import Recording, load
@@ -270,3 +270,9 @@ def test_a_particle_without_weight_does_not_come_back_as_not_a_number() -> None:
         population, *_ = take(population, Observed((k + 1,), {f"y_{k}": number(0.0)}))
         assert not bool(torch.isnan(population.log_weights).any())
     assert bool((population.log_weights == -torch.inf).any())
+
+
+def test_what_happened_prints_in_a_line_however_many_particles_there_are() -> None:
+    info = StepInfo(ancestors=torch.arange(10_000) // 4, exponents=(0.5, 1.0), log_evidence=-3.123456)
+    assert "ancestors=<2500 of 10000>" in repr(info) and "log_evidence=-3.123," in repr(info)
+    assert len(repr(info)) < 200 and "ancestors" not in repr(StepInfo())
