@@ -33,7 +33,7 @@ def sole_bar(console: Console | None = None) -> Iterator[Progress]:
     seen = (console.is_terminal or notebook) and not _shown
     columns = (
         TextColumn("{task.description:>12}"),
-        BarColumn(),
+        BarColumn(bar_width=30),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("about"),
