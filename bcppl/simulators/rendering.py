@@ -50,9 +50,9 @@ def renderer_for(part: Part, cameras: Iterable[Camera] = ()) -> DepthRasteriser 
 
     `DepthRasteriser` draws triangles: its time goes with their number and with the pixels that they cover,
     and it uses all cores. It works in double precision. It is chosen for meshes of up to 30,000 faces. There
-    it was the faster on one core, too: 8 to 20 times for a ring of 512 faces, 1.8 to 6 times for a drill of
-    16,000 (75 poses, 128 x 128 to 640 x 480), and equal where only 32 x 32 pixels of the drill's images
-    count, its worst case.
+    it was the faster on one core, too: 8 to 32 times for a ring of 512 faces, 2.3 to 4.3 times for a drill of
+    16,000 (75 poses, 128 x 128 to 640 x 480, `benchmarks/render.py`), and equal where only 32 x 32 pixels of
+    the drill's images count, its worst case.
 
     `DepthRenderer` casts rays: its time goes with the pixels and hardly with the faces. It works in
     single precision. It is chosen for finer meshes, and where a lens of the `cameras` distorts.
