@@ -1,135 +1,30 @@
 """Recordings on disk: what comes back is what went in, and what is wrong is said in one sentence."""
 
 import dataclasses
-import math
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from bcppl.errors import InputError
-from bcppl.parts import Part, Piece
 from bcppl.recordings import (
     DepthImage,
-    Guess,
     Measurement,
-    Probe,
     ProbeWindow,
     Push,
-    Recording,
     Touch,
     View,
-    describe,
     load,
-    notes,
     problems,
     save,
-    validate,
 )
-from bcppl.simulators.camera import Camera
-
-HALF = math.sqrt(0.5)
-
-
-def block(name: str, side: float = 0.1) -> Part:
-    mesh = trimesh.creation.box((side, 0.8 * side, 0.3 * side))
-    pieces = (
-        Piece("box", np.array([0.05, 0.04, 0.015])),
-        Piece("hull", np.asarray(mesh.vertices), np.ones(3)),
-    )
-    return Part(name, np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64), pieces, "made here")
-
-
-def poses(rows: int, rng: np.random.Generator) -> Any:
-    quaternion = rng.normal(size=(rows, 4))
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-    return np.concatenate([rng.normal(scale=0.1, size=(rows, 3)), quaternion], axis=1)
-
-
-def camera(name: str, height: float = 0.5) -> Camera:
-    return Camera(name, 8, 6, 9.0, 9.5, 3.7, 2.4, np.array([0.0, 0, height, 0, 1, 0, 0]), 0.06, 4.0)
-
-
-def depth(rng: np.random.Generator) -> Any:
-    image = rng.uniform(0.3, 0.6, (6, 8)).astype(np.float32).astype(np.float64)
-    image[1, 2] = np.nan
-    return image
-
-
-def probe(name: str, rng: np.random.Generator) -> Probe:
-    return Probe(
-        name,
-        np.linspace(0, 1, 5),
-        poses(5, rng),
-        rng.uniform(1, 9, 6),
-        rng.uniform(1, 9, 6),
-        np.arange(20) * 0.05,
-    )
-
-
-def touch(times: Any, rng: np.random.Generator, held: bool = True) -> Touch:
-    return Touch(times, rng.normal(size=(len(times), 6)), poses(len(times) if held else 0, rng))
-
-
-def full(seed: int = 0) -> Recording:
-    """A recording with something of everything."""
-    rng = np.random.default_rng(seed)
-    left, right = camera("left"), camera("wrist/right.2", 0.6)
-    slide, press = probe("slide", rng), probe("press", rng)
-    times = np.cumsum(rng.uniform(0.01, 0.02, 400))
-    windows = [
-        Measurement(ProbeWindow(p, a, b), touch(p.stamps[a:b], rng))
-        for p, a, b in ((slide, 0, 7), (press, 0, 9), (slide, 7, 20))
-    ]
-    colour = rng.integers(0, 255, (6, 8, 3)).astype(np.uint8)
-    views = [
-        Measurement(View(c), DepthImage(depth(rng), rgb))
-        for c, rgb in ((left, colour), (right, None), (left, None))
-    ]
-    push = Measurement(Push(times[::3], poses(len(times[::3]), rng)), touch(times, rng, held=False))
-    return Recording(
-        part=block("block"),
-        guess=Guess(np.array([0.01, 0.02, 0, HALF, 0, 0, HALF]), np.array([0.02, 0.01, 0.0]), 0.1, 0.3, 0.2),
-        measurements=[views[0], windows[0], views[1], push, windows[1], windows[2], views[2]],
-        peg=block("peg", 0.02),
-        background={"left": depth(rng)},
-        truth=np.array([0.012, 0.018, 0, HALF, 0, 0, HALF]),
-        model="peg_in_hole",
-        source="nowhere, ©",
-    )
-
-
-def assert_identical(first: Any, second: Any, where: str = "recording") -> None:
-    """Equal to the last bit, all the way down."""
-    if dataclasses.is_dataclass(first):
-        assert type(first) is type(second), where
-        for field in dataclasses.fields(first):
-            assert_identical(getattr(first, field.name), getattr(second, field.name), f"{where}.{field.name}")
-    elif isinstance(first, np.ndarray):
-        assert first.dtype == second.dtype and first.shape == second.shape, where
-        assert first.tobytes() == second.tobytes(), where
-    elif isinstance(first, Mapping):
-        assert first.keys() == second.keys(), where
-        for key in first:
-            assert_identical(first[key], second[key], f"{where}[{key!r}]")
-    elif isinstance(first, Sequence) and not isinstance(first, str):
-        assert len(first) == len(second), where
-        for k, (ours, theirs) in enumerate(zip(first, second, strict=True)):
-            assert_identical(ours, theirs, f"{where}[{k}]")
-    else:
-        assert first == second and type(first) is type(second), where
-
-
-def assert_one_sentence(text: str) -> None:
-    assert "\n" not in text and text.endswith(".") and ". " not in text.rstrip("."), text
+from tests.made_recordings import assert_identical, assert_one_sentence, camera, full, poses
 
 
 def test_everything_comes_back_to_the_last_bit(tmp_path: Path) -> None:
@@ -303,211 +198,3 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     assert "unknown kind" in edited(
         tmp_path, lambda file: file["measurements/000003"].attrs.__setitem__("kind", "sniff")
     )
-
-
-# ---- recordings that are wrong
-
-
-def with_measurement(index: int, **changes: Any) -> Recording:
-    """`full()` with fields of one measurement's action, camera, probe or observation replaced."""
-    recording = full()
-    measurements = list(recording.measurements)
-    action, observation = measurements[index].action, measurements[index].observation
-    for name, value in changes.items():
-        if isinstance(action, View) and hasattr(action.camera, name):
-            action = View(dataclasses.replace(action.camera, **{name: value}))
-        elif isinstance(action, ProbeWindow) and hasattr(action.probe, name):
-            action = dataclasses.replace(action, probe=dataclasses.replace(action.probe, **{name: value}))
-        elif hasattr(action, name) and name != "times":
-            action = dataclasses.replace(action, **{name: value})
-        else:
-            observation = dataclasses.replace(observation, **{name: value})
-    measurements[index] = Measurement(action, observation)
-    return dataclasses.replace(recording, measurements=measurements)
-
-
-def changed(values: Any, *place: int, to: float) -> Any:
-    values = np.array(values)
-    values[place] = to
-    return values
-
-
-def at(index: int, name: str) -> Any:
-    measurement = full().measurements[index]
-    if isinstance(measurement.action, ProbeWindow) and hasattr(measurement.action.probe, name):
-        return getattr(measurement.action.probe, name)
-    return getattr(measurement.action if hasattr(measurement.action, name) else measurement.observation, name)
-
-
-def opened(part: Part) -> Part:
-    return dataclasses.replace(part, faces=part.faces[:-1])
-
-
-def scaled(part: Part) -> Part:
-    return dataclasses.replace(part, vertices=1e3 * part.vertices)
-
-
-def push_with_path_times(times: Any) -> Recording:
-    recording = full()
-    measurements = list(recording.measurements)
-    push: Any = measurements[3].action
-    measurements[3] = Measurement(dataclasses.replace(push, times=times), measurements[3].observation)
-    return dataclasses.replace(recording, measurements=measurements)
-
-
-replace = dataclasses.replace
-WRONG: dict[str, tuple[Recording, str]] = {
-    "mesh in millimetres": (replace(full(), part=scaled(full().part)), "millimetres"),
-    "open mesh": (replace(full(), part=opened(full().part)), "open mesh"),
-    "open peg": (replace(full(), peg=opened(block("rod"))), "'rod' has an open mesh"),
-    "empty mesh": (replace(full(), part=replace(full().part, faces=np.zeros((0, 3), int))), "empty mesh"),
-    "mesh of quads": (replace(full(), part=replace(full().part, faces=np.zeros((2, 4), int))), "triangles"),
-    "no measurement": (replace(full(), measurements=[]), "no measurement"),
-    "no peg": (replace(full(), peg=None), "measurement 1 is a probe window but the recording has no peg"),
-    "negative width": (
-        replace(full(), guess=replace(full().guess, translation=np.array([0.1, -0.1, 0]))),
-        "negative half width",
-    ),
-    "angle in degrees": (replace(full(), guess=replace(full().guess, angle=25.0)), "degrees"),
-    "guess not unit": (
-        replace(full(), guess=replace(full().guess, world_from_part=np.array([0.0, 0, 0, 1, 1, 0, 0]))),
-        "the guess .* quaternion of length 1.414",
-    ),
-    "truth not finite": (replace(full(), truth=np.array([np.nan, 0, 0, 1, 0, 0, 0])), "the truth .* finite"),
-    "camera inside": (
-        with_measurement(2, world_from_camera=np.array([0.01, 0.02, 0.0006, 0, 1, 0, 0])),
-        "measurement 2: camera 'wrist/right.2' stands .* inside it .* wrong units",
-    ),
-    "camera in millimetres": (
-        with_measurement(2, world_from_camera=np.array([0.0, 0, 600, 0, 1, 0, 0])),
-        "measurement 2: camera .* wrong units",
-    ),
-    "camera of nine coefficients": (
-        with_measurement(2, distortion=[0.1] * 8),
-        "measurement 2: camera .* not Brown's k1 k2 p1 p2",
-    ),
-    "camera folded": (
-        with_measurement(2, distortion=(-3.0, 0.5, 0.0, 0.0)),
-        "measurement 2: camera .* folds the image over: .* pixels",
-    ),
-    "camera with a coefficient that is no number": (
-        with_measurement(2, distortion=(0.1, np.nan, 0.0, 0.0)),
-        "measurement 2: camera .* finite numbers",
-    ),
-    "camera on a wrist in another's place": (
-        with_measurement(2, wrist_from_camera=np.array([0, 0, 0.1, 0, 3, 0, 0])),
-        "measurement 2: camera .* wrist_from_camera has a quaternion of length 3",
-    ),
-    "camera not unit": (
-        with_measurement(2, world_from_camera=np.array([0, 0, 0.6, 0, 2, 0, 0])),
-        "measurement 2: camera .* quaternion of length 2",
-    ),
-    "two cameras, one name": (
-        with_measurement(6, world_from_camera=np.array([0, 0, 0.7, 0, 1, 0, 0])),
-        "measurement 6: camera 'left' differs",
-    ),
-    "depth size": (with_measurement(2, depth=np.ones((8, 6))), "measurement 2: .* 6×8, .* 8×6 pixels"),
-    "depth missing": (
-        with_measurement(2, depth=np.full((6, 8), np.nan)),
-        "measurement 2: .* missing in every",
-    ),
-    "depth zero": (with_measurement(2, depth=np.zeros((6, 8))), "measurement 2: .* missing in every"),
-    "depth in millimetres": (
-        with_measurement(2, depth=np.full((6, 8), 480.0)),
-        "measurement 2: .* millimetres",
-    ),
-    "depth out of range": (with_measurement(2, depth=np.full((6, 8), 4.5)), "measurement 2: .* range"),
-    "depth negative": (with_measurement(2, depth=np.full((6, 8), -0.5)), "measurement 2: .* negative"),
-    "wrench times": (
-        with_measurement(3, times=changed(at(3, "times"), 20, to=0.0)),
-        "measurement 3's wrench .* backwards at row 20",
-    ),
-    "path times": (
-        push_with_path_times(changed(full().measurements[3].action.times, 5, to=0.0)),  # type: ignore[union-attr]
-        "measurement 3's finger path .* backwards at row 5",
-    ),
-    "path on another clock": (
-        push_with_path_times(full().measurements[3].action.times + 1e9),  # type: ignore[union-attr]
-        "measurement 3: .* one clock",
-    ),
-    "path not unit": (
-        with_measurement(3, world_from_tip=changed(at(3, "world_from_tip"), 4, 5, to=9.0)),
-        "measurement 3's finger path .* quaternion .* row 4",
-    ),
-    "command times": (
-        with_measurement(4, command_times=changed(at(4, "command_times"), 2, to=0.25)),
-        "measurement 4: probe 'press''s command .* stand still at row 2",
-    ),
-    "command not unit": (
-        with_measurement(4, command=changed(at(4, "command"), 2, 4, to=3.0)),
-        "measurement 4: .* quaternion .* row 2",
-    ),
-    "stamps": (
-        with_measurement(4, stamps=changed(at(4, "stamps"), 15, to=0.1)),
-        "measurement 4: .* stamps .* backwards at row 15",
-    ),
-    "stiffness": (with_measurement(4, stiffness=-np.ones(6)), "measurement 4: .* stiffness"),
-    "two probes, one name": (with_measurement(5, damping=np.ones(6)), "measurement 5: probe 'slide' differs"),
-    "window beyond stamps": (with_measurement(5, last=25), "measurement 5: .* within its 20 stamps"),
-    "window overlaps": (with_measurement(5, first=6), "measurement 5: .* without overlap"),
-    "window times": (
-        with_measurement(5, times=at(5, "stamps")[7:20] + 0.001),
-        "measurement 5: .* wrench time 0.351",
-    ),
-    "peg not unit": (
-        with_measurement(5, world_from_peg=changed(at(5, "world_from_peg"), 3, 3, to=4.0)),
-        "measurement 5's peg pose .* row 3",
-    ),
-    "peg poses short": (with_measurement(5, world_from_peg=np.zeros((2, 7))), "measurement 5's peg pose"),
-    "wrench NaN": (
-        with_measurement(1, wrench=changed(at(1, "wrench"), 4, 2, to=np.nan)),
-        "measurement 1 has a wrench that is not finite at row 4; fill it by interpolation, or cut",
-    ),
-    "wrench NaN in a push": (
-        with_measurement(3, wrench=changed(at(3, "wrench"), 9, 2, to=np.nan)),
-        "measurement 3 has a wrench that is not finite at row 9; leave that row out",
-    ),
-    "wrench too large": (
-        with_measurement(3, wrench=changed(at(3, "wrench"), 9, 2, to=-2e4)),
-        "measurement 3 has a wrench of 2e[+]04 at row 9",
-    ),
-    "view with a touch": (
-        replace(full(), measurements=[Measurement(View(camera("left")), full().measurements[3].observation)]),
-        "measurement 0 pairs a View with a Touch",
-    ),
-    "window left out": (
-        replace(full(), measurements=[m for m in full().measurements if getattr(m.action, "last", 0) != 7]),
-        "leaves out stamps 0 to 7",
-    ),
-    "background size": (replace(full(), background={"left": np.ones((3, 3))}), "background of camera 'left'"),
-}
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_each_problem_is_one_sentence_that_says_where(case: str) -> None:
-    recording, pattern = WRONG[case]
-    found = problems(recording)
-    matching = [problem for problem in found if re.search(pattern, problem)]
-    assert len(matching) == 1, found
-    for problem in found:
-        assert_one_sentence(problem)
-    with pytest.raises(InputError) as failure:
-        validate(recording)
-    assert str(failure.value) == found[0]
-    assert describe(recording)
-
-
-def test_an_open_mesh_may_be_looked_at() -> None:
-    recording = full()
-    seen = replace(recording, part=opened(recording.part), measurements=[recording.measurements[0]], peg=None)
-    assert problems(seen) == []
-    assert len(notes(seen)) == 1 and "open mesh" in notes(seen)[0]
-    assert notes(recording) == []
-
-
-def test_describe_says_what_is_there() -> None:
-    rows = dict(describe(full()))
-    assert "100.0 × 80.0 × 30.0 mm" in rows["part"] and "closed" in rows["part"]
-    assert rows["measurements"] == "3 views, 3 probe windows, 1 push"
-    assert rows["camera left"] == "8×6 pixels, 0.06 to 4 m, background known"
-    assert "20 Hz" in rows["probe slide"] and rows["truth"] == "known"

@@ -1,0 +1,227 @@
+"""Recordings that are wrong: each problem is one sentence that says where."""
+
+import dataclasses
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bcppl.errors import InputError
+from bcppl.parts import Part
+from bcppl.recordings import (
+    Measurement,
+    ProbeWindow,
+    Recording,
+    View,
+    describe,
+    notes,
+    problems,
+    validate,
+)
+from tests.made_recordings import assert_one_sentence, block, camera, full
+
+
+def with_measurement(index: int, **changes: Any) -> Recording:
+    """`full()` with fields of one measurement's action, camera, probe or observation replaced."""
+    recording = full()
+    measurements = list(recording.measurements)
+    action, observation = measurements[index].action, measurements[index].observation
+    for name, value in changes.items():
+        if isinstance(action, View) and hasattr(action.camera, name):
+            action = View(dataclasses.replace(action.camera, **{name: value}))
+        elif isinstance(action, ProbeWindow) and hasattr(action.probe, name):
+            action = dataclasses.replace(action, probe=dataclasses.replace(action.probe, **{name: value}))
+        elif hasattr(action, name) and name != "times":
+            action = dataclasses.replace(action, **{name: value})
+        else:
+            observation = dataclasses.replace(observation, **{name: value})
+    measurements[index] = Measurement(action, observation)
+    return dataclasses.replace(recording, measurements=measurements)
+
+
+def changed(values: Any, *place: int, to: float) -> Any:
+    values = np.array(values)
+    values[place] = to
+    return values
+
+
+def at(index: int, name: str) -> Any:
+    measurement = full().measurements[index]
+    if isinstance(measurement.action, ProbeWindow) and hasattr(measurement.action.probe, name):
+        return getattr(measurement.action.probe, name)
+    return getattr(measurement.action if hasattr(measurement.action, name) else measurement.observation, name)
+
+
+def opened(part: Part) -> Part:
+    return dataclasses.replace(part, faces=part.faces[:-1])
+
+
+def scaled(part: Part) -> Part:
+    return dataclasses.replace(part, vertices=1e3 * part.vertices)
+
+
+def push_with_path_times(times: Any) -> Recording:
+    recording = full()
+    measurements = list(recording.measurements)
+    push: Any = measurements[3].action
+    measurements[3] = Measurement(dataclasses.replace(push, times=times), measurements[3].observation)
+    return dataclasses.replace(recording, measurements=measurements)
+
+
+replace = dataclasses.replace
+WRONG: dict[str, tuple[Recording, str]] = {
+    "mesh in millimetres": (replace(full(), part=scaled(full().part)), "millimetres"),
+    "open mesh": (replace(full(), part=opened(full().part)), "open mesh"),
+    "open peg": (replace(full(), peg=opened(block("rod"))), "'rod' has an open mesh"),
+    "empty mesh": (replace(full(), part=replace(full().part, faces=np.zeros((0, 3), int))), "empty mesh"),
+    "mesh of quads": (replace(full(), part=replace(full().part, faces=np.zeros((2, 4), int))), "triangles"),
+    "no measurement": (replace(full(), measurements=[]), "no measurement"),
+    "no peg": (replace(full(), peg=None), "measurement 1 is a probe window but the recording has no peg"),
+    "negative width": (
+        replace(full(), guess=replace(full().guess, translation=np.array([0.1, -0.1, 0]))),
+        "negative half width",
+    ),
+    "angle in degrees": (replace(full(), guess=replace(full().guess, angle=25.0)), "degrees"),
+    "guess not unit": (
+        replace(full(), guess=replace(full().guess, world_from_part=np.array([0.0, 0, 0, 1, 1, 0, 0]))),
+        "the guess .* quaternion of length 1.414",
+    ),
+    "truth not finite": (replace(full(), truth=np.array([np.nan, 0, 0, 1, 0, 0, 0])), "the truth .* finite"),
+    "camera inside": (
+        with_measurement(2, world_from_camera=np.array([0.01, 0.02, 0.0006, 0, 1, 0, 0])),
+        "measurement 2: camera 'wrist/right.2' stands .* inside it .* wrong units",
+    ),
+    "camera in millimetres": (
+        with_measurement(2, world_from_camera=np.array([0.0, 0, 600, 0, 1, 0, 0])),
+        "measurement 2: camera .* wrong units",
+    ),
+    "camera of nine coefficients": (
+        with_measurement(2, distortion=[0.1] * 8),
+        "measurement 2: camera .* not Brown's k1 k2 p1 p2",
+    ),
+    "camera folded": (
+        with_measurement(2, distortion=(-3.0, 0.5, 0.0, 0.0)),
+        "measurement 2: camera .* folds the image over: .* pixels",
+    ),
+    "camera with a coefficient that is no number": (
+        with_measurement(2, distortion=(0.1, np.nan, 0.0, 0.0)),
+        "measurement 2: camera .* finite numbers",
+    ),
+    "camera on a wrist in another's place": (
+        with_measurement(2, wrist_from_camera=np.array([0, 0, 0.1, 0, 3, 0, 0])),
+        "measurement 2: camera .* wrist_from_camera has a quaternion of length 3",
+    ),
+    "camera not unit": (
+        with_measurement(2, world_from_camera=np.array([0, 0, 0.6, 0, 2, 0, 0])),
+        "measurement 2: camera .* quaternion of length 2",
+    ),
+    "two cameras, one name": (
+        with_measurement(6, world_from_camera=np.array([0, 0, 0.7, 0, 1, 0, 0])),
+        "measurement 6: camera 'left' differs",
+    ),
+    "depth size": (with_measurement(2, depth=np.ones((8, 6))), "measurement 2: .* 6×8, .* 8×6 pixels"),
+    "depth missing": (
+        with_measurement(2, depth=np.full((6, 8), np.nan)),
+        "measurement 2: .* missing in every",
+    ),
+    "depth zero": (with_measurement(2, depth=np.zeros((6, 8))), "measurement 2: .* missing in every"),
+    "depth in millimetres": (
+        with_measurement(2, depth=np.full((6, 8), 480.0)),
+        "measurement 2: .* millimetres",
+    ),
+    "depth out of range": (with_measurement(2, depth=np.full((6, 8), 4.5)), "measurement 2: .* range"),
+    "depth negative": (with_measurement(2, depth=np.full((6, 8), -0.5)), "measurement 2: .* negative"),
+    "wrench times": (
+        with_measurement(3, times=changed(at(3, "times"), 20, to=0.0)),
+        "measurement 3's wrench .* backwards at row 20",
+    ),
+    "path times": (
+        push_with_path_times(changed(full().measurements[3].action.times, 5, to=0.0)),  # type: ignore[union-attr]
+        "measurement 3's finger path .* backwards at row 5",
+    ),
+    "path on another clock": (
+        push_with_path_times(full().measurements[3].action.times + 1e9),  # type: ignore[union-attr]
+        "measurement 3: .* one clock",
+    ),
+    "path not unit": (
+        with_measurement(3, world_from_tip=changed(at(3, "world_from_tip"), 4, 5, to=9.0)),
+        "measurement 3's finger path .* quaternion .* row 4",
+    ),
+    "command times": (
+        with_measurement(4, command_times=changed(at(4, "command_times"), 2, to=0.25)),
+        "measurement 4: probe 'press''s command .* stand still at row 2",
+    ),
+    "command not unit": (
+        with_measurement(4, command=changed(at(4, "command"), 2, 4, to=3.0)),
+        "measurement 4: .* quaternion .* row 2",
+    ),
+    "stamps": (
+        with_measurement(4, stamps=changed(at(4, "stamps"), 15, to=0.1)),
+        "measurement 4: .* stamps .* backwards at row 15",
+    ),
+    "stiffness": (with_measurement(4, stiffness=-np.ones(6)), "measurement 4: .* stiffness"),
+    "two probes, one name": (with_measurement(5, damping=np.ones(6)), "measurement 5: probe 'slide' differs"),
+    "window beyond stamps": (with_measurement(5, last=25), "measurement 5: .* within its 20 stamps"),
+    "window overlaps": (with_measurement(5, first=6), "measurement 5: .* without overlap"),
+    "window times": (
+        with_measurement(5, times=at(5, "stamps")[7:20] + 0.001),
+        "measurement 5: .* wrench time 0.351",
+    ),
+    "peg not unit": (
+        with_measurement(5, world_from_peg=changed(at(5, "world_from_peg"), 3, 3, to=4.0)),
+        "measurement 5's peg pose .* row 3",
+    ),
+    "peg poses short": (with_measurement(5, world_from_peg=np.zeros((2, 7))), "measurement 5's peg pose"),
+    "wrench NaN": (
+        with_measurement(1, wrench=changed(at(1, "wrench"), 4, 2, to=np.nan)),
+        "measurement 1 has a wrench that is not finite at row 4; fill it by interpolation, or cut",
+    ),
+    "wrench NaN in a push": (
+        with_measurement(3, wrench=changed(at(3, "wrench"), 9, 2, to=np.nan)),
+        "measurement 3 has a wrench that is not finite at row 9; leave that row out",
+    ),
+    "wrench too large": (
+        with_measurement(3, wrench=changed(at(3, "wrench"), 9, 2, to=-2e4)),
+        "measurement 3 has a wrench of 2e[+]04 at row 9",
+    ),
+    "view with a touch": (
+        replace(full(), measurements=[Measurement(View(camera("left")), full().measurements[3].observation)]),
+        "measurement 0 pairs a View with a Touch",
+    ),
+    "window left out": (
+        replace(full(), measurements=[m for m in full().measurements if getattr(m.action, "last", 0) != 7]),
+        "leaves out stamps 0 to 7",
+    ),
+    "background size": (replace(full(), background={"left": np.ones((3, 3))}), "background of camera 'left'"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_each_problem_is_one_sentence_that_says_where(case: str) -> None:
+    recording, pattern = WRONG[case]
+    found = problems(recording)
+    matching = [problem for problem in found if re.search(pattern, problem)]
+    assert len(matching) == 1, found
+    for problem in found:
+        assert_one_sentence(problem)
+    with pytest.raises(InputError) as failure:
+        validate(recording)
+    assert str(failure.value) == found[0]
+    assert describe(recording)
+
+
+def test_an_open_mesh_may_be_looked_at() -> None:
+    recording = full()
+    seen = replace(recording, part=opened(recording.part), measurements=[recording.measurements[0]], peg=None)
+    assert problems(seen) == []
+    assert len(notes(seen)) == 1 and "open mesh" in notes(seen)[0]
+    assert notes(recording) == []
+
+
+def test_describe_says_what_is_there() -> None:
+    rows = dict(describe(full()))
+    assert "100.0 × 80.0 × 30.0 mm" in rows["part"] and "closed" in rows["part"]
+    assert rows["measurements"] == "3 views, 3 probe windows, 1 push"
+    assert rows["camera left"] == "8×6 pixels, 0.06 to 4 m, background known"
+    assert "20 Hz" in rows["probe slide"] and rows["truth"] == "known"
