@@ -1,0 +1,72 @@
+"""What an arm is asked to do: straight motions, some of which end where something is felt.
+
+A `Probe` is a command as it was carried out. A plan is what comes before it: whoever carries it out (a robot,
+or a world that plays one) decides from the wrench where guarded motions end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from bcppl.errors import InputError
+
+Array = npt.NDArray[np.float64]
+Manner = Literal["free", "guarded", "held"]
+MANNERS: tuple[Manner, ...] = ("free", "guarded", "held")
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Straight motions of a held peg from knot to knot.
+
+    Between knots translations are interpolated linearly and rotations along the geodesic. A "guarded" motion
+    stops where the force felt exceeds `force`; the way that was left then stays undone: "held" motions after
+    it are made as planned but for that way, so a slide goes on along the surface that was met. A "free"
+    motion leads to its knot as planned.
+
+    Attributes:
+        name: of the probe that comes of it.
+        times: (K,) seconds, increasing.
+        world_from_peg: (K, 7) where the peg is commanded to be at the knots.
+        manners: (K - 1,) one of "free", "guarded" and "held" for each motion.
+        force: newtons at which a guarded motion stops.
+        stiffness: (6,) N/m along, then N m/rad about, the commanded peg's axes.
+        damping: (6,) N s/m, then N m s/rad.
+        rate: samples per second of what is measured.
+
+    Raises:
+        InputError: shapes do not fit, times do not increase, a manner is unknown, or the force is not
+            positive.
+    """
+
+    name: str
+    times: Array
+    world_from_peg: Array
+    manners: tuple[Manner, ...]
+    force: float
+    stiffness: Array
+    damping: Array
+    rate: float = 100.0
+
+    def __post_init__(self) -> None:
+        knots = len(self.times)
+        if knots < 2 or self.world_from_peg.shape != (knots, 7) or len(self.manners) != knots - 1:
+            raise InputError(
+                f"plan {self.name!r} has {knots} times, poses {self.world_from_peg.shape} and "
+                f"{len(self.manners)} manners; give K >= 2 times, (K, 7) poses and K - 1 manners."
+            )
+        if not (np.isfinite(self.times).all() and (np.diff(self.times) > 0).all()):
+            raise InputError(f"plan {self.name!r} has times that do not increase; sort them, in seconds.")
+        if not np.isfinite(self.world_from_peg).all():
+            raise InputError(f"plan {self.name!r} has a pose that is not finite; give poses in metres.")
+        for manner in self.manners:
+            if manner not in MANNERS:
+                raise InputError(
+                    f"plan {self.name!r} has a motion that is {manner!r}; give one of {', '.join(MANNERS)}."
+                )
+        if not self.force > 0.0:
+            raise InputError(f"plan {self.name!r} stops at {self.force:g} N; give a positive force.")
