@@ -1,0 +1,351 @@
+"""The bench of the accuracy benchmark: seven parts, two depth cameras, and an arm that carries out a plan.
+
+Every scene is another: part, clearance, pose, cameras and their errors, friction, stiffness and damping of
+contacts. None of it is read by inference except the recording, and no parameter is shared with a model.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from bcppl import poses
+from bcppl.arguments import number_within, seed_number
+from bcppl.distributions.poses import SwingTwistPose
+from bcppl.models.worlds.bench_parts import PARTS, BenchPart, bench_part
+from bcppl.models.worlds.guarded_motion import CarriedOut, carry_out, stamps_of
+from bcppl.parts import Part
+from bcppl.recordings.measurements import (
+    DepthImage,
+    Guess,
+    Measurement,
+    ProbeWindow,
+    Recording,
+    Touch,
+    View,
+)
+from bcppl.recordings.plan import Plan
+from bcppl.simulators.camera import Camera, looking_at
+from bcppl.simulators.depth_noise import DepthNoise
+from bcppl.simulators.peg_model import ContactParameters
+from bcppl.simulators.scene import SceneRenderer
+from bcppl.simulators.shapes import block
+
+Array = npt.NDArray[np.float64]
+
+# What is drawn for a scene is drawn apart, so that giving a part or a plan changes nothing else.
+_CHOICE, _POSE, _CAMERAS, _CONTACT, _IMAGES, _WRENCH, _DRIFT, _WOBBLE = range(8)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What the bench is like: metres, radians, newtons, seconds; standard deviations where nothing is said.
+
+    Attributes:
+        clearances: diametral; one is drawn per scene.
+        top: (3,) where the centre of the part's top face is thought to be; the table's top is z = 0.
+        translation, tilt, yaw: limits of the prior of the part's pose.
+        distance, height, around: of a camera: from where the top is thought to be, above the table (from
+            there), and between the headings of the two.
+        width, rows, focal: of the images, pixels.
+        depth_noise: of the depth images.
+        camera_shift, camera_turn: how far off the cameras' stated poses are, along and about each axis.
+        camera_error_factor: how much farther off they are than that, for cameras worse than they say.
+        range_bias: what a camera adds to all its ranges.
+        occluder: whether a box that no recording speaks of hides a part of the part from one camera.
+        hidden: the share of the part's pixels that it hides.
+        force_noise, torque_noise: of each sample of the wrench, N and N m.
+        force_bias, torque_bias: of the sensor's zero at the start, N and N m.
+        force_drift, torque_drift: how far the zero has walked after `drift_time` (s), N and N m.
+        peg_noise, peg_turn: of each sample of the peg's measured pose.
+        window: how long (s) a window of a probe is.
+        time_step: of the physics.
+        friction: limits between which the coefficient is drawn.
+        time_constant, damping_ratio: of contacts, in the middle; drawn per scene, uniformly in the logarithm.
+        contact_factor: up to this factor either way.
+    """
+
+    clearances: tuple[float, ...] = (0.0001, 0.0002, 0.0005, 0.001)
+    top: tuple[float, float, float] = (0.5, 0.0, 0.15)
+    translation: float = 0.02
+    tilt: float = math.radians(10.0)
+    yaw: float = math.radians(30.0)
+    distance: tuple[float, float] = (0.35, 0.6)
+    height: tuple[float, float] = (math.radians(30.0), math.radians(60.0))
+    around: float = math.radians(90.0)
+    width: int = 160
+    rows: int = 120
+    focal: float = 160.0
+    depth_noise: DepthNoise = field(
+        default_factory=lambda: DepthNoise(scale=0.002, step=0.001, dropout=0.05, flying=0.5)
+    )
+    camera_shift: float = 0.002
+    camera_turn: float = math.radians(0.5)
+    camera_error_factor: float = 1.0
+    range_bias: float = 0.002
+    occluder: bool = False
+    hidden: float = 1.0 / 3.0
+    force_noise: float = 0.1
+    torque_noise: float = 0.005
+    force_bias: float = 1.0
+    torque_bias: float = 0.05
+    force_drift: float = 0.3
+    torque_drift: float = 0.015
+    drift_time: float = 6.0
+    peg_noise: float = 0.00005
+    peg_turn: float = math.radians(0.02)
+    window: float = 0.5
+    time_step: float = 0.0005
+    friction: tuple[float, float] = (0.1, 0.5)
+    time_constant: float = 0.004
+    damping_ratio: float = 1.0
+    contact_factor: float = 2.0
+
+    def __post_init__(self) -> None:
+        number_within("the bench has camera_error_factor {}", self.camera_error_factor, least=0.0)
+        number_within("the bench hides a share {} of the part", self.hidden, above=0.0, most=1.0)
+        number_within("the bench has windows of {} s", self.window, above=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class BenchScene:
+    """One scene of the bench: all that is true of it, and the recordings that can be made of it.
+
+    Attributes:
+        seed: same seed, same scene.
+        bench: what it was drawn from.
+        kind: the part with its hole's outline and place.
+        clearance: of hole and peg, diametral, metres.
+        peg: what the arm holds.
+        guess: what is known of the part's pose beforehand.
+        truth: (7,) true `world_from_part`.
+        contact: the world's physics.
+        cameras: the two cameras, their poses as stated.
+        world_from_cameras: (2, 7) where they truly stand.
+        range_bias: (2,) what each adds to its ranges, metres.
+        hidden_view: which camera the occluder stands before; None where there is none.
+    """
+
+    seed: int
+    bench: Bench
+    kind: BenchPart
+    clearance: float
+    peg: Part
+    guess: Guess
+    truth: Array
+    contact: ContactParameters
+    cameras: Sequence[Camera]
+    world_from_cameras: Array
+    range_bias: Array
+    hidden_view: int | None
+
+    @property
+    def part(self) -> Part:
+        """The part that is looked for."""
+        return self.kind.part
+
+    @property
+    def friction(self) -> float:
+        """The coefficient between peg and part."""
+        return self.contact.friction
+
+    @property
+    def name(self) -> str:
+        """The part and the clearance in words."""
+        return f"{self.kind.name}, {1000 * self.clearance:g} mm"
+
+    def look(self) -> Recording:
+        """The recording of the two views alone."""
+        return self._recording(())
+
+    def probe(self, plan: Plan) -> Recording:
+        """The recording of the same two views and of a plan carried out, in windows."""
+        carried, wrench, world_from_peg = self.carried_out(plan)
+        probe, step = carried.probe, max(1, round(self.bench.window * plan.rate))
+        windows = []
+        for first in range(0, len(probe.stamps), step):
+            rows = slice(first, min(first + step, len(probe.stamps)))
+            touch = Touch(probe.stamps[rows], wrench[rows], world_from_peg[rows])
+            windows.append(Measurement(ProbeWindow(probe, rows.start, rows.stop), touch))
+        return self._recording(windows)
+
+    def carried_out(self, plan: Plan) -> tuple[CarriedOut, Array, Array]:
+        """A plan as it was truly carried out, and the wrench (T, 6) and peg poses (T, 7) measured then."""
+        bench, count = self.bench, len(stamps_of(plan))
+        bias = _drawn(self.seed, _WRENCH).normal(size=6) * _six(bench.force_bias, bench.torque_bias)
+        pace = _six(bench.force_drift, bench.torque_drift) / math.sqrt(bench.drift_time * plan.rate)
+        drift = np.cumsum(_drawn(self.seed, _DRIFT, 0).normal(size=(count, 6)) * pace, axis=0)
+        noise = _drawn(self.seed, _DRIFT, 1).normal(size=(count, 6))
+        error = bias + drift + noise * _six(bench.force_noise, bench.torque_noise)
+        carried = carry_out(plan, self.part, self.peg, self.contact, self.truth, error)
+        wobble = _drawn(self.seed, _WOBBLE).normal(size=(count, 6)) * _six(bench.peg_noise, bench.peg_turn)
+        there = torch.from_numpy(carried.world_from_peg)
+        return carried, carried.wrench + error, poses.retract(there, torch.from_numpy(wobble)).numpy()
+
+    def _recording(self, windows: Sequence[Measurement]) -> Recording:
+        images, background = self._views
+        views = [Measurement(View(c), i) for c, i in zip(self.cameras, images, strict=True)]
+        return Recording(
+            part=self.part,
+            guess=self.guess,
+            measurements=[*views, *windows],
+            peg=self.peg,
+            background=background,
+            truth=self.truth,
+            model="look_and_touch",
+            source=f"simulated by bcppl, accuracy bench, seed {self.seed}: {self.name}",
+        )
+
+    @functools.cached_property
+    def _views(self) -> tuple[list[DepthImage], dict[str, Array]]:
+        """What the two cameras read, and what they would see of the table alone from where they say."""
+        still, generator = _table(), _drawn(self.seed, _IMAGES)
+        images, background = [], {}
+        empty = SceneRenderer([still])
+        for k, camera in enumerate(self.cameras):
+            background[camera.name] = empty.background(camera, poses.identity(1))
+            depth = self._seen(k) + self.range_bias[k]
+            read = self.bench.depth_noise.read(camera, depth, generator)
+            images.append(DepthImage(read.astype(np.float32).astype(np.float64)))
+        return images, background
+
+    def _seen(self, view: int) -> Array:
+        """True depths (H, W) from where a camera truly stands."""
+        camera = replace(self.cameras[view], world_from_camera=self.world_from_cameras[view])
+        parts, stands = [self.part, _table()], [torch.from_numpy(self.truth), poses.identity()]
+        if view == self.hidden_view:
+            box, pose = occluder(camera, self.part, self.truth, self.bench.hidden, self.seed)
+            parts.append(box)
+            stands.append(torch.from_numpy(pose))
+        return SceneRenderer(parts).images(camera, torch.stack(stands))[0]
+
+
+def bench_scene(
+    seed: int, bench: Bench | None = None, part: str | None = None, clearance: float | None = None
+) -> BenchScene:
+    """One scene of the bench.
+
+    Args:
+        seed: same seed, same scene; a part or a clearance that is given changes nothing else of it.
+        bench: what it is drawn from; the default one unless given.
+        part: a name in `bench_parts.PARTS`; drawn unless given.
+        clearance: diametral, metres; drawn unless given.
+
+    Raises:
+        InputError: the seed is no whole number from 0, there is no such part, or its hole takes no peg with
+            that clearance.
+    """
+    seed = seed_number(seed)
+    bench = Bench() if bench is None else bench
+    choice = _drawn(seed, _CHOICE)
+    drawn_part, drawn_clearance = choice.integers(len(PARTS)), choice.integers(len(bench.clearances))
+    kind = bench_part(list(PARTS)[drawn_part] if part is None else part)
+    clearance = bench.clearances[drawn_clearance] if clearance is None else float(clearance)
+    centre = np.array([*bench.top[:2], bench.top[2] - kind.part_from_hole[2], 1.0, 0.0, 0.0, 0.0])
+    guess = Guess(centre, np.full(3, bench.translation), bench.tilt, bench.yaw)
+    cameras, stand, bias, hidden = _cameras(seed, bench)
+    return BenchScene(
+        seed=seed,
+        bench=bench,
+        kind=kind,
+        clearance=clearance,
+        peg=kind.peg(clearance),
+        guess=guess,
+        truth=_truth(seed, guess),
+        contact=_contact(seed, bench),
+        cameras=cameras,
+        world_from_cameras=stand,
+        range_bias=bias,
+        hidden_view=hidden,
+    )
+
+
+def occluder(
+    camera: Camera, part: Part, world_from_part: Array, share: float, seed: int
+) -> tuple[Part, Array]:
+    """A box between a camera and a part that hides about a share of what the camera sees of it.
+
+    It stands half way, square to the camera, and reaches over the part from a side that is drawn.
+
+    Returns:
+        The box, and where it stands (7,).
+    """
+    only = SceneRenderer([part]).images(camera, torch.from_numpy(world_from_part)[None])[0]
+    seen = np.isfinite(only).ravel()
+    rays = camera.rays()[seen]
+    angle = _drawn(seed, _CAMERAS, 1).uniform(0.0, 2.0 * math.pi)
+    across = np.array([math.cos(angle), math.sin(angle)])
+    halfway = 0.5 * float(np.median(only.ravel()[seen]))
+    place = halfway * rays[:, :2]
+    edge = float(np.quantile(place @ across, 1.0 - share))
+    along = np.array([-across[1], across[0]])
+    middle = float(np.median(place @ along))
+    box = block((0.1, 0.2, 0.01), "occluder")
+    corner = (edge + 0.05) * across + middle * along
+    turn = torch.tensor([*corner, halfway, 0.0, 0.0, angle], dtype=torch.float64)
+    camera_from_box = poses.retract(poses.identity(), turn)
+    return box, poses.compose(torch.from_numpy(camera.world_from_camera), camera_from_box).numpy()
+
+
+def _truth(seed: int, guess: Guess) -> Array:
+    prior = SwingTwistPose(
+        torch.from_numpy(guess.world_from_part), torch.from_numpy(guess.translation), guess.tilt, guess.yaw
+    )
+    with torch.random.fork_rng(devices=[]):
+        # Inference may well be given the same seed, and must not draw the truth with it.
+        torch.manual_seed(int(_drawn(seed, _POSE).integers(2**62)))
+        return np.asarray(prior.sample().numpy())
+
+
+def _cameras(seed: int, bench: Bench) -> tuple[list[Camera], Array, Array, int | None]:
+    """The cameras as stated, where they truly stand, their range biases, and which one looks past a box."""
+    generator, top = _drawn(seed, _CAMERAS), np.array(bench.top)
+    heading = generator.uniform(0.0, 2.0 * math.pi)
+    spread = bench.camera_error_factor * _six(bench.camera_shift, bench.camera_turn)
+    found, stand, bias = [], [], []
+    for k in range(2):
+        distance, height = generator.uniform(*bench.distance), generator.uniform(*bench.height)
+        around = heading + k * bench.around
+        flat = math.cos(height)
+        eye = top + distance * np.array([flat * math.cos(around), flat * math.sin(around), math.sin(height)])
+        pose = looking_at(eye, top)
+        size, focal = (bench.width, bench.rows), bench.focal
+        middle = (0.5 * (size[0] - 1), 0.5 * (size[1] - 1))
+        found.append(Camera(f"camera_{k}", *size, focal, focal, *middle, pose, near=0.1, far=2.0))
+        off = torch.from_numpy(spread * generator.normal(size=6))
+        stand.append(poses.retract(torch.from_numpy(pose), off).numpy())
+        bias.append(generator.normal(scale=bench.range_bias))
+    which = int(generator.integers(2))
+    return found, np.stack(stand), np.array(bias), which if bench.occluder else None
+
+
+def _contact(seed: int, bench: Bench) -> ContactParameters:
+    generator = _drawn(seed, _CONTACT)
+    friction = generator.uniform(*bench.friction)
+    factors = bench.contact_factor ** generator.uniform(-1.0, 1.0, size=2)
+    return ContactParameters(
+        time_step=bench.time_step,
+        friction=friction,
+        time_constant=bench.time_constant * factors[0],
+        damping_ratio=bench.damping_ratio * factors[1],
+    )
+
+
+def _drawn(seed: int, *what: int) -> np.random.Generator:
+    return np.random.default_rng([seed, *what])
+
+
+def _six(along: float, about: float) -> Array:
+    return np.array([along] * 3 + [about] * 3)
+
+
+@functools.cache
+def _table() -> Part:
+    """The table's top as a thin slab, 2 m wide, its upper face at z = 0."""
+    return block((2.0, 2.0, 0.01), "table")
