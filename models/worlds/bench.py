@@ -210,13 +210,13 @@ class BenchScene:
         empty = SceneRenderer([still])
         for k, camera in enumerate(self.cameras):
             background[camera.name] = empty.background(camera, poses.identity(1))
-            depth = self._seen(k) + self.range_bias[k]
+            depth = self.true_depth(k) + self.range_bias[k]
             read = self.bench.depth_noise.read(camera, depth, generator)
             images.append(DepthImage(read.astype(np.float32).astype(np.float64)))
         return images, background
 
-    def _seen(self, view: int) -> Array:
-        """True depths (H, W) from where a camera truly stands."""
+    def true_depth(self, view: int) -> Array:
+        """The depth (H, W) in metres from where a camera truly stands, without noise or bias."""
         camera = replace(self.cameras[view], world_from_camera=self.world_from_cameras[view])
         parts, stands = [self.part, _table()], [torch.from_numpy(self.truth), poses.identity()]
         if view == self.hidden_view:
@@ -286,8 +286,8 @@ def occluder(
     edge = float(np.quantile(place @ across, 1.0 - share))
     along = np.array([-across[1], across[0]])
     middle = float(np.median(place @ along))
-    box = block((0.1, 0.2, 0.01), "occluder")
-    corner = (edge + 0.05) * across + middle * along
+    box = block((0.05, 0.08, 0.01), "occluder")
+    corner = (edge + 0.025) * across + middle * along
     turn = torch.tensor([*corner, halfway, 0.0, 0.0, angle], dtype=torch.float64)
     camera_from_box = poses.retract(poses.identity(), turn)
     return box, poses.compose(torch.from_numpy(camera.world_from_camera), camera_from_box).numpy()
@@ -331,9 +331,9 @@ def _contact(seed: int, bench: Bench) -> ContactParameters:
     factors = bench.contact_factor ** generator.uniform(-1.0, 1.0, size=2)
     return ContactParameters(
         time_step=bench.time_step,
-        friction=friction,
-        time_constant=bench.time_constant * factors[0],
-        damping_ratio=bench.damping_ratio * factors[1],
+        friction=float(friction),
+        time_constant=bench.time_constant * float(factors[0]),
+        damping_ratio=bench.damping_ratio * float(factors[1]),
     )
 
 

@@ -61,7 +61,7 @@ class BenchPart:
 
 
 def _tray(shape: str) -> BenchPart:
-    # The bore of the mesh is within 2 um of these.
+    # The bore of the mesh is within 2 um of these; the corners of a round peg stand out by 3 um.
     hole = round_outline(0.009) if shape == "round" else rectangular_outline(0.009, 0.008)
     place = np.array([0.0, 0.0, TRAY_TOP, 1.0, 0.0, 0.0, 0.0])
     return BenchPart(f"{shape} tray", insert_tray(shape), hole, place, TRAY_TOP - 0.003)

@@ -55,7 +55,8 @@ def command_of(plan: Plan, stops: Mapping[int, float]) -> Probe:
     """The command of a plan of which some guarded motions are stopped early, and no others.
 
     Corners are rounded: the command is the mean of the last 40 ms of where the plan leads. So it is 20 ms
-    late, stops within 40 ms, and never depends on what is yet to be felt.
+    late, stops within 40 ms, and never depends on what is yet to be felt. A corner at which the velocity
+    changes by 100 mm/s is felt as 0.5 N by the 0.2 kg of the tool; slower corners as less, in proportion.
 
     Args:
         plan: what the arm is asked to do.
