@@ -35,6 +35,15 @@ def cluster(
     Raises:
         InputError: a scale is not positive, or there are too many poses.
     """
+    linked = links(world_from_part, translation, rotation, symmetries)
+    _, label = connected_components(linked.numpy(), directed=False)
+    return torch.from_numpy(np.asarray(label, dtype=np.int64))
+
+
+def links(
+    world_from_part: Tensor, translation: float, rotation: float, symmetries: Tensor | None = None
+) -> Tensor:
+    """Which pairs of poses `cluster` links, bool (N, N); it takes and raises what that does."""
     if not (translation > 0 and rotation > 0):
         raise InputError(
             f"modes were asked for at scales {translation} m and {rotation} rad; give two positive numbers."
@@ -46,8 +55,7 @@ def cluster(
     linked = torch.zeros(len(world_from_part), len(world_from_part), dtype=torch.bool)
     for copy in _copies(world_from_part, symmetries).unbind(dim=1):
         linked |= _separation(world_from_part, copy, translation, rotation) <= 1.0
-    _, label = connected_components(linked.numpy(), directed=False)
-    return torch.from_numpy(np.asarray(label, dtype=np.int64))
+    return linked
 
 
 def gathered(
