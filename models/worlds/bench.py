@@ -20,6 +20,7 @@ from bcppl.arguments import number_within, seed_number
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.models.worlds.bench_parts import PARTS, BenchPart, bench_part
 from bcppl.models.worlds.guarded_motion import CarriedOut, carry_out, stamps_of
+from bcppl.models.worlds.occlusion import occluder
 from bcppl.parts import Part
 from bcppl.recordings.measurements import (
     DepthImage,
@@ -220,7 +221,8 @@ class BenchScene:
         camera = replace(self.cameras[view], world_from_camera=self.world_from_cameras[view])
         parts, stands = [self.part, _table()], [torch.from_numpy(self.truth), poses.identity()]
         if view == self.hidden_view:
-            box, pose = occluder(camera, self.part, self.truth, self.bench.hidden, self.seed)
+            angle = _drawn(self.seed, _CAMERAS, 1).uniform(0.0, 2.0 * math.pi)
+            box, pose = occluder(camera, self.part, self.truth, self.bench.hidden, angle)
             parts.append(box)
             stands.append(torch.from_numpy(pose))
         return SceneRenderer(parts).images(camera, torch.stack(stands))[0]
@@ -266,33 +268,6 @@ def bench_scene(
     )
 
 
-def occluder(
-    camera: Camera, part: Part, world_from_part: Array, share: float, seed: int
-) -> tuple[Part, Array]:
-    """A box between a camera and a part that hides about a share of what the camera sees of it.
-
-    It stands half way, square to the camera, and reaches over the part from a side that is drawn.
-
-    Returns:
-        The box, and where it stands (7,).
-    """
-    only = SceneRenderer([part]).images(camera, torch.from_numpy(world_from_part)[None])[0]
-    seen = np.isfinite(only).ravel()
-    rays = camera.rays()[seen]
-    angle = _drawn(seed, _CAMERAS, 1).uniform(0.0, 2.0 * math.pi)
-    across = np.array([math.cos(angle), math.sin(angle)])
-    halfway = 0.5 * float(np.median(only.ravel()[seen]))
-    place = halfway * rays[:, :2]
-    edge = float(np.quantile(place @ across, 1.0 - share))
-    along = np.array([-across[1], across[0]])
-    middle = float(np.median(place @ along))
-    box = block((0.05, 0.08, 0.01), "occluder")
-    corner = (edge + 0.025) * across + middle * along
-    turn = torch.tensor([*corner, halfway, 0.0, 0.0, angle], dtype=torch.float64)
-    camera_from_box = poses.retract(poses.identity(), turn)
-    return box, poses.compose(torch.from_numpy(camera.world_from_camera), camera_from_box).numpy()
-
-
 def _truth(seed: int, guess: Guess) -> Array:
     prior = SwingTwistPose(
         torch.from_numpy(guess.world_from_part), torch.from_numpy(guess.translation), guess.tilt, guess.yaw
@@ -312,8 +287,8 @@ def _cameras(seed: int, bench: Bench) -> tuple[list[Camera], Array, Array, int |
     for k in range(2):
         distance, height = generator.uniform(*bench.distance), generator.uniform(*bench.height)
         around = heading + k * bench.around
-        flat = math.cos(height)
-        eye = top + distance * np.array([flat * math.cos(around), flat * math.sin(around), math.sin(height)])
+        flat, up = math.cos(height), math.sin(height)
+        eye = top + distance * np.array([flat * math.cos(around), flat * math.sin(around), up])
         pose = looking_at(eye, top)
         size, focal = (bench.width, bench.rows), bench.focal
         middle = (0.5 * (size[0] - 1), 0.5 * (size[1] - 1))

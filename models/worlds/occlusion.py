@@ -1,0 +1,57 @@
+"""A box that stands before a camera, of which no recording speaks."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from bcppl import poses
+from bcppl.errors import InputError
+from bcppl.parts import Part
+from bcppl.simulators.camera import Camera
+from bcppl.simulators.renderer import DepthRenderer
+from bcppl.simulators.shapes import block
+
+Array = npt.NDArray[np.float64]
+
+WIDTH, LENGTH, THICKNESS = 0.05, 0.08, 0.01  # m
+
+
+def occluder(
+    camera: Camera, part: Part, world_from_part: Array, share: float, angle: float
+) -> tuple[Part, Array]:
+    """A box between a camera and a part that hides about a share of what the camera sees of it.
+
+    It stands half way, square to the camera, and reaches over the part from one side.
+
+    Args:
+        camera: its pose is where it truly stands.
+        part: what is hidden in part.
+        world_from_part: (7,) where it is.
+        share: of the part's pixels, from 0 to 1.
+        angle: towards which side of the image the box lies, radians from right to down.
+
+    Returns:
+        The box, and where it stands (7,).
+
+    Raises:
+        InputError: the camera does not see the part.
+    """
+    depth = DepthRenderer(part).images(camera, world_from_part[None])[0].ravel()
+    seen = np.isfinite(depth)
+    if not seen.any():
+        raise InputError(f"camera {camera.name!r} does not see part {part.name!r}; turn it towards the part.")
+    halfway = 0.5 * float(np.median(depth[seen]))
+    place = halfway * camera.rays()[seen][:, :2]
+    outwards = np.array([math.cos(angle), math.sin(angle)])
+    along = np.array([-outwards[1], outwards[0]])
+    edge = float(np.quantile(place @ outwards, 1.0 - share))
+    middle = (edge + 0.5 * WIDTH) * outwards + float(np.median(place @ along)) * along
+    stand = torch.tensor([*middle, halfway, 0.0, 0.0, angle], dtype=torch.float64)
+    world_from_box = poses.compose(
+        torch.from_numpy(camera.world_from_camera), poses.retract(poses.identity(), stand)
+    )
+    return block((WIDTH, LENGTH, THICKNESS), "occluder"), world_from_box.numpy()
