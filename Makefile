@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 RECORDINGS := point_probe_10_pushes peg_probe
 # Packages that the benchmarks measure beside bcppl; each gets an environment of its own.
-PEERS := particles blackjax open3d
+PEERS := particles blackjax open3d chsel
 # Test processes; each keeps to one thread.
 JOBS ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
@@ -38,6 +38,7 @@ peers: $(PEERS:%=benchmarks/.peers/%/.installed)
 
 benchmarks/.peers/%/.installed: benchmarks/peers/%.txt | $(STAMP)
 	$(BIN)/python -m venv --clear $(@D)
+	@torch=$$(grep '^torch==' $<); if [ -n "$$torch" ]; then $(@D)/bin/python -m pip install --quiet "$$torch"; fi
 	$(@D)/bin/python -m pip install --quiet --requirement $<
 	@touch $@
 

@@ -6,26 +6,18 @@ explained. One run over the longest series gives the beliefs after every shorter
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jobs import each
-from report import DATA, Row, cores, finish, options, show
+from report import Row, cores, finish, options, show
+from touches import LOGS, OTHER, PARTICLES, errors, explained, learnt, pushes
 
-from bcppl import poses
-from bcppl.inference.tempered_smc import infer
-from bcppl.models.point_probe import Settings, learn, model
-from bcppl.recordings.importers.point_probe import command
-from bcppl.recordings.measurements import Recording
-
-LOGS = DATA / "point_probe_pushes"
+LOG = "10_90"
 COUNTS = (1, 2, 3, 5, 10, 20)
-PARTICLES = 75
 WRONG = 5.0  # mm: farther than this from the truth is another mode, not noise
 
 # What is told to the model: the finger's calibration, and which sites it has.
@@ -49,35 +41,22 @@ class Result(NamedTuple):
     seconds: float
 
 
-def pushes(log: str, count: int, seed: int) -> Recording:
-    """Pushes drawn from a log, the part at a pose within 20 mm and 20 degrees of the guess."""
-    return command(sorted(LOGS.glob(f"{log}_10_10*")), pushes=count, seed=seed)
-
-
-@cache
-def learnt(calibrated: bool) -> Settings:
-    """Settings from all pushes of the other log; without the calibration the finger touches where it says."""
-    recording = pushes("10_130", 50, 0)
-    return learn(recording) if calibrated else learn(recording, finger=(0.0, 0.0, 0.0))
-
-
 def run(asked: tuple[str, int, tuple[int, ...]]) -> list[Result]:
     """The results of one variant on one draw, after each of the counts."""
     variant, seed, counts = asked
     calibrated, sites = VARIANTS[variant]
-    recording = pushes("10_90", max(counts), seed)
-    scene = model.prepare(recording, **{**asdict(learnt(calibrated)), **sites})
-    truth, points = torch.as_tensor(recording.truth), recording.part.surface_points()
-    results, seconds = [], 0.0
-    for done, step in enumerate(infer(model, recording, particles=PARTICLES, seed=seed, scene=scene)):
-        seconds += step.info.seconds
+    recording = pushes(LOG, max(counts), seed)
+    settings = {**asdict(learnt(OTHER[LOG], calibrated)), **sites}
+    results = []
+    for done, (step, seconds) in enumerate(explained(recording, seed, settings)):
         if done in counts:
-            error = poses.local(truth, step.belief.mean)
+            off = errors(step.belief.mean, recording)
+            add = step.belief.weighted_add(recording.part.surface_points(), torch.as_tensor(recording.truth))
             results.append(
                 Result(
-                    1e3 * float(error[:2].norm()),
-                    math.degrees(abs(float(error[5]))),
-                    1e3 * step.belief.weighted_add(points, truth),
+                    off.position,
+                    off.yaw,
+                    1e3 * add,
                     step.info.effective_sample_size,
                     step.info.truth_gap,
                     seconds,
