@@ -58,6 +58,17 @@ def links(
     return linked
 
 
+def nearest(
+    world_from_part: Tensor, translation: float, rotation: float, symmetries: Tensor | None = None
+) -> Tensor:
+    """The distance (N,) of each pose from the nearest other one, in units of the gap between clusters."""
+    squared = torch.full((len(world_from_part),), torch.inf, dtype=torch.float64)
+    for copy in _copies(world_from_part, symmetries).unbind(dim=1):
+        apart = _separation(world_from_part, copy, translation, rotation)
+        squared = torch.minimum(squared, apart.fill_diagonal_(torch.inf).amin(dim=1))
+    return squared.sqrt()
+
+
 def gathered(
     world_from_part: Tensor, reference: Tensor, translation: float, rotation: float, symmetries: Tensor
 ) -> Tensor:

@@ -38,7 +38,7 @@ def chamfer(a: Tensor, b: Tensor, one_empty: float) -> Tensor:
     The mean over a of the squared distance to the nearest point of b, plus the same from b to a
     (Fan, Su and Guibas 2017, equation 6, with means). Both sets empty: 0. One empty: `one_empty`.
     """
-    a, b = a.to(torch.float64), b.to(torch.float64)
+    a, b = _told(a.to(torch.float64)), _told(b.to(torch.float64))
     in_a, in_b = torch.isfinite(a).all(dim=-1), torch.isfinite(b).all(dim=-1)
     count_a, count_b = in_a.sum(dim=-1), in_b.sum(dim=-1)
     # The mode that multiplies matrices is off by up to 1e-8 m, which is a lot for points that are the same.
@@ -53,6 +53,13 @@ def chamfer(a: Tensor, b: Tensor, one_empty: float) -> Tensor:
     distance = mean_to_nearest(-1, in_a, count_a) + mean_to_nearest(-2, in_b, count_b)
     distance = torch.where((count_a == 0) != (count_b == 0), one_empty, distance)
     return torch.where((count_a == 0) & (count_b == 0), 0.0, distance)
+
+
+def _told(points: Tensor) -> Tensor:
+    """The points (..., K, 3) without those places among (..., S, 3) that are NaN in every set."""
+    inside = torch.isfinite(points).all(dim=-1)
+    inside = inside.reshape(inside.shape[:-1].numel(), inside.shape[-1]).any(dim=0)
+    return points if bool(inside.all()) else points[..., inside, :]
 
 
 def _check_positive(name: str, **settings: float) -> None:
@@ -158,6 +165,7 @@ class ContactsInTime(LazyDistribution):
     """
 
     cost = 2
+    broadcasts = True
 
     def __init__(
         self,
@@ -250,6 +258,7 @@ class PegPose(LazyDistribution):
     """
 
     cost = 2
+    broadcasts = True
 
     def __init__(
         self,

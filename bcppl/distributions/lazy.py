@@ -24,9 +24,11 @@ class LazyDistribution(TorchDistribution):
             a log-probability that is known already is not computed again.
         cost: what a log-probability takes: 0 arithmetic, 1 rendering, 2 physics. Kernels ask the cheap ones
             first and move particles less often where they are dear.
+        broadcasts: whether `log_prob` takes H observations at once, (H, 1, *event_shape), and gives (H, N).
     """
 
     cost: int = 0
+    broadcasts: bool = False
 
     arg_constraints: dict[str, Any] = {}
     support = constraints.real

@@ -22,12 +22,12 @@ def checked_stamps(name: str, first: int, last: int) -> tuple[int, int]:
 
 
 def checked_event(name: str, value: Tensor, stamps: int, numbers: int) -> Tensor:
-    """An observation (stamps, numbers), or one for each particle (N, stamps, numbers).
+    """An observation (stamps, numbers), one for each particle (N, ...), or several for all (H, 1, ...).
 
     Raises:
         InputError: its last two dimensions are not these.
     """
-    if value.ndim not in (2, 3) or tuple(value.shape[-2:]) != (stamps, numbers):
+    if value.ndim not in (2, 3, 4) or tuple(value.shape[-2:]) != (stamps, numbers):
         raise InputError(
             f"{name} looks at {stamps} stamps but its observation has shape {tuple(value.shape)}; "
             f"give ({stamps}, {numbers}), a row for each stamp."

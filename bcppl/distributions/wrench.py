@@ -72,6 +72,7 @@ class Wrench(LazyDistribution):
     """
 
     cost = 2
+    broadcasts = True
 
     def __init__(
         self,

@@ -24,7 +24,7 @@ from bcppl import poses
 from bcppl.arguments import whole_number
 from bcppl.beliefs import Belief
 from bcppl.beliefs.merged import distinct_poses
-from bcppl.beliefs.modes import cluster, gathered, links
+from bcppl.beliefs.modes import cluster, gathered, links, nearest
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.probing.mixtures import Mixtures, spanning_factor
@@ -34,6 +34,8 @@ from bcppl.inference.summaries import is_pose, values_at
 EntropyOf = Callable[[Tensor], Tensor]
 Entropy = Callable[[Population], EntropyOf]
 
+# Gaps between modes are at least so many distances of a particle from its nearest neighbour (median).
+SPARSE = 3.0
 # Numbers held at once where a reweighing's neighbours are gathered.
 AT_ONCE = 1 << 24
 
@@ -87,7 +89,8 @@ def mode_entropy(
 
     Args:
         address: a latent one.
-        translation: the gap between modes, metres.
+        translation: the gap between modes, metres. Both are widened together where half of the particles
+            have no neighbour within a third of them.
         rotation: the gap between modes, radians.
         symmetries: (K, 7) `part_from_part` under which the part looks the same.
 
@@ -106,14 +109,17 @@ def mode_entropy(
             distinct, which = distinct_poses(population[address][carrying])
             _refuse_collapsed(address, len(distinct))
             share = _summed(weights, which, len(distinct))
-            label = cluster(distinct, translation, rotation, symmetries)
-            linked = links(distinct, translation, rotation, symmetries)
+            # The few particles of a wide belief are farther apart than modes are, and no modes for that.
+            sparse = SPARSE * float(nearest(distinct, translation, rotation, symmetries).median())
+            gap = (max(1.0, sparse) * translation, max(1.0, sparse) * rotation)
+            label = cluster(distinct, *gap, symmetries)
+            linked = links(distinct, *gap, symmetries)
             tangent = distinct.new_zeros(len(distinct), 6)
             for mode in range(int(label.max()) + 1):
                 within = label == mode
                 own = distinct[within]
                 if symmetries is not None:
-                    own = gathered(own, own[share[within].argmax()], translation, rotation, symmetries)
+                    own = gathered(own, own[share[within].argmax()], *gap, symmetries)
                 tangent[within] = poses.local(_mean(own, share[within]), own)
             coordinates = freedom.coordinates(tangent)
             log_base = freedom.log_base_density(tangent[:, 3:].norm(dim=-1))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -26,8 +26,10 @@ from bcppl.inference.probing.lookahead import Following, Step, entropies, follow
 from bcppl.inference.probing.observations import (
     Arguments,
     Batched,
-    drawn,
-    log_likelihoods,
+    Forecast,
+    Forecasted,
+    Simulated,
+    forecasted,
     seeded,
     simulated,
 )
@@ -42,6 +44,7 @@ def expected_information_gain(
     *,
     hypotheses: int | None = None,
     latent: Collection[str] = (),
+    forecast: Forecast | None = None,
     cost: Callable[[Any], Price] | Mapping[Any, Price] | None = None,
     rate: Price = 1.0,
     depth: int = 1,
@@ -76,6 +79,10 @@ def expected_information_gain(
             `neighbour_entropy(address)`, `value_entropy(address)`, or what answers alike.
         hypotheses: how many play the truth, drawn systematically by weight; None: every particle, once.
         latent: new addresses that are not observed, with wildcards: each particle keeps what it drew there.
+        forecast: for programs whose likelihood weighs what was measured and cannot say what will be (its
+            sites have no `sample`): `forecast(candidate, trace)` gives what would be observed at the
+            particles of a trace, noise included, as (H, *event) by address, drawn from torch's generator.
+            Then only hypotheses are simulated; with `depth=2`, twice.
         cost: of a candidate, in any unit: a function of it or a mapping, giving a number or several by name.
         rate: nats that one unit of cost is worth; by name where costs are.
         depth: 1, or 2 to look ahead.
@@ -102,9 +109,15 @@ def expected_information_gain(
 
     steps: list[Step] = []
     prospects: list[Prospect] = []
-    for k, one in enumerate(simulated(population.trace, candidates, extend_args, latent, seeds[0])):
-        first = log_likelihoods(one, drawn(one, truths.particles, seeds[1]))
-        second = log_likelihoods(one, drawn(one, truths.particles, seeds[2])) if depth == 2 else None
+    trace = population.trace
+    each: Iterator[Simulated | Forecasted] = (
+        simulated(trace, candidates, extend_args, latent, seeds[0])
+        if forecast is None
+        else forecasted(trace, candidates, extend_args, forecast, seeds[0])
+    )
+    for k, one in enumerate(each):
+        first = one.log_likelihoods(one.drawn(truths.particles, seeds[1]))
+        second = one.log_likelihoods(one.drawn(truths.particles, seeds[2])) if depth == 2 else None
         after = entropies(population.log_weights, first, entropy_of)
         _warn_of_lost(k, torch.isnan(after))
         steps.append(Step(first, second, after, costs[k]))

@@ -8,25 +8,23 @@ of them runs a second time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Any
 
-import pyro
 import torch
 from torch import Tensor
 
 from bcppl.arguments import whole_number
-from bcppl.distributions.lazy import LazyDistribution
-from bcppl.distributions.support import log_prob_inside
 from bcppl.errors import InferenceError, InputError
+from bcppl.inference.probing.weighing import refuse_all_lost, weighed
 from bcppl.traces import Trace, extend, regenerate
-from bcppl.traces.run import inward
-from bcppl.traces.trace import unchanged
 
 Arguments = Callable[[Any], tuple[Any, ...]]
+# What hypotheses would observe, (H, *event) by address.
+Values = Mapping[str, Tensor]
 
 
 @dataclass(frozen=True)
@@ -67,6 +65,26 @@ class Simulated:
 
     trace: Trace
     observed: list[str]
+
+    def drawn(self, hypotheses: Tensor, seed: int) -> Values:
+        """What would be observed if particles (H,) were the truth, with sensor noise."""
+        trace = self.trace
+        if not torch.equal(hypotheses, torch.arange(trace.particles)):
+            trace = trace.chosen(hypotheses)
+        with seeded(seed):
+            trace = regenerate(trace, self.observed).trace
+        return {address: trace[address] for address in self.observed}
+
+    def log_likelihoods(self, values: Values) -> Tensor:
+        """Log-probability (H, N) of every observation at every particle.
+
+        A row is NaN where the observation has no probability anywhere: the simulation of that hypothesis
+        failed, or no particle can explain it.
+
+        Raises:
+            InferenceError: a log-probability is +inf, or all rows are NaN.
+        """
+        return refuse_all_lost(self.observed, weighed(self.trace, self.observed, values))
 
 
 def simulated(
@@ -122,76 +140,78 @@ def _observed(number: int, longer: Trace, trace: Trace, latent: Collection[str])
     return observed
 
 
-def drawn(one: Simulated, hypotheses: Tensor, seed: int) -> dict[str, Tensor]:
-    """What would be observed if particles (H,) were the truth, with sensor noise: (H, *event) by address."""
-    trace = one.trace
-    if not torch.equal(hypotheses, torch.arange(trace.particles)):
-        trace = trace.chosen(hypotheses)
-    with seeded(seed):
-        trace = regenerate(trace, one.observed).trace
-    return {address: trace[address] for address in one.observed}
-
-
-def log_likelihoods(one: Simulated, values: dict[str, Tensor]) -> Tensor:
-    """Log-probability (H, N) of every hypothesis's observation at every particle.
-
-    A row is NaN where the observation has no probability anywhere: the simulation of that hypothesis failed,
-    or no particle can explain it.
-
-    Raises:
-        InferenceError: a log-probability is +inf, or all rows are NaN.
-    """
-    sites, first = one.trace.distributions, one.observed[0]
-    # The first of the new sites hangs on no other's value; the others may.
-    if len(one.observed) == 1 and _is_plain(sites[first]):
-        found = _density(first, sites[first], values[first][:, None])
-    else:
-        count = len(values[first])
-        found = torch.stack([_row(one, {a: v[h] for a, v in values.items()}) for h in range(count)])
-    lost = torch.isnan(found).any(dim=1) | (found == -torch.inf).all(dim=1)
-    if bool(lost.all()):
-        raise InferenceError(
-            f"what was simulated at {', '.join(map(repr, one.observed))} has no log-probability at any "
-            "particle; the simulation failed, or the sites' `sample` and `log_prob` do not fit."
-        )
-    return torch.where(lost[:, None], torch.nan, found)
-
-
-def _row(one: Simulated, values: dict[str, Tensor]) -> Tensor:
-    """Log-probability (N,) of one observation, of all new sites together."""
-    trace, particles = one.trace, one.trace.particles
-    # What was rendered or simulated for a site is kept by it: it is asked again wherever its inputs stay.
-    moved = trace
-    if len(values) > 1:
-        moved = trace.at({a: v.expand(particles, *v.shape) for a, v in values.items()})
-    total = torch.zeros(particles, dtype=torch.float64)
-    for k, (address, value) in enumerate(values.items()):
-        kept = k == 0 or unchanged(trace, moved, address)
-        site = (trace if kept else moved).distributions[address]
-        density = _density(address, site, inward(value, site))
-        total = total + density.expand(site.batch_shape).reshape(-1, particles).sum(dim=0)
-    return total
-
-
-def _is_plain(site: Any) -> bool:
-    """Whether a site's densities broadcast: Pyro's own do, outside plates."""
-    return len(site.batch_shape) == 1 and not isinstance(site, LazyDistribution)
-
-
-def _density(address: str, site: Any, value: Tensor) -> Tensor:
-    with torch.no_grad(), pyro.validation_enabled(False):
-        density = log_prob_inside(site, value).to(torch.float64)
-    if bool((density == torch.inf).any()):
-        raise InferenceError(
-            f"site {address!r} has a log-probability of inf for what was simulated there; "
-            "a parameter of its distribution is out of range."
-        )
-    return density
-
-
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
     """Draws within start from a seed, and leave the generator as it was."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         yield
+
+
+Forecast = Callable[[Any, Trace], Values]
+
+
+@dataclass(frozen=True, eq=False)
+class Forecasted:
+    """A candidate of which a forecast says what it would give; sites are asked for log-probabilities alone.
+
+    Attributes:
+        trace: of the N particles as they are.
+        number: of the candidate.
+        candidate: what may be done.
+        args: the program's arguments once it is done.
+        forecast: what it would give at the particles of a trace.
+        seed: of new latent values.
+    """
+
+    trace: Trace
+    number: int
+    candidate: Any
+    args: tuple[Any, ...]
+    forecast: Forecast
+    seed: int
+
+    def drawn(self, hypotheses: Tensor, seed: int) -> Values:
+        """What would be observed if particles (H,) were the truth.
+
+        Raises:
+            InputError: the forecast is empty, or not one value for each of these particles.
+        """
+        with seeded(seed):
+            values = self.forecast(self.candidate, self.trace.chosen(hypotheses))
+        wrong = [a for a, v in values.items() if not isinstance(v, Tensor) or len(v) != len(hypotheses)]
+        if wrong or not values:
+            raise InputError(
+                f"the forecast for candidate {self.number} gives "
+                f"{f'no {len(hypotheses)} values at {wrong[0]!r}' if wrong else 'nothing'}; "
+                "give tensors by address, one value for each particle of the trace that it is given."
+            )
+        return values
+
+    def log_likelihoods(self, values: Values) -> Tensor:
+        """Log-probability (H, N) of every observation at every particle, as `extend` weighs it.
+
+        Raises:
+            InputError: the program does not visit an address, or a value has the wrong shape.
+            InferenceError: no row could be weighed.
+        """
+        rows, failure = [], None
+        for h in range(len(next(iter(values.values())))):
+            try:
+                with seeded(self.seed):
+                    _, row = extend(self.trace, self.args, {a: v[h] for a, v in values.items()})
+            except InferenceError as error:
+                row, failure = torch.full((self.trace.particles,), torch.nan, dtype=torch.float64), error
+            rows.append(row)
+        found = torch.stack(rows)
+        if failure is not None and bool(torch.isnan(found).all()):
+            raise failure
+        return refuse_all_lost(values, found)
+
+
+def forecasted(
+    trace: Trace, candidates: Sequence[Any], arguments: Arguments, forecast: Forecast, seed: int
+) -> Iterator[Forecasted]:
+    """Every candidate, with a forecast of what it would give."""
+    for k, candidate in enumerate(candidates):
+        yield Forecasted(trace, k, candidate, arguments(candidate), forecast, seed)

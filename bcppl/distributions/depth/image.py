@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.depth.observed import KEPT, Observed
-from bcppl.distributions.depth.rendering import Array, Mask, RendersDepth
+from bcppl.distributions.depth.rendering import Array, HitsOfPoses, Mask, RendersDepth
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 
@@ -156,6 +156,11 @@ class DepthDistribution(LazyDistribution):
         return poses.compose(moved if pose.ndim == 2 else moved[..., None, :], pose)
 
     @cached_property
+    def _hits(self) -> HitsOfPoses:
+        region = None if self.region is None else np.asarray(self.region, dtype=bool).reshape(-1)
+        return HitsOfPoses(partial(self.renderer.hits, self.camera, self.seen_pose), region)
+
+    @cached_property
     def _biases(self) -> Array | None:
         """The biases (N,), metres; None where there is none."""
         if not isinstance(self.bias, Tensor) and self.bias == 0.0:
@@ -171,7 +176,7 @@ class DepthDistribution(LazyDistribution):
         """
         self._check_finite()
         seen = self.observed(value)
-        hits = self.renderer.hits(self.camera, self.seen_pose, counted=np.asarray(seen.valid.any(axis=0)))
+        hits = self._hits(np.asarray(seen.valid.any(axis=0)))
         pixel = hits.pixel
         behind = seen.behind.take(pixel)
         several = len(seen.depth) > 1

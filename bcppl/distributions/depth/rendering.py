@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -43,3 +45,40 @@ class RendersDepth(Protocol):
 
     def images(self, camera: Camera, world_from_part: Tensor) -> Array:
         """Depth images (N, H, W) in metres, +inf where a pixel does not see the part."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Chosen:
+    """Some of the hits, as `PixelHits`."""
+
+    particle: npt.NDArray[np.int64]
+    pixel: npt.NDArray[np.int64]
+    depth: Array
+
+
+class HitsOfPoses:
+    """What a camera sees of the same poses, compared with several images: rendered twice at most.
+
+    The first image asks for its own pixels alone, since most have no second. From then on all pixels that
+    may count are kept.
+
+    Args:
+        render: the hits at the counted pixels (H * W,), or at all for None.
+        region: (H * W,) pixels that may count; None for all.
+    """
+
+    def __init__(self, render: Callable[[Mask | None], PixelHits], region: Mask | None) -> None:
+        self._render, self._region = render, region
+        self._asked = False
+        self._every: PixelHits | None = None
+
+    def __call__(self, counted: Mask) -> PixelHits:
+        """The hits at the counted pixels (H * W,)."""
+        if self._every is None:
+            if not self._asked:
+                self._asked = True
+                return self._render(counted)
+            self._every = self._render(self._region)
+        every = self._every
+        kept = np.flatnonzero(counted.take(every.pixel))
+        return _Chosen(every.particle[kept], every.pixel[kept], every.depth[kept])
