@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bcppl.distributions.path import Path
 from bcppl.distributions.poses import prior_from_guess
-from bcppl.distributions.touch import ForceDirection, FreePath, OnsetLocation
+from bcppl.distributions.touch import ForceDirection, FreePath, OnsetLocation, Placed
 from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.poses import inverse, rotation_matrix, transform
@@ -79,12 +79,24 @@ class Scene:
     distance: SignedDistance
     settings: Settings
     paths: dict[Push, Path] = field(default_factory=dict, repr=False)
+    motions: dict[Push, tuple[Tensor, Tensor]] = field(default_factory=dict, repr=False)
 
     def path(self, push: Push) -> Path:
         """The path in the world of the place where the finger touches, thinned."""
         if push not in self.paths:
             self.paths[push] = Path(finger_points(push, self.settings)).thinned(self.settings.spacing)
         return self.paths[push]
+
+    def motion(self, push: Push, onset: Tensor) -> Tensor:
+        """The unit direction (3,) or (N, 3) of the finger's travel about an onset (3,) or (N, 3)."""
+        path, reach = self.path(push), 2.0 * self.settings.spacing
+        if onset.ndim > 1:
+            return path.heading(path.locate(torch.nan_to_num(onset)).travelled, reach)
+        # What was seen is the same in every run of the program.
+        if push not in self.motions or not torch.equal(self.motions[push][0], onset):
+            heading = path.heading(path.locate(torch.nan_to_num(onset)).travelled, reach)
+            self.motions[push] = onset.clone(), heading
+        return self.motions[push][1]
 
 
 def finger_points(push: Push, settings: Settings) -> Tensor:
@@ -95,16 +107,20 @@ def finger_points(push: Push, settings: Settings) -> Tensor:
 
 def point_probe(scene: Scene, actions: Sequence[Push]) -> None:
     """The program: the part's pose, then for every push where it is felt, which way, and that it was free."""
-    distance, settings = scene.distance, scene.settings
+    settings = scene.settings
     part = pyro.sample("part", scene.prior)
+    distance = Placed(scene.distance, part)
     for k, push in enumerate(actions):
         path = scene.path(push)
+        distance.expect(path.points)
         onset = pyro.sample(
             f"onset_{k}",
             OnsetLocation(distance, part, path, settings.offset, settings.spread, settings.outlier),
         )
+        if onset.ndim == 1 and not bool(onset.isnan().any()):
+            distance.expect(onset[None])
         if settings.use_direction:
-            motion = path.heading(path.locate(torch.nan_to_num(onset)).travelled, 2.0 * settings.spacing)
+            motion = scene.motion(push, onset)
             friction, spread, outlier = (
                 settings.friction,
                 settings.direction_spread,

@@ -47,6 +47,7 @@ class Path:
         self._steps = self.points.diff(dim=0)
         self._lengths = self._steps.norm(dim=-1)
         self.travelled = torch.cat([points.new_zeros(1), self._lengths.cumsum(0)])
+        self._last: tuple[Tensor, Located] | None = None
 
     @property
     def length(self) -> float:
@@ -63,6 +64,14 @@ class Path:
 
     def locate(self, places: Tensor) -> Located:
         """The point of the path nearest to each of places (..., 3)."""
+        if places.ndim > 1:
+            return self._located(places)
+        # A place that was seen is asked for by every site and every particle, over and over.
+        if self._last is None or not torch.equal(self._last[0], places):
+            self._last = places.clone(), self._located(places)
+        return self._last[1]
+
+    def _located(self, places: Tensor) -> Located:
         from_start = places[..., None, :] - self.points[:-1]
         along = ((from_start * self._steps).sum(-1) / self._lengths**2).clamp(0.0, 1.0)
         off = (from_start - along[..., None] * self._steps).norm(dim=-1)

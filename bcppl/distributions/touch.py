@@ -2,7 +2,8 @@
 
 The distributions take the signed distance to the part (`bcppl.simulators.distance.SignedDistance`, or any
 callable that maps points (..., 3) in the part's frame to something with `distance` and `normal`) as an
-argument. Scales are floats, or tensors (N,) where they are latent.
+argument, or a `Placed` that answers for a whole program at once. Scales are floats, or tensors (N,) where
+they are latent.
 """
 
 from __future__ import annotations
@@ -42,28 +43,78 @@ def _refuse_impossible(where: str, outlier: float | None, **scales: Scale) -> No
         number_within(f"{where} has the outlier probability {{}}", outlier, least=0.0, below=1.0)
 
 
-def _at(distance: Distance, pose: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance (N,) and outward normal (N, 3) in world axes at one place (N, 3) for each pose."""
+class Placed:
+    """A part at poses (N, 7): where places in the world lie to its surface, those expected in one call.
+
+    A program that knows which places its sites will ask for says so with `expect`. The first question then
+    answers all of them: ten pushes' paths take one call of the simulator, not twenty.
+
+    Args:
+        distance: the signed distance to the part.
+        pose: (N, 7) world_from_part.
+    """
+
+    def __init__(self, distance: Distance, pose: Tensor) -> None:
+        self.distance, self.pose = distance, pose
+        self._expected: list[Tensor] = []
+        self._known: dict[tuple[int, torch.Size], tuple[Tensor, tuple[Tensor, Tensor]]] = {}
+
+    def expect(self, places: Tensor) -> None:
+        """Places (M, 3) in the world that will be asked for, at the same memory."""
+        self._expected.append(places)
+
+    def near(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distances (N, M) and outward normals (N, M, 3), in the world's axes, at places (M, 3)."""
+        key = places.data_ptr(), places.shape
+        if key not in self._known:
+            asked = {(one.data_ptr(), one.shape): one for one in [*self._expected, places]}
+            self._expected = []
+            for (which, one), answer in zip(asked.items(), self._evaluated([*asked.values()]), strict=True):
+                self._known[which] = one, answer  # kept, so that its memory stays its own
+        return self._known[key][1]
+
+    def _evaluated(self, places: list[Tensor]) -> list[tuple[Tensor, Tensor]]:
+        turn = poses.rotation_matrix(self.pose)
+        near = self.distance((torch.cat(places) - self.pose[:, None, :3]) @ turn)
+        sizes = [len(one) for one in places]
+        normal = near.normal @ turn.transpose(-1, -2)
+        return list(zip(near.distance.split(sizes, dim=1), normal.split(sizes, dim=1), strict=True))
+
+
+def _at(distance: Distance | Placed, pose: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+    """Signed distance (N,) and outward normal (N, 3) in world axes at one place (3,), or (N, 3) of each."""
+    if isinstance(distance, Placed):
+        if places.ndim == 1:
+            here, normal = distance.near(places[None])
+            return here[:, 0], normal[:, 0]
+        distance = distance.distance
+    places = places.expand(len(pose), 3)
     near = distance(poses.transform(poses.inverse(pose), places[:, None])[:, 0])
     return near.distance, (poses.rotation_matrix(pose) @ near.normal[..., None])[..., 0]
 
 
-def _lowest(distance: Distance, pose: Tensor, path: Path, travelled: Tensor) -> Tensor:
-    """The least signed distance (N,) of the path's points before a distance travelled (N,); inf for none."""
-    seen = path.points[path.travelled < travelled.max()]
-    if len(seen) == 0:
-        return torch.full_like(travelled, torch.inf)
-    all_distances = distance(poses.transform(poses.inverse(pose), seen)).distance
-    before = path.travelled[: len(seen)] < travelled[:, None]
-    return torch.where(before, all_distances, torch.inf).amin(dim=-1)
+def _everywhere(distance: Distance | Placed, pose: Tensor, path: Path) -> Tensor:
+    """Signed distances (N, R) of all points of a path."""
+    if isinstance(distance, Placed):
+        return distance.near(path.points)[0]
+    near: Tensor = distance(poses.transform(poses.inverse(pose), path.points)).distance
+    return near
 
 
-def _travelled(path: Path, place: Tensor, particles: int) -> Tensor:
-    """The distance travelled (N,) until contact was felt at a place (3,) or (N, 3); inf for NaN (never)."""
-    place = place.expand(particles, 3)
+def _lowest(distance: Distance | Placed, pose: Tensor, path: Path, travelled: Tensor) -> Tensor:
+    """The least signed distance (N,) of the path's points before a distance travelled; inf for none.
+
+    The distance travelled is () for all poses or (N,), one for each.
+    """
+    before = path.travelled < travelled[..., None]
+    return torch.where(before, _everywhere(distance, pose, path), torch.inf).amin(dim=-1)
+
+
+def _travelled(path: Path, place: Tensor) -> Tensor:
+    """The distance travelled, () or (N,), until contact was felt at a place (3,) or (N, 3); inf for NaN."""
     felt = ~torch.isnan(place).any(dim=-1)
     return torch.where(
-        felt, path.locate(torch.where(felt[:, None], place, path.points[0])).travelled, torch.inf
+        felt, path.locate(torch.where(felt[..., None], place, path.points[0])).travelled, torch.inf
     )
 
 
@@ -94,7 +145,13 @@ class OnsetLocation(LazyDistribution):
     """
 
     def __init__(
-        self, distance: Distance, pose: Tensor, path: Path, offset: Scale, spread: Scale, outlier: float
+        self,
+        distance: Distance | Placed,
+        pose: Tensor,
+        path: Path,
+        offset: Scale,
+        spread: Scale,
+        outlier: float,
     ) -> None:
         _refuse_impossible("an onset's location", outlier, spread=spread)
         self.distance, self.pose, self.path = distance, pose, path
@@ -103,11 +160,10 @@ class OnsetLocation(LazyDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density (N,) of one location (3,), or of one for each particle (N, 3)."""
-        particles = len(self.pose)
-        value = value.expand(particles, 3)
-        travelled = _travelled(self.path, value, particles)
+        # What is the same for all particles is worked out once: the inputs keep the shape they have.
+        travelled = _travelled(self.path, value)
         felt = torch.isfinite(travelled)
-        place = torch.where(felt[:, None], value, self.path.points[0])
+        place = value if bool(felt.all()) else torch.where(felt[..., None], value, self.path.points[0])
         located = self.path.locate(place)
         here, normal = _at(self.distance, self.pose, place)
         lowest = _lowest(self.distance, self.pose, self.path, travelled)
@@ -119,7 +175,7 @@ class OnsetLocation(LazyDistribution):
         passage = passage + torch.log(approach.clamp(min=0.0))
         passage = inlier + torch.where(here < lowest, passage, -torch.inf)
         stray = torch.tensor(self.outlier / self.path.length, dtype=torch.float64).log()
-        density = torch.logaddexp(passage, stray.expand(particles))
+        density = torch.logaddexp(passage, stray)
         density = torch.where(travelled == 0.0, inlier + log_ndtr(-score), density)
         density = torch.where(located.off <= OFF_PATH, density, -torch.inf)
         return torch.where(felt, density, inlier + log_ndtr((lowest + self.offset) / spread))
@@ -128,7 +184,7 @@ class OnsetLocation(LazyDistribution):
         """Where contact is first felt, (N, 3): interpolated between the path's points; NaN for never."""
         particles, path = len(self.pose), self.path
         threshold = -self.offset + self.spread * torch.randn(particles, dtype=torch.float64)
-        distances = self.distance(poses.transform(poses.inverse(self.pose), path.points)).distance
+        distances = _everywhere(self.distance, self.pose, path)
         below = distances <= threshold[:, None]
         first = below.to(torch.uint8).argmax(dim=-1, keepdim=True)
         after = distances.gather(-1, first)[:, 0]
@@ -170,7 +226,7 @@ class ForceDirection(LazyDistribution):
 
     def __init__(
         self,
-        distance: Distance,
+        distance: Distance | Placed,
         pose: Tensor,
         tip: Tensor,
         motion: Tensor,
@@ -187,7 +243,11 @@ class ForceDirection(LazyDistribution):
     def _expected(self) -> tuple[Tensor, Tensor, Tensor]:
         """The expected angle (N,), where it has a direction (N,), and where anything was felt (N,)."""
         felt = ~torch.isnan(self.tip).any(dim=-1)
-        _, normal = _at(self.distance, self.pose, torch.where(felt[:, None], self.tip, self.pose[:, :3]))
+        # All particles' tips are one where the tip was seen: then it may be asked for only once.
+        tip = self.tip[0] if self.tip.stride(0) == 0 else self.tip
+        if not bool(felt.all()):
+            tip = torch.where(felt[:, None], self.tip, self.pose[:, :3])
+        _, normal = _at(self.distance, self.pose, tip)
         inward = torch.atan2(-normal[:, 1], -normal[:, 0])
         cone = torch.atan(torch.as_tensor(self.friction, dtype=torch.float64))
         turn = _wrapped(torch.atan2(self.motion[:, 1], self.motion[:, 0]) - inward)
@@ -236,7 +296,13 @@ class FreePath(LazyDistribution):
     """
 
     def __init__(
-        self, distance: Distance, pose: Tensor, path: Path, onset: Tensor, tolerance: Scale, spread: Scale
+        self,
+        distance: Distance | Placed,
+        pose: Tensor,
+        path: Path,
+        onset: Tensor,
+        tolerance: Scale,
+        spread: Scale,
     ) -> None:
         _refuse_impossible("a free path", None, spread=spread)
         self.distance, self.pose, self.path = distance, pose, path
@@ -244,7 +310,7 @@ class FreePath(LazyDistribution):
         super().__init__(len(pose), (), (pose, self.onset, *_latent((tolerance, spread))))
 
     def _score(self) -> Tensor:
-        travelled = _travelled(self.path, self.onset, len(self.pose))
+        travelled = _travelled(self.path, self.onset)
         return (_lowest(self.distance, self.pose, self.path, travelled) + self.tolerance) / self.spread
 
     def log_prob(self, value: Tensor) -> Tensor:

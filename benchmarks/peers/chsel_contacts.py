@@ -3,8 +3,8 @@
 Reads a file of `real.py`: the part's mesh, contacts of several draws, the part's signed distance at a
 contact, and the poses that each draw starts from. Prints the poses that come back, their costs and the
 seconds of each draw; the first draw is run once before, not counted. Works in metres; 15 iterations,
-everything else as CHSEL's constructor sets it but for the cost class: the default carries voxels of free space
-to the part at every iteration, and there are none here.
+everything else as CHSEL's constructor sets it but for the cost class: the default carries voxels of free
+space to the part at every iteration, and there are none here.
 """
 
 from __future__ import annotations
