@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass
 
 import torch
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from bcppl.beliefs import effective_sample_size
@@ -26,13 +24,13 @@ class Mixtures:
         coordinates: (K, d) of each point about the mean of its mode in the belief.
         log_base: (K,) log of the base measure's density there.
         floor: (d, d) the covariance that a single particle stands for.
-        linked: which points are neighbours, sparse (K, K); None for all.
+        linked: (K, K) float32, 1 where two points are neighbours; None where all are.
     """
 
     coordinates: Tensor
     log_base: Tensor
     floor: Tensor
-    linked: csr_matrix | None
+    linked: Tensor | None
 
     @classmethod
     def fitted(
@@ -60,7 +58,7 @@ class Mixtures:
         floor = within * effective_sample_size(weights.log()) ** (-2.0 / dimension)
         if linked is None or bool(linked.all()):
             return cls(coordinates, log_base, floor, None)
-        return cls(coordinates, log_base, floor, csr_matrix(linked.numpy()))
+        return cls(coordinates, log_base, floor, linked.to(torch.float32))
 
     def entropy(self, weights: Tensor) -> Tensor:
         """Entropies (M,) in nats against the base measure, under weights (M, K).
@@ -92,15 +90,25 @@ class Mixtures:
         if self.linked is None:
             return torch.arange(len(weights)), weights
         rows, parts = [], []
-        for row, own in enumerate(weights):
-            index = own.nonzero().flatten()
-            at = index.numpy()
-            modes, label = connected_components(self.linked[at][:, at], directed=False)
-            part = own.new_zeros(modes, len(own))
-            part[torch.from_numpy(label).long(), index] = own[index]
-            rows += [row] * modes
-            parts.append(part)
-        return torch.tensor(rows), torch.cat(parts)
+        left = weights > 0
+        # The heaviest point that is left, and all that chains of links lead to, are a mode of their row.
+        while bool((unfinished := left.any(dim=1)).any()):
+            row = unfinished.nonzero().flatten()
+            among, own = left[row], weights[row]
+            start = torch.where(among, own, -1.0).argmax(dim=1, keepdim=True)
+            mode = self._reached(torch.zeros_like(among).scatter_(1, start, True), among)
+            rows.append(row)
+            parts.append(torch.where(mode, own, 0.0))
+            left[row] = among & ~mode
+        return torch.cat(rows), torch.cat(parts)
+
+    def _reached(self, start: Tensor, among: Tensor) -> Tensor:
+        """The points (M, K) that links lead to from those where `start` (M, K) is true, through `among`."""
+        assert self.linked is not None
+        reached, count = start, -1
+        while count != (count := int(reached.sum())):
+            reached = reached | (among & (reached.to(torch.float32) @ self.linked > 0.0))
+        return reached
 
 
 def spanning_factor(address: str, covariance: Tensor) -> Tensor:
