@@ -491,6 +491,7 @@ def test_bad_input_is_one_sentence() -> None:
     cases: list[tuple[Any, str]] = [
         (lambda: rank(population, []), "no candidates"),
         (lambda: rank(without), "every particle's is zero"),
+        (lambda: rank(point), "collapsed to a point"),
         (lambda: rank(point, measure=mode_entropy("part")), "collapsed to a point"),
         (lambda: rank(point, measure=neighbour_entropy("part")), "collapsed to a point"),
         (lambda: rank(single), "collapsed to a point"),

@@ -45,10 +45,13 @@ def weight_entropy() -> Entropy:
 
     BayesContact's choice of the next probe. It asks nothing of the particles, and tells nothing of how far
     apart they are: two that are a micrometre apart count as two.
+
+    Raises:
+        InputError: (of what it returns) all particles with weight are the same.
     """
 
     def fitted(population: Population) -> EntropyOf:
-        _refuse_one_particle(int((torch.softmax(population.log_weights, 0) > 0).sum()))
+        _refuse_one_particle(population)
         return lambda weights: torch.special.entr(weights).sum(dim=1)
 
     return fitted
@@ -247,9 +250,11 @@ def _refuse_collapsed(address: str, distinct: int) -> None:
         )
 
 
-def _refuse_one_particle(count: int) -> None:
-    if count < 2:
+def _refuse_one_particle(population: Population) -> None:
+    carrying = (torch.softmax(population.log_weights, 0) > 0).nonzero().flatten()
+    latent = [value.index_select(0, carrying) for value in population.trace.choices.values()]
+    if all(bool((value == value[:1]).all()) for value in latent):
         raise InputError(
-            "the belief has collapsed to a point: a single particle has all the weight, so no measurement "
+            "the belief has collapsed to a point: all particles with weight are the same, so no measurement "
             "can tell more; use more particles, or move them apart first (rejuvenation)."
         )
