@@ -24,7 +24,7 @@ from bcppl.beliefs import Belief, average_distance
 from bcppl.beliefs.regions import Measure, average_point_distance, rotation_angle, translation_deviation
 from bcppl.inference.smc import Step
 from bcppl.inference.tempered_smc import infer
-from bcppl.models.point_probe import Settings, felt, learn, model
+from bcppl.models.point_probe import Settings, felt, learn, model, registration_pose
 from bcppl.recordings.importers.point_probe import command
 from bcppl.recordings.measurements import Push, Recording, Touch
 from bcppl.simulators.distance import SignedDistance
@@ -83,11 +83,11 @@ def contacts(recording: Recording, settings: Settings) -> Tensor:
     return torch.stack(places)
 
 
-def fitted(recording: Recording, settings: Settings) -> Tensor:
+def fitted(recording: Recording, settings: Settings, registered: bool) -> Tensor:
     """The pose (7,) of robust least squares on the contacts' depths, started at the truth.
 
     The residual is the depth of a contact less the offset of the settings; beyond a millimetre it counts by
-    its size and no more by its square.
+    its size and no more by its square. With `registered` the settings' registration is made use of too.
     """
     truth, distance = torch.as_tensor(recording.truth), SignedDistance(recording.part)
     places = contacts(recording, settings)
@@ -102,7 +102,14 @@ def fitted(recording: Recording, settings: Settings) -> Tensor:
         return ((near.distance + settings.offset) / SOFT).numpy()
 
     found = least_squares(residual, np.zeros(3), loss="soft_l1", x_scale=[1e-3, 1e-3, 1e-2])
-    return pose(found.x)
+    return tracked(pose(found.x), recording, settings) if registered else pose(found.x)
+
+
+def tracked(world_from_touched: Tensor, recording: Recording, settings: Settings) -> Tensor:
+    """The pose (7,) of the frame that the truth is stated in, of a part that was touched at a pose (7,)."""
+    middle = torch.tensor(recording.part.mesh.centroid, dtype=torch.float64)
+    registration = registration_pose(settings.registration, middle)
+    return poses.compose(world_from_touched, poses.inverse(registration))
 
 
 class Held(NamedTuple):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,11 @@ from torch import Tensor
 
 from bcppl.distributions.path import Path
 from bcppl.distributions.poses import prior_from_guess
-from bcppl.distributions.touch import ForceDirection, FreePath, OnsetLocation, Placed
+from bcppl.distributions.shared_error import SharedError, SharedOnset
+from bcppl.distributions.touch import ForceDirection, FreePath, Placed
 from bcppl.errors import InputError
 from bcppl.parts import Part
-from bcppl.poses import inverse, rotation_matrix, transform
+from bcppl.poses import compose, inverse, rotation_matrix, transform
 from bcppl.recordings.measurements import Measurement, Push, Recording, Touch
 from bcppl.simulators.distance import SignedDistance
 from bcppl.traces.model import Model
@@ -34,6 +36,10 @@ class Settings:
 
     Attributes:
         finger: where the finger really touches, in the recorded tip's frame, metres: its calibration error.
+        registration: where the part that is touched stands in the frame whose pose is asked for (a tracker's,
+            say): x and y, metres, and yaw, radians, about the part's middle.
+        drift: how far the registration of another session lies from that: standard deviations, metres along
+            either axis and radians. All pushes of one recording share it; (0, 0) for none.
         offset, spread: how far inside the part that place lies at onset, mean and standard deviation, metres.
         outlier: probability of an onset that has nothing to do with the part.
         friction: coefficient between finger and part.
@@ -46,14 +52,16 @@ class Settings:
         use_direction, use_free_path: whether the sites `direction_*` and `free_*` are there.
     """
 
-    finger: tuple[float, float, float] = (-0.000848, -0.000855, 0.0)
-    offset: float = -0.000011
+    finger: tuple[float, float, float] = (-0.000704, -0.000821, 0.0)
+    registration: tuple[float, float, float] = (-0.000106, -0.000056, 0.001991)
+    drift: tuple[float, float] = (0.000147, 0.003448)
+    offset: float = -0.000013
     spread: float = 0.000403
     outlier: float = 0.01
     friction: float = 0.413
-    direction_spread: float = 0.0422
+    direction_spread: float = 0.0413
     direction_outlier: float = 0.01
-    tolerance: float = 0.000811
+    tolerance: float = 0.000794
     free_spread: float = 0.000403
     spacing: float = 0.0005
     threshold: float = 0.6
@@ -81,6 +89,16 @@ class Scene:
     paths: dict[Push, Path] = field(default_factory=dict, repr=False)
     motions: dict[Push, tuple[Tensor, Tensor]] = field(default_factory=dict, repr=False)
 
+    @cached_property
+    def middle(self) -> Tensor:
+        """The part's middle (3,), in its frame."""
+        return torch.tensor(self.part.mesh.centroid, dtype=torch.float64)
+
+    @cached_property
+    def part_from_touched(self) -> Tensor:
+        """The registration as a pose (7,)."""
+        return registration_pose(self.settings.registration, self.middle)
+
     def path(self, push: Push) -> Path:
         """The path in the world of the place where the finger touches, thinned."""
         if push not in self.paths:
@@ -99,6 +117,14 @@ class Scene:
         return self.motions[push][1]
 
 
+def registration_pose(registration: Sequence[float], middle: Tensor) -> Tensor:
+    """The pose (7,) of a shift in the plane and a turn about a vertical axis through a part's middle."""
+    x, y, yaw = registration
+    turn = torch.tensor([0.0, 0.0, 0.0, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)], dtype=torch.float64)
+    turn[:3] = middle - transform(turn, middle[None])[0] + torch.tensor([x, y, 0.0], dtype=torch.float64)
+    return turn
+
+
 def finger_points(push: Push, settings: Settings) -> Tensor:
     """Where the finger's touching place was, in the world, at the push's times: (R, 3), metres."""
     finger = torch.tensor([settings.finger], dtype=torch.float64)
@@ -108,15 +134,15 @@ def finger_points(push: Push, settings: Settings) -> Tensor:
 def point_probe(scene: Scene, actions: Sequence[Push]) -> None:
     """The program: the part's pose, then for every push where it is felt, which way, and that it was free."""
     settings = scene.settings
-    part = pyro.sample("part", scene.prior)
-    distance = Placed(scene.distance, part)
+    touched = compose(pyro.sample("part", scene.prior), scene.part_from_touched)
+    distance = Placed(scene.distance, touched)
+    shared = SharedError(distance, scene.middle, *settings.drift, settings.offset, settings.spread)
     for k, push in enumerate(actions):
         path = scene.path(push)
         distance.expect(path.points)
-        onset = pyro.sample(
-            f"onset_{k}",
-            OnsetLocation(distance, part, path, settings.offset, settings.spread, settings.outlier),
-        )
+        shared.expect(path)
+        onset = pyro.sample(f"onset_{k}", SharedOnset(shared, settings.outlier))
+        shared.felt(onset)
         if onset.ndim == 1 and not bool(onset.isnan().any()):
             distance.expect(onset[None])
         if settings.use_direction:
@@ -127,11 +153,11 @@ def point_probe(scene: Scene, actions: Sequence[Push]) -> None:
                 settings.direction_outlier,
             )
             pyro.sample(
-                f"direction_{k}", ForceDirection(distance, part, onset, motion, friction, spread, outlier)
+                f"direction_{k}", ForceDirection(distance, touched, onset, motion, friction, spread, outlier)
             )
         if settings.use_free_path:
             tolerance, spread = settings.tolerance, settings.free_spread
-            pyro.sample(f"free_{k}", FreePath(distance, part, path, onset, tolerance, spread))
+            pyro.sample(f"free_{k}", FreePath(distance, touched, path, onset, tolerance, spread))
 
 
 def prepare(recording: Recording, **settings: Any) -> Scene:
@@ -223,11 +249,13 @@ def _push(measurement: Measurement, k: int) -> tuple[Push, Touch]:
 
 
 def learn(recording: Recording, **settings: Any) -> Settings:
-    """Settings from pushes at a known pose: the finger's calibration, offset, spreads, friction, tolerance.
+    """Settings from pushes at a known pose: finger, registration, offset, spreads, friction, tolerance.
 
-    The finger's place in the tip's xy plane is found by least squares on the signed distance at onset
-    (linearised along the normals, three rounds); offset and spread are what is left, the tolerance is the
-    deepest free place, and the friction the one with the least squared error of the force's direction.
+    The finger's place in the tip's xy plane and the registration are found by least squares on the signed
+    distance at onset (linearised along the normals, three rounds), and the offset is what is left. The spread
+    is what the finger alone leaves: from one log to another the scatter differs by nearly a factor of two,
+    so it had better be wide. The tolerance is the deepest free place, and the friction the one with the least
+    squared error of the force's direction. Where the finger is held nothing is learnt of the registration.
 
     Args:
         recording: ten pushes or more, with the true pose.
@@ -254,14 +282,30 @@ def learn(recording: Recording, **settings: Any) -> Settings:
         [rotation_matrix(torch.from_numpy(pushes[k][0].world_from_tip[0])) for k in kept]
     )
 
-    finger = tips.new_tensor(settings.get("finger", start.finger))
-    for _ in range(0 if "finger" in settings else 3):
-        near = distance(transform(inverse(truth), tips + world_from_tips @ finger))
-        normals = near.normal @ rotation_matrix(truth).T
-        in_tip = (world_from_tips.transpose(-1, -2) @ normals[..., None])[:, :2, 0]
-        finger[:2] -= torch.linalg.lstsq(in_tip, near.distance[:, None]).solution[:, 0]
-    near = distance(transform(inverse(truth), tips + world_from_tips @ finger))
-    depth, normals = -near.distance, near.normal @ rotation_matrix(truth).T
+    middle = torch.tensor(recording.part.mesh.centroid, dtype=torch.float64)
+
+    def fitted(axes: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The first axes of finger (2) and registration (3) by least squares; what is left; normals."""
+        found = torch.cat([tips.new_tensor(settings.get("finger", start.finger))[:2], tips.new_zeros(3)])
+        for last in (False, False, False, True):
+            touched = compose(truth, registration_pose(found[2:].tolist(), middle))
+            finger = torch.cat([found[:2], tips.new_zeros(1)])
+            places = transform(inverse(touched), tips + world_from_tips @ finger)
+            near = distance(places)
+            normals = near.normal @ rotation_matrix(touched).T
+            if not last and axes:
+                in_tip = (world_from_tips.mT @ normals[..., None])[:, :2, 0]
+                turning = torch.linalg.cross(places - middle, near.normal)[:, 2:]
+                slopes = torch.cat([in_tip, -near.normal[:, :2], -turning], dim=1)[:, :axes]
+                found[:axes] -= torch.linalg.lstsq(slopes, near.distance[:, None]).solution[:, 0]
+        return found, -near.distance, normals
+
+    held = "finger" in settings
+    _, scatter, _ = fitted(0 if held else 2)
+    found, depth, normals = fitted(0 if held else 5)
+    # Half of what one log shows is taken to last and half for this session's own: two normals of equal
+    # variance, of which the sum r was seen, leave r / 2 for the next session, with a variance of 3 / 4 r^2.
+    lasting, drift = 0.5 * found[2:], math.sqrt(0.75) * found[2:].abs()
 
     inward = torch.atan2(-normals[:, 1], -normals[:, 0])
     paths = [Path(finger_points(pushes[k][0], start)).thinned(start.spacing) for k in kept]
@@ -276,9 +320,11 @@ def learn(recording: Recording, **settings: Any) -> Settings:
     cone = float(
         minimize_scalar(lambda a: float((error(a) ** 2).sum()), bounds=(0.02, 1.4), method="bounded").x
     )
-    spread = float(depth.std())
+    spread = float(scatter.std())
     learnt = Settings(
-        finger=(float(finger[0]), float(finger[1]), float(finger[2])),
+        finger=(float(found[0]), float(found[1]), 0.0),
+        registration=(float(lasting[0]), float(lasting[1]), float(lasting[2])),
+        drift=(float(drift[:2].square().mean().sqrt()), float(drift[2])),
         offset=float(depth.mean()),
         spread=spread,
         friction=math.tan(cone),

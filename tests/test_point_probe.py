@@ -90,12 +90,24 @@ def test_what_is_invented_is_read_back() -> None:
 
 
 def test_settings_are_learnt_from_pushes_at_a_known_pose() -> None:
-    said = Settings(finger=(0.0010, -0.0005, 0.0), offset=0.0004, spread=0.0002, friction=0.6, outlier=0.0)
-    keys = ("finger", "offset", "spread", "friction", "outlier")
+    said = Settings(
+        finger=(0.0010, -0.0005, 0.0),
+        registration=(0.0003, -0.0002, 0.004),
+        drift=(0.0, 0.0),
+        offset=0.0004,
+        spread=0.0002,
+        friction=0.6,
+        outlier=0.0,
+    )
+    keys = ("finger", "registration", "drift", "offset", "spread", "friction", "outlier")
     recording = model.invent(4, pushes=80, direction_outlier=0.0, **{k: getattr(said, k) for k in keys})
     touching = [m for m in recording.measurements if np.abs(m.observation.wrench[-1, :2]).max() > 2.0]
     learnt = learn(replace(recording, measurements=touching))
     assert learnt.finger == pytest.approx(said.finger, abs=2e-4)
+    # Half of what one session shows is taken to last.
+    half = [0.5 * r for r in said.registration]
+    assert learnt.registration[:2] == pytest.approx(half[:2], abs=1e-4)
+    assert learnt.registration[2] == pytest.approx(half[2], abs=1e-3)  # some of the offset looks like a turn
     assert learnt.offset == pytest.approx(said.offset, abs=1e-4)
     assert learnt.spread == pytest.approx(said.spread, rel=0.35)
     assert learnt.friction == pytest.approx(said.friction, abs=0.03)
@@ -152,7 +164,8 @@ def log(name: str) -> Recording:
 
 def test_defaults_are_learnt_from_one_log() -> None:
     learnt, settings = learn(log("10_130")), Settings()
-    assert learnt.finger == pytest.approx(settings.finger, abs=1e-5)
+    for name in ("finger", "registration", "drift"):
+        assert getattr(learnt, name) == pytest.approx(getattr(settings, name), abs=1e-5)
     for name in ("offset", "spread", "tolerance", "free_spread"):
         assert getattr(learnt, name) == pytest.approx(getattr(settings, name), abs=1e-5)
     assert learnt.friction == pytest.approx(settings.friction, abs=0.005)

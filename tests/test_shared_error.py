@@ -1,0 +1,103 @@
+"""Touches that share an error: the joint density in closed form, order, normalisation, what is left of it."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.path import Path
+from bcppl.distributions.shared_error import SharedError, SharedOnset
+from bcppl.distributions.touch import Placed
+from bcppl.parts import Part
+from bcppl.simulators.distance import SignedDistance
+
+SHIFT, TURN, OFFSET, SPREAD = 0.0004, 0.005, 0.0002, 0.0003
+NEVER = torch.full((3,), math.nan, dtype=torch.float64)
+
+
+def t(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def box() -> SignedDistance:
+    """0.1 x 0.2 x 0.3 m about the origin."""
+    mesh = trimesh.creation.box((0.1, 0.2, 0.3))
+    return SignedDistance(Part("box", np.asarray(mesh.vertices), np.asarray(mesh.faces)))
+
+
+def towards(y: float) -> Path:
+    """Straight at the face at x = -0.05 m, from 10 mm before it to 10 mm inside."""
+    return Path(torch.stack([t(-0.06 + 0.0005 * k, y, 0.0) for k in range(41)]))
+
+
+def log_probs(pose: Tensor, touches: list[tuple[Path, Tensor]], outlier: float = 0.0) -> list[Tensor]:
+    """Of every touch given those before it, as a program asks for them: after it has run."""
+    shared = SharedError(Placed(box(), pose), t(0.0, 0.0, 0.0), SHIFT, TURN, OFFSET, SPREAD)
+    sites = []
+    for path, place in touches:
+        shared.placed.expect(path.points)
+        shared.expect(path)
+        sites.append(SharedOnset(shared, outlier))
+        shared.felt(place)
+    return [site.log_prob(place) for site, (_, place) in zip(sites, touches, strict=True)]
+
+
+def at(*x: float) -> Tensor:
+    pose = poses.identity(len(x))
+    pose[:, 0] = t(*x)
+    return pose
+
+
+TOUCHES = [(towards(y), t(x, y, 0.0)) for y, x in ((-0.08, -0.0497), (0.05, -0.0502), (0.09, -0.0495))]
+
+
+def test_touches_of_one_face_are_jointly_normal() -> None:
+    # A shift moves the face as it is, a turn moves a place at y by -y to first order.
+    slopes = t(*[p.points[0, 1].item() for p, _ in TOUCHES])
+    covariance = SPREAD**2 * torch.eye(3) + SHIFT**2 + TURN**2 * torch.outer(slopes, slopes)
+    pose = at(0.0, 0.0003, -0.0004)
+    for k, x in enumerate(pose[:, 0]):
+        inside = torch.stack([place[0] + 0.05 - x for _, place in TOUCHES])
+        exact = torch.distributions.MultivariateNormal(torch.full((3,), OFFSET).double(), covariance.double())
+        found = sum(float(one[k]) for one in log_probs(pose, TOUCHES))
+        assert found == pytest.approx(float(exact.log_prob(inside)), abs=1e-6)
+
+
+def test_the_order_of_touches_does_not_matter() -> None:
+    pose = at(0.0, 0.0004)
+    there, back = log_probs(pose, TOUCHES), log_probs(pose, TOUCHES[::-1])
+    assert torch.allclose(sum(there), sum(back), atol=1e-9)
+    # A touch that met nothing and ought not to tells nothing of the others.
+    away = Path(towards(0.0).points + t(0.0, 0.0, 0.5))
+    more = log_probs(pose, [TOUCHES[0], (away, NEVER), *TOUCHES[1:]])
+    assert torch.allclose(sum(more), sum(there), atol=1e-9)
+
+
+def test_each_touch_integrates_to_one_given_the_others() -> None:
+    path, steps = towards(0.03), 800
+    places = path.at((torch.arange(steps, dtype=torch.float64) + 0.5) / steps * path.length)
+    total = 0.0
+    for place in [*places, NEVER, path.points[0]]:
+        mass = float(log_probs(at(0.0002), [*TOUCHES[:2], (path, place)], 0.05)[-1].exp())
+        total += mass if place is NEVER or place is path.points[0] else mass * path.length / steps
+    assert total == pytest.approx(1.0, abs=5e-3)
+
+
+def test_samples_err_together() -> None:
+    torch.manual_seed(0)
+    pose = at(0.0).expand(20000, 7)
+    shared = SharedError(Placed(box(), pose), t(0.0, 0.0, 0.0), SHIFT, 0.0, OFFSET, SPREAD)
+    drawn = []
+    for y in (-0.08, 0.05):
+        shared.expect(towards(y))
+        drawn.append(SharedOnset(shared, 0.0).sample())
+        shared.felt(drawn[-1])
+    inside = torch.stack(drawn)[..., 0] + 0.05
+    covariance = torch.cov(inside)
+    assert inside.mean(dim=1).tolist() == pytest.approx([OFFSET] * 2, abs=1.5e-5)
+    assert covariance[0, 1].item() == pytest.approx(SHIFT**2, rel=0.05)
+    assert covariance[1, 1].item() == pytest.approx(SHIFT**2 + SPREAD**2, rel=0.05)
