@@ -109,7 +109,8 @@ def test_settings_are_learnt_from_pushes_at_a_known_pose() -> None:
     assert learnt.registration[:2] == pytest.approx(half[:2], abs=1e-4)
     assert learnt.registration[2] == pytest.approx(half[2], abs=1e-3)  # some of the offset looks like a turn
     assert learnt.offset == pytest.approx(said.offset, abs=1e-4)
-    assert learnt.spread == pytest.approx(said.spread, rel=0.35)
+    # What the finger alone leaves: the registration is in it.
+    assert 0.65 * said.spread < learnt.spread < math.hypot(said.spread, *said.registration[:2])
     assert learnt.friction == pytest.approx(said.friction, abs=0.03)
     assert learnt.direction_spread == pytest.approx(said.direction_spread, rel=0.3)
 
