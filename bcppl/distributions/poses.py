@@ -266,6 +266,12 @@ class NormalPose(_PoseDistribution):
             )
         super().__init__(middle, freedom)
 
+    @property
+    def covariance(self) -> Tensor:
+        """Over the free coordinates, (d, d) or (N, d, d), in m^2, m rad and rad^2."""
+        scale = self._normal.scale_tril
+        return scale @ scale.transpose(-1, -2)
+
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Poses (*sample_shape, *batch_shape, 7)."""
         shape = torch.Size(sample_shape) + self.batch_shape

@@ -32,6 +32,11 @@ class Model:
             `spreads` are covariances of other particles in the coordinates of each continuous latent value,
             by address. No answer hangs on proposals, only how soon it comes: a model still never knows how it
             is inferred.
+        arrival: two programs, there and back, by which a population may take a new measurement in
+            (`bcppl.inference.smcp3.Pair`): `there(trace)` reads the trace with the new arguments and
+            observations and chooses the latent values that come with them, and new ones in place of old ones;
+            `back(trace)` chooses the old ones, as they were before. None where the model has none. No answer
+            hangs on it either.
     """
 
     program: Program | Series
@@ -40,3 +45,4 @@ class Model:
     pose: str
     invent: Callable[..., Any] | None = None
     proposals: Sequence[Callable[..., Any]] = ()
+    arrival: tuple[Callable[[Any], Any], Callable[[Any], Any]] | None = None

@@ -1,0 +1,179 @@
+"""The contact manifold: where a peg stood while it felt something has no gap to the part, elsewhere one."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+from torch.special import log_ndtr
+
+from bcppl.arguments import number_within
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.errors import InputError
+
+FARTHEST = 0.02  # m: the range over which an outlier's gap is spread evenly
+
+
+class Gaps(Protocol):
+    """What `bcppl.simulators.gap.PegGap` gives."""
+
+    @property
+    def distance(self) -> Tensor:
+        """(N, T) metres."""
+
+    def slope(self, world_from_part: Tensor) -> Tensor:
+        """(N, T, 6) its derivatives in the tangent space at the part's poses."""
+
+
+class MeasuresGap(Protocol):
+    """`bcppl.simulators.gap.PegGap`, or what answers alike."""
+
+    def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gaps: ...
+
+
+class Quadratic(NamedTuple):
+    """A log-likelihood to second order around poses, in their tangent space.
+
+    Attributes:
+        slope: (N, 6) of minus the log-likelihood, 1/m and 1/rad.
+        information: (N, 6, 6) its curvature as Gauss and Newton take it.
+    """
+
+    slope: Tensor
+    information: Tensor
+
+
+class ContactManifold(LazyDistribution):
+    """Where a held peg was measured to be, and whether it felt the part, over a window of T stamps.
+
+    With d the gap between the peg as measured and the part, a stamp with contact has d normal about
+    `-sink`, one without has the probability that a gap about d is positive: Phi(d / spread). Errors of d are
+    `noise`, anew at each stamp, and `shared`, the same for all stamps of a window at which there is contact:
+    what is not known of the contact's stiffness and of the geometry. With probability `outlier` a stamp, or
+    all contacts of the window together, have nothing to do with the part.
+
+    As a density over the peg's poses it is normalised but for a constant: on the manifold of contact the peg
+    may be anywhere with equal chance, and off it anywhere that is free. Moving the part moves both along, so
+    the constant does not hang on the part's pose (the manifold particle filter of Koval, Pollard and
+    Srinivasa, Pose estimation for planar contact manipulation with manifold particle filters, IJRR 34, 2015,
+    has the same likelihood). It is a likelihood of the pose of the part, given where the peg got to, and no
+    forecast of where it will get to: it has no `sample`; simulate the probe for that.
+
+    The event is (T, 8): the measured world_from_peg, then 1 where contact is felt, 0 where there is none, and
+    NaN where that cannot be told.
+
+    Args:
+        gap: measures gaps.
+        pose: (N, 7) world_from_part.
+        stamps: T.
+        noise: m, of the gap at one stamp: the measured peg's position, and its turn times the peg's length.
+        shared: m, of the gap, common to a window's contacts.
+        sink: m that a peg sinks into the part at the forces of a probe.
+        outlier: a probability.
+
+    Raises:
+        InputError: a number is out of range.
+    """
+
+    cost = 1
+
+    def __init__(
+        self,
+        gap: MeasuresGap,
+        pose: Tensor,
+        stamps: int,
+        noise: float,
+        shared: float,
+        sink: float = 0.0,
+        outlier: float = 0.001,
+    ) -> None:
+        number_within("a contact manifold is given noise {}", noise, above=0.0)
+        number_within("a contact manifold is given shared {}", shared, least=0.0)
+        number_within("a contact manifold is given sink {}", sink, least=0.0)
+        number_within("a contact manifold is given outlier {}", outlier, above=0.0, below=1.0)
+        self.gap, self.pose = gap, pose
+        self.noise, self.shared, self.sink, self.outlier = noise, shared, sink, outlier
+        super().__init__(len(pose), (stamps, 8), (pose,))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-likelihood (N,) of one window (T, 8)."""
+        poses, felt = self._read(value)
+        told = ~torch.isnan(felt)
+        if not bool(told.any()):
+            return torch.zeros(len(self.pose), dtype=torch.float64)
+        distance = self.gap(self.pose, poses[told]).distance
+        return self._of_contacts(distance[:, felt[told] == 1.0]) + self._of_free(
+            distance[:, felt[told] == 0.0]
+        )
+
+    def quadratic(self, value: Tensor, blur: float = 0.0) -> Quadratic:
+        """The log-likelihood of a window (T, 8) to second order, errors `blur` metres wider, no outliers."""
+        poses, felt = self._read(value)
+        told = ~torch.isnan(felt)
+        if not bool(told.any()):
+            return Quadratic(self.pose.new_zeros(len(self.pose), 6), self.pose.new_zeros(len(self.pose), 6, 6))
+        gaps = self.gap(self.pose, poses[told])
+        slope, touching = gaps.slope(self.pose), felt[told] == 1.0
+        error, rows = gaps.distance[:, touching] + self.sink, slope[:, touching]
+        # The common error takes the mean of a window's contacts part of its weight.
+        variance, common = self.noise**2, self.shared**2 + blur**2
+        count = int(touching.sum())
+        share = common / (variance + count * common) if count else 0.0
+        weighed = (rows - share * rows.sum(dim=1, keepdim=True)) / variance
+        pull = (weighed * error[..., None]).sum(dim=1)
+        information = weighed.transpose(-1, -2) @ rows
+        spread = math.sqrt(variance + self.shared**2 + blur**2)
+        score, free = gaps.distance[:, ~touching] / spread, slope[:, ~touching] / spread
+        hazard = torch.exp(-0.5 * score**2 - 0.5 * math.log(2.0 * math.pi) - log_ndtr(score))
+        pull = pull - (hazard[..., None] * free).sum(dim=1)
+        bend = (hazard * (hazard + score)).clamp(min=0.0)
+        return Quadratic(pull, information + free.transpose(-1, -2) @ (bend[..., None] * free))
+
+    def residual(self, value: Tensor) -> Tensor:
+        """Gaps (N, T) that contradict what was felt, in metres; 0 where free, NaN where nothing can be told.
+
+        Where contact was felt the gap and the sink, elsewhere how deep the peg would have been in the part.
+        """
+        poses, felt = self._read(value)
+        distance = self.gap(self.pose, poses).distance
+        found = torch.where(felt == 1.0, distance + self.sink, distance.clamp(max=0.0))
+        return torch.where(torch.isnan(felt), torch.nan, found)
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """Refused: see the class.
+
+        Raises:
+            InputError: always.
+        """
+        raise InputError(
+            "ContactManifold weighs poses of the part by where a peg got to and cannot say where it will get "
+            "to; simulate the probe with bcppl.simulators.track.ContactTrack."
+        )
+
+    def _read(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        if tuple(value.shape) != tuple(self.event_shape):
+            raise InputError(
+                f"ContactManifold looks at {self.event_shape[0]} stamps but its observation has shape "
+                f"{tuple(value.shape)}; give ({self.event_shape[0]}, 8): peg pose, and whether it felt contact."
+            )
+        return value[:, :7], value[:, 7]
+
+    def _of_contacts(self, distance: Tensor) -> Tensor:
+        count = distance.shape[1]
+        if count == 0:
+            return distance.new_zeros(len(distance))
+        error = distance + self.sink
+        variance, common = self.noise**2, self.shared**2
+        share = common / (variance + count * common)
+        squared = ((error**2).sum(dim=1) - share * error.sum(dim=1) ** 2) / variance
+        size = (count - 1) * math.log(variance) + math.log(variance + count * common)
+        inlier = -0.5 * (squared + size + count * math.log(2.0 * math.pi)) + math.log1p(-self.outlier)
+        stray = math.log(self.outlier) - count * math.log(FARTHEST)
+        return torch.logaddexp(inlier, torch.full_like(inlier, stray))
+
+    def _of_free(self, distance: Tensor) -> Tensor:
+        score = distance / math.hypot(self.noise, self.shared)
+        inlier = log_ndtr(score) + math.log1p(-self.outlier)
+        return torch.logaddexp(inlier, torch.full_like(inlier, math.log(self.outlier))).sum(dim=1)

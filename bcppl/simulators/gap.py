@@ -1,0 +1,289 @@
+"""How far a held peg is from a part, for many poses of the part: nothing is simulated.
+
+Where a peg stood when it felt something, or nothing, is known from the robot's joints. What a pose of the part
+makes of that is a distance: it should be about zero where contact was felt and positive elsewhere.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.parts import Part
+from bcppl.simulators.distance import SignedDistance
+from bcppl.simulators.distance_grid import DistanceGrid, distance_grid, looked_up, sloped
+from bcppl.simulators.effort import Effort
+from bcppl.simulators.fidelity import solid_of
+from bcppl.simulators.placement import compiled
+
+Array = npt.NDArray[np.float64]
+Numbers = npt.NDArray[np.int64]
+
+EDGE_SPACING = 0.001  # m between the points that stand for the part's sharp edges
+_RUN = 8  # points of an edge that are passed over together
+_NEAR = 0.002  # m: nearer than this, what the grid cannot tell is measured exactly
+_SHARP = np.radians(5.0)
+_FLAT = 1e-9
+_MARGIN = 0.012  # m around the part that the grid covers
+_SHARE = 8  # particles that a thread takes at a time
+
+
+class Gap(NamedTuple):
+    """How a peg at T poses lies to a part at N.
+
+    Attributes:
+        distance: (N, T) metres, negative where they overlap: by how much the peg's deepest corner lies in the
+            part, or the part's deepest edge in the peg.
+        place: (N, T, 3) where that is, in the part's frame.
+        normal: (N, T, 3) the part's outward unit normal there, in its frame.
+    """
+
+    distance: Tensor
+    place: Tensor
+    normal: Tensor
+
+    def slope(self, world_from_part: Tensor) -> Tensor:
+        """Derivatives (N, T, 6) of the distance in the tangent space at poses (N, 7) of the part.
+
+        Metres for each metre along the world's axes and each radian about the part's.
+        """
+        rotation = poses.rotation_matrix(world_from_part)
+        along = -(self.normal @ rotation.transpose(-1, -2))
+        return torch.cat([along, -torch.linalg.cross(self.place, self.normal)], dim=-1)
+
+
+class PegGap:
+    """The gap between a part and a peg. Their meshes are closed; a peg that is not convex has convex pieces.
+
+    Contact between solids with flat faces begins at a corner of the one, at a corner of the other, or where
+    two edges cross. So the gap is the least of the distances of the peg's corners to the part and of points
+    1 mm apart along the part's sharp edges to the peg. Where nothing touches it is never too small, and too
+    large by at most what an edge's point is off. Corners are chosen by a grid of distances; those near an edge
+    of the part, which a grid rounds off, are then measured exactly.
+
+    Attributes:
+        part, peg: the solids.
+        effort: calls, and pairs of poses as `items`.
+
+    Raises:
+        InputError: a mesh is empty, open or not finite.
+    """
+
+    def __init__(self, part: Part, peg: Part) -> None:
+        self.part, self.peg = part, peg
+        self.effort = Effort()
+        self._signed = SignedDistance(part)
+        self._grid: DistanceGrid | None = None
+        self._corners = _corners(peg)
+        self._edges, self._runs, self._balls = _edge_points(part)
+        self._planes, self._ends = _planes(peg)
+        self._box = np.stack([peg.vertices.min(axis=0), peg.vertices.max(axis=0)])
+
+    def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gap:
+        """Gaps for poses (N, 7) of the part and (T, 7) of the peg."""
+        particles, stamps = len(world_from_part), len(world_from_peg)
+        with self.effort.measure(items=particles * stamps):
+            if self._grid is None:
+                self._grid = distance_grid(self.part, self._signed, _MARGIN)
+            part = _frames(world_from_part)
+            peg = _frames(world_from_peg)
+            distance = np.empty((particles, stamps))
+            place, normal = np.empty((particles, stamps, 3)), np.empty((particles, stamps, 3))
+            rounded = np.empty((particles, stamps), dtype=np.bool_)
+
+            def work(first: int, last: int) -> None:
+                _measure(
+                    first,
+                    last,
+                    *part,
+                    *peg,
+                    self._corners,
+                    *self._grid_arrays,
+                    self._edges,
+                    self._runs,
+                    self._balls,
+                    self._planes,
+                    self._ends,
+                    self._box,
+                    distance,
+                    place,
+                    normal,
+                    rounded,
+                )
+
+            _shared(work, particles)
+            exact = self._signed(torch.from_numpy(place[rounded]))
+            distance[rounded] = exact.distance.numpy()
+            normal[rounded] = exact.normal.numpy()
+        return Gap(torch.from_numpy(distance), torch.from_numpy(place), torch.from_numpy(normal))
+
+    @property
+    def _grid_arrays(self) -> tuple[Array, float, npt.NDArray[np.float32]]:
+        assert self._grid is not None
+        return self._grid.low, self._grid.spacing, self._grid.distance
+
+
+def _frames(pose: Tensor) -> tuple[Array, Array]:
+    rotation = np.ascontiguousarray(poses.rotation_matrix(pose.detach()).numpy())
+    return rotation, np.ascontiguousarray(pose.detach()[:, :3].numpy())
+
+
+def _corners(peg: Part) -> Array:
+    """The peg's distinct vertices (V, 3)."""
+    return np.unique(np.round(peg.vertices, 9), axis=0)
+
+
+def _edge_points(part: Part) -> tuple[Array, Numbers, Array]:
+    """Points (E, 3) along the edges at which the part is sharp and convex, in runs.
+
+    Returns:
+        The points; where each run ends (R,); centre and radius (R, 4) of a ball around each run.
+    """
+    mesh = part.mesh.copy()
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    sharp = mesh.face_adjacency_convex & (mesh.face_adjacency_angles > _SHARP)
+    runs: list[Array] = []
+    for start, stop in np.asarray(mesh.vertices)[mesh.face_adjacency_edges[sharp]]:
+        count = int(np.ceil(np.linalg.norm(stop - start) / EDGE_SPACING)) + 1
+        points = np.linspace(start, stop, count)
+        runs += [points[first : first + _RUN] for first in range(0, count, _RUN)]
+    centers = [0.5 * (run[0] + run[-1]) for run in runs]
+    radii = [0.5 * float(np.linalg.norm(run[-1] - run[0])) for run in runs]
+    balls = np.column_stack([np.reshape(centers, (-1, 3)), radii])
+    points = np.concatenate(runs) if runs else np.empty((0, 3))
+    return points, np.cumsum([len(run) for run in runs], dtype=np.int64), balls
+
+
+def _planes(peg: Part) -> tuple[Array, Numbers]:
+    """Planes (P, 4) of the peg's convex solids, outward normal and offset, and where each solid's end."""
+    solids = [peg.mesh.convex_hull] if peg.mesh.is_convex or not peg.pieces else map(solid_of, peg.pieces)
+    planes = []
+    for solid in solids:
+        normals = np.asarray(solid.face_normals)
+        offsets = np.einsum("fi,fi->f", normals, np.asarray(solid.triangles)[:, 0])
+        whole = np.round(np.column_stack([normals, offsets]), 9)
+        planes.append(np.unique(whole, axis=0))
+    return np.concatenate(planes), np.cumsum([len(each) for each in planes])
+
+
+def _shared(work: object, particles: int) -> None:
+    """Runs of particles shared among threads, which end with the call."""
+    assert callable(work)
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    runs = iter(range(0, particles, _SHARE))
+    errors: list[BaseException] = []
+
+    def take() -> None:
+        try:
+            for first in runs:
+                work(first, min(first + _SHARE, particles))
+        except BaseException as error:
+            errors.append(error)
+
+    others = [threading.Thread(target=take) for _ in range(min(available, -(-particles // _SHARE)) - 1)]
+    for other in others:
+        other.start()
+    take()
+    for other in others:
+        other.join()
+    if errors:
+        raise errors[0]
+
+
+@compiled
+def _measure(
+    first: int,
+    last: int,
+    part_rotation: Array,
+    part_place: Array,
+    peg_rotation: Array,
+    peg_place: Array,
+    corners: Array,
+    low: Array,
+    spacing: float,
+    grid: npt.NDArray[np.float32],
+    edges: Array,
+    runs: Numbers,
+    balls: Array,
+    planes: Array,
+    ends: Numbers,
+    box: Array,
+    distance: Array,
+    place: Array,
+    normal: Array,
+    rounded: npt.NDArray[np.bool_],
+) -> None:
+    stamps = len(peg_rotation)
+    slope = np.empty(3)
+    for n in range(first, last):
+        for t in range(stamps):
+            # part_from_peg
+            turn = part_rotation[n].T @ peg_rotation[t]
+            shift = part_rotation[n].T @ (peg_place[t] - part_place[n])
+            least, which = np.inf, 0
+            for c in range(len(corners)):
+                p = corners[c]
+                x = turn[0, 0] * p[0] + turn[0, 1] * p[1] + turn[0, 2] * p[2] + shift[0]
+                y = turn[1, 0] * p[0] + turn[1, 1] * p[1] + turn[1, 2] * p[2] + shift[1]
+                z = turn[2, 0] * p[0] + turn[2, 1] * p[1] + turn[2, 2] * p[2] + shift[2]
+                here = looked_up(x, y, z, low, spacing, grid)
+                if here < least:
+                    least, which = here, c
+            place[n, t] = turn @ corners[which] + shift
+            rounded[n, t] = not sloped(place[n, t], low, spacing, grid, slope) and abs(least) < _NEAR
+            normal[n, t] = slope
+            begin = 0
+            for r in range(len(runs)):
+                if _may_be_nearer(balls[r], turn, shift, box, least):
+                    for e in range(begin, runs[r]):
+                        inside, plane = _inside(edges[e], turn, shift, planes, ends, least)
+                        if inside < least:
+                            least = inside
+                            rounded[n, t] = False
+                            place[n, t] = edges[e]
+                            normal[n, t] = -(turn @ planes[plane, :3])
+                begin = runs[r]
+            distance[n, t] = least
+
+
+@compiled
+def _may_be_nearer(ball: Array, turn: Array, shift: Array, box: Array, least: float) -> bool:
+    """Whether a ball in the part's frame may be nearer than `least` to the peg's box, or deeper in it."""
+    reach = ball[3] + least
+    x, y, z = ball[0] - shift[0], ball[1] - shift[1], ball[2] - shift[2]
+    for axis in range(3):
+        along = turn[0, axis] * x + turn[1, axis] * y + turn[2, axis] * z
+        if along < box[0, axis] - reach or along > box[1, axis] + reach:
+            return False
+    return True
+
+
+@compiled
+def _inside(
+    point: Array, turn: Array, shift: Array, planes: Array, ends: Numbers, least: float
+) -> tuple[float, int]:
+    """How far a point of the part is outside the peg, where that is less than `least`; by which plane."""
+    q = point - shift
+    x = turn[0, 0] * q[0] + turn[1, 0] * q[1] + turn[2, 0] * q[2]
+    y = turn[0, 1] * q[0] + turn[1, 1] * q[1] + turn[2, 1] * q[2]
+    z = turn[0, 2] * q[0] + turn[1, 2] * q[1] + turn[2, 2] * q[2]
+    nearest, which, begin = np.inf, 0, 0
+    for s in range(len(ends)):
+        farthest, plane = -np.inf, begin
+        for f in range(begin, ends[s]):
+            away = planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z - planes[f, 3]
+            if away > farthest:
+                farthest, plane = away, f
+                if away >= least:
+                    break
+        begin = ends[s]
+        if farthest < nearest:
+            nearest, which = farthest, plane
+    return nearest, which

@@ -1,0 +1,57 @@
+"""Whether a force sensor feels a contact, where that can be told for sure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bcppl.arguments import number_within, whole_number
+from bcppl.errors import InputError
+
+
+@dataclass(frozen=True)
+class Felt:
+    """From which force on there is a contact.
+
+    A peg that begins to touch, or lets go, is between the two: such stamps tell nothing.
+
+    Attributes:
+        contact: N; more than this is a contact. Above what the sensor's zero drifts and what accelerating the
+            tool takes.
+        free: N; less than this is none.
+        beside: so many samples to either side must agree.
+
+    Raises:
+        InputError: a number is out of range.
+    """
+
+    contact: float = 2.0
+    free: float = 1.0
+    beside: int = 3
+
+    def __post_init__(self) -> None:
+        number_within("a contact is felt from {} N on", self.contact, above=0.0)
+        number_within("nothing is felt up to {} N", self.free, above=0.0, most=self.contact)
+        whole_number("{} samples beside are to agree", self.beside, least=0)
+
+    def __call__(self, force: Tensor) -> Tensor:
+        """1 for contact, 0 for none and NaN for neither, (T,), of tared forces (T, 3) in newtons.
+
+        A force that is NaN, as while taring, tells nothing.
+
+        Raises:
+            InputError: forces are not (T, 3).
+        """
+        if force.ndim != 2 or force.shape[1] != 3:
+            raise InputError(f"forces have shape {tuple(force.shape)}; give (T, 3), in newtons.")
+        size = force.norm(dim=1)
+        told = ~torch.isnan(size)
+        contact = self._agreed(told & (size > self.contact))
+        free = self._agreed(told & (size < self.free))
+        return torch.where(contact, 1.0, torch.where(free, 0.0, torch.nan)).to(torch.float64)
+
+    def _agreed(self, held: Tensor) -> Tensor:
+        padded = torch.nn.functional.pad(held, (self.beside, self.beside), value=True)
+        return padded.unfold(0, 2 * self.beside + 1, 1).all(dim=1)

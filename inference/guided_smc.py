@@ -1,0 +1,139 @@
+"""SMC in which the model's own programs take measurements in, and moves repair what they do not know.
+
+A program that goes straight to where the new measurement says that the part is, weighed by SMCP3
+(`bcppl.inference.smcp3`), spares the many small steps by which tempering lets a sharp likelihood in. Where
+such a step leaves too few particles with weight, it is undone and the likelihood is tempered in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from torch import Tensor
+
+from bcppl.arguments import number_within, whole_number
+from bcppl.errors import InferenceError, InputError
+from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence
+from bcppl.inference.kernels.kernel import Move
+from bcppl.inference.population import Population
+from bcppl.inference.proposals import Program, drift
+from bcppl.inference.proposals.together import continuous
+from bcppl.inference.resampling import adaptive, never, systematic
+from bcppl.inference.sizing import replicated
+from bcppl.inference.smc import Step, smc
+from bcppl.inference.smcp3 import Pair, smcp3
+from bcppl.inference.step import Observed, StepFunction, StepInfo, Stepped
+from bcppl.inference.targets import POSTERIOR
+from bcppl.inference.tempering import resample_move, tempered
+from bcppl.traces import Model
+
+WALK = (0.2, 2.0)  # scales of the random walks
+
+
+def kernel(pose: str, proposals: Sequence[Program]) -> Kernel:
+    """Every other latent value walks, then the pose is drawn anew by the model's proposals, then it walks."""
+
+    def moved(population: Population) -> Move:
+        others = [address for address in continuous(population.trace) if address != pose]
+        walks = [metropolis_hastings(drift(other, WALK)) for other in others]
+        given = [metropolis_hastings(proposal) for proposal in proposals]
+        return sequence([*walks, *given, metropolis_hastings(drift(pose, WALK))])(population)
+
+    return moved
+
+
+def guided(
+    pair: Pair,
+    moves: Kernel,
+    *,
+    sweeps: int = 1,
+    share: float = 0.5,
+    tries: int = 8,
+    least: float = 0.05,
+) -> StepFunction:
+    """A step that takes a measurement in by a pair of programs, resamples when needed, and moves.
+
+    Args:
+        pair: there and back.
+        moves: of every particle after each step.
+        sweeps: how many of them.
+        share: particles are resampled below this effective sample size, as a share of N.
+        tries: where the pair leaves fewer effective than that, it is run anew with so many copies of each
+            particle, and N of all are kept.
+        least: where even then fewer are left effective, as a share of N, the measurement is tempered in.
+    """
+    by_pair = smcp3(pair, resample=never)
+    resample = adaptive(systematic, share)
+    rejuvenation = resample_move(moves, sweeps, resample, always_move=True)
+    by_tempering = tempered(moves, sweeps=2 * sweeps, resample=resample)
+
+    def weighed(population: Population, observed: Observed) -> Population | None:
+        try:
+            return by_pair(population, observed).population
+        except InferenceError:
+            return None
+
+    def step(population: Population, observed: Observed) -> Stepped:
+        count = len(population)
+        reached = weighed(population, observed)
+        chosen: Tensor | None = None
+        if tries > 1 and (reached is None or reached.effective_sample_size < share * count):
+            reached = weighed(replicated(population, tries), observed)
+        if reached is None or reached.effective_sample_size < least * count:
+            return by_tempering(population, observed)
+        effective = reached.effective_sample_size
+        if len(reached) > count:
+            chosen = systematic(reached.log_weights, count)
+            reached = reached.selected(chosen)
+        moved, ancestors, acceptance, _ = rejuvenation(reached, POSTERIOR)
+        if chosen is not None:
+            origin = chosen // tries
+            ancestors = origin if ancestors is None else origin[ancestors]
+        info = StepInfo(
+            acceptance=float("nan") if acceptance is None else acceptance,
+            resampled=int(ancestors is not None),
+            effective_sample_size_before=effective,
+            effective_sample_size=moved.effective_sample_size,
+            log_evidence=moved.log_evidence - population.log_evidence,
+            ancestors=ancestors,
+        )
+        return Stepped(moved, info)
+
+    return step
+
+
+def infer(
+    model: Model,
+    recording: Any,
+    *,
+    particles: int = 75,
+    seed: int = 0,
+    sweeps: int = 1,
+    share: float = 0.5,
+    scene: Any = None,
+) -> Iterator[Step]:
+    """Beliefs over a recording, one step for each measurement, the prior first.
+
+    Args:
+        model: what explains the recording; it has an `arrival`.
+        recording: a `bcppl.recordings.Recording`.
+        particles: how many.
+        seed: same seed, same beliefs.
+        sweeps: moves of every particle after each measurement.
+        share: particles are resampled below this effective sample size, as a share of N.
+        scene: what `model.prepare(recording)` gives, if it is at hand.
+
+    Raises:
+        InputError: a number is out of range, or the model brings no `arrival`.
+    """
+    particles = whole_number("SMC is to run {} particles", particles)
+    sweeps = whole_number("SMC is to make {} sweeps", sweeps)
+    share = number_within("particles are to be resampled below a share of {}", share, least=0.0, most=1.0)
+    if model.arrival is None:
+        raise InputError(
+            "guided SMC is given a model without programs by which measurements arrive; give it an `arrival`, "
+            "or use bcppl.inference.tempered_smc."
+        )
+    step = guided(Pair(*model.arrival), kernel(model.pose, model.proposals), sweeps=sweeps, share=share)
+    return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene)

@@ -1,0 +1,198 @@
+"""A fixed rule for where to touch: metrology's 3-2-1.
+
+Three points on the top fix a part's height and tilt, two on one side its place across and its yaw, one on the
+next side what is left. A peg that is pressed on and slides touches all the points on its way.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.parts import Part
+from bcppl.recordings.plan import Manner, Plan
+from bcppl.simulators.faces import Side, sides, spots_on_top
+
+Array = npt.NDArray[np.float64]
+
+
+class Pace(NamedTuple):
+    """How a plan is carried out.
+
+    Attributes:
+        first: seconds; when the first contact is expected.
+        last: seconds; when the plan ends.
+        guarded, free, sliding: m/s, at most. Faster is made only as far as the plan would not end in time.
+        force: newtons at which a guarded motion stops.
+        press: metres that a stopped command is taken to lie under the surface: the spring's travel.
+        depth: metres below the top at which sides are touched, where the part is high enough.
+        sure: a stroke begins and ends so many standard deviations of where the belief says the surface is.
+        shortest, longest: metres between which a stroke's half lies.
+    """
+
+    first: float = 3.0
+    last: float = 6.0
+    guarded: float = 0.06
+    free: float = 0.25
+    sliding: float = 0.09
+    force: float = 4.0
+    press: float = 0.0015
+    depth: float = 0.012
+    sure: float = 3.0
+    shortest: float = 0.003
+    longest: float = 0.012
+
+
+STIFFNESS = (2500.0, 2500.0, 2500.0, 150.0, 150.0, 150.0)
+DAMPING = (120.0, 120.0, 120.0, 2.5, 2.5, 2.5)
+_ABOVE = 0.06  # m above the top at which a plan begins
+
+
+class _Knot(NamedTuple):
+    place: Array  # (3,) of the tip's centre in the part's frame
+    manner: Manner  # of the motion to it
+    speed: float
+
+
+def three_two_one(belief: Belief, part: Part, peg: Part, pace: Pace | None = None) -> Plan:
+    """Three touches on the part's top, two on one side and one on the next, joined by slides.
+
+    The plan is laid out around the belief's mean; the peg keeps the part's orientation there. Strokes towards
+    a face are as long as the belief is unsure of where that face is.
+
+    Args:
+        belief: over world_from_part.
+        part: its z axis points out of its top.
+        peg: what is held, its frame at the wrench sensor and its tip at its lowest z.
+        pace: speeds and times.
+
+    Raises:
+        InputError: the part's top has no room for the peg.
+    """
+    pace = Pace() if pace is None else pace
+    top = float(part.vertices[:, 2].max())
+    height = top - min(pace.depth, 0.5 * float(part.extent[2]))
+    across = float(np.linalg.norm(peg.vertices[:, :2], axis=1).max())
+    lateral = _stroke(belief, np.array([0.0, 0.0, top]), np.array([1.0, 0.0, 0.0]), pace)
+    spots = spots_on_top(part, peg, lateral)
+    faces = sides(part, height)
+    first, second = _pair(faces, spots[2], across)
+    knots = [
+        *_on_top(belief, spots, top, pace),
+        *_on_side(belief, first, peg, spots[2], top, height, pace, slide=True),
+    ]
+    knots += _on_side(belief, second, peg, knots[-1].place[:2], top, height, pace, slide=False)
+    return _timed(belief, knots, peg, pace)
+
+
+def _stroke(belief: Belief, place: Array, normal: Array, pace: Pace) -> float:
+    """Half a stroke (m) towards a surface at a place of the part, along its normal there."""
+    there = poses.transform(belief.world_from_part, torch.as_tensor(place)[None])[:, 0]
+    direction = poses.rotation_matrix(belief.mean) @ torch.as_tensor(normal)
+    along = there @ direction
+    middle = belief.weights @ along
+    spread = float(torch.sqrt(belief.weights @ (along - middle) ** 2))
+    return float(np.clip(pace.sure * spread, pace.shortest, pace.longest))
+
+
+def _pair(faces: list[Side], near: Array, across: float) -> tuple[Side, Side]:
+    """A long side, the one nearest to where the peg comes from, and one that stands across it."""
+    longest = [face for face in faces if face.length > 0.8 * faces[0].length]
+
+    def away(face: Side) -> float:
+        return float(np.linalg.norm(0.5 * (face.start + face.stop) + across * face.normal - near))
+
+    first = min(longest, key=away)
+    upright = [face for face in faces if abs(float(face.normal @ first.normal)) < 0.5]
+    second = min(upright or faces, key=lambda face: (-round(face.length, 3), away(face)))
+    return first, second
+
+
+def _on_top(belief: Belief, spots: Array, top: float, pace: Pace) -> list[_Knot]:
+    a, b, c = (np.array([*spot, top]) for spot in spots)
+    stroke = _stroke(belief, a, np.array([0.0, 0.0, 1.0]), pace)
+    up, down = np.array([0.0, 0.0, stroke]), np.array([0.0, 0.0, -stroke])
+    return [
+        _Knot(a + np.array([0.0, 0.0, _ABOVE]), "free", pace.free),
+        _Knot(a + up, "free", pace.free),
+        _Knot(a + down, "guarded", pace.guarded),
+        _Knot(b + down, "held", pace.sliding),
+        _Knot(c + down, "held", pace.sliding),
+        _Knot(c + up, "free", pace.free),
+    ]
+
+
+def _on_side(
+    belief: Belief, face: Side, peg: Part, before: Array, top: float, height: float, pace: Pace, slide: bool
+) -> list[_Knot]:
+    normal = np.array([*face.normal, 0.0])
+    along = (face.stop - face.start) / max(face.length, 1e-9)
+    reach = float((peg.vertices[:, :2] @ -face.normal).max())  # of the peg towards the face
+    inset = min(0.5 * face.length, reach + pace.longest * 0.5)
+    ends = [face.start + inset * along, face.stop - inset * along]
+    if np.linalg.norm(ends[0] - before) > np.linalg.norm(ends[1] - before):
+        ends.reverse()
+    if not slide:
+        ends = [0.5 * (face.start + face.stop)]
+    begin = np.array([*ends[0], height])
+    stroke = _stroke(belief, begin, normal, pace)
+    clear, stop = (reach + stroke) * normal, (reach - stroke) * normal
+    lift = _stroke(belief, np.array([*ends[0], top]), np.array([0.0, 0.0, 1.0]), pace)
+    above = np.array([*ends[0], top + lift]) + clear
+    knots = [
+        _Knot(above, "free", pace.free),
+        _Knot(begin + clear, "free", pace.free),
+        _Knot(begin + stop, "guarded", pace.guarded),
+    ]
+    if slide:
+        end = np.array([*ends[1], height])
+        knots += [_Knot(end + stop, "held", pace.sliding), _Knot(end + clear, "free", pace.free)]
+    else:
+        knots += [_Knot(begin + stop, "held", pace.sliding)]
+    return knots
+
+
+def _timed(belief: Belief, knots: list[_Knot], peg: Part, pace: Pace) -> Plan:
+    """The plan of knots in the part's frame, faster where it would not end in time."""
+    places = np.stack([knot.place for knot in knots])
+    ways = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    needed = np.maximum(ways / np.array([knot.speed for knot in knots[1:]]), 0.04)
+    touched = next(k for k, knot in enumerate(knots) if knot.manner == "guarded")
+    # Half of the first stroke is over at the first contact; what comes after must fit in what is left.
+    after = np.concatenate([[0.5 * needed[touched - 1]], needed[touched:]])
+    left = pace.last - pace.first
+    faster = np.array([0.5 if knot.manner == "guarded" else 1.0 for knot in knots[1:]])
+    if after.sum() > left:
+        guarded = np.concatenate([[True], faster[touched:] < 1.0])
+        slow = after[guarded].sum()
+        if slow < 0.6 * left:  # guarded strokes keep their speed where that leaves enough for the rest
+            shrink = np.where(guarded, 1.0, (left - slow) / after[~guarded].sum())
+        else:
+            shrink = np.full(len(after), left / after.sum())
+        needed[touched - 1 :] *= shrink
+    begin = pace.first - needed[: touched - 1].sum() - 0.5 * needed[touched - 1]
+    times = begin + np.concatenate([[0.0], np.cumsum(needed)])
+    times = np.concatenate([[0.0], times])
+    places = np.concatenate([places[:1], places])
+    manners: tuple[Manner, ...] = ("free", *(knot.manner for knot in knots[1:]))
+    if times[-1] < pace.last - 1e-6:
+        times, places = np.append(times, pace.last), np.concatenate([places, places[-1:]])
+        manners = (*manners, "held")
+    tip = -float(peg.vertices[:, 2].min())
+    world_from_peg = belief.mean.expand(len(places), 7).clone()
+    sensor = torch.from_numpy(places + np.array([0.0, 0.0, tip]))
+    world_from_peg[:, :3] = poses.transform(belief.mean, sensor)
+    return Plan(
+        "3-2-1",
+        times,
+        world_from_peg.numpy(),
+        manners,
+        pace.force,
+        np.array(STIFFNESS),
+        np.array(DAMPING),
+    )
