@@ -61,7 +61,7 @@ class SharedError:
 
     def _conditionals(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation (N, K) of what is added to the signed distance at each touch."""
-        slopes = torch.stack([self._slope(path) for path in self.paths], dim=1) * self.scale
+        slopes = self._slopes() * self.scale
         count = len(self.paths)
         depth = slopes.new_zeros(len(slopes), count)
         told = torch.zeros(len(slopes), count, dtype=torch.bool)
@@ -85,19 +85,22 @@ class SharedError:
             spread[:, k] = torch.where(told[:, k], spread[:, k], left.sqrt())
         return mean, spread
 
-    def _slope(self, path: Path) -> Tensor:
-        """What a shift and a turn of the part change in the signed distance (N, 3) where the path meets it.
+    def _slopes(self) -> Tensor:
+        """What a shift and a turn of the part change in the signed distance (N, K, 3) where a path meets it.
 
-        It hangs on pose and path, not on where the touch is felt: so a touch's density integrates to one.
+        They hang on pose and paths, not on where a touch is felt: so a touch's density integrates to one.
         """
-        distance, normal = self.placed.near(path.points)
-        inside = distance <= 0.0
-        first = inside.to(torch.uint8).argmax(dim=-1)
-        meets = torch.where(inside.any(dim=-1), first, distance.argmin(dim=-1))
-        normal = normal[torch.arange(len(normal)), meets]
-        arm = path.points[meets] - poses.transform(self.placed.pose, self.center[None])[:, 0]
-        turning = normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]
-        return -torch.stack([normal[:, 0], normal[:, 1], turning], dim=-1)
+        each = torch.arange(len(self.placed.pose))
+        normals, points = [], []
+        for path in self.paths:
+            distance, normal = self.placed.near(path.points)
+            meets = distance.abs().argmin(dim=-1)
+            normals.append(normal[each, meets])
+            points.append(path.points[meets])
+        normal = torch.stack(normals, dim=1)
+        arm = torch.stack(points, dim=1) - poses.transform(self.placed.pose, self.center[None])
+        turning = normal[..., 1] * arm[..., 0] - normal[..., 0] * arm[..., 1]
+        return -torch.stack([normal[..., 0], normal[..., 1], turning], dim=-1)
 
     def _distance(self, place: Tensor) -> Tensor:
         """Signed distance (N,) at a place (3,) or (N, 3) where it is known, else anything finite."""

@@ -68,8 +68,9 @@ def independent(
         if len(population) > TEACHERS:
             places = places[systematic(weights.log(), TEACHERS)]
             weights = weights.new_full((TEACHERS,), 1.0 / TEACHERS)
-        mixture = _kernel_density(known, places, weights)
-        if components is not None:
+        if components is None:
+            mixture = _kernel_density(known, places, weights)
+        else:
             mixture = _maximised(known, places, weights, components)
         mean = known.mean(places, weights)
         whole = conditioned(covariance_of(known.steps(mean, places), weights))
