@@ -40,6 +40,7 @@ from touches import (
     fitted,
     learnt,
     pushes,
+    tracked,
 )
 
 from bcppl import poses
@@ -101,8 +102,11 @@ def recording_of(log: str, seed: int, count: int) -> Any:
     return recording
 
 
-def chsel(draws: Sequence[tuple[str, int]], measure: str) -> list[Answer] | None:
-    """CHSEL's answers to draws (log, seed): its pose of least cost, and how far its poses lie apart."""
+def chsel(draws: Sequence[tuple[str, int]], measure: str) -> tuple[list[Answer], list[Answer]] | None:
+    """CHSEL's answers to draws (log, seed), and the same after they are told the registration.
+
+    An answer is the pose of least cost; its spread is how far the poses lie apart that come back.
+    """
     recordings = [recording_of(log, seed, JUDGED) for log, seed in draws]
     told = [learnt(OTHER[log]) for log, _ in draws]
     starts = []
@@ -126,14 +130,15 @@ def chsel(draws: Sequence[tuple[str, int]], measure: str) -> list[Answer] | None
         printed = ask("chsel", "chsel_contacts.py", file, "--measure", measure, "--threads", threads)
     if printed is None:
         return None
-    found = []
-    for recording, one in zip(recordings, printed, strict=True):
+    found: tuple[list[Answer], list[Answer]] = [], []
+    for recording, settings, one in zip(recordings, told, printed, strict=True):
         matrix = torch.tensor(one["world_from_part"], dtype=torch.float64)
         world_from_part = poses.from_rotation_matrix(matrix[:, :3, 3], matrix[:, :3, :3])
         best = world_from_part[int(np.argmin(one["cost"]))]
         around = poses.local(best, world_from_part).std(dim=0, correction=0)
         wide = 1e3 * float(around[:2].norm()), math.degrees(float(around[5]))
-        found.append(Answer(errors(best, recording), *wide, one["seconds"]))
+        for kind, pose in zip(found, (best, tracked(best, recording, settings)), strict=True):
+            kind.append(Answer(errors(pose, recording), *wide, one["seconds"]))
     return found
 
 
@@ -213,20 +218,23 @@ def of_pushes(draws: int, seed: int, jobs: int, beside: bool) -> list[Row]:
     show(title, LINE, lines)
     if beside:
         shared = [(log, s) for s in seeds for log in OTHER][:SHARED]
-        at = [results[k][BCPPL][JUDGED] for k, a in enumerate(asked) if a[:2] in shared]
-        rows += against_chsel(shared, at)
+        of_draw = {one[:2]: result[BCPPL][JUDGED] for one, result in zip(asked, results, strict=True)}
+        rows += against_chsel(shared, [of_draw[draw] for draw in shared])
     return rows
 
 
 def against_chsel(draws: Sequence[tuple[str, int]], ours: Sequence[Answer]) -> list[Row]:
     rows, lines = [], [line(BCPPL, JUDGED, ours)]
     for measure in MEASURES:
-        theirs = chsel(draws, measure)
-        if theirs is None:
+        both = chsel(draws, measure)
+        if both is None:
             return []
+        theirs, registered = both
         name = f"CHSEL, {measure} measure"
         lines.append(line(name, JUDGED, theirs))
+        lines.append(line(f"{name}, told the registration too", JUDGED, registered))
         rows += ratios(f"to {name}", ours, theirs, 1.0)
+        rows += ratios(f"to {name}, told the registration too", ours, registered, None)
         seconds = [float(np.median(columns_of(a)["seconds"])) for a in (ours, theirs)]
         rows.append(Row(f"to {name}: wall, median", seconds[0] / seconds[1], "ratio", 1.0))
         # How many times too wide or too narrow, whichever it is.
