@@ -282,7 +282,7 @@ def calibration(jobs: int, seed: int = 0, divisions: int = 4, count: int = JUDGE
                     Row(f"{name}: p of its mass", float(test.pvalue), "probability", 1 - CONFIDENCE, "min")
                 )
     show(
-        f"real pushes, regions after {count}: share that holds the truth, {100 * CONFIDENCE:.0f} % interval",
+        f"regions after {count} real pushes, {100 * CONFIDENCE:.0f} % interval",
         ["", "groups", "holds %", "from %", "to %"],
         lines,
     )
