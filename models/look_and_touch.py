@@ -45,7 +45,8 @@ WIDTHS = torch.tensor([1.1, 3.0], dtype=torch.float64)
 SHARES = torch.tensor([0.85, 0.15], dtype=torch.float64)
 # What an image says of where it sees the part is taken for no surer than this: metres, radians, metres of bias.
 SHARPEST = torch.tensor([5e-5] * 3 + [1e-3] * 3 + [1e-4], dtype=torch.float64)
-BLURS = (0.003, 0.001, 0.0003, 0.0001, 0.0, 0.0, 0.0)  # m: errors that Gauss-Newton adds to the gaps
+BLURS = (0.003, 0.002, 0.001, 0.0005, 0.0002, 0.0001, 0.0, 0.0, 0.0, 0.0)  # m that Gauss-Newton adds to errors
+SHARES_OF_STEP = torch.tensor([0.0, 0.1, 0.3, 0.6, 1.0], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -149,8 +150,8 @@ def image_of(scene: Scene, camera: Camera, there: Tensor, bias: Tensor | float) 
     )
 
 
-def touch_of(scene: Scene, window: ProbeWindow, part: Tensor) -> ContactManifold:
-    """What a window says of parts at poses (N, 7)."""
+def touch_of(scene: Scene, window: ProbeWindow, part: Tensor, blur: float = 0.0) -> ContactManifold:
+    """What a window says of parts at poses (N, 7), or would with common errors `blur` metres wider."""
     assert scene.gap is not None
     settings = scene.settings
     return ContactManifold(
@@ -158,7 +159,7 @@ def touch_of(scene: Scene, window: ProbeWindow, part: Tensor) -> ContactManifold
         part,
         len(range(window.first, window.last, settings.every)),
         settings.gap_noise,
-        settings.gap_shared,
+        math.hypot(settings.gap_shared, blur),
         settings.sink,
         settings.gap_outlier,
     )
@@ -219,22 +220,63 @@ def told_by_touches(
     """
     if len(actions) in scene.told:
         return scene.told[len(actions)]
-    touches = [(k, a) for k, a in enumerate(actions) if isinstance(a, ProbeWindow)]
     center, precision = placed_by_images(scene, actions)
-    start = [scene.told[k].around for k in sorted(scene.told)][-1:]
-    pose = start[0] if start else center
-    slope, information = torch.zeros(1, 6, dtype=torch.float64), torch.zeros(1, 6, 6, dtype=torch.float64)
+    latest = max(scene.told, default=None)
+    starts = [center] if latest is None else [center, scene.told[latest].around[None]]
+    found = [nearest_fit(scene, actions, observations, start, center, precision) for start in starts]
+    pose, _ = max(found, key=lambda fit: fit[1])
+    slope, information = pulls(scene, actions, observations, pose, 0.0)
+    scene.told[len(actions)] = Told(pose[0], slope[0], information[0])
+    return scene.told[len(actions)]
+
+
+def nearest_fit(
+    scene: Scene,
+    actions: Sequence[View | ProbeWindow],
+    observations: Mapping[str, Tensor],
+    start: Tensor,
+    center: Tensor,
+    precision: Tensor,
+) -> tuple[Tensor, float]:
+    """The pose (1, 7) to which Gauss-Newton leads from a start (1, 7), and its log-probability.
+
+    Args:
+        center, precision: (1, 7) and (1, 6, 6) of what is known beside the touches.
+    """
+
+    def fits(pose: Tensor, blur: float) -> Tensor:
+        away = poses.local(center, pose)
+        total = -0.5 * ((away @ precision[0]) * away).sum(dim=-1)
+        for k, window in enumerate(actions):
+            if isinstance(window, ProbeWindow):
+                total = total + touch_of(scene, window, pose, blur).log_prob(observations[f"touch_{k}"])
+        return total
+
+    pose = start
     for blur in BLURS:
-        slope, information = torch.zeros_like(slope), torch.zeros_like(information)
-        for k, window in touches:
+        slope, information = pulls(scene, actions, observations, pose, blur)
+        pull = (precision @ poses.local(pose, center)[..., None])[..., 0] - slope
+        step = torch.linalg.solve(precision + information, pull[..., None])[..., 0]
+        # Which corner touches changes on the way: so far and no farther than it gains.
+        tried = poses.retract(pose, SHARES_OF_STEP[:, None] * step)
+        pose = tried[fits(tried, blur).argmax()][None]
+    return pose, float(fits(pose, 0.0))
+
+
+def pulls(
+    scene: Scene,
+    actions: Sequence[View | ProbeWindow],
+    observations: Mapping[str, Tensor],
+    pose: Tensor,
+    blur: float,
+) -> tuple[Tensor, Tensor]:
+    """Slope (1, 6) and curvature (1, 6, 6) of minus the log-likelihood of all touches at a pose (1, 7)."""
+    slope, information = torch.zeros(1, 6, dtype=torch.float64), torch.zeros(1, 6, 6, dtype=torch.float64)
+    for k, window in enumerate(actions):
+        if isinstance(window, ProbeWindow):
             said = touch_of(scene, window, pose).quadratic(observations[f"touch_{k}"], blur)
             slope, information = slope + said.slope, information + said.information
-        if blur is not BLURS[-1]:
-            pull = (precision @ poses.local(pose, center)[..., None])[..., 0] - slope
-            step = torch.linalg.solve(precision + information, pull[..., None])[..., 0]
-            pose = poses.retract(pose, step)
-    scene.told[len(actions)] = Told(pose, slope[0], information[0])
-    return scene.told[len(actions)]
+    return slope, information
 
 
 def placed_by_images(scene: Scene, actions: Sequence[View | ProbeWindow]) -> tuple[Tensor, Tensor]:
@@ -394,7 +436,7 @@ def observe(scene: Scene, measurements: Sequence[Measurement]) -> Mapping[str, T
     for windows in touches.values():
         assert scene.sensing is not None
         tared = scene.sensing.tared([touch for _, touch in windows])
-        flags = scene.settings.felt(torch.cat(tared)[:, :3])
+        flags = scene.settings.felt(torch.cat(tared)[:, :3], accelerations(measurements, windows))
         begin = 0
         for (k, touch), wrench in zip(windows, tared, strict=True):
             mine = flags[begin : begin + len(wrench), None]
@@ -402,6 +444,21 @@ def observe(scene: Scene, measurements: Sequence[Measurement]) -> Mapping[str, T
             rows = torch.cat([torch.from_numpy(np.array(touch.world_from_peg)), mine], dim=1)
             values[f"touch_{k}"] = rows[:: scene.settings.every]
     return values
+
+
+def accelerations(measurements: Sequence[Measurement], windows: Sequence[tuple[int, Touch]]) -> Tensor:
+    """What the commands of a probe's windows ask for at their stamps, (T,), the most within 50 ms, m/s^2."""
+    found = []
+    for k, _ in windows:
+        action = measurements[k].action
+        assert isinstance(action, ProbeWindow)
+        found.append(action.probe.stamps[action.first : action.last])
+    assert isinstance(action, ProbeWindow)
+    stamps, probe = np.concatenate(found), action.probe
+    near = stamps[:, None] + np.arange(-0.05, 0.051, 0.01)
+    place = np.stack([np.interp(near, probe.command_times, probe.command[:, axis]) for axis in range(3)])
+    speed = np.diff(place, axis=-1) / 0.01
+    return torch.from_numpy(np.linalg.norm(np.diff(speed, axis=-1) / 0.01, axis=0).max(axis=-1))
 
 
 def invent(seed: int, **options: Any) -> Recording:

@@ -13,6 +13,7 @@ from bcppl.arguments import number_within
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 
+_FAR = 4.0  # standard deviations
 FARTHEST = 0.02  # m: the range over which an outlier's gap is spread evenly
 
 
@@ -109,7 +110,10 @@ class ContactManifold(LazyDistribution):
         )
 
     def quadratic(self, value: Tensor, blur: float = 0.0) -> Quadratic:
-        """The log-likelihood of a window (T, 8) to second order, errors `blur` metres wider, no outliers."""
+        """The log-likelihood of a window (T, 8) to second order, errors `blur` metres wider.
+
+        Stamps with contact that are off by many standard deviations count for little.
+        """
         poses, felt = self._read(value)
         told = ~torch.isnan(felt)
         if not bool(told.any()):
@@ -121,6 +125,9 @@ class ContactManifold(LazyDistribution):
         variance, common = self.noise**2, self.shared**2 + blur**2
         count = int(touching.sum())
         share = common / (variance + count * common) if count else 0.0
+        # What is far off, seen as wide as the errors are taken to be, hardly pulls.
+        trust = 1.0 / (1.0 + error**2 / (_FAR**2 * (variance + common)))
+        rows, error = rows * trust.sqrt()[..., None], error * trust.sqrt()
         weighed = (rows - share * rows.sum(dim=1, keepdim=True)) / variance
         pull = (weighed * error[..., None]).sum(dim=1)
         information = weighed.transpose(-1, -2) @ rows

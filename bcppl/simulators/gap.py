@@ -26,8 +26,9 @@ from bcppl.simulators.placement import compiled
 Array = npt.NDArray[np.float64]
 Numbers = npt.NDArray[np.int64]
 
-EDGE_SPACING = 0.001  # m between the points that stand for the part's sharp edges
-_RUN = 8  # points of an edge that are passed over together
+_RUN = 0.008  # m of an edge that are passed over together
+_ROUNDS = 12
+_EXACT = 1e-8  # m
 _NEAR = 0.002  # m: nearer than this, what the grid cannot tell is measured exactly
 _SHARP = np.radians(5.0)
 _FLAT = 1e-9
@@ -63,10 +64,10 @@ class PegGap:
     """The gap between a part and a peg. Their meshes are closed; a peg that is not convex has convex pieces.
 
     Contact between solids with flat faces begins at a corner of the one, at a corner of the other, or where
-    two edges cross. So the gap is the least of the distances of the peg's corners to the part and of points
-    1 mm apart along the part's sharp edges to the peg. Where nothing touches it is never too small, and too
-    large by at most what an edge's point is off. Corners are chosen by a grid of distances; those near an edge
-    of the part, which a grid rounds off, are then measured exactly.
+    two edges cross. So the gap is the least of the distances of the peg's corners to the part and of the
+    part's sharp edges to the peg. Corners are chosen by a grid of distances; those near an edge of the part,
+    which a grid rounds off, are then measured exactly. The distance of an edge to the peg is that to its
+    nearest plane: exact in contact, too small beside the peg's own edges and corners.
 
     Attributes:
         part, peg: the solids.
@@ -82,7 +83,7 @@ class PegGap:
         self._signed = SignedDistance(part)
         self._grid: DistanceGrid | None = None
         self._corners = _corners(peg)
-        self._edges, self._runs, self._balls = _edge_points(part)
+        self._edges, self._balls = _edges(part)
         self._planes, self._ends = _planes(peg)
         self._box = np.stack([peg.vertices.min(axis=0), peg.vertices.max(axis=0)])
 
@@ -107,7 +108,6 @@ class PegGap:
                     self._corners,
                     *self._grid_arrays,
                     self._edges,
-                    self._runs,
                     self._balls,
                     self._planes,
                     self._ends,
@@ -140,25 +140,23 @@ def _corners(peg: Part) -> Array:
     return np.unique(np.round(peg.vertices, 9), axis=0)
 
 
-def _edge_points(part: Part) -> tuple[Array, Numbers, Array]:
-    """Points (E, 3) along the edges at which the part is sharp and convex, in runs.
+def _edges(part: Part) -> tuple[Array, Array]:
+    """Stretches (E, 2, 3) of the edges at which the part is sharp and convex, from point to point.
 
     Returns:
-        The points; where each run ends (R,); centre and radius (R, 4) of a ball around each run.
+        The stretches, and centre and radius (E, 4) of a ball around each.
     """
     mesh = part.mesh.copy()
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     sharp = mesh.face_adjacency_convex & (mesh.face_adjacency_angles > _SHARP)
-    runs: list[Array] = []
+    stretches = [np.empty((0, 2, 3))]
     for start, stop in np.asarray(mesh.vertices)[mesh.face_adjacency_edges[sharp]]:
-        count = int(np.ceil(np.linalg.norm(stop - start) / EDGE_SPACING)) + 1
-        points = np.linspace(start, stop, count)
-        runs += [points[first : first + _RUN] for first in range(0, count, _RUN)]
-    centers = [0.5 * (run[0] + run[-1]) for run in runs]
-    radii = [0.5 * float(np.linalg.norm(run[-1] - run[0])) for run in runs]
-    balls = np.column_stack([np.reshape(centers, (-1, 3)), radii])
-    points = np.concatenate(runs) if runs else np.empty((0, 3))
-    return points, np.cumsum([len(run) for run in runs], dtype=np.int64), balls
+        count = max(1, int(np.ceil(np.linalg.norm(stop - start) / _RUN)))
+        points = np.linspace(start, stop, count + 1)
+        stretches.append(np.stack([points[:-1], points[1:]], axis=1))
+    edges = np.concatenate(stretches)
+    radii = 0.5 * np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
+    return edges, np.column_stack([edges.mean(axis=1), radii])
 
 
 def _planes(peg: Part) -> tuple[Array, Numbers]:
@@ -210,7 +208,6 @@ def _measure(
     spacing: float,
     grid: npt.NDArray[np.float32],
     edges: Array,
-    runs: Numbers,
     balls: Array,
     planes: Array,
     ends: Numbers,
@@ -239,17 +236,18 @@ def _measure(
             place[n, t] = turn @ corners[which] + shift
             rounded[n, t] = not sloped(place[n, t], low, spacing, grid, slope) and abs(least) < _NEAR
             normal[n, t] = slope
-            begin = 0
-            for r in range(len(runs)):
-                if _may_be_nearer(balls[r], turn, shift, box, least):
-                    for e in range(begin, runs[r]):
-                        inside, plane = _inside(edges[e], turn, shift, planes, ends, least)
+            for e in range(len(edges)):
+                if _may_be_nearer(balls[e], turn, shift, box, least):
+                    start, stop = turn.T @ (edges[e, 0] - shift), turn.T @ (edges[e, 1] - shift)
+                    begin = 0
+                    for s in range(len(ends)):
+                        inside, share, plane = _deepest(start, stop, planes[begin : ends[s]], least)
                         if inside < least:
                             least = inside
                             rounded[n, t] = False
-                            place[n, t] = edges[e]
-                            normal[n, t] = -(turn @ planes[plane, :3])
-                begin = runs[r]
+                            place[n, t] = edges[e, 0] + share * (edges[e, 1] - edges[e, 0])
+                            normal[n, t] = -(turn @ planes[begin + plane, :3])
+                        begin = ends[s]
             distance[n, t] = least
 
 
@@ -266,24 +264,53 @@ def _may_be_nearer(ball: Array, turn: Array, shift: Array, box: Array, least: fl
 
 
 @compiled
-def _inside(
-    point: Array, turn: Array, shift: Array, planes: Array, ends: Numbers, least: float
-) -> tuple[float, int]:
-    """How far a point of the part is outside the peg, where that is less than `least`; by which plane."""
-    q = point - shift
-    x = turn[0, 0] * q[0] + turn[1, 0] * q[1] + turn[2, 0] * q[2]
-    y = turn[0, 1] * q[0] + turn[1, 1] * q[1] + turn[2, 1] * q[2]
-    z = turn[0, 2] * q[0] + turn[1, 2] * q[1] + turn[2, 2] * q[2]
-    nearest, which, begin = np.inf, 0, 0
-    for s in range(len(ends)):
-        farthest, plane = -np.inf, begin
-        for f in range(begin, ends[s]):
-            away = planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z - planes[f, 3]
-            if away > farthest:
-                farthest, plane = away, f
-                if away >= least:
-                    break
-        begin = ends[s]
-        if farthest < nearest:
-            nearest, which = farthest, plane
-    return nearest, which
+def _deepest(start: Array, stop: Array, planes: Array, least: float) -> tuple[float, float, int]:
+    """Where a stretch of an edge is deepest in a convex solid, or nearest to it: by cutting planes.
+
+    How far a point is out of the solid, by the plane that it is farthest out of, is convex and piecewise
+    linear along the stretch.
+
+    Args:
+        start, stop: (3,) its ends in the peg's frame.
+        planes: (P, 4) of the solid.
+        least: what it must be less than to matter.
+
+    Returns:
+        The distance, negative inside, or one of at least `least`; where on the stretch, from 0 to 1; the plane.
+    """
+    step = stop - start
+    low, high = 0.0, 1.0
+    at_low, plane_low = _out(start, planes)
+    slope_low = planes[plane_low, :3] @ step
+    if slope_low >= 0.0:
+        return at_low, low, plane_low
+    at_high, plane_high = _out(stop, planes)
+    slope_high = planes[plane_high, :3] @ step
+    if slope_high <= 0.0:
+        return at_high, high, plane_high
+    for _ in range(_ROUNDS):
+        share = (at_low - at_high + slope_high * high - slope_low * low) / (slope_high - slope_low)
+        share = min(max(share, low), high)
+        bound = at_low + slope_low * (share - low)
+        if bound >= least:
+            return bound, share, plane_low
+        here, plane = _out(start + share * step, planes)
+        if here <= bound + _EXACT:
+            break
+        slope = planes[plane, :3] @ step
+        if slope < 0.0:
+            low, at_low, slope_low = share, here, slope
+        else:
+            high, at_high, slope_high = share, here, slope
+    return here, share, plane
+
+
+@compiled
+def _out(point: Array, planes: Array) -> tuple[float, int]:
+    """How far a point is out of a convex solid, by the plane that it is farthest out of."""
+    farthest, plane = -np.inf, 0
+    for f in range(len(planes)):
+        away = planes[f, 0] * point[0] + planes[f, 1] * point[1] + planes[f, 2] * point[2] - planes[f, 3]
+        if away > farthest:
+            farthest, plane = away, f
+    return farthest, plane

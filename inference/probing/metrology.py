@@ -10,13 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import shapely
 import torch
 
 from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.parts import Part
 from bcppl.recordings.plan import Manner, Plan
-from bcppl.simulators.faces import Side, sides, spots_on_top
+from bcppl.simulators.faces import Side, section, sides, spots_on_top
 
 Array = npt.NDArray[np.float64]
 
@@ -29,7 +30,7 @@ class Pace(NamedTuple):
         last: seconds; when the plan ends.
         guarded, free, sliding: m/s, at most. Faster is made only as far as the plan would not end in time.
         force: newtons at which a guarded motion stops.
-        press: metres that a stopped command is taken to lie under the surface: the spring's travel.
+        press: metres that a command goes on towards a surface once it was met: an impact may have stopped it.
         depth: metres below the top at which sides are touched, where the part is high enough.
         sure: a stroke begins and ends so many standard deviations of where the belief says the surface is.
         shortest, longest: metres between which a stroke's half lies.
@@ -41,7 +42,7 @@ class Pace(NamedTuple):
     free: float = 0.25
     sliding: float = 0.09
     force: float = 4.0
-    press: float = 0.0015
+    press: float = 0.002
     depth: float = 0.012
     sure: float = 3.0
     shortest: float = 0.003
@@ -51,6 +52,7 @@ class Pace(NamedTuple):
 STIFFNESS = (2500.0, 2500.0, 2500.0, 150.0, 150.0, 150.0)
 DAMPING = (120.0, 120.0, 120.0, 2.5, 2.5, 2.5)
 _ABOVE = 0.06  # m above the top at which a plan begins
+_AWAY = 0.002  # m from the part on ways around it
 
 
 class _Knot(NamedTuple):
@@ -80,14 +82,99 @@ def three_two_one(belief: Belief, part: Part, peg: Part, pace: Pace | None = Non
     across = float(np.linalg.norm(peg.vertices[:, :2], axis=1).max())
     lateral = _stroke(belief, np.array([0.0, 0.0, top]), np.array([1.0, 0.0, 0.0]), pace)
     spots = spots_on_top(part, peg, lateral)
-    faces = sides(part, height)
-    first, second = _pair(faces, spots[2], across)
+    first, second = _pair(sides(part, height), spots[2], across)
+    one = _OnSide.of(belief, first, peg, height, pace)
+    other = _OnSide.of(belief, second, peg, height, pace)
+    begin, end = one.slide(spots[2], other.middle)
+    lift = _stroke(belief, np.array([*begin, top]), np.array([0.0, 0.0, 1.0]), pace)
     knots = [
         *_on_top(belief, spots, top, pace),
-        *_on_side(belief, first, peg, spots[2], top, height, pace, slide=True),
+        _Knot(np.array([*begin, top + lift]) + one.clear, "free", pace.free),
+        *one.touch(begin),
+        _Knot(one.at(end) + one.stop - one.press, "held", pace.sliding),
+        _Knot(one.at(end) + one.clear, "free", pace.free),
+        *_around(section(part, height), one.at(end) + one.clear, other, one, across, top + lift),
+        *other.touch(other.middle),
     ]
-    knots += _on_side(belief, second, peg, knots[-1].place[:2], top, height, pace, slide=False)
     return _timed(belief, knots, peg, pace)
+
+
+class _OnSide(NamedTuple):
+    """How a side is touched, in the part's frame: metres.
+
+    Attributes:
+        face: the side.
+        height: z of the tip.
+        clear, stop, press: (3,) where a stroke begins and ends beside the face, and what presses on.
+        inset: of the ends of a slide from the face's.
+        pace: speeds.
+    """
+
+    face: Side
+    height: float
+    clear: Array
+    stop: Array
+    press: Array
+    inset: float
+    pace: Pace
+
+    @classmethod
+    def of(cls, belief: Belief, face: Side, peg: Part, height: float, pace: Pace) -> _OnSide:
+        """For a belief over where the face is."""
+        normal = np.array([*face.normal, 0.0])
+        reach = float((peg.vertices[:, :2] @ -face.normal).max())  # of the peg towards the face
+        middle = 0.5 * (face.start + face.stop)
+        stroke = _stroke(belief, np.array([*middle, height]), normal, pace)
+        inset = min(0.5 * face.length, reach + 0.5 * pace.longest)
+        return cls(
+            face, height, (reach + stroke) * normal, (reach - stroke) * normal, pace.press * normal, inset, pace
+        )
+
+    @property
+    def middle(self) -> Array:
+        """(2,)."""
+        return 0.5 * (self.face.start + self.face.stop)
+
+    def slide(self, before: Array, after: Array) -> tuple[Array, Array]:
+        """Where a slide begins and ends, (2,) each, so that the ways from and to other places are short."""
+        along = (self.face.stop - self.face.start) / max(self.face.length, 1e-9)
+        a, b = self.face.start + self.inset * along, self.face.stop - self.inset * along
+        forth = np.linalg.norm(a - before) + np.linalg.norm(b - after)
+        back = np.linalg.norm(b - before) + np.linalg.norm(a - after)
+        return (a, b) if forth <= back else (b, a)
+
+    def at(self, place: Array) -> Array:
+        """(3,)."""
+        return np.array([*place, self.height])
+
+    def touch(self, place: Array) -> list[_Knot]:
+        """Beside the face, to it, and on."""
+        here = self.at(place)
+        return [
+            _Knot(here + self.clear, "free", self.pace.free),
+            _Knot(here + self.stop, "guarded", self.pace.guarded),
+            _Knot(here + self.stop - self.press, "held", self.pace.guarded),
+        ]
+
+
+def _around(
+    outline: shapely.Polygon, start: Array, other: _OnSide, one: _OnSide, across: float, above: float
+) -> list[_Knot]:
+    """The way from beside one side to beside the other that does not touch the part."""
+    body = outline.convex_hull.buffer(across + _AWAY)
+    goal = other.at(other.middle) + other.clear
+    corner = start + ((goal - start) @ _unit(other.clear)) * _unit(other.clear)
+    for ways in ([], [corner]):
+        places = [start, *ways, goal]
+        line = shapely.LineString([place[:2] for place in places])
+        if not body.intersects(line):
+            return [_Knot(place, "free", one.pace.free) for place in ways]
+    up = [np.array([*start[:2], above]), np.array([*goal[:2], above])]
+    return [_Knot(place, "free", one.pace.free) for place in up]
+
+
+def _unit(vector: Array) -> Array:
+    return vector / np.linalg.norm(vector)
 
 
 def _stroke(belief: Belief, place: Array, normal: Array, pace: Pace) -> float:
@@ -117,44 +204,16 @@ def _on_top(belief: Belief, spots: Array, top: float, pace: Pace) -> list[_Knot]
     a, b, c = (np.array([*spot, top]) for spot in spots)
     stroke = _stroke(belief, a, np.array([0.0, 0.0, 1.0]), pace)
     up, down = np.array([0.0, 0.0, stroke]), np.array([0.0, 0.0, -stroke])
+    on = down - np.array([0.0, 0.0, pace.press])
     return [
         _Knot(a + np.array([0.0, 0.0, _ABOVE]), "free", pace.free),
         _Knot(a + up, "free", pace.free),
         _Knot(a + down, "guarded", pace.guarded),
-        _Knot(b + down, "held", pace.sliding),
-        _Knot(c + down, "held", pace.sliding),
+        _Knot(a + on, "held", pace.guarded),
+        _Knot(b + on, "held", pace.sliding),
+        _Knot(c + on, "held", pace.sliding),
         _Knot(c + up, "free", pace.free),
     ]
-
-
-def _on_side(
-    belief: Belief, face: Side, peg: Part, before: Array, top: float, height: float, pace: Pace, slide: bool
-) -> list[_Knot]:
-    normal = np.array([*face.normal, 0.0])
-    along = (face.stop - face.start) / max(face.length, 1e-9)
-    reach = float((peg.vertices[:, :2] @ -face.normal).max())  # of the peg towards the face
-    inset = min(0.5 * face.length, reach + pace.longest * 0.5)
-    ends = [face.start + inset * along, face.stop - inset * along]
-    if np.linalg.norm(ends[0] - before) > np.linalg.norm(ends[1] - before):
-        ends.reverse()
-    if not slide:
-        ends = [0.5 * (face.start + face.stop)]
-    begin = np.array([*ends[0], height])
-    stroke = _stroke(belief, begin, normal, pace)
-    clear, stop = (reach + stroke) * normal, (reach - stroke) * normal
-    lift = _stroke(belief, np.array([*ends[0], top]), np.array([0.0, 0.0, 1.0]), pace)
-    above = np.array([*ends[0], top + lift]) + clear
-    knots = [
-        _Knot(above, "free", pace.free),
-        _Knot(begin + clear, "free", pace.free),
-        _Knot(begin + stop, "guarded", pace.guarded),
-    ]
-    if slide:
-        end = np.array([*ends[1], height])
-        knots += [_Knot(end + stop, "held", pace.sliding), _Knot(end + clear, "free", pace.free)]
-    else:
-        knots += [_Knot(begin + stop, "held", pace.sliding)]
-    return knots
 
 
 def _timed(belief: Belief, knots: list[_Knot], peg: Part, pace: Pace) -> Plan:

@@ -21,25 +21,32 @@ class Felt:
         contact: N; more than this is a contact. Above what the sensor's zero drifts and what accelerating the
             tool takes.
         free: N; less than this is none.
+        load: kg; so much more than the two forces for each m/s^2 by which the tool is being accelerated.
         beside: so many samples to either side must agree.
 
     Raises:
         InputError: a number is out of range.
     """
 
-    contact: float = 2.0
-    free: float = 1.0
-    beside: int = 3
+    contact: float = 1.5
+    free: float = 0.8
+    load: float = 0.3
+    beside: int = 2
 
     def __post_init__(self) -> None:
         number_within("a contact is felt from {} N on", self.contact, above=0.0)
         number_within("nothing is felt up to {} N", self.free, above=0.0, most=self.contact)
+        number_within("a load of {} kg is accelerated", self.load, least=0.0)
         whole_number("{} samples beside are to agree", self.beside, least=0)
 
-    def __call__(self, force: Tensor) -> Tensor:
+    def __call__(self, force: Tensor, acceleration: Tensor | float = 0.0) -> Tensor:
         """1 for contact, 0 for none and NaN for neither, (T,), of tared forces (T, 3) in newtons.
 
         A force that is NaN, as while taring, tells nothing.
+
+        Args:
+            force: (T, 3).
+            acceleration: (T,) m/s^2 that is commanded at the tool.
 
         Raises:
             InputError: forces are not (T, 3).
@@ -48,7 +55,7 @@ class Felt:
             raise InputError(f"forces have shape {tuple(force.shape)}; give (T, 3), in newtons.")
         size = force.norm(dim=1)
         told = ~torch.isnan(size)
-        contact = self._agreed(told & (size > self.contact))
+        contact = self._agreed(told & (size > self.contact + self.load * acceleration))
         free = self._agreed(told & (size < self.free))
         return torch.where(contact, 1.0, torch.where(free, 0.0, torch.nan)).to(torch.float64)
 
