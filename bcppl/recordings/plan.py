@@ -15,8 +15,8 @@ import numpy.typing as npt
 from bcppl.errors import InputError
 
 Array = npt.NDArray[np.float64]
-Manner = Literal["free", "guarded", "held"]
-MANNERS: tuple[Manner, ...] = ("free", "guarded", "held")
+Manner = Literal["free", "guarded", "held", "searching"]
+MANNERS: tuple[Manner, ...] = ("free", "guarded", "held", "searching")
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,21 +26,24 @@ class Plan:
     Between knots translations are interpolated linearly and rotations along the geodesic. A "guarded" motion
     stops where the force felt exceeds `force`; the way that was left then stays undone: "held" motions after
     it are made as planned but for that way, so a slide goes on along the surface that was met. A "free"
-    motion leads to its knot as planned.
+    motion leads to its knot as planned. "Searching" motions are held ones, made while the peg is pressed
+    on by a command that lies below a surface: once the peg has come within `near` of its command, along the
+    commanded z, it has found a hole; that motion stops, and the searching motions right after it stay undone.
 
     Attributes:
         name: of the probe that comes of it.
         times: (K,) seconds, increasing.
         world_from_peg: (K, 7) where the peg is commanded to be at the knots.
-        manners: (K - 1,) one of "free", "guarded" and "held" for each motion.
+        manners: (K - 1,) one of "free", "guarded", "held" and "searching" for each motion.
         force: newtons at which a guarded motion stops.
         stiffness: (6,) N/m along, then N m/rad about, the commanded peg's axes.
         damping: (6,) N s/m, then N m s/rad.
         rate: samples per second of what is measured.
+        near: metres between peg and command, along the commanded z, below which a search has found its hole.
 
     Raises:
-        InputError: shapes do not fit, times do not increase, a manner is unknown, or the force is not
-            positive.
+        InputError: shapes do not fit, times do not increase, a manner is unknown, the force is not positive,
+            or a motion searches and nothing says what it finds.
     """
 
     name: str
@@ -51,6 +54,7 @@ class Plan:
     stiffness: Array
     damping: Array
     rate: float = 100.0
+    near: float = 0.0
 
     def __post_init__(self) -> None:
         knots = len(self.times)
@@ -70,3 +74,8 @@ class Plan:
                 )
         if not self.force > 0.0:
             raise InputError(f"plan {self.name!r} stops at {self.force:g} N; give a positive force.")
+        if "searching" in self.manners and not self.near > 0.0:
+            raise InputError(
+                f"plan {self.name!r} searches until the peg is within {self.near:g} m of its command; give a "
+                "positive `near`, less than how far the command lies below the surface."
+            )

@@ -20,8 +20,10 @@ from bcppl.arguments import number_within, seed_number
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.models.worlds.bench_parts import PARTS, BenchPart, bench_part
 from bcppl.models.worlds.guarded_motion import CarriedOut, carry_out, stamps_of
+from bcppl.models.worlds.inserting import InsertionResult, insert, samples_of
 from bcppl.models.worlds.occlusion import occluder
 from bcppl.parts import Part
+from bcppl.recordings.insertion_plan import InsertionPlan
 from bcppl.recordings.measurements import (
     DepthImage,
     Guess,
@@ -178,16 +180,27 @@ class BenchScene:
 
     def carried_out(self, plan: Plan) -> tuple[CarriedOut, Array, Array]:
         """A plan as it was truly carried out, and the wrench (T, 6) and peg poses (T, 7) measured then."""
-        bench, count = self.bench, len(stamps_of(plan))
+        error, wobble = self._errors(len(stamps_of(plan)), plan.rate)
+        carried = carry_out(plan, self.part, self.peg, self.contact, self.truth, error)
+        there = torch.from_numpy(carried.world_from_peg)
+        return carried, carried.wrench + error, poses.retract(there, torch.from_numpy(wobble)).numpy()
+
+    def insert(self, plan: InsertionPlan) -> InsertionResult:
+        """An insertion as it truly went."""
+        error, wobble = self._errors(samples_of(plan), plan.search.rate)
+        place = self.kind.part_from_hole
+        return insert(plan, self.part, self.peg, self.contact, self.truth, place, error, wobble)
+
+    def _errors(self, count: int, rate: float) -> tuple[Array, Array]:
+        """What the sensors add to `count` samples of the wrench (T, 6) and of the peg's pose (T, 6)."""
+        bench = self.bench
         bias = _drawn(self.seed, _WRENCH).normal(size=6) * _six(bench.force_bias, bench.torque_bias)
-        pace = _six(bench.force_drift, bench.torque_drift) / math.sqrt(bench.drift_time * plan.rate)
+        pace = _six(bench.force_drift, bench.torque_drift) / math.sqrt(bench.drift_time * rate)
         drift = np.cumsum(_drawn(self.seed, _DRIFT, 0).normal(size=(count, 6)) * pace, axis=0)
         noise = _drawn(self.seed, _DRIFT, 1).normal(size=(count, 6))
         error = bias + drift + noise * _six(bench.force_noise, bench.torque_noise)
-        carried = carry_out(plan, self.part, self.peg, self.contact, self.truth, error)
         wobble = _drawn(self.seed, _WOBBLE).normal(size=(count, 6)) * _six(bench.peg_noise, bench.peg_turn)
-        there = torch.from_numpy(carried.world_from_peg)
-        return carried, carried.wrench + error, poses.retract(there, torch.from_numpy(wobble)).numpy()
+        return error, wobble
 
     def _recording(self, windows: Sequence[Measurement]) -> Recording:
         images, background = self._views

@@ -1,4 +1,4 @@
-"""An arm that carries out a plan: guarded motions end where it feels a force, and all else follows from that.
+"""An arm that carries out a plan: guarded motions end where it feels a force, searches where the peg yields.
 
 The wrench is watched as a robot's program would watch it: at the recorded rate, tared, noise and bias
 included; a motion that has felt enough twice in a row is stopped at the next sample.
@@ -6,8 +6,8 @@ included; a motion that has felt enough twice in a row is stopped at the next sa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.recordings.measurements import Probe
-from bcppl.recordings.plan import Plan
+from bcppl.recordings.plan import Manner, Plan
 from bcppl.simulators.peg_model import ContactParameters, build_model, commands
-from bcppl.simulators.stepping import POSE, WRENCH, Clock
+from bcppl.simulators.stepping import POSE, WRENCH, Clock, Standing
 
 Array = npt.NDArray[np.float64]
 
@@ -34,15 +34,18 @@ class CarriedOut:
 
     Attributes:
         probe: the command and the stamps.
-        stops: (s) when each guarded motion that felt enough was stopped, by its place in the plan.
+        stops: (s) when each guarded motion that felt enough, or search that found its hole, was stopped, by
+            its place in the plan.
         wrench: (T, 6) what was truly exerted on the peg at the stamps, N and N m, in the peg's frame.
         world_from_peg: (T, 7) where the peg truly was.
+        standing: where the simulation stood at the last stamp: what follows goes on from there.
     """
 
     probe: Probe
     stops: Mapping[int, float]
     wrench: Array
     world_from_peg: Array
+    standing: Standing
 
 
 def stamps_of(plan: Plan) -> Array:
@@ -52,7 +55,7 @@ def stamps_of(plan: Plan) -> Array:
 
 
 def command_of(plan: Plan, stops: Mapping[int, float]) -> Probe:
-    """The command of a plan of which some guarded motions are stopped early, and no others.
+    """The command of a plan of which some guarded motions and searches are stopped early, and no others.
 
     Corners are rounded: the command is the mean of the last 40 ms of where the plan leads. So it is 20 ms
     late, stops within 40 ms, and never depends on what is yet to be felt. A corner at which the velocity
@@ -60,8 +63,9 @@ def command_of(plan: Plan, stops: Mapping[int, float]) -> Probe:
 
     Args:
         plan: what the arm is asked to do.
-        stops: when (s) a guarded motion is stopped, by its place in the plan.
+        stops: when (s) a guarded or searching motion is stopped, by its place in the plan.
     """
+    found = False  # what the search was for: the motions it has left stay undone
     times, ends = [float(plan.times[0])], [plan.world_from_peg[0]]
     shift, turn = np.zeros(3), Rotation.identity()  # of what follows, by the ways left undone
     for k, manner in enumerate(plan.manners):
@@ -69,7 +73,12 @@ def command_of(plan: Plan, stops: Mapping[int, float]) -> Probe:
             shift, turn = np.zeros(3), Rotation.identity()
         planned = plan.world_from_peg[k + 1]
         end = np.concatenate([planned[:3] + shift, _quaternion(_rotation(planned) * turn)])
-        if k in stops:
+        found = found and manner == "searching"
+        if found:
+            end = ends[-1]
+            shift, turn = end[:3] - planned[:3], _rotation(planned).inv() * _rotation(end)
+        elif k in stops:
+            found = manner == "searching"
             path = _path(plan, np.array([times[-1], plan.times[k + 1]]), np.stack([ends[-1], end]))
             end = commands(path, np.array([stops[k]]))[0][0]
             shift, turn = end[:3] - planned[:3], _rotation(planned).inv() * _rotation(end)
@@ -89,7 +98,16 @@ def command_of(plan: Plan, stops: Mapping[int, float]) -> Probe:
 
 
 def carry_out(
-    plan: Plan, part: Part, peg: Part, contact: ContactParameters, world_from_part: Array, error: Array
+    plan: Plan,
+    part: Part,
+    peg: Part,
+    contact: ContactParameters,
+    world_from_part: Array,
+    error: Array,
+    *,
+    until_found: bool = False,
+    following: CarriedOut | None = None,
+    zero: Array | None = None,
 ) -> CarriedOut:
     """Simulate an arm that carries out a plan.
 
@@ -103,6 +121,10 @@ def carry_out(
         contact: the world's physics.
         world_from_part: (7,) where the part truly is.
         error: (T, 6) what the sensor adds to the wrench at the stamps: bias, drift and noise, N and N m.
+        until_found: it is over when a search has found its hole.
+        following: another plan, just carried out: the peg goes on from where it stood, as fast as it was.
+        zero: (3,) N that the sensor reads when nothing is touched; unless given the mean of the first ten
+            samples, during which nothing stops.
 
     Raises:
         InputError: the plan takes less than the eleven samples by which the wrench is tared, or is sampled
@@ -118,22 +140,52 @@ def carry_out(
     stops: dict[int, float] = {}
     probe = command_of(plan, stops)
     clock = Clock(model, probe, contact.time_step)
-    standing = clock.beginning(1)
+    standing = clock.beginning(1) if following is None else following.standing
     rows = np.empty((len(stamps), WRENCH.stop))
     motion = np.clip(np.searchsorted(plan.times, stamps + 1e-9, side="right") - 1, 0, len(manners) - 1)
+    done = len(stamps)
     for k, of in enumerate(motion):
         row, standing = clock.read(standing, pose, {}, k, k + 1)
         rows[k] = row[0, 0]
-        following = k + 1 < len(stamps) and stamps[k + 1] < plan.times[of + 1]
-        if manners[of] != "guarded" or of in stops or k < TARE or not following:
+        if of in stops or k + 1 == len(stamps):
             continue
-        felt = rows[: k + 1, WRENCH][:, :3] + error[: k + 1, :3]
-        pressed = np.linalg.norm(felt[-FELT:] - felt[:TARE].mean(axis=0), axis=1) > plan.force
-        if pressed.all():
-            stops[int(of)] = float(stamps[k + 1])
+        if (
+            manners[of] == "guarded"
+            and stamps[k + 1] < plan.times[of + 1]
+            and (k >= TARE or zero is not None)
+        ):
+            felt = rows[: k + 1, WRENCH][:, :3] + error[: k + 1, :3]
+            rest = felt[:TARE].mean(axis=0) if zero is None else zero
+            stopped = bool((np.linalg.norm(felt[-FELT:] - rest, axis=1) > plan.force).all())
+        else:
+            searching = manners[of] == "searching" and not _found_before(manners, stops, int(of))
+            stopped = searching and _yielded(probe, rows[k, POSE], float(stamps[k]), plan.near)
+            if stopped and until_found:
+                stops[int(of)], done = float(stamps[k]), k + 1
+                break
+        if stopped and manners[motion[k + 1]] == manners[of]:  # else it is over anyway
+            stops[int(motion[k + 1])] = float(stamps[k + 1])
             probe = _going_on(probe, command_of(plan, stops), stamps[k + 1])
             clock = Clock(model, probe, contact.time_step)
-    return CarriedOut(probe, stops, rows[:, WRENCH].copy(), rows[:, POSE].copy())
+    rows = rows[:done]
+    probe = replace(probe, stamps=stamps[:done])
+    return CarriedOut(probe, stops, rows[:, WRENCH].copy(), rows[:, POSE].copy(), standing)
+
+
+def _yielded(probe: Probe, world_from_peg: Array, time: float, near: float) -> bool:
+    """Whether a peg is within a distance of its command, along the commanded z."""
+    led = commands(probe, np.array([time]))[0][0]
+    above = _rotation(led).inv().apply(world_from_peg[:3] - led[:3])[2]
+    return bool(above < near)
+
+
+def _found_before(manners: Sequence[Manner], stops: Mapping[int, float], motion: int) -> bool:
+    """Whether the search of which a motion is a part has found its hole."""
+    while motion >= 0 and manners[motion] == "searching":
+        if motion in stops:
+            return True
+        motion -= 1
+    return False
 
 
 def _going_on(before: Probe, after: Probe, time: float) -> Probe:

@@ -1,0 +1,96 @@
+"""An arm that carries out an insertion: it searches until the peg yields, and pushes from where it stands."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from bcppl import poses
+from bcppl.models.worlds.guarded_motion import TARE, carry_out, stamps_of
+from bcppl.parts import Part
+from bcppl.recordings.insertion_plan import InsertionPlan
+from bcppl.simulators.peg_model import ContactParameters
+
+Array = npt.NDArray[np.float64]
+
+
+class InsertionResult(NamedTuple):
+    """How an insertion went.
+
+    Attributes:
+        inserted: whether the peg ended at least 0.8 of the hole's depth or 10 mm beyond its chamfer below the
+            top of the part.
+        found: whether the search ended because the peg yielded, and when (s); NaN where it did not.
+        depth: how deep the tip truly ended below the top, metres.
+        peak_force: the largest force that was exerted on the peg at a sample, N.
+        peak_press: the same but for single samples, over within which is an impact: of each two samples in a
+            row the lesser, N.
+        time: seconds that all of it took.
+    """
+
+    inserted: bool
+    found: float
+    depth: float
+    peak_force: float
+    peak_press: float
+    time: float
+
+
+def insert(
+    plan: InsertionPlan,
+    part: Part,
+    peg: Part,
+    contact: ContactParameters,
+    world_from_part: Array,
+    part_from_hole: Array,
+    error: Array,
+    wobble: Array,
+) -> InsertionResult:
+    """Simulate an arm that carries out an insertion.
+
+    Args:
+        plan: what it is asked to do.
+        part: what has the hole.
+        peg: what is held.
+        contact: the world's physics.
+        world_from_part: (7,) where the part truly is.
+        part_from_hole: (7,) where its hole truly is.
+        error: (T, 6) what the sensor adds to the wrench, N and N m; T as `samples_of` the plan.
+        wobble: (T, 6) what the measured pose of the peg is off by, m and radians, in the peg's axes.
+    """
+    search = carry_out(plan.search, part, peg, contact, world_from_part, error, until_found=True)
+    done = len(search.wrench)
+    zero = (search.wrench[:TARE, :3] + error[:TARE, :3]).mean(axis=0)
+    seen = poses.retract(torch.from_numpy(search.world_from_peg[-1]), torch.from_numpy(wobble[done - 1]))
+    push = carry_out(
+        plan.push_from(seen.numpy()),
+        part,
+        peg,
+        contact,
+        world_from_part,
+        error[done:],
+        following=search,
+        zero=zero,
+    )
+    world_from_hole = poses.compose(torch.from_numpy(world_from_part), torch.from_numpy(part_from_hole))
+    tip = torch.tensor([[0.0, 0.0, float(peg.vertices[:, 2].min())]], dtype=torch.float64)
+    there = poses.transform(torch.from_numpy(push.world_from_peg[-1]), tip)
+    depth = -float(poses.transform(poses.inverse(world_from_hole), there)[0, 2])
+    force = np.linalg.norm(np.concatenate([search.wrench, push.wrench])[:, :3], axis=1)
+    searched = [t for k, t in search.stops.items() if plan.search.manners[k] == "searching"]
+    return InsertionResult(
+        inserted=depth >= plan.deep_enough,
+        found=searched[0] if searched else float("nan"),
+        depth=depth,
+        peak_force=float(force.max()),
+        peak_press=float(np.minimum(force[1:], force[:-1]).max()),
+        time=len(force) / plan.search.rate,
+    )
+
+
+def samples_of(plan: InsertionPlan) -> int:
+    """How many samples an insertion takes at most."""
+    return len(stamps_of(plan.search)) + len(stamps_of(plan.push))
