@@ -1,0 +1,264 @@
+"""The gap between a peg and a part, against closed forms, brute force, finite differences and MuJoCo."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.errors import InputError
+from bcppl.models.worlds.bench_parts import bench_part
+from bcppl.parts import Part
+from bcppl.simulators.gap import PegGap
+from bcppl.simulators.outlines import block_with_hole, peg_for, round_outline
+from bcppl.simulators.peg_model import ContactParameters, build_model
+from bcppl.simulators.shapes import block, box_peg
+
+SIZE = np.array([0.06, 0.06, 0.025])  # of the block, m; its top is z = 0
+BASE = np.array([-0.5 * SIZE[0], -0.5 * SIZE[1], -SIZE[2]])
+HALF, LENGTH = 0.008, 0.05  # of the peg, m
+LOW = np.array([-HALF, -HALF, -LENGTH])
+HIGH = np.array([HALF, HALF, 0.0])
+
+
+@functools.cache
+def measured() -> PegGap:
+    return PegGap(block(tuple(SIZE)), box_peg(2 * HALF, LENGTH))
+
+
+@functools.cache
+def in_a_hole() -> tuple[PegGap, float]:
+    hole, clearance = round_outline(0.016), 0.0005
+    return PegGap(block_with_hole(hole, offset=(0.007, 0.005)), peg_for(hole, clearance, 0.08)), clearance
+
+
+def pose(place: np.ndarray, turn: Rotation) -> Tensor:
+    return torch.from_numpy(np.concatenate([place, turn.as_quat()[[3, 0, 1, 2]]]))
+
+
+def anyhow(count: int, seed: int, shift: float = 0.3) -> Tensor:
+    rng = np.random.default_rng(seed)
+    return torch.stack(
+        [pose(rng.uniform(-shift, shift, 3), turn) for turn in Rotation.random(count, rng=rng)]
+    )
+
+
+def box_distance(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Signed distances of points (..., 3) to a box."""
+    out = np.abs(points - 0.5 * (low + high)) - 0.5 * (high - low)
+    outside = np.linalg.norm(np.maximum(out, 0.0), axis=-1)
+    return np.asarray(outside + np.minimum(out.max(axis=-1), 0.0))
+
+
+def corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    return np.array([[(low, high)[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
+
+
+@functools.cache
+def along_edges(apart: float) -> np.ndarray:
+    """Points on the block's edges."""
+    ends = corners(BASE, BASE + SIZE)
+    found = []
+    for a in range(8):
+        for b in range(a + 1, 8):
+            if bin(a ^ b).count("1") == 1:
+                steps = int(np.linalg.norm(ends[b] - ends[a]) / apart) + 2
+                found.append(ends[a] + np.linspace(0, 1, steps)[:, None] * (ends[b] - ends[a]))
+    return np.concatenate(found)
+
+
+def beside(count: int, seed: int, depth: float) -> list[Tensor]:
+    """Poses of a tilted peg whose tip, or side, is within `depth` of the block's top, or its top edge."""
+    rng, found = np.random.default_rng(seed), []
+    for k in range(count):
+        turn = Rotation.from_rotvec([*rng.uniform(-0.4, 0.4, 2), rng.uniform(-3, 3)])
+        if k % 2:  # pressed from the side, an upright edge on the block's top edge
+            place = np.array([0.5 * SIZE[0] + HALF, rng.uniform(-0.01, 0.01), 0.5 * LENGTH])
+        else:
+            place = np.array([*rng.uniform(-0.035, 0.035, 2), LENGTH])
+        direction = np.array([1.0, 0.0, 0.0]) if k % 2 else np.array([0.0, 0.0, 1.0])
+        # Along the way to the part until about `depth` deep, by the exact corners and edges.
+        shifts = np.linspace(-0.012, 0.012, 41)
+        gaps = np.array([by_hand(pose(place + s * direction, turn), 1e-3) for s in shifts])
+        near = shifts[np.abs(gaps - rng.uniform(-depth, depth)).argmin()]
+        found.append(pose(place + (near + rng.uniform(-1e-4, 1e-4)) * direction, turn))
+    return found
+
+
+def by_hand(world_from_peg: Tensor, apart: float = 2e-5) -> float:
+    """The least distance of the peg's corners to the block and of the block's edges to the peg's planes."""
+    turn = Rotation.from_quat(world_from_peg[[4, 5, 6, 3]].numpy())
+    place = world_from_peg[:3].numpy()
+    ends = box_distance(turn.apply(corners(LOW, HIGH)) + place, BASE, BASE + SIZE).min()
+    edge = turn.inv().apply(along_edges(apart) - place)
+    planes = np.maximum(LOW - edge, edge - HIGH).max(axis=1).min()
+    return float(min(ends, planes))
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.02, 0.3])
+def test_over_a_plane_it_is_the_height_of_the_lowest_corner(tilt: float) -> None:
+    heights = np.array([0.004, 0.0004, 0.0, -0.0001, -0.003, -0.009])
+    turn = Rotation.from_rotvec([tilt, 0.5 * tilt, 0.0])
+    down = turn.apply(corners(LOW, HIGH))[:, 2].min()
+    peg = torch.stack([pose(np.array([0.003, -0.002, h - down]), turn) for h in heights])
+    part = anyhow(3, 0)
+    for n in range(3):
+        gap = measured()(part[n : n + 1], poses.compose(part[n], peg))
+        # 2 mm and more in, the grid's single precision is all there is.
+        np.testing.assert_allclose(gap.distance[0].numpy(), heights, atol=2e-9)
+        np.testing.assert_allclose(gap.normal[0, 1:4].numpy(), [[0.0, 0.0, 1.0]] * 3, atol=1e-6)
+        np.testing.assert_allclose(gap.place[0, :, 2].numpy(), heights, atol=1e-9)
+
+
+def test_corners_and_crossing_edges_are_those_of_brute_force() -> None:
+    peg = torch.stack(beside(40, 1, 0.0015))
+    gap = measured()(poses.identity(1), peg)
+    exact = np.array([by_hand(p) for p in peg])
+    touching, found = exact < 0.0, gap.distance[0].numpy()
+    crossing = (np.abs(gap.place[0, :, :2].numpy()) - 0.5 * SIZE[:2]).max(axis=-1) > -1e-9
+    assert 10 < touching.sum() < 30 and (crossing & touching).sum() >= 5
+    # The grid rounds off the block's edges, so that once in fifty poses it takes another corner.
+    off = np.abs(found - exact)[~crossing]
+    assert (off > 1.2e-5).sum() <= 2 and off.max() < 2.5e-4
+    # Across two edges the depth is along the normal of both: up to the diagonal of what it is by one plane.
+    share = (found / exact)[crossing & touching & (exact < -1e-4)]
+    assert share.min() > 0.98 and share.max() < math.sqrt(2.0) + 0.02 and share.max() > 1.05
+
+
+def test_it_is_mujocos_contact_distance_between_boxes() -> None:
+    peg = torch.stack(beside(60, 2, 0.001))
+    model = build_model(measured().part, measured().peg, ContactParameters())
+    data, theirs = mujoco.MjData(model), []
+    geoms = [int(model.body_geomadr[model.body(name).id]) for name in ("part", "peg")]
+    for p in peg.numpy():
+        data.qpos[:] = p
+        mujoco.mj_forward(model, data)
+        theirs.append(mujoco.mj_geomDistance(model, data, *geoms, 0.1, None))
+    gap = measured()(poses.identity(1), peg)
+    ours, others = gap.distance[0].numpy(), np.array(theirs)
+    clear = np.abs(others) > 2e-5
+    assert np.all(np.sign(ours[clear]) == np.sign(others[clear])) and 10 < (others < 0).sum() < 50
+    share = (ours / others)[clear & (others < 0)]
+    assert (np.abs(share - 1.0) < 0.01).mean() > 0.8 and share.max() < 1.02
+    assert np.all(ours[clear & (others > 0)] < others[clear & (others > 0)] + 1e-5)
+
+
+@pytest.mark.parametrize("name", ["round tray", "rectangular tray", "hexagon 12 mm", "D 10 mm"])
+def test_pegs_in_and_over_the_holes_of_the_bench_touch_where_mujocos_do(name: str) -> None:
+    """Part and peg in many convex pieces, near contact in the hole, on its rim and on the top."""
+    kind, rng = bench_part(name), np.random.default_rng(3)
+    peg = kind.peg(0.0005)
+    hole = torch.from_numpy(kind.part_from_hole)
+    into = rng.choice([-0.006, 0.0002, 0.0], 40)
+    where = np.stack([*rng.uniform(-4e-4, 4e-4, (2, 40)), into + 0.08 + rng.uniform(-2e-4, 2e-4, 40)], axis=1)
+    where[::4, 0] += 0.012
+    turns = Rotation.from_rotvec(rng.uniform(-0.01, 0.01, (40, 3)))
+    world_from_peg = torch.stack([poses.compose(hole, pose(p, t)) for p, t in zip(where, turns, strict=True)])
+    ours = PegGap(kind.part, peg)(poses.identity(1), world_from_peg).distance[0].numpy()
+    model = build_model(kind.part, peg, ContactParameters())
+    data, theirs = mujoco.MjData(model), []
+    for p in world_from_peg.numpy():
+        data.qpos[:] = p
+        mujoco.mj_forward(model, data)
+        theirs.append(min((c.dist for c in data.contact), default=math.inf))
+    apart = np.isinf(theirs)
+    assert 5 < apart.sum() < 35
+    assert ours[apart].min() > -1e-5
+    # MuJoCo measures piece by piece: never deeper than the deepest corner by more than a crossing of edges.
+    np.testing.assert_array_less(ours[~apart], 2e-5)
+    shallow = ~apart & (ours > -3e-4)
+    np.testing.assert_allclose(ours[shallow], np.array(theirs)[shallow], atol=1.2e-4)
+
+
+def test_centred_in_a_round_hole_it_is_half_the_clearance() -> None:
+    gap, clearance = in_a_hole()
+    off = np.array([0.0, 5e-5, -1e-4, 2e-4, 0.00025, 0.0003])
+    peg = torch.stack([pose(np.array([0.007 + x, 0.005, 0.07]), Rotation.identity()) for x in off])
+    found = gap(poses.identity(1), peg).distance[0].numpy()
+    # Of 64 corners the grid may take one that is up to three sides (8.4 degrees) from the nearest.
+    assert np.all(np.abs(found - 0.5 * clearance + np.abs(off)) < 0.012 * np.abs(off) + 1e-8)
+
+
+def off_slopes(pegs: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """How far slopes are from finite differences for each peg, and whether a corner of the peg is nearest."""
+    part, step = anyhow(1, 4, 0.02), 1e-7
+    peg = poses.compose(part[0], pegs)
+    gap = measured()(part, peg)
+    numeric = torch.stack(
+        [
+            measured()(poses.retract(part, step * axis), peg).distance[0]
+            - measured()(poses.retract(part, -step * axis), peg).distance[0]
+            for axis in torch.eye(6, dtype=torch.float64)
+        ],
+        dim=-1,
+    ) / (2 * step)
+    places = poses.transform(poses.inverse(pegs), gap.place[0][:, None])[:, 0].numpy()
+    at_corner = np.abs(box_distance(places, LOW, HIGH)) < 1e-9
+    return (gap.slope(part)[0] - numeric).abs().amax(dim=-1).numpy(), at_corner
+
+
+def test_slopes_are_finite_differences() -> None:
+    turns = [Rotation.from_rotvec([0.1, 0.05, z]) for z in np.linspace(0, 1.5, 15)]
+    flat = torch.stack([pose(np.array([0.01, 0.0, LENGTH - 1e-3]), turn) for turn in turns])
+    off, at_corner = off_slopes(torch.cat([flat, torch.stack(beside(30, 5, 0.0005))]))
+    assert at_corner.sum() > 25
+    assert np.quantile(off[at_corner], 0.9) < 1e-4
+
+
+def test_slopes_where_edges_cross_are_finite_differences() -> None:
+    off, at_corner = off_slopes(torch.stack(beside(40, 5, 0.0005))[1::2])
+    assert (~at_corner).sum() > 10
+    assert np.quantile(off[~at_corner], 0.8) < 1e-3
+
+
+def test_moving_part_and_peg_together_changes_nothing() -> None:
+    gap, _ = in_a_hole()
+    rng = np.random.default_rng(6)
+    part = poses.retract(poses.identity(9), torch.from_numpy(rng.normal(size=(9, 6)) * 2e-3))
+    turn = Rotation.from_rotvec([0.01, 0.0, 0.3])
+    peg = torch.stack([pose(np.array([0.007, 0.005, z]), turn) for z in np.linspace(0.07, 0.083, 8)])
+    here = gap(part, peg)
+    for motion in anyhow(3, 7):
+        there = gap(poses.compose(motion, part), poses.compose(motion, peg))
+        torch.testing.assert_close(there.distance, here.distance, atol=1e-9, rtol=0.0)
+        torch.testing.assert_close(there.place, here.place, atol=1e-8, rtol=0.0)
+    # One particle, one stamp at a time gives the same.
+    each = torch.stack([torch.cat([gap(a[None], b[None]).distance[0] for b in peg]) for a in part])
+    assert torch.equal(each, here.distance)
+
+
+def test_a_peg_deep_inside_and_none_at_all() -> None:
+    part, peg = (
+        poses.identity(1),
+        torch.stack(
+            [pose(np.array([0.0, 0.0, LENGTH - d]), Rotation.identity()) for d in (0.003, 0.006, 0.012)]
+        ),
+    )
+    gap = measured()(part, peg)
+    np.testing.assert_allclose(gap.distance[0].numpy(), [-0.003, -0.006, -0.012], atol=1e-6)
+    rng, turns = (
+        np.random.default_rng(8),
+        Rotation.from_rotvec(np.random.default_rng(9).normal(size=(30, 3)) * 0.2),
+    )
+    tips = rng.uniform([-0.02, -0.02, -0.011], [0.02, 0.02, -0.004], (30, 3))
+    inside = torch.stack([pose(p - t.apply([0, 0, -LENGTH]), t) for p, t in zip(tips, turns, strict=True)])
+    exact = np.array([by_hand(p, 2e-4) for p in inside])
+    assert exact.max() < -0.004
+    assert np.abs(measured()(part, inside).distance[0].numpy() - exact).max() < 0.0009
+    for n, t in ((0, 3), (2, 0), (0, 0)):
+        none = measured()(poses.identity(n), poses.identity(t))
+        assert none.distance.shape == (n, t) and none.place.shape == none.normal.shape == (n, t, 3)
+        assert none.slope(poses.identity(n)).shape == (n, t, 6)
+
+
+def test_an_open_part_is_refused() -> None:
+    whole = block((0.02, 0.02, 0.01))
+    with pytest.raises(InputError, match="open"):
+        PegGap(Part("lid off", whole.vertices, whole.faces[:-1]), box_peg(0.008, 0.05))
