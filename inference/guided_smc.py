@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
@@ -26,9 +27,10 @@ from bcppl.inference.smcp3 import Pair, smcp3
 from bcppl.inference.step import Observed, StepFunction, StepInfo, Stepped
 from bcppl.inference.targets import POSTERIOR
 from bcppl.inference.tempering import resample_move, tempered
-from bcppl.traces import Model
+from bcppl.traces import Model, extend
 
 WALK = (0.2, 2.0)  # scales of the random walks
+CERTAIN = 0.01  # nats: what is expected for sure tells nothing
 
 
 def kernel(pose: str, proposals: Sequence[Program]) -> Kernel:
@@ -49,8 +51,9 @@ def guided(
     *,
     sweeps: int = 1,
     share: float = 0.5,
-    tries: int = 8,
-    least: float = 0.05,
+    few: float = 0.2,
+    tries: Sequence[int] = (1, 8, 40),
+    least: float = 0.03,
 ) -> StepFunction:
     """A step that takes a measurement in by a pair of programs, resamples when needed, and moves.
 
@@ -59,8 +62,8 @@ def guided(
         moves: of every particle after each step.
         sweeps: how many of them.
         share: particles are resampled below this effective sample size, as a share of N.
-        tries: where the pair leaves fewer effective than that, it is run anew with so many copies of each
-            particle, and N of all are kept.
+        few, tries: the pair is run with so many copies of each particle, one number after the other, until
+            it leaves more than `few` effective, as a share of N; N of all are kept.
         least: where even then fewer are left effective, as a share of N, the measurement is tempered in.
     """
     by_pair = smcp3(pair, resample=never)
@@ -74,12 +77,25 @@ def guided(
         except InferenceError:
             return None
 
+    def as_expected(population: Population, observed: Observed) -> Population | None:
+        """The particles as they are, where all had to expect the measurement and no latent value comes along."""
+        longer, gained = extend(population.trace, *observed)
+        if len(longer.choices) > len(population.trace.choices):
+            return None
+        alive = gained[population.log_weights > -torch.inf]
+        certain = bool((alive.abs() < CERTAIN).all())
+        return population.with_trace(longer).reweighed(gained) if certain else None
+
     def step(population: Population, observed: Observed) -> Stepped:
         count = len(population)
-        reached = weighed(population, observed)
         chosen: Tensor | None = None
-        if tries > 1 and (reached is None or reached.effective_sample_size < share * count):
-            reached = weighed(replicated(population, tries), observed)
+        stayed = as_expected(population, observed)
+        if stayed is not None:
+            return Stepped(stayed, _info(population, stayed, stayed.effective_sample_size))
+        for times in tries:
+            reached = weighed(replicated(population, times), observed)
+            if reached is not None and reached.effective_sample_size >= few * count:
+                break
         if reached is None or reached.effective_sample_size < least * count:
             return by_tempering(population, observed)
         effective = reached.effective_sample_size
@@ -88,19 +104,28 @@ def guided(
             reached = reached.selected(chosen)
         moved, ancestors, acceptance, _ = rejuvenation(reached, POSTERIOR)
         if chosen is not None:
-            origin = chosen // tries
+            origin = chosen // times
             ancestors = origin if ancestors is None else origin[ancestors]
-        info = StepInfo(
-            acceptance=float("nan") if acceptance is None else acceptance,
-            resampled=int(ancestors is not None),
-            effective_sample_size_before=effective,
-            effective_sample_size=moved.effective_sample_size,
-            log_evidence=moved.log_evidence - population.log_evidence,
-            ancestors=ancestors,
-        )
-        return Stepped(moved, info)
+        return Stepped(moved, _info(population, moved, effective, acceptance, ancestors))
 
     return step
+
+
+def _info(
+    before: Population,
+    after: Population,
+    effective: float,
+    acceptance: float | None = None,
+    ancestors: Tensor | None = None,
+) -> StepInfo:
+    return StepInfo(
+        acceptance=float("nan") if acceptance is None else acceptance,
+        resampled=int(ancestors is not None),
+        effective_sample_size_before=effective,
+        effective_sample_size=after.effective_sample_size,
+        log_evidence=after.log_evidence - before.log_evidence,
+        ancestors=ancestors,
+    )
 
 
 def infer(

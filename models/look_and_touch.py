@@ -8,7 +8,7 @@ millimetre. Where the wrench says that the peg felt the part it has no gap to it
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from bcppl import poses
 from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import FittedNormal, fitted_normal
-from bcppl.distributions.manifold import ContactManifold
+from bcppl.distributions.manifold import ContactManifold, MeasuresGap
 from bcppl.distributions.mixture import MixturePose
 from bcppl.distributions.poses import NormalPose, prior_from_guess
 from bcppl.errors import InputError
@@ -31,7 +31,7 @@ from bcppl.models.camera_error import Look, farther
 from bcppl.recordings.measurements import DepthImage, Measurement, ProbeWindow, Recording, Touch, View
 from bcppl.simulators.camera import Camera, bin_depth
 from bcppl.simulators.effort import Effort
-from bcppl.simulators.gap import PegGap
+from bcppl.simulators.gap import Gap, PegGap
 from bcppl.simulators.region import region_of
 from bcppl.simulators.renderer import DepthRenderer
 from bcppl.simulators.sensing.felt import Felt
@@ -45,7 +45,8 @@ WIDTHS = torch.tensor([1.1, 3.0], dtype=torch.float64)
 SHARES = torch.tensor([0.85, 0.15], dtype=torch.float64)
 # What an image says of where it sees the part is taken for no surer than this: metres, radians, metres of bias.
 SHARPEST = torch.tensor([5e-5] * 3 + [1e-3] * 3 + [1e-4], dtype=torch.float64)
-BLURS = (0.003, 0.002, 0.001, 0.0005, 0.0002, 0.0001, 0.0, 0.0, 0.0, 0.0)  # m that Gauss-Newton adds to errors
+BLURS = (0.003, 0.002, 0.001, 0.0005, 0.0002, 0.0, 0.0, 0.0)  # m that Gauss-Newton adds to errors
+NEAR = 0.02  # m: a window in which the peg stays farther off says nothing
 SHARES_OF_STEP = torch.tensor([0.0, 0.1, 0.3, 0.6, 1.0], dtype=torch.float64)
 
 
@@ -93,6 +94,7 @@ class Scene:
     Attributes:
         fits: by address, what an image alone says of where its camera sees the part, in the tangent space at
             the guess, and of the camera's bias.
+        near: by address, whether a window's peg came near where images place the part.
         told: by the number of actions, what all of their touches say to second order.
     """
 
@@ -104,6 +106,7 @@ class Scene:
     settings: Settings
     fits: dict[str, FittedNormal] = field(default_factory=dict)
     told: dict[int, Told] = field(default_factory=dict)
+    near: dict[str, bool] = field(default_factory=dict)
 
     @property
     def efforts(self) -> Mapping[str, Effort]:
@@ -150,12 +153,14 @@ def image_of(scene: Scene, camera: Camera, there: Tensor, bias: Tensor | float) 
     )
 
 
-def touch_of(scene: Scene, window: ProbeWindow, part: Tensor, blur: float = 0.0) -> ContactManifold:
+def touch_of(
+    scene: Scene, window: ProbeWindow, part: Tensor, blur: float = 0.0, gap: MeasuresGap | None = None
+) -> ContactManifold:
     """What a window says of parts at poses (N, 7), or would with common errors `blur` metres wider."""
-    assert scene.gap is not None
-    settings = scene.settings
+    settings, measures = scene.settings, scene.gap if gap is None else gap
+    assert measures is not None
     return ContactManifold(
-        scene.gap,
+        measures,
         part,
         len(range(window.first, window.last, settings.every)),
         settings.gap_noise,
@@ -221,62 +226,90 @@ def told_by_touches(
     if len(actions) in scene.told:
         return scene.told[len(actions)]
     center, precision = placed_by_images(scene, actions)
+    touches = Touches.of(scene, actions, observations, center)
     latest = max(scene.told, default=None)
     starts = [center] if latest is None else [center, scene.told[latest].around[None]]
-    found = [nearest_fit(scene, actions, observations, start, center, precision) for start in starts]
+    found = [touches.fitted(start, center, precision) for start in starts]
     pose, _ = max(found, key=lambda fit: fit[1])
-    slope, information = pulls(scene, actions, observations, pose, 0.0)
+    slope, information = touches.pull(pose, 0.0)
     scene.told[len(actions)] = Told(pose[0], slope[0], information[0])
     return scene.told[len(actions)]
 
 
-def nearest_fit(
-    scene: Scene,
-    actions: Sequence[View | ProbeWindow],
-    observations: Mapping[str, Tensor],
-    start: Tensor,
-    center: Tensor,
-    precision: Tensor,
-) -> tuple[Tensor, float]:
-    """The pose (1, 7) to which Gauss-Newton leads from a start (1, 7), and its log-probability.
+class Touches(NamedTuple):
+    """The windows of probes near enough to the part to say something, looked at together.
 
-    Args:
-        center, precision: (1, 7) and (1, 6, 6) of what is known beside the touches.
+    Attributes:
+        scene: measures gaps.
+        windows: what each says, (T, 8), and where its stamps stand among all.
+        stamps: (S, 7) the peg's poses at all of their stamps.
     """
 
-    def fits(pose: Tensor, blur: float) -> Tensor:
-        away = poses.local(center, pose)
-        total = -0.5 * ((away @ precision[0]) * away).sum(dim=-1)
-        for k, window in enumerate(actions):
-            if isinstance(window, ProbeWindow):
-                total = total + touch_of(scene, window, pose, blur).log_prob(observations[f"touch_{k}"])
-        return total
+    scene: Scene
+    windows: Sequence[tuple[ProbeWindow, Tensor, slice]]
+    stamps: Tensor
 
-    pose = start
-    for blur in BLURS:
-        slope, information = pulls(scene, actions, observations, pose, blur)
-        pull = (precision @ poses.local(pose, center)[..., None])[..., 0] - slope
-        step = torch.linalg.solve(precision + information, pull[..., None])[..., 0]
-        # Which corner touches changes on the way: so far and no farther than it gains.
-        tried = poses.retract(pose, SHARES_OF_STEP[:, None] * step)
-        pose = tried[fits(tried, blur).argmax()][None]
-    return pose, float(fits(pose, 0.0))
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        actions: Sequence[View | ProbeWindow],
+        observations: Mapping[str, Tensor],
+        center: Tensor,
+    ) -> Touches:
+        """Those near a part at a pose (1, 7)."""
+        assert scene.gap is not None
+        windows: list[tuple[ProbeWindow, Tensor, slice]] = []
+        begin = 0
+        for k, action in enumerate(actions):
+            if isinstance(action, ProbeWindow):
+                said = observations[f"touch_{k}"]
+                if f"near_{k}" not in scene.near:
+                    scene.near[f"near_{k}"] = bool((scene.gap(center, said[:, :7]).distance < NEAR).any())
+                if scene.near[f"near_{k}"]:
+                    windows.append((action, said, slice(begin, begin + len(said))))
+                    begin += len(said)
+        stamps = [said[:, :7] for _, said, _ in windows]
+        return cls(scene, windows, torch.cat(stamps) if stamps else torch.empty(0, 7, dtype=torch.float64))
 
+    def fitted(self, start: Tensor, center: Tensor, precision: Tensor) -> tuple[Tensor, float]:
+        """The pose (1, 7) to which Gauss-Newton leads from a start (1, 7), and its log-probability.
 
-def pulls(
-    scene: Scene,
-    actions: Sequence[View | ProbeWindow],
-    observations: Mapping[str, Tensor],
-    pose: Tensor,
-    blur: float,
-) -> tuple[Tensor, Tensor]:
-    """Slope (1, 6) and curvature (1, 6, 6) of minus the log-likelihood of all touches at a pose (1, 7)."""
-    slope, information = torch.zeros(1, 6, dtype=torch.float64), torch.zeros(1, 6, 6, dtype=torch.float64)
-    for k, window in enumerate(actions):
-        if isinstance(window, ProbeWindow):
-            said = touch_of(scene, window, pose).quadratic(observations[f"touch_{k}"], blur)
+        Args:
+            start: (1, 7).
+            center, precision: (1, 7) and (1, 6, 6) of what is known beside the touches.
+        """
+        pose, said = start, 0.0
+        for blur in BLURS:
+            slope, information = self.pull(pose, blur)
+            pull = (precision @ poses.local(pose, center)[..., None])[..., 0] - slope
+            step = torch.linalg.solve(precision + information, pull[..., None])[..., 0]
+            # Which corner touches changes on the way: so far and no farther than it gains.
+            tried = poses.retract(pose, SHARES_OF_STEP[:, None] * step)
+            away = poses.local(center, tried)
+            total = -0.5 * ((away @ precision[0]) * away).sum(dim=-1)
+            for window, value in self._sites(tried, blur):
+                total = total + window.log_prob(value)
+            pose, said = tried[total.argmax()][None], float(total.max())
+        return pose, said
+
+    def pull(self, pose: Tensor, blur: float) -> tuple[Tensor, Tensor]:
+        """Slope (1, 6) and curvature (1, 6, 6) of minus the log-likelihood of all at a pose (1, 7)."""
+        slope = torch.zeros(1, 6, dtype=torch.float64)
+        information = torch.zeros(1, 6, 6, dtype=torch.float64)
+        for window, value in self._sites(pose, blur):
+            said = window.quadratic(value, blur)
             slope, information = slope + said.slope, information + said.information
-    return slope, information
+        return slope, information
+
+    def _sites(self, pose: Tensor, blur: float) -> Iterator[tuple[ContactManifold, Tensor]]:
+        if self.windows:
+            assert self.scene.gap is not None
+            gaps = self.scene.gap(pose, self.stamps)
+            for action, value, rows in self.windows:
+                told = ~torch.isnan(value[:, 7])
+                known = Gap(*(each[:, rows][:, told] for each in gaps))
+                yield touch_of(self.scene, action, pose, blur, lambda part, peg, known=known: known), value
 
 
 def placed_by_images(scene: Scene, actions: Sequence[View | ProbeWindow]) -> tuple[Tensor, Tensor]:

@@ -241,12 +241,12 @@ def _measure(
                     start, stop = turn.T @ (edges[e, 0] - shift), turn.T @ (edges[e, 1] - shift)
                     begin = 0
                     for s in range(len(ends)):
-                        inside, share, plane = _deepest(start, stop, planes[begin : ends[s]], least)
+                        inside, share = _deepest(start, stop, planes[begin : ends[s]], least, slope)
                         if inside < least:
                             least = inside
                             rounded[n, t] = False
                             place[n, t] = edges[e, 0] + share * (edges[e, 1] - edges[e, 0])
-                            normal[n, t] = -(turn @ planes[begin + plane, :3])
+                            normal[n, t] = -(turn @ slope)
                         begin = ends[s]
             distance[n, t] = least
 
@@ -264,45 +264,55 @@ def _may_be_nearer(ball: Array, turn: Array, shift: Array, box: Array, least: fl
 
 
 @compiled
-def _deepest(start: Array, stop: Array, planes: Array, least: float) -> tuple[float, float, int]:
+def _deepest(start: Array, stop: Array, planes: Array, least: float, normal: Array) -> tuple[float, float]:
     """Where a stretch of an edge is deepest in a convex solid, or nearest to it: by cutting planes.
 
     How far a point is out of the solid, by the plane that it is farthest out of, is convex and piecewise
-    linear along the stretch.
+    linear along the stretch. Where that is least between two planes, the stretch crosses the edge between
+    them: the distance is along the normal of both edges, a mixture of the planes' normals.
 
     Args:
         start, stop: (3,) its ends in the peg's frame.
         planes: (P, 4) of the solid.
         least: what it must be less than to matter.
+        normal: (3,) becomes the solid's outward unit normal there.
 
     Returns:
-        The distance, negative inside, or one of at least `least`; where on the stretch, from 0 to 1; the plane.
+        The distance, negative inside, or one of at least `least`; where on the stretch, from 0 to 1.
     """
     step = stop - start
     low, high = 0.0, 1.0
     at_low, plane_low = _out(start, planes)
     slope_low = planes[plane_low, :3] @ step
     if slope_low >= 0.0:
-        return at_low, low, plane_low
+        normal[:] = planes[plane_low, :3]
+        return at_low, low
     at_high, plane_high = _out(stop, planes)
     slope_high = planes[plane_high, :3] @ step
     if slope_high <= 0.0:
-        return at_high, high, plane_high
+        normal[:] = planes[plane_high, :3]
+        return at_high, high
+    share, bound = low, at_low
     for _ in range(_ROUNDS):
         share = (at_low - at_high + slope_high * high - slope_low * low) / (slope_high - slope_low)
         share = min(max(share, low), high)
         bound = at_low + slope_low * (share - low)
-        if bound >= least:
-            return bound, share, plane_low
+        # Along a normal that leans the distance is longer than by either plane, at most as crossing edges are.
+        if bound >= least and bound >= 0.0:
+            return bound, share
         here, plane = _out(start + share * step, planes)
         if here <= bound + _EXACT:
             break
         slope = planes[plane, :3] @ step
         if slope < 0.0:
-            low, at_low, slope_low = share, here, slope
+            low, at_low, slope_low, plane_low = share, here, slope, plane
         else:
-            high, at_high, slope_high = share, here, slope
-    return here, share, plane
+            high, at_high, slope_high, plane_high = share, here, slope, plane
+    mixed = slope_high / (slope_high - slope_low)
+    normal[:] = mixed * planes[plane_low, :3] + (1.0 - mixed) * planes[plane_high, :3]
+    length = np.sqrt((normal * normal).sum())
+    normal /= length
+    return bound / length, share
 
 
 @compiled
