@@ -23,6 +23,7 @@ _LEVEL = 1e-5  # m: corners nearer in height than this are of one level
 _LEAST = 0.0005  # m across: what is smaller is no hole for a peg
 _WIDER = 1e-5  # m by which a section is wider where a chamfer is
 _TURNS = 720  # yaws that are tried
+_OUT = 2e-6  # m by which a peg as wide as its hole stands out of it by rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,16 +112,20 @@ def hole_from_peg(hole: Hole, peg: Part) -> Array:
     held = np.array([outline.centroid.x, outline.centroid.y])
     centred = translate(outline, *-held)
 
-    def beyond(yaw: float) -> float:
-        return float(rotate(centred, yaw, origin=(0.0, 0.0), use_radians=True).difference(hole.outline).area)
+    # As wide as the peg, so that it fits in the middle of its play and nowhere else.
+    gap = max((hole.outline.area - centred.area) / hole.outline.length, 0.0)
+    narrowed = hole.outline.buffer(-gap, join_style="mitre", mitre_limit=100.0)
 
-    step = 2.0 * np.pi / _TURNS
-    tried = sorted((k * step for k in range(-_TURNS // 2, _TURNS // 2)), key=abs)
-    areas = [beyond(0.0)]
-    if areas[0] > 0.0:
-        areas += [beyond(yaw) for yaw in tried[1:]]
-    yaw = tried[int(np.argmin(areas))]
-    if min(areas) > 0.0:
+    def beyond(yaw: float) -> float:
+        """The area (m^2) that stands out."""
+        return float(rotate(centred, yaw, origin=(0.0, 0.0), use_radians=True).difference(narrowed).area)
+
+    yaw, nothing = 0.0, _OUT * float(centred.length)
+    if beyond(0.0) > nothing:
+        step = 2.0 * np.pi / _TURNS
+        tried = sorted((k * step for k in range(-_TURNS // 2, _TURNS // 2)), key=abs)
+        areas = np.array([beyond(yaw) for yaw in tried])
+        yaw = tried[int(np.flatnonzero(areas <= 1.5 * areas.min() + nothing)[0])]
         yaw = float(minimize_scalar(beyond, bounds=(yaw - step, yaw + step), method="bounded").x)
     turned = rotate(centred, yaw, origin=(0.0, 0.0), use_radians=True)
     try:

@@ -97,8 +97,8 @@ def insertion_plan(
     found, way = _spiral(doubt[:2, :2].numpy(), clearance, attempt)
     times = np.concatenate([times, times[-1] + found])
     tips = np.concatenate([tips, np.column_stack([way, np.full(len(way), -press)])])
-    searches: tuple[Manner, ...] = ("searching",) * len(way)
-    manners = (*manners, *searches)
+    search_on: Manner = "searching"
+    manners = (*manners, *((search_on,) * len(way)))
 
     def led(tip: Array) -> Array:
         """The peg's poses (K, 7) with its tip at places in the hole's frame."""

@@ -17,13 +17,16 @@ from bcppl.simulators.peg_model import ContactParameters
 Array = npt.NDArray[np.float64]
 
 
+_BESIDE = 0.002  # m: a tip farther from the hole's axis is not in the hole but beside the part
+
+
 class InsertionResult(NamedTuple):
     """How an insertion went.
 
     Attributes:
-        inserted: whether the peg ended at least 0.8 of the hole's depth or 10 mm beyond its chamfer below the
-            top of the part.
-        found: whether the search ended because the peg yielded, and when (s); NaN where it did not.
+        inserted: whether the peg ended in the hole, at least 0.8 of its depth or 10 mm beyond its chamfer
+            below the top of the part.
+        found: when (s) the search ended because the peg yielded; NaN where it did not.
         depth: how deep the tip truly ended below the top, metres.
         peak_force: the largest force that was exerted on the peg at a sample, N.
         peak_press: the same but for single samples, over within which is an impact: of each two samples in a
@@ -78,11 +81,12 @@ def insert(
     world_from_hole = poses.compose(torch.from_numpy(world_from_part), torch.from_numpy(part_from_hole))
     tip = torch.tensor([[0.0, 0.0, float(peg.vertices[:, 2].min())]], dtype=torch.float64)
     there = poses.transform(torch.from_numpy(push.world_from_peg[-1]), tip)
-    depth = -float(poses.transform(poses.inverse(world_from_hole), there)[0, 2])
+    in_hole = poses.transform(poses.inverse(world_from_hole), there)[0]
+    depth, beside = -float(in_hole[2]), float(in_hole[:2].norm())
     force = np.linalg.norm(np.concatenate([search.wrench, push.wrench])[:, :3], axis=1)
     searched = [t for k, t in search.stops.items() if plan.search.manners[k] == "searching"]
     return InsertionResult(
-        inserted=depth >= plan.deep_enough,
+        inserted=depth >= plan.deep_enough and beside < _BESIDE,
         found=searched[0] if searched else float("nan"),
         depth=depth,
         peak_force=float(force.max()),

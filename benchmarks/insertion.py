@@ -1,0 +1,216 @@
+"""One insertion attempt in each scene of the bench: by vision alone, and after the fixed probe."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jobs import each
+from report import Row, cores, finish, options, show
+from scipy.stats import binomtest
+
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.errors import InferenceError, InputError
+from bcppl.inference.guided_smc import infer
+from bcppl.inference.probing.chance import chance_of_success
+from bcppl.inference.probing.insertion import insertion_plan
+from bcppl.inference.probing.metrology import three_two_one
+from bcppl.models.look_and_touch import model
+from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
+from bcppl.recordings import Recording
+from bcppl.simulators.physics import PegPhysics
+
+CLEARANCES = Bench().clearances
+KNOWN = ("vision", "3-2-1 probe")
+CONFIDENCE = 0.95
+OVERALL, TIGHTEST = 0.97, 0.94  # shares that are to succeed
+CHANCES = 12  # particles by which the chance of an attempt is foretold
+
+
+class Task(NamedTuple):
+    """One scene at one clearance (m), and whether the chance of its attempts is foretold."""
+
+    seed: int
+    clearance: float
+    foretell: bool
+
+
+class Outcome(NamedTuple):
+    """One attempt: what it came to, and how far off the belief's mean was.
+
+    Attributes:
+        seed, clearance, name, known: the scene and what was known; metres.
+        inserted, found: whether it ended in the hole; whether the search found it.
+        depth, across, tilt: metres and radians; of the tip, and of the mean across the hole and of its axis.
+        peak, press: N; the largest force at a sample, and at two in a row.
+        time: s.
+        chance: foretold; NaN unless asked for.
+        failed: what went wrong before the attempt, in words; it counts as not inserted.
+    """
+
+    seed: int
+    clearance: float
+    name: str
+    known: str
+    inserted: bool = False
+    found: bool = False
+    depth: float = math.nan
+    across: float = math.nan
+    tilt: float = math.nan
+    peak: float = math.nan
+    press: float = math.nan
+    time: float = math.nan
+    chance: float = math.nan
+    failed: str = ""
+
+
+def attempts(task: Task) -> list[Outcome]:
+    """The scene's attempts, one for each of what is known."""
+    scene = bench_scene(task.seed, clearance=task.clearance)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        outcomes, belief = [], None
+        for known in KNOWN:
+            try:
+                recording = scene.look()
+                if known == "3-2-1 probe":
+                    if belief is None:
+                        raise InferenceError("there is no belief from vision to plan the probe from.")
+                    recording = scene.probe(three_two_one(belief, scene.part, scene.peg))
+                belief = _believed(recording, task.seed)
+                outcomes.append(_attempt(scene, belief, known, task.foretell))
+            except (InputError, InferenceError) as error:
+                outcomes.append(Outcome(task.seed, task.clearance, scene.name, known, failed=str(error)))
+    return outcomes
+
+
+def _believed(recording: Recording, seed: int) -> Belief:
+    *_, last = infer(model, recording, seed=seed)
+    return last.belief
+
+
+def _attempt(scene: BenchScene, belief: Belief, known: str, foretell: bool) -> Outcome:
+    plan = insertion_plan(belief, scene.part, scene.peg)
+    result = scene.insert(plan)
+    chance = math.nan
+    if foretell:
+        physics = PegPhysics(scene.part, scene.peg)
+        chance = chance_of_success(belief, plan, physics, particles=CHANCES, seed=scene.seed).success
+    hole = torch.from_numpy(scene.kind.part_from_hole)
+    world_from_hole = poses.compose(torch.from_numpy(scene.truth), hole)
+    off = poses.compose(poses.inverse(world_from_hole), poses.compose(belief.mean, hole))
+    tilt = math.acos(min(1.0, float(poses.rotation_matrix(off)[2, 2])))
+    return Outcome(
+        seed=scene.seed,
+        clearance=scene.clearance,
+        name=scene.name,
+        known=known,
+        inserted=result.inserted,
+        found=math.isfinite(result.found),
+        depth=result.depth,
+        across=float(off[:2].norm()),
+        tilt=tilt,
+        peak=result.peak_force,
+        press=result.peak_press,
+        time=result.time,
+        chance=chance,
+    )
+
+
+def rate(outcomes: Sequence[Outcome]) -> tuple[float, float, float]:
+    """The share that succeeded and its exact interval (Clopper and Pearson)."""
+    test = binomtest(sum(o.inserted for o in outcomes), len(outcomes))
+    interval = test.proportion_ci(CONFIDENCE)
+    return float(test.statistic), float(interval.low), float(interval.high)
+
+
+def _line(label: str, outcomes: Sequence[Outcome]) -> list[str | float]:
+    share, low, high = rate(outcomes)
+
+    def at(values: Sequence[float], quantile: float) -> float:
+        finite = [value for value in values if math.isfinite(value)]
+        return float(np.quantile(finite, quantile)) if finite else math.nan
+
+    across, tilt = [1e3 * o.across for o in outcomes], [math.degrees(o.tilt) for o in outcomes]
+    return [
+        label,
+        len(outcomes),
+        f"{100 * share:.1f} ({100 * low:.0f} to {100 * high:.0f})",
+        100.0 * sum(o.found for o in outcomes) / len(outcomes),
+        at(across, 0.5),
+        at(across, 0.9),
+        at(tilt, 0.5),
+        at([o.press for o in outcomes], 0.5),
+        at([o.press for o in outcomes], 0.9),
+        at([o.peak for o in outcomes], 0.5),
+        at([o.peak for o in outcomes], 1.0),
+        at([o.time for o in outcomes], 0.5),
+        float(np.nanmean([o.chance for o in outcomes])) * 100.0
+        if any(math.isfinite(o.chance) for o in outcomes)
+        else math.nan,
+    ]
+
+
+COLUMNS = (
+    "",
+    "attempts",
+    f"in, % ({100 * CONFIDENCE:.0f} % interval)",
+    "found %",
+    "across mm",
+    "90 %",
+    "tilt deg",
+    "press N",
+    "90 %",
+    "peak N",
+    "most",
+    "s",
+    "foretold %",
+)
+
+
+def main() -> None:
+    parser = options(__doc__ or "")
+    parser.add_argument("--scenes", type=int, default=100, help="at each clearance")
+    parser.add_argument("--jobs", type=int, default=cores(), help="scenes at a time")
+    parser.add_argument("--foretell", action="store_true", help="compute the chance of each attempt as well")
+    arguments = parser.parse_args()
+    count = 2 if arguments.quick else arguments.scenes
+    seeds = range(arguments.seed, arguments.seed + count)
+    tasks = [Task(seed, clearance, arguments.foretell) for clearance in CLEARANCES for seed in seeds]
+    outcomes = [outcome for made in each(attempts, tasks, arguments.jobs) for outcome in made]
+    lines, rows = [], []
+    for known in KNOWN:
+        mine = [o for o in outcomes if o.known == known]
+        for clearance in (*CLEARANCES, None):
+            some = [o for o in mine if clearance in (None, o.clearance)]
+            where = "all" if clearance is None else f"{1e3 * clearance:g} mm"
+            lines.append(_line(f"{known}, {where}", some))
+            share, low, high = rate(some)
+            goal = None
+            if known != "vision":
+                goal = OVERALL if clearance is None else TIGHTEST if clearance == min(CLEARANCES) else None
+            rows += [
+                Row(f"inserted, {known}, {where}", share, "share", goal, "min"),
+                Row(f"inserted, {known}, {where}, lower end", low, "share", None, "min"),
+                Row(f"inserted, {known}, {where}, upper end", high, "share", None, "min"),
+                Row(f"force held for two samples, {known}, {where}, median", float(lines[-1][7]), "N"),
+                Row(f"peak force, {known}, {where}, median", float(lines[-1][9]), "N"),
+            ]
+    show(f"one attempt each, scenes {seeds[0]} to {seeds[-1]} at each clearance", COLUMNS, lines)
+    missed = [o for o in outcomes if not o.inserted and o.known != "vision"]
+    for o in missed:
+        why = o.failed or f"depth {1e3 * o.depth:.1f} mm, {'found' if o.found else 'hole not found'}"
+        print(
+            f"not in, {o.known}: scene {o.seed}, {o.name}: {why}; off by {1e3 * o.across:.2f} mm, "
+            f"{math.degrees(o.tilt):.2f} degrees"
+        )
+    finish(rows, arguments.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,193 @@
+"""Insertion: the hole is where the part has it, the plan is what was asked, and the peg goes in as foretold."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+import shapely.affinity
+import torch
+
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.errors import InputError
+from bcppl.inference.probing.chance import chance_of_success
+from bcppl.inference.probing.insertion import Attempt, insertion_plan
+from bcppl.models.worlds.bench import BenchScene, bench_scene
+from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, bench_part
+from bcppl.models.worlds.guarded_motion import command_of
+from bcppl.parts import Part
+from bcppl.recordings.insertion_plan import InsertionPlan
+from bcppl.simulators.extrusion import extruded
+from bcppl.simulators.holes import Hole, clearance_in, hole_from_peg, hole_of
+from bcppl.simulators.outlines import rectangular_outline
+from bcppl.simulators.physics import PegPhysics
+from bcppl.simulators.shapes import block
+
+
+def believed(
+    scene: BenchScene, seed: int, shift: float, turn: float, off: tuple[float, ...] | None = None
+) -> Belief:
+    """What a probe leaves: 40 particles about a mean that is off as they are (or by `off`), at the hole."""
+    generator = np.random.default_rng(seed)
+    spread = torch.tensor([shift] * 3 + [turn] * 3, dtype=torch.float64)
+    hole = torch.from_numpy(scene.kind.part_from_hole)
+    error = torch.from_numpy(generator.normal(size=6)) * spread
+    if off is not None:
+        error = torch.tensor(off, dtype=torch.float64)
+    mean = poses.retract(poses.compose(torch.from_numpy(scene.truth), hole), error)
+    holes = poses.retract(mean.expand(40, 7), torch.from_numpy(generator.normal(size=(40, 6))) * spread)
+    world_from_part = poses.compose(holes, poses.inverse(hole).expand(40, 7))
+    return Belief(world_from_part, torch.zeros(40, dtype=torch.float64))
+
+
+@functools.cache
+def tight(part: str = "square 8 mm", seed: int = 3) -> BenchScene:
+    return bench_scene(seed, part=part, clearance=0.0001)
+
+
+@functools.cache
+def touched(part: str = "square 8 mm") -> Belief:
+    return believed(tight(part), 3, 0.0001, np.radians(0.1))
+
+
+def plan_of(part: str = "square 8 mm") -> InsertionPlan:
+    return insertion_plan(touched(part), tight(part).part, tight(part).peg)
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_the_hole_of_a_mesh_is_the_one_that_was_drawn(name: str) -> None:
+    kind = bench_part(name)
+    hole = hole_of(kind.part)
+    stands = hole_from_peg(hole, kind.peg(0.0001))
+    # Where the peg stands in the part is what counts; the two frames of a D differ in where its middle is.
+    place = poses.compose(torch.from_numpy(hole.part_from_hole), torch.from_numpy(stands))
+    drawn = kind.part_from_hole.copy()
+    drawn[2] += PEG_LENGTH
+    np.testing.assert_allclose(place.numpy(), drawn, atol=5e-6)
+    assert hole.depth == pytest.approx(kind.depth, abs=1e-6)
+    tray = "tray" in name
+    assert hole.chamfer == pytest.approx(0.001 if tray else 0.0, abs=1e-6) and hole.through == (not tray)
+    assert hole.round == ("round" in name)
+    assert clearance_in(hole, kind.peg(0.0002)) == pytest.approx(0.0002, abs=1e-5)
+
+
+def test_a_peg_that_is_held_turned_and_aside_is_turned_into_the_hole() -> None:
+    kind = bench_part("D 10 mm")
+    hole, peg = hole_of(kind.part), kind.peg(0.0002)
+    yaw = np.radians(77.3)
+    held = np.array([0.003, -0.002, 0.0, np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw)])
+    stands = torch.from_numpy(hole_from_peg(hole, peg.moved(held)))
+    back = poses.local(
+        torch.from_numpy(hole_from_peg(hole, peg)), poses.compose(stands, torch.from_numpy(held))
+    )
+    assert float(back[:3].norm()) < 1e-5 and float(back[3:].norm()) < np.radians(0.1)
+
+
+def test_a_plan_follows_the_axis_covers_the_doubt_and_searches_as_finely_as_the_peg_fits() -> None:
+    scene, plan = tight(), plan_of()
+    under = poses.inverse(torch.from_numpy(plan.world_from_hole))
+    tips = poses.transform(
+        torch.from_numpy(plan.search.world_from_peg), torch.tensor([[0.0, 0.0, -PEG_LENGTH]]).double()
+    )[:, 0]
+    inside = poses.transform(under, tips).numpy()
+    searching = 1 + np.flatnonzero(np.array(plan.search.manners) == "searching")
+    before = inside[: searching[0]]
+    assert np.abs(before[:, :2]).max() < 1e-5 and (np.diff(before[:, 2]) < 1e-9).all()
+    assert np.ptp(inside[searching, 2]) < 1e-9 and inside[searching[0], 2] < -plan.search.near
+    # Nine in ten of where the particles have the hole are within a clearance of the way, and so is its middle.
+    hole = torch.from_numpy(scene.kind.part_from_hole)
+    holes = poses.compose(touched().world_from_part, hole.expand(40, 7))
+    places = shapely.points(poses.transform(under, holes[:, :3])[:, :2].numpy())
+    way = shapely.LineString(inside[searching, :2])
+    assert np.mean(shapely.distance(places, way) < 0.5 * scene.clearance) > 0.9
+    # A belief twice as wide is searched twice as far; the clearance, not the doubt, says how finely.
+    wide = insertion_plan(believed(scene, 3, 0.0002, np.radians(0.1)), scene.part, scene.peg)
+    assert 2.5 < wide.search.manners.count("searching") / plan.search.manners.count("searching") * 2.0 < 5.0
+
+
+@pytest.mark.parametrize("part", ["rectangular tray", "square 8 mm", "hexagon 12 mm"])
+def test_a_peg_with_a_tenth_of_clearance_goes_in_and_the_chance_says_so(part: str) -> None:
+    scene, plan = tight(part), plan_of(part)
+    result = scene.insert(plan)
+    assert result.inserted and result.depth > 0.02 and result.peak_press < 10.0
+    assert result.found <= plan.search.times[-1] and result.time < 8.0
+    assert scene.insert(plan) == result
+    if part == "square 8 mm":
+        chance = chance_of_success(touched(part), plan, PegPhysics(scene.part, scene.peg), particles=8)
+        assert chance.success > 0.7 and chance.success <= chance.found
+
+
+def test_the_search_is_what_finds_it() -> None:
+    """Off by 0.3 mm the same plan goes in with its spiral, and does not where the spiral is but a point."""
+    scene = tight()
+    off = believed(scene, 1, 0.0002, 0.0005, off=(0.0003, 0.0, 0.0, 0.0, 0.0, 0.0))
+    assert scene.insert(insertion_plan(off, scene.part, scene.peg)).inserted
+    blind = insertion_plan(off, scene.part, scene.peg, attempt=Attempt(widest=0.0001, longest=1.0))
+    result = scene.insert(blind)
+    assert not result.inserted and np.isnan(result.found) and result.depth < 0.001
+    assert result.peak_press < 30.0
+
+
+def test_the_chance_is_nothing_where_no_particle_has_the_hole_and_rises_with_the_clearance() -> None:
+    chances = []
+    for clearance, shift in ((0.0001, 0.0015), (0.001, 0.0015), (0.001, 0.0003)):
+        scene = bench_scene(3, part="square 8 mm", clearance=clearance)
+        belief = believed(scene, 3, shift, np.radians(0.3))
+        plan = insertion_plan(belief, scene.part, scene.peg, attempt=Attempt(longest=3.0))
+        chances.append(chance_of_success(belief, plan, PegPhysics(scene.part, scene.peg), particles=12))
+    assert chances[0].success <= 0.25 and chances[2].success > 0.9
+    assert chances[0].success < chances[1].success <= chances[2].success
+    elsewhere = belief.world_from_part.clone()
+    elsewhere[:, 0] += 0.015
+    away = Belief(elsewhere, belief.log_weights)
+    assert chance_of_success(away, plan, PegPhysics(scene.part, scene.peg), particles=4).success == 0.0
+
+
+def test_a_search_that_has_found_its_hole_leaves_the_rest_undone() -> None:
+    scene, plan = tight(), plan_of()
+    whole = scene.carried_out(plan.search)[0]
+    (stopped,) = [t for k, t in whole.stops.items() if plan.search.manners[k] == "searching"]
+    after = whole.probe.command[whole.probe.command_times > stopped + 0.05]
+    assert np.ptp(after, axis=0).max() < 1e-9
+    led = command_of(plan.search, {}).command
+    assert np.abs(led[-1] - after[-1])[:3].max() > 1e-5
+
+
+def _no_hole() -> Part:
+    return block((0.05, 0.05, 0.02), "brick")
+
+
+def _two_holes() -> Part:
+    hole = rectangular_outline(0.008, 0.008)
+    rings = [shapely.affinity.translate(hole, x, 0.1 * x).exterior for x in (-0.012, 0.012)]
+    return extruded("plate", shapely.Polygon(rectangular_outline(0.06, 0.04).exterior, rings), -0.02, 0.0)
+
+
+def test_one_of_several_holes_is_the_one_around_the_point() -> None:
+    hole = hole_of(_two_holes(), inside=(0.011, 0.001))
+    np.testing.assert_allclose(hole.part_from_hole[:3], [0.012, 0.0012, 0.0], atol=1e-9)
+
+
+def test_what_cannot_be_inserted_is_refused_in_one_sentence() -> None:
+    scene, plan = tight(), plan_of()
+    hole: Hole = hole_of(scene.part)
+    with pytest.raises(InputError, match="'brick' has no hole in its top"):
+        hole_of(_no_hole())
+    with pytest.raises(InputError, match="has 2 holes in its top"):
+        hole_of(_two_holes())
+    with pytest.raises(InputError, match="no hole around"):
+        hole_of(_two_holes(), inside=(0.0, 0.0))
+    with pytest.raises(InputError, match="does not fit the hole"):
+        hole_from_peg(hole, bench_part("round 16 mm").peg(0.0001))
+    with pytest.raises(InputError, match="the insertion has press 0"):
+        insertion_plan(touched(), scene.part, scene.peg, attempt=Attempt(press=0.0))
+    with pytest.raises(InputError, match="searches until the peg is within 0 m"):
+        replace(plan.search, near=0.0)
+    with pytest.raises(InputError, match="has no searching motion"):
+        replace(plan, search=plan.push)
+    with pytest.raises(InputError, match="chance of an insertion is asked for"):
+        chance_of_success(touched(), plan, PegPhysics(scene.part, scene.peg), particles=0)
