@@ -1,4 +1,4 @@
-"""Insertion: the hole is where the part has it, the plan is what was asked, and the peg goes in as foretold."""
+"""Insertion: the hole is where the mesh has it, the plan is what was asked, the peg goes in as foretold."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_a_plan_follows_the_axis_covers_the_doubt_and_searches_as_finely_as_the_
     before = inside[: searching[0]]
     assert np.abs(before[:, :2]).max() < 1e-5 and (np.diff(before[:, 2]) < 1e-9).all()
     assert np.ptp(inside[searching, 2]) < 1e-9 and inside[searching[0], 2] < -plan.search.near
-    # Nine in ten of where the particles have the hole are within a clearance of the way, and so is its middle.
+    # Where the particles have the hole, the way passes it within half of the clearance for nine in ten.
     hole = torch.from_numpy(scene.kind.part_from_hole)
     holes = poses.compose(touched().world_from_part, hole.expand(40, 7))
     places = shapely.points(poses.transform(under, holes[:, :3])[:, :2].numpy())
