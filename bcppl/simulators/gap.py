@@ -29,7 +29,7 @@ Numbers = npt.NDArray[np.int64]
 _RUN = 0.008  # m of an edge that are passed over together
 _ROUNDS = 12
 _EXACT = 1e-8  # m
-_NEAR = 0.002  # m: nearer than this, what the grid cannot tell is measured exactly
+_NEAR = 0.002  # m: nearer than this, edges count, and what the grid cannot tell is measured exactly
 _SHARP = np.radians(5.0)
 _FLAT = 1e-9
 _MARGIN = 0.012  # m around the part that the grid covers
@@ -236,14 +236,16 @@ def _measure(
             place[n, t] = turn @ corners[which] + shift
             rounded[n, t] = not sloped(place[n, t], low, spacing, grid, slope) and abs(least) < _NEAR
             normal[n, t] = slope
+            # An edge that is farther off than this would not touch either way.
+            nearer = min(least, _NEAR)
             for e in range(len(edges)):
-                if _may_be_nearer(balls[e], turn, shift, box, least):
+                if _may_be_nearer(balls[e], turn, shift, box, nearer):
                     start, stop = turn.T @ (edges[e, 0] - shift), turn.T @ (edges[e, 1] - shift)
                     begin = 0
                     for s in range(len(ends)):
-                        inside, share = _deepest(start, stop, planes[begin : ends[s]], least, slope)
-                        if inside < least:
-                            least = inside
+                        inside, share = _deepest(start, stop, planes[begin : ends[s]], nearer, slope)
+                        if inside < nearer:
+                            nearer = least = inside
                             rounded[n, t] = False
                             place[n, t] = edges[e, 0] + share * (edges[e, 1] - edges[e, 0])
                             normal[n, t] = -(turn @ slope)
