@@ -18,7 +18,7 @@ from rich.table import Table
 
 from bcppl import poses
 from bcppl.beliefs import average_distance, average_nearest_distance
-from bcppl.cli import latent_sites, loading
+from bcppl.cli import latent_sites, loading, surprises
 from bcppl.errors import InputError
 from bcppl.figures import add_over_time, belief_in_3d
 from bcppl.inference.progress import sole_bar
@@ -36,12 +36,13 @@ HEADER = (
     "steps",
     "ADD mm",
     "truth gap",
+    "p value",
     "sim. s",
     "wall s",
 )
 FEWEST = 20
 LARGEST_GAP = 5.0  # nats: the truth may score better than the best particle by chance, not by more
-WIDTHS = (12, 7, 6, 8, 9, 8, 5, 7, 9, 7, 6)
+WIDTHS = (12, 7, 6, 8, 9, 8, 5, 7, 9, 8, 7, 6)
 
 
 def run(
@@ -78,6 +79,8 @@ def run(
     chosen.observe(scene, found.measurements)  # what cannot be read is refused before anything is written
     console = Console(highlight=False)
     steps: list[Any] = []
+    rows: list[list[str]] = []
+    watch = surprises.Watch()
     made = {
         "recording": recording,
         "model": model or found.model,
@@ -101,8 +104,9 @@ def run(
                     progress.console.print(_row(HEADER), style="bold", soft_wrap=True)
                 _keep(folder, len(steps), step)
                 steps.append(step)
-                _write_record(folder, made, steps, found)
-                progress.console.print(_row(_cells(step, found)), soft_wrap=True)
+                rows.append(_cells(step, found, watch.cell(step)))
+                _write_record(folder, made, steps, rows)
+                progress.console.print(_row(rows[-1]), soft_wrap=True)
                 doing = next_label(found, len(steps))
                 progress.update(task, completed=len(steps) - 1, description=doing)
     finally:
@@ -115,6 +119,11 @@ def run(
                     style="yellow",
                 )
             _report(console, found, chosen, steps)
+            if not watch.told:
+                console.print(surprises.NOT_TOLD, style="dim", markup=False)
+            warning = watch.warning(steps[-1])
+            if warning is not None:
+                console.print(warning, style="yellow", markup=False)
             _draw(folder, found, steps)
             console.print(f"beliefs and figures are in {folder}")
 
@@ -142,11 +151,13 @@ def _keep(folder: Path, number: int, step: Any) -> None:
     )
 
 
-def _write_record(folder: Path, made: dict[str, Any], steps: Sequence[Any], recording: Recording) -> None:
+def _write_record(
+    folder: Path, made: dict[str, Any], steps: Sequence[Any], rows: Sequence[Sequence[str]]
+) -> None:
     """What was run, the table so far, and what the last step says of every latent site, as JSON."""
-    rows = [dict(zip(HEADER, _cells(step, recording), strict=True)) for step in steps]
     unfinished = folder / "run.json.part"
-    whole = {**made, "rows": rows, "latent": latent_sites.summarised(steps[-1])}
+    table = [dict(zip(HEADER, row, strict=True)) for row in rows]
+    whole = {**made, "rows": table, "latent": latent_sites.summarised(steps[-1])}
     unfinished.write_text(json.dumps(whole, indent=1), encoding="utf-8")
     unfinished.replace(folder / "run.json")
 
@@ -160,7 +171,7 @@ def _number(value: float, digits: int) -> str:
     return "" if math.isnan(value) else f"{value:.{digits}f}"
 
 
-def _cells(step: Any, recording: Recording) -> list[str]:
+def _cells(step: Any, recording: Recording, surprise: str) -> list[str]:
     info = step.info
     add = math.nan
     if recording.truth is not None:
@@ -175,6 +186,7 @@ def _cells(step: Any, recording: Recording) -> list[str]:
         str(len(info.exponents) or ""),
         _number(add, 2),
         _number(info.truth_gap, 2),
+        surprise,
         _number(info.effort["physics"].amount if "physics" in info.effort else math.nan, 0),
         _number(info.seconds, 2),
     ]

@@ -1,0 +1,66 @@
+"""`bcppl run` marks measurements that do not fit the belief, and says so in one sentence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+
+from bcppl.cli.surprises import MEANING, NAMED, sentence, together
+from bcppl.inference.predictive import Surprise
+from bcppl.models.worlds.bench import Bench, bench_scene
+from bcppl.recordings import save
+from tests.command_line import Ran, short
+from tests.made_recordings import assert_one_sentence
+
+SETTINGS = "--model", "look_and_touch", "--inference", "guided_smc", "--particles", 30
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_hidden_view_is_marked_and_named_and_a_clean_one_is_not(
+    hidden: bool, bcppl: Callable[..., Ran], tmp_path: Path
+) -> None:
+    scene = bench_scene(0, Bench(occluder=hidden))
+    save(scene.look(), tmp_path / "look.h5")
+    ran = bcppl("run", "look.h5", *SETTINGS)
+    assert ran.code == 0, ran.err
+    rows = json.loads((tmp_path / "runs/look/run.json").read_text())["rows"]
+    said = [row["p value"] for row in rows]
+    assert said[0] == "" and all(said[1:])
+    marked = [k for k, p in enumerate(said) if p.endswith("!")]
+    warnings = [line for line in ran.out.splitlines() if "surprising" in line]
+    if hidden:
+        assert scene.hidden_view is not None and scene.hidden_view + 1 in marked
+        assert len(warnings) == 1 and f"view {scene.hidden_view + 1}" in warnings[0]
+        assert "before the camera" in warnings[0]
+    else:
+        assert not marked and not warnings
+
+
+def test_a_model_of_which_nothing_can_be_told_says_so(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    save(short(1), tmp_path / "short.h5")
+    ran = bcppl("run", "short.h5", "--particles", 4)
+    assert ran.code == 0 and "p value: empty" in ran.out and "surprising" not in ran.out
+
+
+def of(kind: str, probability: float = 1e-9) -> Mapping[str, Surprise]:
+    return {kind: Surprise(probability, kind, 9.0)}
+
+
+def test_one_sentence_names_the_measurements_and_what_each_kind_may_mean() -> None:
+    said = sentence({"view 1": of("image"), "window 7": of("contacts")})
+    assert "view 1, window 7 do not fit" in said
+    assert MEANING["image"] in said and MEANING["contacts"] in said and MEANING["normal"] not in said
+    assert_one_sentence(said)
+    many = sentence({f"window {k}": of("contacts") for k in range(1, NAMED + 4)})
+    assert "and 3 more" in many and many.count(MEANING["contacts"]) == 1
+    # Of several sites that came with one measurement the least likely says what is wrong.
+    assert MEANING["normal"] in sentence({"view 2": {**of("image", 0.5), **of("normal")}})
+
+
+def test_sites_that_came_together_are_counted() -> None:
+    three = [Surprise(p, "normal", 0.0) for p in (0.2, 0.01, 0.9)]
+    assert together(three) == pytest.approx(0.03)
+    assert together(three[:1]) == 0.2 and together([three[2]] * 2) == 1.0
