@@ -97,16 +97,16 @@ def test_a_plan_follows_the_axis_covers_the_doubt_and_searches_as_finely_as_the_
     searching = 1 + np.flatnonzero(np.array(plan.search.manners) == "searching")
     before = inside[: searching[0]]
     assert np.abs(before[:, :2]).max() < 1e-5 and (np.diff(before[:, 2]) < 1e-9).all()
-    assert np.ptp(inside[searching, 2]) < 1e-9 and inside[searching[0], 2] < -plan.search.near
+    assert np.ptp(inside[searching, 2]) < 1e-9 and inside[searching[0], 2] < -plan.search.sink
     # Where the particles have the hole, the way passes it within half of the clearance for nine in ten.
     hole = torch.from_numpy(scene.kind.part_from_hole)
     holes = poses.compose(touched().world_from_part, hole.expand(40, 7))
     places = shapely.points(poses.transform(under, holes[:, :3])[:, :2].numpy())
     way = shapely.LineString(inside[searching, :2])
     assert np.mean(shapely.distance(places, way) < 0.5 * scene.clearance) > 0.9
-    # A belief twice as wide is searched twice as far; the clearance, not the doubt, says how finely.
+    # A belief twice as wide is searched with nearly twice the rounds: the clearance says how finely.
     wide = insertion_plan(believed(scene, 3, 0.0002, np.radians(0.1)), scene.part, scene.peg)
-    assert 2.5 < wide.search.manners.count("searching") / plan.search.manners.count("searching") * 2.0 < 5.0
+    assert 1.5 < wide.search.manners.count("searching") / plan.search.manners.count("searching") < 2.1
 
 
 @pytest.mark.parametrize("part", ["rectangular tray", "square 8 mm", "hexagon 12 mm"])
@@ -134,7 +134,7 @@ def test_the_search_is_what_finds_it() -> None:
 
 def test_the_chance_is_nothing_where_no_particle_has_the_hole_and_rises_with_the_clearance() -> None:
     chances = []
-    for clearance, shift in ((0.0001, 0.0015), (0.001, 0.0015), (0.001, 0.0003)):
+    for clearance, shift in ((0.0001, 0.001), (0.001, 0.001), (0.001, 0.0002)):
         scene = bench_scene(3, part="square 8 mm", clearance=clearance)
         belief = believed(scene, 3, shift, np.radians(0.3))
         plan = insertion_plan(belief, scene.part, scene.peg, attempt=Attempt(longest=3.0))
@@ -185,8 +185,8 @@ def test_what_cannot_be_inserted_is_refused_in_one_sentence() -> None:
         hole_from_peg(hole, bench_part("round 16 mm").peg(0.0001))
     with pytest.raises(InputError, match="the insertion has press 0"):
         insertion_plan(touched(), scene.part, scene.peg, attempt=Attempt(press=0.0))
-    with pytest.raises(InputError, match="searches until the peg is within 0 m"):
-        replace(plan.search, near=0.0)
+    with pytest.raises(InputError, match="searches until the peg has sunk by 0 m"):
+        replace(plan.search, sink=0.0)
     with pytest.raises(InputError, match="has no searching motion"):
         replace(plan, search=plan.push)
     with pytest.raises(InputError, match="chance of an insertion is asked for"):

@@ -58,17 +58,22 @@ class InsertionPlan:
         """From how deep below the top (m) the peg is in: 0.8 of the depth, or 10 mm beyond the chamfer."""
         return min(0.8 * self.depth, self.chamfer + 0.01)
 
-    def push_from(self, world_from_peg: Array) -> Plan:
+    def push_from(self, world_from_peg: Array, sunk: float | None = None) -> Plan:
         """The push, moved as a whole so that it begins at a pose (7,) and ends as deep as planned.
 
         The peg turns with the hole that it is in, so the way is along its own axes.
+
+        Args:
+            world_from_peg: where the peg stands.
+            sunk: how far (m) it is then below the top, where that was felt; None to take it from where the
+                hole is thought to be.
         """
         start = torch.from_numpy(self.push.world_from_peg[0])
         stands = torch.as_tensor(world_from_peg)
         way = poses.compose(poses.inverse(start), torch.from_numpy(self.push.world_from_peg))
-        # What it has sunk already, or stands out more, is less or more to go.
-        above = float(poses.transform(poses.inverse(start), stands[None, :3])[0, 2])
+        if sunk is None:
+            sunk = -float(poses.transform(poses.inverse(start), stands[None, :3])[0, 2])
         length = float(way[:, 2].abs().max())
         if length > 0.0:
-            way[:, :3] *= max(length + above, 0.0) / length
+            way[:, :3] *= max(length - sunk, 0.0) / length
         return replace(self.push, world_from_peg=poses.compose(stands, way).numpy())

@@ -27,8 +27,9 @@ class Plan:
     stops where the force felt exceeds `force`; the way that was left then stays undone: "held" motions after
     it are made as planned but for that way, so a slide goes on along the surface that was met. A "free"
     motion leads to its knot as planned. "Searching" motions are held ones, made while the peg is pressed
-    on by a command that lies below a surface: once the peg has come within `near` of its command, along the
-    commanded z, it has found a hole; that motion stops, and the searching motions right after it stay undone.
+    on by a command that lies below a surface: once the peg has sunk by `sink` below where the last guarded
+    motion was stopped, along the commanded z, or if that met nothing, it has found a hole; the motion stops,
+    and the searching motions right after it stay undone.
 
     Attributes:
         name: of the probe that comes of it.
@@ -39,7 +40,7 @@ class Plan:
         stiffness: (6,) N/m along, then N m/rad about, the commanded peg's axes.
         damping: (6,) N s/m, then N m s/rad.
         rate: samples per second of what is measured.
-        near: metres between peg and command, along the commanded z, below which a search has found its hole.
+        sink: metres; how far below the surface it met a peg is in a hole that is searched for.
 
     Raises:
         InputError: shapes do not fit, times do not increase, a manner is unknown, the force is not positive,
@@ -54,7 +55,7 @@ class Plan:
     stiffness: Array
     damping: Array
     rate: float = 100.0
-    near: float = 0.0
+    sink: float = 0.0
 
     def __post_init__(self) -> None:
         knots = len(self.times)
@@ -74,8 +75,8 @@ class Plan:
                 )
         if not self.force > 0.0:
             raise InputError(f"plan {self.name!r} stops at {self.force:g} N; give a positive force.")
-        if "searching" in self.manners and not self.near > 0.0:
+        if "searching" in self.manners and not self.sink > 0.0:
             raise InputError(
-                f"plan {self.name!r} searches until the peg is within {self.near:g} m of its command; give a "
-                "positive `near`, less than how far the command lies below the surface."
+                f"plan {self.name!r} searches until the peg has sunk by {self.sink:g} m; give a positive "
+                "`sink`, less than how far the command lies below the surface."
             )

@@ -151,16 +151,16 @@ def clearance_in(hole: Hole, peg: Part) -> float:
 
 
 def depth_reached(hole: Hole, peg: Part, part_from_peg: Array) -> Array:
-    """How deep (N,) the lowest end of a peg is below the plane of the part's top, metres.
+    """How deep (...) the lowest end of a peg is below the plane of the part's top, metres.
 
     Args:
         hole: in the part.
         peg: what is held.
-        part_from_peg: (N, 7).
+        part_from_peg: (..., 7).
     """
     tip = torch.tensor([[0.0, 0.0, float(peg.vertices[:, 2].min())]], dtype=torch.float64)
-    there = poses.transform(torch.as_tensor(part_from_peg), tip)[:, 0]
-    return np.asarray(hole.part_from_hole[2] - there[:, 2].numpy())
+    there = poses.transform(torch.as_tensor(part_from_peg), tip)[..., 0, :]
+    return np.asarray(hole.part_from_hole[2] - there[..., 2].numpy())
 
 
 def _levels(part: Part) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from bcppl import poses
 from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief
 from bcppl.inference.schemes import systematic
+from bcppl.parts import Part
 from bcppl.recordings.insertion_plan import InsertionPlan
 from bcppl.recordings.measurements import Probe
 from bcppl.recordings.plan import Plan
@@ -69,7 +71,7 @@ def chance_of_success(
     hole = hole_of(physics.part) if hole is None else hole
     world_from_part = _drawn(belief, particles, seed)
     count = len(world_from_part)
-    found, stands = _search(plan, physics, world_from_part)
+    found, stands = _search(plan, physics, hole, world_from_part)
     success = np.zeros(count, dtype=bool)
     if found.any():
         depth = _push(plan, physics, hole, world_from_part[found], stands[found])
@@ -88,11 +90,28 @@ def _drawn(belief: Belief, particles: int, seed: int) -> torch.Tensor:
     return belief.world_from_part[chosen]
 
 
-def _search(plan: InsertionPlan, physics: PegPhysics, world_from_part: torch.Tensor) -> tuple[Mask, Array]:
+def _landed(plan: InsertionPlan, peg: Part) -> Plan:
+    """The search with its guarded motion stopped where the hole's top is thought to be."""
+    search, under = plan.search, poses.inverse(torch.from_numpy(plan.world_from_hole))
+    if "guarded" not in search.manners:
+        return search
+    stops = search.manners.index("guarded") + 1
+    tip = torch.tensor([[0.0, 0.0, float(peg.vertices[:, 2].min())]], dtype=torch.float64)
+    lowest = poses.transform(torch.from_numpy(search.world_from_peg[stops]), tip)
+    pressed = search.force / max(float(search.stiffness[2]), 1e-9)
+    undone = -float(poses.transform(under, lowest)[0, 2]) - pressed
+    up = poses.rotation_matrix(torch.from_numpy(search.world_from_peg[stops])).numpy()[:, 2]
+    landed = search.world_from_peg.copy()
+    landed[stops:, :3] += undone * up
+    return replace(search, world_from_peg=landed)
+
+
+def _search(
+    plan: InsertionPlan, physics: PegPhysics, hole: Hole, world_from_part: torch.Tensor
+) -> tuple[Mask, Array]:
     """Which particles (N,) find the hole, and where their peg stands then (N, 7)."""
-    probe = _probe(plan.search)
+    probe = _probe(_landed(plan, physics.peg))
     searching = probe.stamps >= plan.search.times[plan.search.manners.index("searching")] - 1e-9
-    under = poses.inverse(torch.from_numpy(plan.search.world_from_peg[-1]))
     found = np.zeros(len(world_from_part), dtype=bool)
     stands = np.full((len(world_from_part), 7), np.nan)
     left = np.arange(len(world_from_part))
@@ -100,9 +119,11 @@ def _search(plan: InsertionPlan, physics: PegPhysics, world_from_part: torch.Ten
     for first in range(0, len(probe.stamps), _AT_ONCE):
         rollout.advance(min(first + _AT_ONCE, len(probe.stamps)))
         seen = rollout.world_from_peg[:, first:]
-        # Every command of a search lies equally deep, so that the last one's height is that of all.
-        height = poses.transform(under, torch.from_numpy(seen[..., :3]))[..., 2].numpy()
-        near = (height < plan.search.near) & searching[first : rollout.count]
+        part_from_world = poses.inverse(world_from_part[left])[:, None].expand(*seen.shape[:2], 7)
+        deep = depth_reached(
+            hole, physics.peg, poses.compose(part_from_world, torch.from_numpy(seen)).numpy()
+        )
+        near = (deep > plan.search.sink) & searching[first : rollout.count]
         yields = near.any(axis=1)
         stands[left[yields]] = seen[np.flatnonzero(yields), near[yields].argmax(axis=1)]
         found[left[yields]] = True

@@ -31,9 +31,11 @@ class Attempt(NamedTuple):
     Attributes:
         above: where the peg starts above the hole.
         free, landing, searching, pushing: m/s at most.
-        press: how far below the top the search's command lies; its spring along the axis presses by that.
+        touch: newtons at which the top is met.
+        press: how far beyond that the search's command goes on; its spring along the axis presses by that.
         sure: the spiral reaches so many standard deviations of where the hole is.
-        widest: the spiral's radius at most.
+        least, widest: between which the spiral's radius lies. It ends where the hole is, so that what is
+            beyond costs time only where the belief was too sure.
         longest: the search's time at most; a spiral that would take longer is made with a wider pitch.
         turns: rounds per second of the spiral at most.
         pitch: of the spiral, in clearances.
@@ -48,8 +50,10 @@ class Attempt(NamedTuple):
     landing: float = 0.015
     searching: float = 0.005
     pushing: float = 0.02
-    press: float = 0.008
-    sure: float = 3.0
+    touch: float = 0.7
+    press: float = 0.006
+    sure: float = 4.0
+    least: float = 0.0003
     widest: float = 0.004
     longest: float = 12.0
     turns: float = 2.0
@@ -65,7 +69,6 @@ class Attempt(NamedTuple):
 _STILL = 0.15  # s before anything moves, in which the wrench is tared
 _SETTLE = 0.15  # s between the press and the search
 _SUNK = 0.001  # m below the chamfer from which a peg is in a hole
-_LEAST = 0.0001  # m: a spiral is at least so wide
 _ROUND = 16  # knots per round, at least
 
 
@@ -92,11 +95,10 @@ def insertion_plan(
     world_from_hole = poses.compose(belief.mean, place)
     doubt = _doubt(belief, world_from_hole, place)
     lands = max(0.001, attempt.sure * float(doubt[2, 2].sqrt()))
-    press = max(attempt.press, hole.chamfer + _SUNK + 2.0 * lands)
-    times, tips, manners = _descent(attempt, lands, press)
+    times, tips, manners = _descent(attempt, lands)
     found, way = _spiral(doubt[:2, :2].numpy(), clearance, attempt)
     times = np.concatenate([times, times[-1] + found])
-    tips = np.concatenate([tips, np.column_stack([way, np.full(len(way), -press)])])
+    tips = np.concatenate([tips, np.column_stack([way, np.full(len(way), tips[-1, 2])])])
     search_on: Manner = "searching"
     manners = (*manners, *((search_on,) * len(way)))
 
@@ -111,10 +113,10 @@ def insertion_plan(
         times,
         led(tips),
         manners,
-        attempt.force,
+        attempt.touch,
         np.array(attempt.search_stiffness),
         np.array(attempt.search_damping),
-        near=press - hole.chamfer - max(_SUNK, lands),
+        sink=hole.chamfer + _SUNK,
     )
     deep = attempt.deep * hole.depth
     down = max(deep / attempt.pushing, 0.2)
@@ -145,14 +147,16 @@ def _doubt(belief: Belief, world_from_hole: torch.Tensor, part_from_hole: torch.
     return (belief.weights[:, None] * off).T @ off
 
 
-def _descent(attempt: Attempt, lands: float, press: float) -> tuple[Array, Array, tuple[Manner, ...]]:
+def _descent(attempt: Attempt, lands: float) -> tuple[Array, Array, tuple[Manner, ...]]:
     """Times (K,), tips (K, 3) in the hole's frame and manners (K - 1,) up to the beginning of a search."""
-    heights = np.array([attempt.above + lands, attempt.above + lands, lands, -lands, -press, -press])
+    lowest = -lands - 2.0 * attempt.touch / attempt.search_stiffness[2]
+    pressed = lowest - attempt.press
+    heights = np.array([attempt.above + lands, attempt.above + lands, lands, lowest, pressed, pressed])
     pace = [attempt.free, attempt.landing, 2.0 * attempt.landing]
     spans = [_STILL, *(np.abs(np.diff(heights[1:5])) / pace), _SETTLE]
     times = np.concatenate([[0.0], np.cumsum(np.maximum(spans, 0.05))])
     tips = np.column_stack([np.zeros((len(heights), 2)), heights])
-    return times, tips, ("free", "free", "held", "held", "held")
+    return times, tips, ("free", "free", "guarded", "held", "held")
 
 
 def _spiral(doubt: Array, clearance: float, attempt: Attempt) -> tuple[Array, Array]:
@@ -161,7 +165,8 @@ def _spiral(doubt: Array, clearance: float, attempt: Attempt) -> tuple[Array, Ar
     Rounds are a pitch apart, so that one of them passes the hole's middle within the clearance to each side.
     """
     variances, axes = np.linalg.eigh(doubt)
-    reach = np.clip(attempt.sure * np.sqrt(np.maximum(variances, 0.0)), _LEAST, attempt.widest) + clearance
+    spread = attempt.sure * np.sqrt(np.maximum(variances, 0.0))
+    reach = np.clip(spread, attempt.least, attempt.widest) + clearance
     pitch = attempt.pitch * clearance
     # An ellipse's area over the pitch is the length of the way.
     pitch = max(pitch, math.pi * reach[0] * reach[1] / (2.0 * attempt.searching * attempt.longest))

@@ -38,6 +38,7 @@ class CarriedOut:
             its place in the plan.
         wrench: (T, 6) what was truly exerted on the peg at the stamps, N and N m, in the peg's frame.
         world_from_peg: (T, 7) where the peg truly was.
+        met: (7,) where the peg was when the last guarded motion was stopped; None where none was.
         standing: where the simulation stood at the last stamp: what follows goes on from there.
     """
 
@@ -45,6 +46,7 @@ class CarriedOut:
     stops: Mapping[int, float]
     wrench: Array
     world_from_peg: Array
+    met: Array | None
     standing: Standing
 
 
@@ -143,7 +145,7 @@ def carry_out(
     standing = clock.beginning(1) if following is None else following.standing
     rows = np.empty((len(stamps), WRENCH.stop))
     motion = np.clip(np.searchsorted(plan.times, stamps + 1e-9, side="right") - 1, 0, len(manners) - 1)
-    done = len(stamps)
+    done, met = len(stamps), None
     for k, of in enumerate(motion):
         row, standing = clock.read(standing, pose, {}, k, k + 1)
         rows[k] = row[0, 0]
@@ -157,9 +159,10 @@ def carry_out(
             felt = rows[: k + 1, WRENCH][:, :3] + error[: k + 1, :3]
             rest = felt[:TARE].mean(axis=0) if zero is None else zero
             stopped = bool((np.linalg.norm(felt[-FELT:] - rest, axis=1) > plan.force).all())
+            met = rows[k, POSE].copy() if stopped else met
         else:
             searching = manners[of] == "searching" and not _found_before(manners, stops, int(of))
-            stopped = searching and _yielded(probe, rows[k, POSE], float(stamps[k]), plan.near)
+            stopped = searching and _sunk(probe, rows[k, POSE], float(stamps[k]), met) > plan.sink
             if stopped and until_found:
                 stops[int(of)], done = float(stamps[k]), k + 1
                 break
@@ -169,14 +172,15 @@ def carry_out(
             clock = Clock(model, probe, contact.time_step)
     rows = rows[:done]
     probe = replace(probe, stamps=stamps[:done])
-    return CarriedOut(probe, stops, rows[:, WRENCH].copy(), rows[:, POSE].copy(), standing)
+    return CarriedOut(probe, stops, rows[:, WRENCH].copy(), rows[:, POSE].copy(), met, standing)
 
 
-def _yielded(probe: Probe, world_from_peg: Array, time: float, near: float) -> bool:
-    """Whether a peg is within a distance of its command, along the commanded z."""
+def _sunk(probe: Probe, world_from_peg: Array, time: float, met: Array | None) -> float:
+    """How far (m) a peg is below where it met a surface, along the commanded z; none met: infinite."""
+    if met is None:
+        return float("inf")
     led = commands(probe, np.array([time]))[0][0]
-    above = _rotation(led).inv().apply(world_from_peg[:3] - led[:3])[2]
-    return bool(above < near)
+    return float(_rotation(led).inv().apply(met[:3] - world_from_peg[:3])[2])
 
 
 def _found_before(manners: Sequence[Manner], stops: Mapping[int, float], motion: int) -> bool:

@@ -69,7 +69,7 @@ def insert(
     zero = (search.wrench[:TARE, :3] + error[:TARE, :3]).mean(axis=0)
     seen = poses.retract(torch.from_numpy(search.world_from_peg[-1]), torch.from_numpy(wobble[done - 1]))
     push = carry_out(
-        plan.push_from(seen.numpy()),
+        plan.push_from(seen.numpy(), _below(search.met, seen)),
         part,
         peg,
         contact,
@@ -93,6 +93,13 @@ def insert(
         peak_press=float(np.minimum(force[1:], force[:-1]).max()),
         time=len(force) / plan.search.rate,
     )
+
+
+def _below(met: Array | None, seen: torch.Tensor) -> float | None:
+    """How far (m) a peg is below where it met the top, along its z; None where it met nothing."""
+    if met is None:
+        return None
+    return -float(poses.transform(poses.inverse(torch.from_numpy(met)), seen[None, :3])[0, 2])
 
 
 def samples_of(plan: InsertionPlan) -> int:
