@@ -1,0 +1,221 @@
+"""Where a part is touched: faces, plans, what is felt, and metrology's 3-2-1 carried out on the bench."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+import torch
+
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.errors import InputError
+from bcppl.inference.probing.metrology import Pace, three_two_one
+from bcppl.models.worlds.bench import BenchScene, bench_scene
+from bcppl.models.worlds.guarded_motion import CarriedOut
+from bcppl.recordings.plan import Plan
+from bcppl.simulators.faces import section, sides, spots_on_top
+from bcppl.simulators.gap import PegGap
+from bcppl.simulators.sensing.felt import Felt
+from bcppl.simulators.shapes import block, block_with_square_hole, box_peg, round_peg
+from tests.made_recordings import assert_one_sentence
+
+NAN = float("nan")
+
+# ---------------------------------------------------------------- faces
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.007, 0.005), (-0.008, 0.004)])
+def test_spots_and_the_ways_between_them_keep_their_margins(offset: tuple[float, float]) -> None:
+    part, peg, margin = block_with_square_hole(hole=0.0105, offset=offset), round_peg(0.005, 0.08), 0.004
+    spots = spots_on_top(part, peg, margin)
+    way = shapely.LineString(spots)
+    hole = shapely.box(-0.00525, -0.00525, 0.00525, 0.00525)
+    outline = shapely.box(-0.03, -0.03, 0.03, 0.03)
+    assert spots.shape == (3, 2) and outline.contains(way)
+    assert way.distance(outline.exterior) > 0.005 + margin - 2e-5
+    assert way.distance(shapely.affinity.translate(hole, *offset)) > 0.005 + 0.002 - 2e-4
+    area = 0.5 * abs(np.linalg.det(spots[1:] - spots[0]))
+    assert area > 0.4 * (0.06 - 2 * 0.009) ** 2  # of a square's corners any three span half of it
+
+
+def test_sides_of_a_block_are_its_four_faces() -> None:
+    part = block_with_square_hole((0.06, 0.04, 0.025))
+    found = sides(part, -0.01)
+    assert [round(side.length, 6) for side in found] == [0.06, 0.06, 0.04, 0.04]
+    for side in found:
+        middle = 0.5 * (side.start + side.stop)
+        np.testing.assert_allclose(side.normal, middle / np.linalg.norm(middle), atol=1e-9)
+    assert {tuple(np.round(side.normal).astype(int)) for side in found} == {(1, 0), (-1, 0), (0, 1), (0, -1)}
+    assert section(part, -0.01).area == pytest.approx(0.06 * 0.04 - 0.0165**2, rel=1e-6)
+
+
+def test_a_top_without_room_and_a_height_outside_are_refused() -> None:
+    part = block((0.01, 0.01, 0.02))
+    for call in (lambda: spots_on_top(part, round_peg(0.012, 0.05), 0.004), lambda: section(part, 0.5)):
+        with pytest.raises(InputError) as caught:
+            call()
+        assert_one_sentence(str(caught.value))
+
+
+# ---------------------------------------------------------------- plans
+
+
+def plan_of(**changed: Any) -> Plan:
+    given = {
+        "name": "press",
+        "times": np.array([0.0, 1.0, 2.0]),
+        "world_from_peg": poses.identity(3).numpy(),
+        "manners": ("free", "guarded"),
+        "force": 4.0,
+        "stiffness": np.full(6, 100.0),
+        "damping": np.full(6, 1.0),
+    }
+    return Plan(**{**given, **changed})
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"times": np.array([0.0])}, "1 times"),
+        ({"world_from_peg": np.zeros((3, 6))}, r"poses \(3, 6\)"),
+        ({"manners": ("free",)}, "1 manners"),
+        ({"manners": ("free", "pushed")}, "'pushed'; give one of free, guarded, held"),
+        ({"times": np.array([0.0, 2.0, 1.0])}, "times that do not increase"),
+        ({"times": np.array([0.0, NAN, 1.0])}, "times that do not increase"),
+        ({"world_from_peg": np.full((3, 7), NAN)}, "not finite"),
+        ({"force": 0.0}, "stops at 0 N"),
+        ({"force": NAN}, "stops at nan N"),
+    ],
+)
+def test_a_plan_that_makes_no_sense_is_refused_by_name(changed: dict[str, Any], said: str) -> None:
+    assert plan_of().manners == ("free", "guarded")
+    with pytest.raises(InputError, match=rf"plan 'press' .*{said}") as caught:
+        plan_of(**changed)
+    assert_one_sentence(str(caught.value))
+
+
+# ---------------------------------------------------------------- what is felt
+
+
+def forces(*sizes: float) -> torch.Tensor:
+    """Forces (T, 3) of these sizes in all directions."""
+    torch.manual_seed(0)
+    direction = torch.nn.functional.normalize(torch.randn(len(sizes), 3, dtype=torch.float64), dim=1)
+    return direction * torch.tensor(sizes, dtype=torch.float64)[:, None]
+
+
+def test_a_contact_is_felt_from_one_force_on_and_none_below_another() -> None:
+    at_once = Felt(contact=1.5, free=0.8, load=0.3, beside=0)
+    told = at_once(forces(0.0, 0.79, 0.81, 1.49, 1.51, 40.0, NAN))
+    np.testing.assert_array_equal(told.numpy(), [0, 0, NAN, NAN, 1, 1, NAN])
+    # Accelerating the tool takes force: 4 m/s^2 hide 1.2 N.
+    np.testing.assert_array_equal(at_once(forces(2.6, 2.8, 0.1), 4.0).numpy(), [NAN, 1, 0])
+    each = at_once(forces(2.6, 2.6), torch.tensor([4.0, 0.0], dtype=torch.float64))
+    np.testing.assert_array_equal(each.numpy(), [NAN, 1])
+
+
+def test_neighbours_must_agree_either_way_in_time() -> None:
+    sizes = [0.1] * 6 + [1.0] + [3.0] * 7 + [0.1] * 5 + [9.0] + [0.1] * 4
+    told = Felt(beside=2)(forces(*sizes)).numpy()
+    expected = [0] * 4 + [NAN] * 5 + [1] * 3 + [NAN] * 4 + [0] * 1 + [NAN] * 5 + [0] * 2
+    np.testing.assert_array_equal(told, expected)
+    np.testing.assert_array_equal(Felt(beside=2)(forces(*sizes[::-1])).numpy(), told[::-1])
+
+
+def test_forces_and_numbers_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(InputError, match=r"shape \(5, 6\); give \(T, 3\)"):
+        Felt()(torch.zeros(5, 6))
+    for numbers in ({"free": 2.0}, {"contact": 0.0}, {"load": -1.0}, {"beside": -1}):
+        with pytest.raises(InputError):
+            Felt(**numbers)
+
+
+# ---------------------------------------------------------------- 3-2-1
+
+
+def about(scene: BenchScene, spread: float) -> Belief:
+    """A belief about the truth, of so many metres."""
+    torch.manual_seed(scene.seed)
+    away = spread * torch.randn(40, 6, dtype=torch.float64)
+    around = poses.retract(torch.from_numpy(scene.truth), away - away.mean(dim=0))
+    return Belief(around, torch.zeros(40, dtype=torch.float64))
+
+
+@functools.cache
+def carried(seed: int) -> tuple[BenchScene, Plan, CarriedOut]:
+    """A plan for a belief that is the truth, as the bench carries it out."""
+    scene = bench_scene(seed)
+    plan = three_two_one(about(scene, 0.0), scene.part, scene.peg)
+    return scene, plan, scene.carried_out(plan)[0]
+
+
+SEEDS = (5, 7, 11)  # a square and a D-shaped hole in blocks, a round tray
+
+
+@functools.cache
+def gaps(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """The gap to the true part of the commanded peg, and of where the peg truly was."""
+    scene, _, motion = carried(seed)
+    gap, truth = PegGap(scene.part, scene.peg), torch.from_numpy(scene.truth)[None]
+    found = [gap(truth, torch.from_numpy(path)) for path in (motion.probe.command, motion.world_from_peg)]
+    return found[0].distance[0].numpy(), found[1].distance[0].numpy()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_free_motion_touches_the_part_and_every_guarded_one_does(seed: int) -> None:
+    _, plan, motion = carried(seed)
+    commanded, _ = gaps(seed)
+    times, pressed, released = motion.probe.command_times, 0, -1.0
+    assert plan.manners.count("guarded") == 3
+    for k, manner in enumerate(plan.manners):
+        begin, end = plan.times[k], plan.times[k + 1]
+        if manner == "free":
+            # What was pressed on is let go of within 80 ms: the command's corners are rounded over 40.
+            during = (times > max(begin, released + 0.08)) & (times < end)
+            assert commanded[during].min(initial=1.0) > 0.0, k
+        else:
+            released = end
+        if manner == "guarded":
+            during = (times > begin) & (times < plan.times[k + 2])
+            assert commanded[during].min() < -0.0005 and plan.manners[k + 1] == "held"
+            pressed += 1
+    assert pressed == 3 and motion.stops
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_first_contact_is_near_3_s_and_the_plan_ends_at_6(seed: int) -> None:
+    scene, plan, motion = carried(seed)
+    _, truly = gaps(seed)
+    assert plan.times[-1] == pytest.approx(Pace().last) and plan.times[0] == 0.0
+    assert abs(motion.probe.stamps[np.argmax(truly < 0.0)] - Pace().first) < 0.1
+    assert truly.min() > -0.0003  # nothing is pressed farther in than steel would let it
+    # It is felt on the top, on one side and on the next: three directions of the part's frame.
+    turn = poses.rotation_matrix(torch.from_numpy(scene.truth)).numpy()
+    held = poses.rotation_matrix(torch.from_numpy(motion.world_from_peg)).numpy()
+    along = ((held @ motion.wrench[:, :3, None])[..., 0] @ turn)[truly < 0.0]
+    strong = along[np.linalg.norm(along, axis=1) > 1.0]
+    assert (np.eye(3)[np.abs(strong).argmax(axis=1)].sum(axis=0) >= 5).all()
+
+
+def test_strokes_are_as_long_as_the_belief_is_unsure() -> None:
+    scene, lengths = bench_scene(2), []
+    for spread in (0.0, 0.0012, 0.02):
+        plan = three_two_one(about(scene, spread), scene.part, scene.peg)
+        strokes = [k for k, manner in enumerate(plan.manners) if manner == "guarded"]
+        ways = np.linalg.norm(np.diff(plan.world_from_peg[:, :3], axis=0)[strokes], axis=1)
+        lengths.append((ways.min(), ways.max()))
+    shortest, longest = 2 * Pace().shortest, 2 * Pace().longest
+    assert lengths[0] == pytest.approx((shortest, shortest))
+    assert lengths[2] == pytest.approx((longest, longest))
+    assert shortest < lengths[1][1] < longest
+
+
+def test_a_part_with_no_room_on_top_is_refused() -> None:
+    belief = Belief(poses.identity(3), torch.zeros(3, dtype=torch.float64))
+    with pytest.raises(InputError, match="no room for a peg") as caught:
+        three_two_one(belief, block((0.01, 0.01, 0.02)), box_peg(0.03, 0.05))
+    assert_one_sentence(str(caught.value))
