@@ -21,13 +21,14 @@ from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
-from bcppl.inference import guided_smc, tempered_smc
+from bcppl.inference import tempered_smc
 from bcppl.inference.guided_smc import infer, kernel
 from bcppl.inference.population import Population
 from bcppl.inference.probing.metrology import three_two_one
 from bcppl.inference.resampling import never
 from bcppl.inference.smc import smc
 from bcppl.inference.smcp3 import Pair, smcp3
+from bcppl.inference.targets import POSTERIOR
 from bcppl.models import look_and_touch
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.poses import Freedom
@@ -244,7 +245,7 @@ def test_moves_leave_the_exact_posterior_as_it_is() -> None:
     drawn = conditional(trace, 3, 1.0).sample((2000,))
     population = Population(trace.at({"part": drawn}), torch.zeros(2000, dtype=torch.float64))
     move = kernel("part", [functools.partial(there, wider=1.5)])(population)
-    moved, _ = move(population.trace, guided_smc.POSTERIOR)
+    moved, _ = move(population.trace, POSTERIOR)
     for power in (1, 2):
         before, after = (t["part"][:, :3] ** power for t in (trace.at({"part": drawn}), moved))
         error = (before.var(dim=0) / 2000 + after.var(dim=0) / 2000).sqrt()

@@ -169,7 +169,8 @@ def test_a_step_of_gauss_and_newton_leads_to_the_truth() -> None:
     value = torch.cat([poses.compose(turn, peg), torch.ones(6, 1).double()], dim=1)
     pose = poses.retract(turn, torch.tensor([[8e-4, -5e-4, 6e-4, 0.01, -0.008, 0.012]]).double())
     for blur in (0.001, 0.0003, 0.0, 0.0, 0.0, 0.0):
-        said = manifold(gap, pose, 6).quadratic(value, blur)
+        noise, shared = math.hypot(NOISE, blur), math.hypot(SHARED, blur)
+        said = ContactManifold(gap, pose, 6, noise, shared, SINK, OUTLIER).quadratic(value)
         ridge = torch.diag(torch.tensor([1e4] * 3 + [1e1] * 3).double())
         pose = poses.retract(pose, -torch.linalg.solve(said.information + ridge, said.slope))
     off = poses.local(turn, pose)[0]
