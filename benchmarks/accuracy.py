@@ -87,6 +87,7 @@ def per_scene(found: Sequence[Probed]) -> None:
         *NAMES[1:],
         *[f"{stage} s" for stage in STAGES],
         "tempered",
+        "warned",
         "in 50/90 %",
     ]
 
@@ -100,10 +101,12 @@ def per_scene(found: Sequence[Probed]) -> None:
     def inside(one: Probed) -> str:
         return " ".join("/".join("yn"[not one.held(END, r, m)] for m in MASSES) for r in REGIONS)
 
-    lines: list[list[Any]] = [[one.name, *numbers(one), one.tempered, inside(one)] for one in found]
+    lines: list[list[Any]] = [
+        [one.name, *numbers(one), one.tempered, "yes" if one.warned else "no", inside(one)] for one in found
+    ]
     table = np.array([numbers(one) for one in found])
     for name, level in (("median", 0.5), ("90 %", 0.9)):
-        lines.append([name, *[quantile(column, level) for column in table.T], "", ""])
+        lines.append([name, *[quantile(column, level) for column in table.T], "", "", ""])
     show(
         f"scenes: mm and degrees; the truth in the regions of {', '.join(REGIONS)}",
         ["", *columns],
@@ -160,6 +163,7 @@ def rows_of(found: Sequence[Probed], alone: bool) -> list[Row]:
             for name, level in (("median", 0.5), ("90 %", 0.9)):
                 said = f"{WORDS[what]}, {'after' if moment == VISION else 'at'} {moment}, {name}"
                 rows.append(Row(said, quantile(values, level), UNITS[what]))
+    rows.append(Row("scenes with a warning", sum(one.warned for one in found), "scenes"))
     wall = [one.wall for one in found if not one.missed]
     rows.append(Row("wall of a scene, median", quantile(wall, 0.5), "s", 6.0 if alone else None))
     for stage in STAGES:

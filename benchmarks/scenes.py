@@ -35,6 +35,7 @@ from bcppl.beliefs.regions import (
     rotation_deviation,
     translation_deviation,
 )
+from bcppl.cli.surprises import MARK, Watch
 from bcppl.inference.guided_smc import guided, kernel
 from bcppl.inference.probing.metrology import three_two_one
 from bcppl.inference.smc import Step, smc
@@ -99,6 +100,7 @@ class Probed:
         seconds: wall time of "vision", "planning" and "touch".
         efforts: by simulator, wall time (s) and what it made (images or gaps).
         tempered: how many measurements were let in by tempering.
+        warned: whether a run would have said that a measurement does not fit (`bcppl.cli.surprises`).
         memory: most that the process ever held, GB.
     """
 
@@ -112,6 +114,7 @@ class Probed:
     seconds: dict[str, float] = field(default_factory=dict)
     efforts: dict[str, tuple[float, int]] = field(default_factory=dict)
     tempered: int = 0
+    warned: bool = False
     memory: float = math.nan
 
     @property
@@ -178,11 +181,7 @@ def regions_of(belief: Belief, scene: BenchScene) -> dict[tuple[str, float], boo
 
 
 def taken_in(
-    recording: Recording,
-    particles: int,
-    seed: int,
-    scene: Any = None,
-    start: Step | None = None,
+    recording: Recording, particles: int, seed: int, scene: Any = None, start: Step | None = None
 ) -> Iterator[Step]:
     """As `bcppl.inference.guided_smc.infer` with its defaults, and able to go on from a step."""
     assert model.arrival is not None
@@ -229,8 +228,11 @@ def followed(
                 steps.append(step)
     except Exception as error:
         found.missed = one_line(error)
-    if steps:
-        judge(found, steps, scene)
+    try:
+        if steps:
+            judge(found, steps, scene)
+    except Exception as error:
+        found.missed = found.missed or one_line(error)
     return found, steps, recording
 
 
@@ -249,6 +251,9 @@ def judge(found: Probed, steps: Sequence[Step], scene: BenchScene) -> None:
         found.moments[name] = moment_of(step.belief, scene)
         if name in (VISION, END):
             found.holds[name] = regions_of(step.belief, scene)
+    watch = Watch()
+    marked = [watch.cell(step).endswith(MARK) for step in steps]
+    found.warned = any(marked) or watch.warning(steps[-1]) is not None
     found.memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
         1e6 if sys.platform != "darwin" else 1e9
     )
