@@ -86,7 +86,9 @@ def of_world(name: str, seeds: Sequence[int], particles: int, jobs: int) -> list
     far = [one for one in found if not one.held(END, "ADD-radius", 0.9) and one.at(END).add > 2.0]
     rows.append(Row(f"{name}: outside the 90 % ADD-radius and over 2 mm off", len(far), "scenes"))
     silent = sum(not one.warned for one in far)
-    rows.append(Row(f"{name}: the same, and no measurement was said not to fit", silent, "scenes", 0.0))
+    rows.append(
+        Row(f"{name}: outside the 90 % ADD-radius, over 2 mm off, without a warning", silent, "scenes", 0.0)
+    )
     rows.append(Row(f"{name}: scenes with a warning", sum(one.warned for one in found), "scenes"))
     rows.append(Row(f"{name}: scenes missed", sum(bool(one.missed) for one in found), "scenes"))
     for one in far:
