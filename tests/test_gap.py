@@ -147,7 +147,8 @@ def test_it_is_mujocos_contact_distance_between_boxes() -> None:
     assert np.all(np.sign(ours[clear]) == np.sign(others[clear])) and 10 < (others < 0).sum() < 50
     share = (ours / others)[clear & (others < 0)]
     assert (np.abs(share - 1.0) < 0.01).mean() > 0.8 and share.max() < 1.02
-    assert np.all(ours[clear & (others > 0)] < others[clear & (others > 0)] + 1e-5)
+    beside_it = clear & (others > 0) & (others < 0.0015)  # farther off edges are not looked at
+    assert beside_it.sum() > 5 and np.all(ours[beside_it] < others[beside_it] + 1e-5)
 
 
 @pytest.mark.parametrize("name", ["round tray", "rectangular tray", "hexagon 12 mm", "D 10 mm"])
