@@ -133,8 +133,8 @@ def test_evidence_is_unbiased_and_a_way_back_to_elsewhere_costs_it() -> None:
 
 
 def test_the_whole_step_agrees_with_tempering_and_with_the_truth() -> None:
-    guided = [list(infer(toy(*WIDER), RECORDING, particles=60, seed=s))[-1] for s in range(4)]
-    tempered = list(tempered_smc.infer(toy(), RECORDING, particles=60, seed=0))[-1]
+    guided = [list(infer(toy(*WIDER), RECORDING, particles=60, seed=s))[-1] for s in range(3)]
+    tempered = list(tempered_smc.infer(toy(), RECORDING, particles=40, seed=0))[-1]
     assert abs(np.mean([run.info.log_evidence for run in guided]) - evidence()) < 0.3
     assert tempered.info.log_evidence == pytest.approx(evidence(), abs=2.0)
     means = torch.stack([run.belief.mean[:3] for run in guided]).mean(dim=0)
