@@ -62,8 +62,9 @@ def guided(
         moves: of every particle after each step.
         sweeps: how many of them.
         share: particles are resampled below this effective sample size, as a share of N.
-        few, tries: the pair is run with so many copies of each particle, one number after the other, until
-            it leaves more than `few` effective, as a share of N; N of all are kept.
+        few: so many are to be left effective by the pair, as a share of N.
+        tries: it is run with so many copies of each particle, one number after the other, until they are; N
+            of all are kept.
         least: where even then fewer are left effective, as a share of N, the measurement is tempered in.
     """
     by_pair = smcp3(pair, resample=never)
@@ -78,7 +79,7 @@ def guided(
             return None
 
     def as_expected(population: Population, observed: Observed) -> Population | None:
-        """The particles as they are, where all had to expect the measurement and no latent value comes along."""
+        """The particles as they are, where all had to expect the measurement and nothing latent comes."""
         longer, gained = extend(population.trace, *observed)
         if len(longer.choices) > len(population.trace.choices):
             return None
@@ -157,7 +158,7 @@ def infer(
     share = number_within("particles are to be resampled below a share of {}", share, least=0.0, most=1.0)
     if model.arrival is None:
         raise InputError(
-            "guided SMC is given a model without programs by which measurements arrive; give it an `arrival`, "
+            "guided SMC is given a model without programs that take measurements in; give it an `arrival`, "
             "or use bcppl.inference.tempered_smc."
         )
     step = guided(Pair(*model.arrival), kernel(model.pose, model.proposals), sweeps=sweeps, share=share)

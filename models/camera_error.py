@@ -131,7 +131,7 @@ def farther(camera: Camera, part: Tensor, bias: Tensor) -> Tensor:
     return torch.cat([moved, part[..., 3:]], dim=-1)
 
 
-def given_seen(scene: Scene, looks: Mapping[str, tuple[Camera, Tensor, Tensor]]) -> NormalPose:
+def given_seen(scene: Any, looks: Mapping[str, tuple[Camera, Tensor, Tensor]]) -> NormalPose:
     """Nearly the conditional of the part's pose, given where cameras see it and their biases, by instrument.
 
     The product of the densities of `seen_by_*`, each taken as normal in the tangent space about the product's

@@ -8,9 +8,10 @@ millimetre. Where the wrench says that the peg felt the part it has no gap to it
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pyro
@@ -23,6 +24,7 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import FittedNormal, fitted_normal
 from bcppl.distributions.manifold import ContactManifold, MeasuresGap
+from bcppl.distributions.manifold_fit import Normal, Told, Window, told_by
 from bcppl.distributions.mixture import MixturePose
 from bcppl.distributions.poses import NormalPose, prior_from_guess
 from bcppl.errors import InputError
@@ -31,7 +33,7 @@ from bcppl.models.camera_error import Look, farther
 from bcppl.recordings.measurements import DepthImage, Measurement, ProbeWindow, Recording, Touch, View
 from bcppl.simulators.camera import Camera, bin_depth
 from bcppl.simulators.effort import Effort
-from bcppl.simulators.gap import Gap, PegGap
+from bcppl.simulators.gap import PegGap
 from bcppl.simulators.region import region_of
 from bcppl.simulators.renderer import DepthRenderer
 from bcppl.simulators.sensing.felt import Felt
@@ -39,15 +41,12 @@ from bcppl.simulators.stated_cameras import apparent_covariance, seen_elsewhere
 from bcppl.simulators.wrench import Sensing
 from bcppl.traces import Model, Trace
 
-
 # How proposals are widened, in deviations, and how often.
 WIDTHS = torch.tensor([1.1, 3.0], dtype=torch.float64)
 SHARES = torch.tensor([0.85, 0.15], dtype=torch.float64)
-# What an image says of where it sees the part is taken for no surer than this: metres, radians, metres of bias.
+# What an image says is taken for no surer than this: metres, radians, metres of bias.
 SHARPEST = torch.tensor([5e-5] * 3 + [1e-3] * 3 + [1e-4], dtype=torch.float64)
-BLURS = (0.003, 0.002, 0.001, 0.0005, 0.0002, 0.0, 0.0, 0.0)  # m that Gauss-Newton adds to errors
 NEAR = 0.02  # m: a window in which the peg stays farther off says nothing
-SHARES_OF_STEP = torch.tensor([0.0, 0.1, 0.3, 0.6, 1.0], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -62,6 +61,7 @@ class Settings(camera_error.Settings):
         gap_outlier: the probability that a stamp, or a window's contacts, are something else.
         every: so many stamps apart the peg's pose counts.
         felt: from which force on there is a contact.
+        free_space: whether it counts that the part is not where the peg moved freely.
     """
 
     bins: int = 1
@@ -72,19 +72,12 @@ class Settings(camera_error.Settings):
     gap_outlier: float = 0.001
     every: int = 5
     felt: Felt = field(default_factory=Felt)
+    free_space: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
         number_within("look_and_touch is given gap_noise {}", self.gap_noise, above=0.0)
         whole_number("look_and_touch is given every {}", self.every)
-
-
-class Told(NamedTuple):
-    """What touches say of the part's pose to second order around a pose (7,): slope (6,), information (6, 6)."""
-
-    around: Tensor
-    slope: Tensor
-    information: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +133,7 @@ def look_and_touch(scene: Scene, actions: Sequence[View | ProbeWindow]) -> None:
 
 
 def image_of(scene: Scene, camera: Camera, there: Tensor, bias: Tensor | float) -> RobustDepth:
-    """What a camera with a bias (N,) makes of a part that stands at `there` (N, 7) if it is taken by its word."""
+    """What a camera with a bias (N,) makes of a part at `there` (N, 7), taken by its word."""
     settings = scene.settings
     return RobustDepth(
         scene.renderer,
@@ -156,14 +149,14 @@ def image_of(scene: Scene, camera: Camera, there: Tensor, bias: Tensor | float) 
 def touch_of(
     scene: Scene, window: ProbeWindow, part: Tensor, blur: float = 0.0, gap: MeasuresGap | None = None
 ) -> ContactManifold:
-    """What a window says of parts at poses (N, 7), or would with common errors `blur` metres wider."""
+    """What a window says of parts at poses (N, 7), or would with errors `blur` metres wider."""
     settings, measures = scene.settings, scene.gap if gap is None else gap
     assert measures is not None
     return ContactManifold(
         measures,
         part,
         len(range(window.first, window.last, settings.every)),
-        settings.gap_noise,
+        math.hypot(settings.gap_noise, blur),
         math.hypot(settings.gap_shared, blur),
         settings.sink,
         settings.gap_outlier,
@@ -218,102 +211,27 @@ def widened(center: Tensor, covariance: Tensor) -> MixturePose:
 def told_by_touches(
     scene: Scene, actions: Sequence[View | ProbeWindow], observations: Mapping[str, Tensor]
 ) -> Told:
-    """What touches say around where they and the images place the part: Gauss-Newton on the gaps.
-
-    It starts from where the images place it, at first with errors of millimetres. It hangs on what was
-    observed and on no particle.
-    """
+    """What touches say around where they and the images place the part: it hangs on no particle."""
     if len(actions) in scene.told:
         return scene.told[len(actions)]
-    center, precision = placed_by_images(scene, actions)
-    touches = Touches.of(scene, actions, observations, center)
+    assert scene.gap is not None
+    known, windows = placed_by_images(scene, actions), []
+    for k, action in enumerate(actions):
+        if isinstance(action, ProbeWindow):
+            value = observations[f"touch_{k}"]
+            if f"touch_{k}" not in scene.near:
+                distance = scene.gap(known.center, value[:, :7]).distance
+                scene.near[f"touch_{k}"] = bool((distance < NEAR).any())
+            if scene.near[f"touch_{k}"]:
+                windows.append(Window(value, partial(touch_of, scene, action)))
     latest = max(scene.told, default=None)
-    starts = [center] if latest is None else [center, scene.told[latest].around[None]]
-    found = [touches.fitted(start, center, precision) for start in starts]
-    pose, _ = max(found, key=lambda fit: fit[1])
-    slope, information = touches.pull(pose, 0.0)
-    scene.told[len(actions)] = Told(pose[0], slope[0], information[0])
+    before = None if latest is None else scene.told[latest].around[None]
+    scene.told[len(actions)] = told_by(scene.gap, windows, known, before)
     return scene.told[len(actions)]
 
 
-class Touches(NamedTuple):
-    """The windows of probes near enough to the part to say something, looked at together.
-
-    Attributes:
-        scene: measures gaps.
-        windows: what each says, (T, 8), and where its stamps stand among all.
-        stamps: (S, 7) the peg's poses at all of their stamps.
-    """
-
-    scene: Scene
-    windows: Sequence[tuple[ProbeWindow, Tensor, slice]]
-    stamps: Tensor
-
-    @classmethod
-    def of(
-        cls,
-        scene: Scene,
-        actions: Sequence[View | ProbeWindow],
-        observations: Mapping[str, Tensor],
-        center: Tensor,
-    ) -> Touches:
-        """Those near a part at a pose (1, 7)."""
-        assert scene.gap is not None
-        windows: list[tuple[ProbeWindow, Tensor, slice]] = []
-        begin = 0
-        for k, action in enumerate(actions):
-            if isinstance(action, ProbeWindow):
-                said = observations[f"touch_{k}"]
-                if f"near_{k}" not in scene.near:
-                    scene.near[f"near_{k}"] = bool((scene.gap(center, said[:, :7]).distance < NEAR).any())
-                if scene.near[f"near_{k}"]:
-                    windows.append((action, said, slice(begin, begin + len(said))))
-                    begin += len(said)
-        stamps = [said[:, :7] for _, said, _ in windows]
-        return cls(scene, windows, torch.cat(stamps) if stamps else torch.empty(0, 7, dtype=torch.float64))
-
-    def fitted(self, start: Tensor, center: Tensor, precision: Tensor) -> tuple[Tensor, float]:
-        """The pose (1, 7) to which Gauss-Newton leads from a start (1, 7), and its log-probability.
-
-        Args:
-            start: (1, 7).
-            center, precision: (1, 7) and (1, 6, 6) of what is known beside the touches.
-        """
-        pose, said = start, 0.0
-        for blur in BLURS:
-            slope, information = self.pull(pose, blur)
-            pull = (precision @ poses.local(pose, center)[..., None])[..., 0] - slope
-            step = torch.linalg.solve(precision + information, pull[..., None])[..., 0]
-            # Which corner touches changes on the way: so far and no farther than it gains.
-            tried = poses.retract(pose, SHARES_OF_STEP[:, None] * step)
-            away = poses.local(center, tried)
-            total = -0.5 * ((away @ precision[0]) * away).sum(dim=-1)
-            for window, value in self._sites(tried, blur):
-                total = total + window.log_prob(value)
-            pose, said = tried[total.argmax()][None], float(total.max())
-        return pose, said
-
-    def pull(self, pose: Tensor, blur: float) -> tuple[Tensor, Tensor]:
-        """Slope (1, 6) and curvature (1, 6, 6) of minus the log-likelihood of all at a pose (1, 7)."""
-        slope = torch.zeros(1, 6, dtype=torch.float64)
-        information = torch.zeros(1, 6, 6, dtype=torch.float64)
-        for window, value in self._sites(pose, blur):
-            said = window.quadratic(value, blur)
-            slope, information = slope + said.slope, information + said.information
-        return slope, information
-
-    def _sites(self, pose: Tensor, blur: float) -> Iterator[tuple[ContactManifold, Tensor]]:
-        if self.windows:
-            assert self.scene.gap is not None
-            gaps = self.scene.gap(pose, self.stamps)
-            for action, value, rows in self.windows:
-                told = ~torch.isnan(value[:, 7])
-                known = Gap(*(each[:, rows][:, told] for each in gaps))
-                yield touch_of(self.scene, action, pose, blur, lambda part, peg, known=known: known), value
-
-
-def placed_by_images(scene: Scene, actions: Sequence[View | ProbeWindow]) -> tuple[Tensor, Tensor]:
-    """Where the images' fits place the part (1, 7), and how surely, (1, 6, 6); the prior where there is none."""
+def placed_by_images(scene: Scene, actions: Sequence[View | ProbeWindow]) -> Normal:
+    """Where the images' fits place the part, and how surely; the prior where there is none."""
     looks: dict[str, tuple[Camera, Tensor, Tensor]] = {}
     for k, action in enumerate(actions):
         if isinstance(action, View) and f"depth_{k}" in scene.fits:
@@ -323,9 +241,9 @@ def placed_by_images(scene: Scene, actions: Sequence[View | ProbeWindow]) -> tup
             looks.setdefault(action.camera.instrument, (camera, seen, mean[6:]))
     if not looks:
         expected = normal_like(scene.prior)
-        return expected.center[None], torch.linalg.inv(expected.covariance)[None]
+        return Normal(expected.center[None], torch.linalg.inv(expected.covariance)[None])
     said = camera_error.given_seen(scene, looks)
-    return said.center, torch.linalg.inv(said.covariance)
+    return Normal(said.center, torch.linalg.inv(said.covariance))
 
 
 def allowed(prior: Any, there: Tensor) -> Tensor:
@@ -406,7 +324,9 @@ def seen_in(scene: Scene, view: Camera, address: str, image: Tensor) -> FittedNo
 
         spread = normal_like(prior).covariance.diagonal().sqrt()
         bias = torch.tensor([scene.settings.bias], dtype=torch.float64)
-        scene.fits[address] = fitted_normal(log_density, torch.cat([spread, bias]), SHARPEST)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)  # a scene that is used again gives the same beliefs
+            scene.fits[address] = fitted_normal(log_density, torch.cat([spread, bias]), SHARPEST)
     return scene.fits[address]
 
 
@@ -470,6 +390,8 @@ def observe(scene: Scene, measurements: Sequence[Measurement]) -> Mapping[str, T
         assert scene.sensing is not None
         tared = scene.sensing.tared([touch for _, touch in windows])
         flags = scene.settings.felt(torch.cat(tared)[:, :3], accelerations(measurements, windows))
+        if not scene.settings.free_space:
+            flags = torch.where(flags == 0.0, torch.nan, flags)
         begin = 0
         for (k, touch), wrench in zip(windows, tared, strict=True):
             mine = flags[begin : begin + len(wrench), None]
@@ -495,10 +417,10 @@ def accelerations(measurements: Sequence[Measurement], windows: Sequence[tuple[i
 
 
 def invent(seed: int, **options: Any) -> Recording:
-    """A part with a hole on a bench, seen and probed: see `bcppl.models.worlds.bench`."""
-    from bcppl.models.worlds.bench import record
+    """A part on a bench, seen by two cameras and not yet touched: see `bcppl.models.worlds.bench`."""
+    from bcppl.models.worlds.bench import bench_scene
 
-    return record(seed, **options)
+    return bench_scene(seed, **options).look()
 
 
 model = Model(

@@ -50,7 +50,13 @@ def run(
     model: Annotated[
         str | None, typer.Option(help="A model's name or file; by default the one the recording names.")
     ] = None,
-    inference: Annotated[str, typer.Option(help="An inference program's name or file.")] = "tempered_smc",
+    inference: Annotated[
+        str | None,
+        typer.Option(
+            help="An inference program's name or file; by default guided_smc for models with programs that "
+            "take measurements in, tempered_smc for others."
+        ),
+    ] = None,
     particles: Annotated[int, typer.Option(help="How many particles.")] = 75,
     seed: Annotated[int, typer.Option(help="Same seed, same belief, bit for bit.")] = 0,
     out: Annotated[
@@ -63,6 +69,7 @@ def run(
     loading.refuse_seed(seed)
     found = loading.recording(recording)
     chosen = loading.model(model or found.model)
+    inference = inference or ("tempered_smc" if chosen.arrival is None else "guided_smc")
     infer = loading.inference(inference)
     try:
         inspect.signature(infer).bind(chosen, found, particles=particles, seed=seed, scene=None)

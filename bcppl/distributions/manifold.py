@@ -31,7 +31,8 @@ class Gaps(Protocol):
 class MeasuresGap(Protocol):
     """`bcppl.simulators.gap.PegGap`, or what answers alike."""
 
-    def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gaps: ...
+    def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gaps:  # noqa: D102
+        ...
 
 
 class Quadratic(NamedTuple):
@@ -109,20 +110,21 @@ class ContactManifold(LazyDistribution):
             distance[:, felt[told] == 0.0]
         )
 
-    def quadratic(self, value: Tensor, blur: float = 0.0) -> Quadratic:
-        """The log-likelihood of a window (T, 8) to second order, errors `blur` metres wider.
+    def quadratic(self, value: Tensor) -> Quadratic:
+        """The log-likelihood of a window (T, 8) to second order.
 
         Stamps with contact that are off by many standard deviations count for little.
         """
         poses, felt = self._read(value)
         told = ~torch.isnan(felt)
         if not bool(told.any()):
-            return Quadratic(self.pose.new_zeros(len(self.pose), 6), self.pose.new_zeros(len(self.pose), 6, 6))
+            count = len(self.pose)
+            return Quadratic(self.pose.new_zeros(count, 6), self.pose.new_zeros(count, 6, 6))
         gaps = self.gap(self.pose, poses[told])
         slope, touching = gaps.slope(self.pose), felt[told] == 1.0
         error, rows = gaps.distance[:, touching] + self.sink, slope[:, touching]
         # The common error takes the mean of a window's contacts part of its weight.
-        variance, common = self.noise**2, self.shared**2 + blur**2
+        variance, common = self.noise**2, self.shared**2
         count = int(touching.sum())
         share = common / (variance + count * common) if count else 0.0
         # What is far off, seen as wide as the errors are taken to be, hardly pulls.
@@ -131,7 +133,7 @@ class ContactManifold(LazyDistribution):
         weighed = (rows - share * rows.sum(dim=1, keepdim=True)) / variance
         pull = (weighed * error[..., None]).sum(dim=1)
         information = weighed.transpose(-1, -2) @ rows
-        spread = math.sqrt(variance + self.shared**2 + blur**2)
+        spread = math.hypot(self.noise, self.shared)
         score, free = gaps.distance[:, ~touching] / spread, slope[:, ~touching] / spread
         hazard = torch.exp(-0.5 * score**2 - 0.5 * math.log(2.0 * math.pi) - log_ndtr(score))
         pull = pull - (hazard[..., None] * free).sum(dim=1)
@@ -163,7 +165,7 @@ class ContactManifold(LazyDistribution):
         if tuple(value.shape) != tuple(self.event_shape):
             raise InputError(
                 f"ContactManifold looks at {self.event_shape[0]} stamps but its observation has shape "
-                f"{tuple(value.shape)}; give ({self.event_shape[0]}, 8): peg pose, and whether it felt contact."
+                f"{tuple(value.shape)}; give ({self.event_shape[0]}, 8): peg pose, and whether it felt it."
             )
         return value[:, :7], value[:, 7]
 

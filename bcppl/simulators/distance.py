@@ -94,7 +94,7 @@ class SignedDistance:
         )
 
     def _pseudonormals(self, face: Faces, closest: Array) -> Array:
-        """The mesh's normals (P, 3) at points of it: of a face, or where two or more meet, the mean of theirs."""
+        """The normals (P, 3) at points of the mesh: of a face, or the mean of those that meet there."""
         corners = self._vertices[self._faces[face]]
         opposite = corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]]
         across = np.cross(opposite, closest[:, None] - corners[:, [1, 2, 0]])

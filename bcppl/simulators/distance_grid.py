@@ -71,10 +71,8 @@ def looked_up(
 
 
 @compiled
-def sloped(
-    point: Array, low: Array, spacing: float, distance: npt.NDArray[np.float32], slope: Array
-) -> bool:
-    """Whether one plane alone is nearest around a point; `slope` (3,) becomes the distance's gradient there."""
+def sloped(point: Array, low: Array, spacing: float, distance: npt.NDArray[np.float32], slope: Array) -> bool:
+    """Whether one plane alone is nearest around a point; `slope` (3,) becomes the gradient there."""
     cell, share = np.empty(3, np.int64), np.empty(3)
     for axis in range(3):
         at = min(max((point[axis] - low[axis]) / spacing, 0.0), distance.shape[axis] - 1.000001)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -59,8 +60,8 @@ def section(part: Part, height: float) -> shapely.Polygon:
 def spots_on_top(part: Part, peg: Part, margin: float) -> Array:
     """Three spots (3, 2) on a part's top, far apart, between which a peg can slide on it, in that order.
 
-    The peg's whole cross section stays on the top, `margin` metres from its outer edge where there is room for
-    so much, and 2 mm from holes. Of all such triples of candidates, the one whose triangle is largest.
+    The peg's whole cross section stays on the top, `margin` metres from its outer edge where there is room
+    for so much, and 2 mm from holes. Of all such triples of candidates, the one whose triangle is largest.
 
     Raises:
         InputError: the top has no room for the peg.
@@ -102,7 +103,7 @@ def sides(part: Part, height: float) -> list[Side]:
     ring = shapely.geometry.polygon.orient(section(part, height).convex_hull).exterior
     corners = np.asarray(shapely.simplify(ring, 1e-4).coords)
     found = []
-    for start, stop in zip(corners[:-1], corners[1:], strict=True):
+    for start, stop in pairwise(corners):
         along = (stop - start) / np.linalg.norm(stop - start)
         found.append(Side(start, stop, np.array([along[1], -along[0]])))
     return sorted(found, key=lambda side: -side.length)

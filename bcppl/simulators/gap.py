@@ -1,7 +1,7 @@
 """How far a held peg is from a part, for many poses of the part: nothing is simulated.
 
-Where a peg stood when it felt something, or nothing, is known from the robot's joints. What a pose of the part
-makes of that is a distance: it should be about zero where contact was felt and positive elsewhere.
+Where a peg stood when it felt something, or nothing, is known from the robot's joints. What a pose of the
+part makes of that is a distance: about zero where contact was felt and positive elsewhere.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ Numbers = npt.NDArray[np.int64]
 _RUN = 0.008  # m of an edge that are passed over together
 _ROUNDS = 12
 _EXACT = 1e-8  # m
+_CANCELLED = 0.1
 _NEAR = 0.002  # m: nearer than this, edges count, and what the grid cannot tell is measured exactly
 _SHARP = np.radians(5.0)
 _FLAT = 1e-9
@@ -93,6 +94,7 @@ class PegGap:
         with self.effort.measure(items=particles * stamps):
             if self._grid is None:
                 self._grid = distance_grid(self.part, self._signed, _MARGIN)
+            grid = self._grid
             part = _frames(world_from_part)
             peg = _frames(world_from_peg)
             distance = np.empty((particles, stamps))
@@ -106,7 +108,9 @@ class PegGap:
                     *part,
                     *peg,
                     self._corners,
-                    *self._grid_arrays,
+                    grid.low,
+                    grid.spacing,
+                    grid.distance,
                     self._edges,
                     self._balls,
                     self._planes,
@@ -123,11 +127,6 @@ class PegGap:
             distance[rounded] = exact.distance.numpy()
             normal[rounded] = exact.normal.numpy()
         return Gap(torch.from_numpy(distance), torch.from_numpy(place), torch.from_numpy(normal))
-
-    @property
-    def _grid_arrays(self) -> tuple[Array, float, npt.NDArray[np.float32]]:
-        assert self._grid is not None
-        return self._grid.low, self._grid.spacing, self._grid.distance
 
 
 def _frames(pose: Tensor) -> tuple[Array, Array]:
@@ -274,7 +273,8 @@ def _deepest(start: Array, stop: Array, planes: Array, least: float, normal: Arr
     them: the distance is along the normal of both edges, a mixture of the planes' normals.
 
     Args:
-        start, stop: (3,) its ends in the peg's frame.
+        start: (3,) its one end in the peg's frame.
+        stop: (3,) the other.
         planes: (P, 4) of the solid.
         least: what it must be less than to matter.
         normal: (3,) becomes the solid's outward unit normal there.
@@ -282,15 +282,15 @@ def _deepest(start: Array, stop: Array, planes: Array, least: float, normal: Arr
     Returns:
         The distance, negative inside, or one of at least `least`; where on the stretch, from 0 to 1.
     """
-    step = stop - start
+    step: Array = stop - start
     low, high = 0.0, 1.0
     at_low, plane_low = _out(start, planes)
-    slope_low = planes[plane_low, :3] @ step
+    slope_low = float(planes[plane_low, :3] @ step)
     if slope_low >= 0.0:
         normal[:] = planes[plane_low, :3]
         return at_low, low
     at_high, plane_high = _out(stop, planes)
-    slope_high = planes[plane_high, :3] @ step
+    slope_high = float(planes[plane_high, :3] @ step)
     if slope_high <= 0.0:
         normal[:] = planes[plane_high, :3]
         return at_high, high
@@ -299,13 +299,13 @@ def _deepest(start: Array, stop: Array, planes: Array, least: float, normal: Arr
         share = (at_low - at_high + slope_high * high - slope_low * low) / (slope_high - slope_low)
         share = min(max(share, low), high)
         bound = at_low + slope_low * (share - low)
-        # Along a normal that leans the distance is longer than by either plane, at most as crossing edges are.
+        # Along a normal that leans the distance is only longer.
         if bound >= least and bound >= 0.0:
             return bound, share
         here, plane = _out(start + share * step, planes)
         if here <= bound + _EXACT:
             break
-        slope = planes[plane, :3] @ step
+        slope = float(planes[plane, :3] @ step)
         if slope < 0.0:
             low, at_low, slope_low, plane_low = share, here, slope, plane
         else:
@@ -313,6 +313,9 @@ def _deepest(start: Array, stop: Array, planes: Array, least: float, normal: Arr
     mixed = slope_high / (slope_high - slope_low)
     normal[:] = mixed * planes[plane_low, :3] + (1.0 - mixed) * planes[plane_high, :3]
     length = np.sqrt((normal * normal).sum())
+    if length < _CANCELLED:  # between opposite planes: the stretch crosses a thin solid
+        normal[:] = planes[plane_low, :3]
+        return bound, share
     normal /= length
     return bound / length, share
 

@@ -127,7 +127,13 @@ class _OnSide(NamedTuple):
         stroke = _stroke(belief, np.array([*middle, height]), normal, pace)
         inset = min(0.5 * face.length, reach + 0.5 * pace.longest)
         return cls(
-            face, height, (reach + stroke) * normal, (reach - stroke) * normal, pace.press * normal, inset, pace
+            face,
+            height,
+            (reach + stroke) * normal,
+            (reach - stroke) * normal,
+            pace.press * normal,
+            inset,
+            pace,
         )
 
     @property

@@ -84,7 +84,8 @@ def _equations(trace: Trace, address: str, felt: str) -> tuple[Equations, Tensor
         place = value.expand(len(pose), 3)[:, None]
         known = torch.isfinite(place).all(dim=-1)
         inside = poses.transform(poses.inverse(pose), torch.nan_to_num(place))
-        near = site.distance(inside)
+        measured: Any = getattr(site.distance, "distance", site.distance)  # of a part that is `Placed`
+        near = measured(inside)
         gap = near.distance + torch.as_tensor(site.offset, dtype=torch.float64).reshape(-1, 1)
         spread = torch.as_tensor(site.spread, dtype=torch.float64).reshape(-1, 1)
         precision = torch.where(known, 1.0 / spread**2, 0.0)
