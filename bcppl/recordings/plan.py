@@ -27,9 +27,9 @@ class Plan:
     stops where the force felt exceeds `force`; the way that was left then stays undone: "held" motions after
     it are made as planned but for that way, so a slide goes on along the surface that was met. A "free"
     motion leads to its knot as planned. "Searching" motions are held ones, made while the peg is pressed
-    on by a command that lies below a surface: once the peg has sunk by `sink` below where the last guarded
-    motion was stopped, along the commanded z, or if that met nothing, it has found a hole; the motion stops,
-    and the searching motions right after it stay undone.
+    on by a command that lies below a surface: once the peg has sunk by `sink` below where a guarded
+    motion was last stopped, along the commanded z, or if none was, it has found a hole; the motion stops, and
+    the searching motions right after it stay undone.
 
     Attributes:
         name: of the probe that comes of it.
