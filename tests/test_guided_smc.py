@@ -22,7 +22,7 @@ from bcppl.beliefs import Belief
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.inference import tempered_smc
-from bcppl.inference.guided_smc import infer, kernel
+from bcppl.inference.guided_smc import guided, infer, kernel
 from bcppl.inference.population import Population
 from bcppl.inference.probing.metrology import three_two_one
 from bcppl.inference.resampling import never
@@ -133,11 +133,11 @@ def test_evidence_is_unbiased_and_a_way_back_to_elsewhere_costs_it() -> None:
 
 
 def test_the_whole_step_agrees_with_tempering_and_with_the_truth() -> None:
-    guided = [list(infer(toy(*WIDER), RECORDING, particles=60, seed=s))[-1] for s in range(3)]
+    runs = [list(infer(toy(*WIDER), RECORDING, particles=60, seed=s))[-1] for s in range(3)]
     tempered = list(tempered_smc.infer(toy(), RECORDING, particles=40, seed=0))[-1]
-    assert abs(np.mean([run.info.log_evidence for run in guided]) - evidence()) < 0.3
+    assert abs(np.mean([run.info.log_evidence for run in runs]) - evidence()) < 0.3
     assert tempered.info.log_evidence == pytest.approx(evidence(), abs=2.0)
-    means = torch.stack([run.belief.mean[:3] for run in guided]).mean(dim=0)
+    means = torch.stack([run.belief.mean[:3] for run in runs]).mean(dim=0)
     assert float((means - tempered.belief.mean[:3]).abs().max()) < 0.0015
 
 
@@ -197,7 +197,8 @@ def test_the_same_seed_gives_the_same_belief_to_the_bit() -> None:
 def test_the_pair_leads_back_to_where_it_came_from() -> None:
     """`check` inverts every move and refuses one that does not: two cameras, then touches."""
     assert look_and_touch.model.arrival is not None
-    step = smcp3(Pair(*look_and_touch.model.arrival, check=True), resample=never)
+    pair = Pair(*look_and_touch.model.arrival, check=True)
+    step = guided(pair, kernel("part", look_and_touch.model.proposals))
     steps = list(smc(look_and_touch.model, some(VIEW, 1, 8, 13), step=step, particles=6, seed=0))
     assert len(steps) == 5 and all(math.isfinite(s.info.log_evidence) for s in steps)
 
