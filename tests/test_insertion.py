@@ -71,7 +71,6 @@ def test_the_hole_of_a_mesh_is_the_one_that_was_drawn(name: str) -> None:
     assert hole.depth == pytest.approx(kind.depth, abs=1e-6)
     tray = "tray" in name
     assert hole.chamfer == pytest.approx(0.001 if tray else 0.0, abs=1e-6) and hole.through == (not tray)
-    assert hole.round == ("round" in name)
     assert clearance_in(hole, kind.peg(0.0002)) == pytest.approx(0.0002, abs=1e-5)
 
 

@@ -45,12 +45,6 @@ class Hole:
     chamfer: float
     through: bool
 
-    @property
-    def round(self) -> bool:
-        """Whether a turn about its axis changes nothing, within 20 um."""
-        radii = np.linalg.norm(shapely.get_coordinates(self.outline), axis=1)
-        return bool(len(radii) > 16 and np.ptp(radii) < 2e-5)
-
 
 def hole_of(part: Part, inside: tuple[float, float] | None = None) -> Hole:
     """The hole in a part's top, from sections of its mesh between the levels at which it has corners.
