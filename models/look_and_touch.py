@@ -66,7 +66,7 @@ class Settings(camera_error.Settings):
 
     bins: int = 1
     temperature: float = 2.0
-    gap_noise: float = 0.00008
+    gap_noise: float = 0.00007
     gap_shared: float = 0.00003
     sink: float = 0.00002
     gap_outlier: float = 0.001
