@@ -291,9 +291,10 @@ def seen_before(trace: Trace, view: Camera, bias: Tensor) -> NormalPose | None:
     if before is scene.prior:
         return None
     settings, camera = scene.settings, scene.looks[view.name].camera
-    center, covariance = before.center, before.covariance
     if isinstance(before, MixturePose):
         center, covariance = before.components.center[:, 0], before.components.covariance[:, 0]
+    else:
+        center, covariance = before.center, before.covariance
     error = apparent_covariance(camera, center, settings.camera_shift, settings.camera_turn)
     return NormalPose(farther(camera, center, bias), covariance + error)
 

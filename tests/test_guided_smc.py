@@ -203,7 +203,6 @@ def test_the_pair_leads_back_to_where_it_came_from() -> None:
     assert len(steps) == 5 and all(math.isfinite(s.info.log_evidence) for s in steps)
 
 
-@pytest.mark.xfail(raises=AttributeError, reason="what was known before a second camera is a mixture")
 def test_a_second_camera_after_a_touch_is_taken_in() -> None:
     *_, last = infer(look_and_touch.model, some(VIEW, 8, 1), particles=6, seed=0)
     assert last.taken == 3

@@ -73,6 +73,20 @@ class Plan:
                 raise InputError(
                     f"plan {self.name!r} has a motion that is {manner!r}; give one of {', '.join(MANNERS)}."
                 )
+        if not (np.isfinite(self.rate) and self.rate > 0.0):
+            raise InputError(f"plan {self.name!r} has a rate of {self.rate:g} a second; give more than 0.")
+        lengths = np.linalg.norm(self.world_from_peg[:, 3:], axis=1)
+        if not (np.abs(lengths - 1.0) < 1e-3).all():
+            raise InputError(
+                f"plan {self.name!r} has a pose whose quaternion is not of unit length; "
+                "give x y z (m) qw qx qy qz."
+            )
+        for name, values in (("stiffness", self.stiffness), ("damping", self.damping)):
+            given = np.asarray(values, dtype=np.float64)
+            if given.shape != (6,) or not (np.isfinite(given).all() and (given >= 0.0).all()):
+                raise InputError(
+                    f"plan {self.name!r} has {name} {given.tolist()}; give six numbers, none negative."
+                )
         if not self.force > 0.0:
             raise InputError(f"plan {self.name!r} stops at {self.force:g} N; give a positive force.")
         if "searching" in self.manners and not self.sink > 0.0:

@@ -53,6 +53,8 @@ class Felt:
         """
         if force.ndim != 2 or force.shape[1] != 3:
             raise InputError(f"forces have shape {tuple(force.shape)}; give (T, 3), in newtons.")
+        if len(force) == 0:
+            return torch.empty(0, dtype=torch.float64)
         size = force.norm(dim=1)
         told = ~torch.isnan(size)
         contact = self._agreed(told & (size > self.contact + self.load * acceleration))
