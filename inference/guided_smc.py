@@ -53,7 +53,7 @@ def guided(
     share: float = 0.5,
     few: float = 0.2,
     tries: Sequence[int] = (1, 8, 40),
-    least: float = 0.03,
+    least: float = 0.015,
 ) -> StepFunction:
     """A step that takes a measurement in by a pair of programs, resamples when needed, and moves.
 

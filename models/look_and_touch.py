@@ -21,6 +21,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within, whole_number
+from bcppl.distributions.boxed import BoxedNormal
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import FittedNormal, fitted_normal
 from bcppl.distributions.manifold import ContactManifold, MeasuresGap
@@ -65,7 +66,7 @@ class Settings(camera_error.Settings):
     """
 
     bins: int = 1
-    temperature: float = 2.0
+    temperature: float = 6.0
     gap_noise: float = 0.00007
     gap_shared: float = 0.00003
     sink: float = 0.00002
@@ -187,7 +188,7 @@ def part_given(
     looks = looks_at(trace, actions, values)
     seen = camera_error.given_seen(scene, looks) if looks else None
     if not any(isinstance(action, ProbeWindow) for action in actions):
-        return scene.prior if seen is None else seen
+        return scene.prior if seen is None else within(scene.prior, seen)
     told = told_by_touches(scene, actions, trace.observations)
     if seen is None:
         expected = normal_like(scene.prior)
@@ -198,6 +199,14 @@ def part_given(
     pull = (precision @ poses.local(told.around, center)[..., None])[..., 0] - told.slope
     pose = poses.retract(told.around, (covariance @ pull[..., None])[..., 0])
     return widened(pose, 0.5 * (covariance + covariance.transpose(-1, -2)))
+
+
+def within(prior: Any, normal: NormalPose) -> NormalPose | BoxedNormal:
+    """A normal (N,) cut off where a prior's box ends: near its border few draws would lie within."""
+    if not bool((prior.widths > 0.0).all()):
+        return normal
+    low, high = prior.center[:3] - prior.widths, prior.center[:3] + prior.widths
+    return BoxedNormal(normal.center, normal.covariance, low, high)
 
 
 def widened(center: Tensor, covariance: Tensor) -> MixturePose:

@@ -13,7 +13,7 @@ _WIDTHS = (1.2, 3.0)  # of the normals that are drawn from, in deviations of the
 _SHARES = (0.85, 0.15)
 _LEAST = 0.15  # of the draws: their effective number, which says how sharp the density may become
 _FASTER = 1.1  # by how much sharper it becomes at least
-_ENOUGH = 2  # rounds with the density as it is
+_ENOUGH = 0.3  # of the draws: so many effective, and the fit is good
 
 
 class FittedNormal(NamedTuple):
@@ -33,9 +33,9 @@ def fitted_normal(
     start: Tensor,
     least: Tensor,
     *,
-    draws: int = 150,
+    draws: int = 200,
     first: int = 400,
-    rounds: int = 25,
+    rounds: int = 30,
 ) -> FittedNormal:
     """The normal after a density times a normal about zero, near its highest mass.
 
@@ -56,15 +56,14 @@ def fitted_normal(
     fit = FittedNormal(torch.zeros_like(start), torch.diag(start**2))
     point = prior.sample((first,))
     log_proposal = prior.log_prob(point)
-    remaining, exponent = _ENOUGH, 0.0
+    exponent = 0.0
     for _ in range(rounds):
         said, correction = log_density(point), prior.log_prob(point) - log_proposal
         exponent = _exponent(said, correction, exponent)
-        fit = _moments(point, torch.softmax(exponent * said + correction, dim=0), least)
-        if exponent == 1.0:
-            remaining -= 1
-            if remaining == 0:
-                break
+        log_weights = exponent * said + correction
+        fit = _moments(point, torch.softmax(log_weights, dim=0), least)
+        if exponent == 1.0 and _effective(log_weights) >= _ENOUGH * len(point):
+            break
         point, log_proposal = _drawn(fit, draws)
     return fit
 

@@ -1,0 +1,104 @@
+"""A normal over poses whose translation stays in a box."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from pyro.distributions import TorchDistribution
+from torch import Tensor
+from torch.distributions import constraints
+from torch.special import log_ndtr, ndtr, ndtri
+
+from bcppl import poses
+from bcppl.distributions.poses import NormalPose
+from bcppl.errors import InputError
+
+_LEAST = 1e-300
+_FARTHEST = 30.0  # deviations: beyond, a uniform share of what is left of a tail is rounding
+
+
+class BoxedNormal(TorchDistribution):
+    """A normal over poses (`NormalPose`, all axes free), its translation drawn within a box, axis by axis.
+
+    Each coordinate is drawn from its conditional given those before, cut off at the box: the simulator of
+    Geweke, Hajivassiliou and Keane (Geweke, Efficient simulation from the multivariate normal and Student-t
+    distributions subject to linear constraints, 1991). Its density is that of the normal over the product of
+    the chances of those intervals, and known exactly. It is near the normal given that it is in the box, and
+    a proposal for that.
+
+    Args:
+        center: (N, 7).
+        covariance: (N, 6, 6) or (6, 6).
+        low: (3,) the box's least corner, in the world, metres.
+        high: (3,) its largest.
+
+    Raises:
+        InputError: the box is empty, or as `NormalPose`.
+    """
+
+    arg_constraints: dict[str, Any] = {}
+    support = constraints.real_vector
+
+    def __init__(self, center: Tensor, covariance: Tensor, low: Tensor, high: Tensor) -> None:
+        if not bool((low < high).all()):
+            raise InputError(
+                f"a boxed normal is given a box from {low.tolist()} to {high.tolist()} m; "
+                "give the smaller corner first."
+            )
+        self.center, self.low, self.high = center, low, high
+        self.normal = NormalPose(center, covariance)
+        self.freedom = self.normal.freedom
+        super().__init__(torch.Size(center.shape[:-1]), torch.Size([7]), validate_args=False)
+
+    @property
+    def covariance(self) -> Tensor:
+        """Of the normal that is cut off."""
+        return self.normal.covariance
+
+    def expand(self, batch_shape: Any, _instance: Any = None) -> BoxedNormal:
+        """Itself: it is made for its particles."""
+        if torch.Size(batch_shape) == self.batch_shape:
+            return self
+        covariance = self.covariance.expand(*batch_shape, 6, 6)
+        return BoxedNormal(self.center.expand(*batch_shape, 7), covariance, self.low, self.high)
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """Poses (N, 7); only the empty sample_shape is known."""
+        if torch.Size(sample_shape) != torch.Size():
+            raise InputError("a boxed normal draws one pose for each particle; ask for no sample_shape.")
+        scale = torch.linalg.cholesky(self.covariance).expand(*self.batch_shape, 6, 6)
+        score = torch.randn(*self.batch_shape, 6, dtype=torch.float64)
+        uniform = torch.rand(*self.batch_shape, 3, dtype=torch.float64)
+        for axis in range(3):
+            first, last, flip = self._interval(scale, score, axis)
+            share = ndtr(first) + uniform[..., axis] * (ndtr(last) - ndtr(first))
+            drawn = ndtri(share.clamp(min=_LEAST)).clamp(first, last)
+            score[..., axis] = torch.where(flip, -drawn, drawn)
+        return poses.retract(self.center, (scale @ score[..., None])[..., 0])
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (N,) with respect to Lebesgue times Haar; -inf outside the box."""
+        scale = torch.linalg.cholesky(self.covariance).expand(*value.shape[:-1], 6, 6)
+        tangent = poses.local(self.center, value)
+        score = torch.linalg.solve_triangular(scale, tangent[..., None], upper=False)[..., 0]
+        density = self.normal.log_prob(value)
+        for axis in range(3):
+            first, last, _ = self._interval(scale, score, axis)
+            upper, lower = log_ndtr(last), log_ndtr(first)
+            density = density - (upper + torch.log1p(-torch.exp(lower - upper)))
+        inside = (value[..., :3] >= self.low) & (value[..., :3] <= self.high)
+        return torch.where(inside.all(dim=-1), density, -torch.inf)
+
+    def _interval(self, scale: Tensor, score: Tensor, axis: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Between which scores an axis lies in the box, given those before; mirrored in a right tail.
+
+        Returns:
+            The smaller and the larger, and whether both are mirrored: right tails would round to nothing.
+        """
+        middle = self.center[..., axis] + (scale[..., axis, :axis] * score[..., :axis]).sum(dim=-1)
+        first = (self.low[axis] - middle) / scale[..., axis, axis]
+        last = (self.high[axis] - middle) / scale[..., axis, axis]
+        flip = first > 0.0
+        first, last = torch.where(flip, -last, first), torch.where(flip, -first, last)
+        return first.clamp(min=-_FARTHEST), torch.maximum(last, first.clamp(min=-_FARTHEST) + 1e-9), flip

@@ -1,0 +1,48 @@
+"""A normal over poses cut off at a box: its draws lie within, and its density is theirs."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from bcppl import poses
+from bcppl.distributions.boxed import BoxedNormal
+from bcppl.errors import InputError
+
+LIMIT = torch.full((3,), 0.01, dtype=torch.float64)
+
+
+def correlated() -> Tensor:
+    mixed = torch.randn(6, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    scale = torch.diag(torch.tensor([0.004] * 3 + [0.02] * 3, dtype=torch.float64))
+    return scale @ mixed @ mixed.T @ scale
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.012, -0.03])
+def test_its_density_is_that_of_its_draws(shift: float) -> None:
+    """Reweighed to the normal, draws in the box give the normal's chance of lying in it, also far out."""
+    torch.manual_seed(1)
+    count, covariance = 100_000, correlated()
+    center = poses.identity(count)
+    center[:, 0] += shift
+    center[:, 2] -= shift
+    boxed = BoxedNormal(center, covariance, -LIMIT, LIMIT)
+    drawn = boxed.sample()
+    assert bool((drawn[:, :3].abs() <= LIMIT).all())
+    share = torch.exp(boxed.normal.log_prob(drawn) - boxed.log_prob(drawn))
+    tangent = MultivariateNormal(torch.zeros(6, dtype=torch.float64), covariance).sample((1_000_000,))
+    inside = (tangent[:, :3] + center[0, :3]).abs() <= LIMIT
+    chance = inside.all(dim=1).double()
+    error = float(torch.hypot(share.std() / count**0.5, chance.std() / 1e3))
+    assert float(share.mean()) == pytest.approx(float(chance.mean()), abs=4.0 * error)
+
+
+def test_outside_it_has_no_density_and_an_empty_box_is_refused() -> None:
+    boxed = BoxedNormal(poses.identity(2), correlated(), -LIMIT, LIMIT)
+    outside = poses.identity(2)
+    outside[1, 1] = 0.011
+    assert torch.isfinite(boxed.log_prob(outside)).tolist() == [True, False]
+    with pytest.raises(InputError, match="smaller corner first"):
+        BoxedNormal(poses.identity(2), correlated(), LIMIT, -LIMIT)
