@@ -21,12 +21,12 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within, whole_number
-from bcppl.distributions.boxed import BoxedNormal
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import FittedNormal, fitted_normal
 from bcppl.distributions.manifold import ContactManifold, MeasuresGap
 from bcppl.distributions.manifold_fit import Normal, Told, Window, told_by
 from bcppl.distributions.mixture import MixturePose
+from bcppl.distributions.pose_normals import allowed, normal_like, product, widened, within
 from bcppl.distributions.poses import NormalPose, prior_from_guess
 from bcppl.errors import InputError
 from bcppl.models import camera_error
@@ -42,9 +42,6 @@ from bcppl.simulators.stated_cameras import apparent_covariance, seen_elsewhere
 from bcppl.simulators.wrench import Sensing
 from bcppl.traces import Model, Trace
 
-# How proposals are widened, in deviations, and how often.
-WIDTHS = torch.tensor([1.1, 3.0], dtype=torch.float64)
-SHARES = torch.tensor([0.85, 0.15], dtype=torch.float64)
 # What an image says is taken for no surer than this: metres, radians, metres of bias.
 SHARPEST = torch.tensor([5e-5] * 3 + [1e-3] * 3 + [1e-4], dtype=torch.float64)
 NEAR = 0.02  # m: a window in which the peg stays farther off says nothing
@@ -201,22 +198,6 @@ def part_given(
     return widened(pose, 0.5 * (covariance + covariance.transpose(-1, -2)))
 
 
-def within(prior: Any, normal: NormalPose) -> NormalPose | BoxedNormal:
-    """A normal (N,) cut off where a prior's box ends: near its border few draws would lie within."""
-    if not bool((prior.widths > 0.0).all()):
-        return normal
-    low, high = prior.center[:3] - prior.widths, prior.center[:3] + prior.widths
-    return BoxedNormal(normal.center, normal.covariance, low, high)
-
-
-def widened(center: Tensor, covariance: Tensor) -> MixturePose:
-    """A normal with centres (N, 7) and covariances (N, 6, 6), and a share of it wider."""
-    covariances = WIDTHS[:, None, None] ** 2 * covariance[..., None, :, :]
-    return MixturePose(
-        SHARES.log(), center[..., None, :].expand(*center.shape[:-1], len(WIDTHS), 7), covariances
-    )
-
-
 def told_by_touches(
     scene: Scene, actions: Sequence[View | ProbeWindow], observations: Mapping[str, Tensor]
 ) -> Told:
@@ -253,20 +234,6 @@ def placed_by_images(scene: Scene, actions: Sequence[View | ProbeWindow]) -> Nor
         return Normal(expected.center[None], torch.linalg.inv(expected.covariance)[None])
     said = camera_error.given_seen(scene, looks)
     return Normal(said.center, torch.linalg.inv(said.covariance))
-
-
-def allowed(prior: Any, there: Tensor) -> Tensor:
-    """Whether a prior allows poses (M, 7), or would if its limits were a third wider."""
-    inwards = poses.retract(prior.center, 0.75 * poses.local(prior.center, there))
-    return prior.log_prob(inwards) > -torch.inf
-
-
-def normal_like(prior: Any) -> NormalPose:
-    """A normal with about the spread of a prior that is uniform within limits."""
-    angle = getattr(prior, "angle", None)
-    turns = [angle] * 3 if angle is not None else [prior.tilt, prior.tilt, prior.yaw]
-    widths = torch.cat([torch.as_tensor(prior.widths), torch.tensor(turns, dtype=torch.float64)])
-    return NormalPose(prior.center, 0.6 * widths.clamp(min=1e-4))
 
 
 def taken_in(trace: Trace) -> None:
@@ -306,15 +273,6 @@ def seen_before(trace: Trace, view: Camera, bias: Tensor) -> NormalPose | None:
         center, covariance = before.center, before.covariance
     error = apparent_covariance(camera, center, settings.camera_shift, settings.camera_turn)
     return NormalPose(farther(camera, center, bias), covariance + error)
-
-
-def product(first: NormalPose, second: NormalPose) -> NormalPose:
-    """The normal that is like the product of two."""
-    own, other = torch.linalg.inv(first.covariance), torch.linalg.inv(second.covariance)
-    covariance = torch.linalg.inv(own + other)
-    away = poses.local(first.center, second.center)
-    center = poses.retract(first.center, (covariance @ other @ away[..., None])[..., 0])
-    return NormalPose(center, 0.5 * (covariance + covariance.transpose(-1, -2)))
 
 
 def left_out(trace: Trace) -> None:

@@ -1,0 +1,56 @@
+"""Normals over poses as proposals need them: widened, multiplied, kept within a prior, as wide as one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.boxed import BoxedNormal
+from bcppl.distributions.mixture import MixturePose
+from bcppl.distributions.poses import NormalPose
+
+# How proposals are widened, in deviations, and how often.
+WIDTHS = torch.tensor([1.1, 3.0], dtype=torch.float64)
+SHARES = torch.tensor([0.85, 0.15], dtype=torch.float64)
+
+
+def widened(center: Tensor, covariance: Tensor) -> MixturePose:
+    """A normal with centres (N, 7) and covariances (N, 6, 6), and a share of it wider."""
+    covariances = WIDTHS[:, None, None] ** 2 * covariance[..., None, :, :]
+    return MixturePose(
+        SHARES.log(), center[..., None, :].expand(*center.shape[:-1], len(WIDTHS), 7), covariances
+    )
+
+
+def within(prior: Any, normal: NormalPose) -> NormalPose | BoxedNormal:
+    """A normal (N,) cut off where a prior's box ends: near its border few draws would lie within."""
+    if not bool((prior.widths > 0.0).all()):
+        return normal
+    low, high = prior.center[:3] - prior.widths, prior.center[:3] + prior.widths
+    return BoxedNormal(normal.center, normal.covariance, low, high)
+
+
+def product(first: NormalPose, second: NormalPose) -> NormalPose:
+    """The normal that is like the product of two."""
+    own, other = torch.linalg.inv(first.covariance), torch.linalg.inv(second.covariance)
+    covariance = torch.linalg.inv(own + other)
+    away = poses.local(first.center, second.center)
+    center = poses.retract(first.center, (covariance @ other @ away[..., None])[..., 0])
+    return NormalPose(center, 0.5 * (covariance + covariance.transpose(-1, -2)))
+
+
+def normal_like(prior: Any) -> NormalPose:
+    """A normal with about the spread of a prior that is uniform within limits."""
+    angle = getattr(prior, "angle", None)
+    turns = [angle] * 3 if angle is not None else [prior.tilt, prior.tilt, prior.yaw]
+    widths = torch.cat([torch.as_tensor(prior.widths), torch.tensor(turns, dtype=torch.float64)])
+    return NormalPose(prior.center, 0.6 * widths.clamp(min=1e-4))
+
+
+def allowed(prior: Any, there: Tensor) -> Tensor:
+    """Whether a prior allows poses (M, 7), or would if its limits were a third wider."""
+    inwards = poses.retract(prior.center, 0.75 * poses.local(prior.center, there))
+    return prior.log_prob(inwards) > -torch.inf
