@@ -13,7 +13,7 @@ MARK = "!"
 NOT_TOLD = "p value: empty, for nothing in this model is a depth image, a contact manifold or normal."
 NAMED = 6  # measurements that a warning names
 MEANING = {
-    "image": "something unknown may stand before the camera",
+    "image": "something unknown may stand before the camera, or it is not where it says",
     "normal": "a camera, or what else is latent, may be farther off than was stated",
     "contacts": "the peg may have touched something else, slipped in the hand or bent",
 }
