@@ -102,8 +102,7 @@ def ways(particles: int, many: bool) -> dict[str, tuple[Way, int]]:
     """The variants beside the default and vision alone, by name: how, and with how many particles."""
     found: dict[str, tuple[Way, int]] = {"contact only, same plan": (of_touches, particles)}
     found["no measured peg pose (peg_in_hole: contacts by physics)"] = by_contacts, particles
-    if any(field.name == "free_space" for field in dataclasses.fields(look_and_touch.Settings)):
-        found[FREE_SPACE] = without_free_space, particles
+    found[FREE_SPACE] = without_free_space, particles
     found["random walks only"] = by_walks, particles
     for count in (25, 300, *([MANY] if many else [])):
         found[f"N = {count}"] = taken_in, count
@@ -213,7 +212,5 @@ def rows_of(seeds: Sequence[int], particles: int, jobs: int) -> list[Row]:
         for name, variant in result.items():
             if variant.missed:
                 print(f"missed, {name}: {variant.missed}")
-    if FREE_SPACE not in names:
-        print(f"left out: {FREE_SPACE}; the model has no setting for it.")
     print("no row for delayed acceptance: the default simulates no physics, so there is nothing to delay.")
     return [row._replace(value=math.nan) if math.isinf(row.value) else row for row in rows]

@@ -36,10 +36,9 @@ from bcppl.beliefs.regions import (
     translation_deviation,
 )
 from bcppl.cli.surprises import MARK, Watch
-from bcppl.inference.guided_smc import guided, kernel
+from bcppl.inference.guided_smc import infer
 from bcppl.inference.probing.metrology import three_two_one
-from bcppl.inference.smc import Step, smc
-from bcppl.inference.smcp3 import Pair
+from bcppl.inference.smc import Step
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
 from bcppl.recordings.measurements import Recording
@@ -183,10 +182,8 @@ def regions_of(belief: Belief, scene: BenchScene) -> dict[tuple[str, float], boo
 def taken_in(
     recording: Recording, particles: int, seed: int, scene: Any = None, start: Step | None = None
 ) -> Iterator[Step]:
-    """As `bcppl.inference.guided_smc.infer` with its defaults, and able to go on from a step."""
-    assert model.arrival is not None
-    step = guided(Pair(*model.arrival), kernel(model.pose, model.proposals))
-    return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)
+    """The default inference, from the beginning or from a step."""
+    return infer(model, recording, particles=particles, seed=seed, scene=scene, start=start)
 
 
 def gone_on(recording: Recording, before: Any, start: Step) -> Iterator[Step]:

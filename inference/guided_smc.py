@@ -138,6 +138,7 @@ def infer(
     sweeps: int = 1,
     share: float = 0.5,
     scene: Any = None,
+    start: Step | None = None,
 ) -> Iterator[Step]:
     """Beliefs over a recording, one step for each measurement, the prior first.
 
@@ -149,6 +150,7 @@ def infer(
         sweeps: moves of every particle after each measurement.
         share: particles are resampled below this effective sample size, as a share of N.
         scene: what `model.prepare(recording)` gives, if it is at hand.
+        start: a step to go on from, as `bcppl.inference.smc.smc` does.
 
     Raises:
         InputError: a number is out of range, or the model brings no `arrival`.
@@ -162,4 +164,4 @@ def infer(
             "or use bcppl.inference.tempered_smc."
         )
     step = guided(Pair(*model.arrival), kernel(model.pose, model.proposals), sweeps=sweeps, share=share)
-    return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene)
+    return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)
