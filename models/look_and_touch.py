@@ -35,9 +35,10 @@ from bcppl.recordings.measurements import DepthImage, Measurement, ProbeWindow, 
 from bcppl.simulators.camera import Camera, bin_depth
 from bcppl.simulators.effort import Effort
 from bcppl.simulators.gap import PegGap
+from bcppl.simulators.god_object import GodObject, along
 from bcppl.simulators.region import region_of
 from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.sensing.felt import Felt
+from bcppl.simulators.sensing.felt import Felt, accelerations
 from bcppl.simulators.stated_cameras import apparent_covariance, seen_elsewhere
 from bcppl.simulators.wrench import Sensing
 from bcppl.traces import Model, Trace
@@ -93,6 +94,7 @@ class Scene:
     renderer: DepthRenderer
     looks: Mapping[str, Look]
     gap: PegGap | None
+    proxy: GodObject | None
     sensing: Sensing | None
     settings: Settings
     fits: dict[str, FittedNormal] = field(default_factory=dict)
@@ -158,6 +160,7 @@ def touch_of(
         math.hypot(settings.gap_shared, blur),
         settings.sink,
         settings.gap_outlier,
+        None if scene.proxy is None else partial(along, scene.proxy, window, settings.every),
     )
 
 
@@ -322,13 +325,16 @@ def prepare(recording: Recording, **settings: Any) -> Scene:
             camera = action.camera
             region = region_of(camera, recording.part, guess.world_from_part, within, chosen.bins)
             looks[camera.name] = Look(region, camera.cropped(*region).binned(chosen.bins))
-    gap = sensing = None
+    gap = proxy = sensing = None
+    if recording.peg is not None:
+        gap = PegGap(recording.part, recording.peg)
+        proxy = GodObject(gap)
     if windows:
         if recording.peg is None:
             raise InputError("the recording has probe windows but no peg; add the peg that was held.")
-        gap = PegGap(recording.part, recording.peg)
         sensing = Sensing(recording.peg, rate=1.0 / float(np.median(np.diff(windows[0].probe.stamps))))
-    return Scene(prior_from_guess(guess), DepthRenderer(recording.part), looks, gap, sensing, chosen)
+    renderer = DepthRenderer(recording.part)
+    return Scene(prior_from_guess(guess), renderer, looks, gap, proxy, sensing, chosen)
 
 
 def observe(scene: Scene, measurements: Sequence[Measurement]) -> Mapping[str, Tensor]:
@@ -338,7 +344,7 @@ def observe(scene: Scene, measurements: Sequence[Measurement]) -> Mapping[str, T
         InputError: a measurement is neither a view nor a probe window.
     """
     values: dict[str, Tensor] = {}
-    touches: dict[str, list[tuple[int, Touch]]] = {}
+    touches: dict[str, list[tuple[int, ProbeWindow, Touch]]] = {}
     for k, measurement in enumerate(measurements):
         action, seen = measurement.action, measurement.observation
         if isinstance(action, View) and isinstance(seen, DepthImage):
@@ -348,7 +354,7 @@ def observe(scene: Scene, measurements: Sequence[Measurement]) -> Mapping[str, T
             binned = bin_depth(region, scene.settings.bins, near=camera.near, far=camera.far)
             values[f"depth_{k}"] = torch.from_numpy(binned)
         elif isinstance(action, ProbeWindow) and isinstance(seen, Touch):
-            touches.setdefault(action.probe.name, []).append((k, seen))
+            touches.setdefault(action.probe.name, []).append((k, action, seen))
         else:
             raise InputError(
                 f"measurement {k} is a {measurement.kind}, which look_and_touch does not explain; "
@@ -356,32 +362,18 @@ def observe(scene: Scene, measurements: Sequence[Measurement]) -> Mapping[str, T
             )
     for windows in touches.values():
         assert scene.sensing is not None
-        tared = scene.sensing.tared([touch for _, touch in windows])
-        flags = scene.settings.felt(torch.cat(tared)[:, :3], accelerations(measurements, windows))
+        tared = scene.sensing.tared([touch for *_, touch in windows])
+        asked = accelerations([window for _, window, _ in windows])
+        flags = scene.settings.felt(torch.cat(tared)[:, :3], asked)
         if not scene.settings.free_space:
             flags = torch.where(flags == 0.0, torch.nan, flags)
         begin = 0
-        for (k, touch), wrench in zip(windows, tared, strict=True):
+        for (k, _, touch), wrench in zip(windows, tared, strict=True):
             mine = flags[begin : begin + len(wrench), None]
             begin += len(wrench)
             rows = torch.cat([torch.from_numpy(np.array(touch.world_from_peg)), mine], dim=1)
             values[f"touch_{k}"] = rows[:: scene.settings.every]
     return values
-
-
-def accelerations(measurements: Sequence[Measurement], windows: Sequence[tuple[int, Touch]]) -> Tensor:
-    """What the commands of a probe's windows ask for at their stamps, (T,), the most within 50 ms, m/s^2."""
-    found = []
-    for k, _ in windows:
-        action = measurements[k].action
-        assert isinstance(action, ProbeWindow)
-        found.append(action.probe.stamps[action.first : action.last])
-    assert isinstance(action, ProbeWindow)
-    stamps, probe = np.concatenate(found), action.probe
-    near = stamps[:, None] + np.arange(-0.05, 0.051, 0.01)
-    place = np.stack([np.interp(near, probe.command_times, probe.command[:, axis]) for axis in range(3)])
-    speed = np.diff(place, axis=-1) / 0.01
-    return torch.from_numpy(np.linalg.norm(np.diff(speed, axis=-1) / 0.01, axis=0).max(axis=-1))
 
 
 def invent(seed: int, **options: Any) -> Recording:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -61,7 +62,7 @@ class ContactManifold(LazyDistribution):
     the constant does not hang on the part's pose (the manifold particle filter of Koval, Pollard and
     Srinivasa, Pose estimation for planar contact manipulation with manifold particle filters, IJRR 34, 2015,
     has the same likelihood). It is a likelihood of the pose of the part, given where the peg got to, and no
-    forecast of where it will get to: it has no `sample`; simulate the probe for that.
+    forecast of where it will get to: it has a `sample` only where it is given a `motion` that is one.
 
     The event is (T, 8): the measured world_from_peg, then 1 where contact is felt, 0 where there is none, and
     NaN where that cannot be told.
@@ -74,6 +75,8 @@ class ContactManifold(LazyDistribution):
         shared: m, of the gap, common to a window's contacts.
         sink: m that a peg sinks into the part at the forces of a probe.
         outlier: a probability.
+        motion: where pegs get to, and whether they touch, (N, T, 8) for poses (N, 7) of the part; asked for
+            samples only. Such is `bcppl.simulators.god_object.GodObject`, along a command.
 
     Raises:
         InputError: a number is out of range.
@@ -90,22 +93,23 @@ class ContactManifold(LazyDistribution):
         shared: float,
         sink: float = 0.0,
         outlier: float = 0.001,
+        motion: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         number_within("a contact manifold is given noise {}", noise, above=0.0)
         number_within("a contact manifold is given shared {}", shared, least=0.0)
         number_within("a contact manifold is given sink {}", sink, least=0.0)
         number_within("a contact manifold is given outlier {}", outlier, above=0.0, below=1.0)
-        self.gap, self.pose = gap, pose
+        self.gap, self.pose, self.motion = gap, pose, motion
         self.noise, self.shared, self.sink, self.outlier = noise, shared, sink, outlier
         super().__init__(len(pose), (stamps, 8), (pose,))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-likelihood (N,) of one window (T, 8)."""
-        poses, felt = self._read(value)
+        stood, felt = self._read(value)
         told = ~torch.isnan(felt)
         if not bool(told.any()):
             return torch.zeros(len(self.pose), dtype=torch.float64)
-        distance = self.gap(self.pose, poses[told]).distance
+        distance = self.gap(self.pose, stood[told]).distance
         return self._of_contacts(distance[:, felt[told] == 1.0]) + self._of_free(
             distance[:, felt[told] == 0.0]
         )
@@ -115,12 +119,12 @@ class ContactManifold(LazyDistribution):
 
         Stamps with contact that are off by many standard deviations count for little.
         """
-        poses, felt = self._read(value)
+        stood, felt = self._read(value)
         told = ~torch.isnan(felt)
         if not bool(told.any()):
             count = len(self.pose)
             return Quadratic(self.pose.new_zeros(count, 6), self.pose.new_zeros(count, 6, 6))
-        gaps = self.gap(self.pose, poses[told])
+        gaps = self.gap(self.pose, stood[told])
         slope, touching = gaps.slope(self.pose), felt[told] == 1.0
         error, rows = gaps.distance[:, touching] + self.sink, slope[:, touching]
         # The common error takes the mean of a window's contacts part of its weight.
@@ -145,21 +149,41 @@ class ContactManifold(LazyDistribution):
 
         Where contact was felt the gap and the sink, elsewhere how deep the peg would have been in the part.
         """
-        poses, felt = self._read(value)
-        distance = self.gap(self.pose, poses).distance
+        stood, felt = self._read(value)
+        distance = self.gap(self.pose, stood).distance
         found = torch.where(felt == 1.0, distance + self.sink, distance.clamp(max=0.0))
         return torch.where(torch.isnan(felt), torch.nan, found)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
-        """Refused: see the class.
+        """Where pegs get to as `motion` says, with errors, (N, T, 8); none is an outlier.
+
+        Where a peg touches it sinks in along the contact's normal, and its place there has the common error;
+        every stamp's place has `noise` along each axis.
 
         Raises:
-            InputError: always.
+            InputError: no motion was given, or it gives something else.
         """
-        raise InputError(
-            "ContactManifold weighs poses of the part by where a peg got to and cannot say where it will get "
-            "to; simulate the probe with bcppl.simulators.track.ContactTrack."
-        )
+        if self.motion is None:
+            raise InputError(
+                "ContactManifold weighs poses of the part by where a peg got to and cannot say where it will "
+                "get to; give it a `motion`, such as bcppl.simulators.god_object.along a command, or "
+                "simulate the probe with bcppl.simulators.track.ContactTrack."
+            )
+        rows = self.motion(self.pose)
+        if tuple(rows.shape) != (*self.batch_shape, *self.event_shape):
+            raise InputError(
+                f"ContactManifold's motion gives {tuple(rows.shape)}; "
+                f"give {(*self.batch_shape, *self.event_shape)}: peg pose, and whether it touches."
+            )
+        shared = self.shared * torch.randn(len(rows), 1, 1, dtype=torch.float64)
+        noise = self.noise * torch.randn(*rows.shape[:2], 3, dtype=torch.float64)
+        sound = torch.isfinite(rows).all(dim=2).all(dim=1)
+        shift = torch.full_like(noise, torch.nan)
+        pose, drawn = self.pose[sound], rows[sound]
+        normal = -self.gap(pose, drawn[..., :7]).slope(pose)[..., :3]
+        touching = (drawn[..., 7:] == 1.0).to(torch.float64)
+        shift[sound] = noise[sound] + touching * normal * (shared[sound] - self.sink)
+        return torch.cat([rows[..., :3] + shift, rows[..., 3:]], dim=-1)
 
     def _read(self, value: Tensor) -> tuple[Tensor, Tensor]:
         if tuple(value.shape) != tuple(self.event_shape):

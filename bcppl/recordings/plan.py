@@ -1,7 +1,7 @@
 """What an arm is asked to do: straight motions, some of which end where something is felt.
 
-A `Probe` is a command as it was carried out. A plan is what comes before it: whoever carries it out (a robot,
-or a world that plays one) decides from the wrench where guarded motions end.
+A `Probe` is a command as it was carried out, or would be. A plan is what comes before it: whoever carries it
+out (a robot, or a world that plays one) decides from the wrench where guarded motions end.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bcppl.errors import InputError
+from bcppl.recordings.measurements import Probe, ProbeWindow, View
 
 Array = npt.NDArray[np.float64]
 Manner = Literal["free", "guarded", "held", "searching"]
@@ -94,3 +95,18 @@ class Plan:
                 f"plan {self.name!r} searches until the peg has sunk by {self.sink:g} m; give a positive "
                 "`sink`, less than how far the command lies below the surface."
             )
+
+
+def probe_of(plan: Plan) -> Probe:
+    """The command of a plan of which nothing is stopped, with stamps up to but without its last knot."""
+    count = max(1, round(float(plan.times[-1] - plan.times[0]) * plan.rate))
+    stamps = plan.times[0] + np.arange(count) / plan.rate
+    return Probe(plan.name, plan.times, plan.world_from_peg, plan.stiffness, plan.damping, stamps)
+
+
+def action_of(candidate: Plan | View) -> ProbeWindow | View:
+    """What a model takes as an action: a plan as one window of which nothing is stopped, a view as it is."""
+    if isinstance(candidate, View):
+        return candidate
+    probe = probe_of(candidate)
+    return ProbeWindow(probe, 0, len(probe.stamps))

@@ -35,6 +35,7 @@ _SHARP = np.radians(5.0)
 _FLAT = 1e-9
 _MARGIN = 0.012  # m around the part that the grid covers
 _SHARE = 8  # particles that a thread takes at a time
+_PAIRS = 256  # pairs that it takes at least
 
 
 class Gap(NamedTuple):
@@ -89,14 +90,14 @@ class PegGap:
         self._box = np.stack([peg.vertices.min(axis=0), peg.vertices.max(axis=0)])
 
     def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gap:
-        """Gaps for poses (N, 7) of the part and (T, 7) of the peg."""
-        particles, stamps = len(world_from_part), len(world_from_peg)
+        """Gaps for poses (N, 7) of the part and (T, 7) of the peg, or (N, T, 7): each particle its own."""
+        particles, stamps = len(world_from_part), world_from_peg.shape[-2]
         with self.effort.measure(items=particles * stamps):
             if self._grid is None:
                 self._grid = distance_grid(self.part, self._signed, _MARGIN)
             grid = self._grid
             part = _frames(world_from_part)
-            peg = _frames(world_from_peg)
+            peg = _frames(world_from_peg if world_from_peg.ndim == 3 else world_from_peg[None])
             distance = np.empty((particles, stamps))
             place, normal = np.empty((particles, stamps, 3)), np.empty((particles, stamps, 3))
             rounded = np.empty((particles, stamps), dtype=np.bool_)
@@ -122,7 +123,7 @@ class PegGap:
                     rounded,
                 )
 
-            _shared(work, particles)
+            _shared(work, particles, max(_SHARE, _PAIRS // max(1, stamps)))
             exact = self._signed(torch.from_numpy(place[rounded]))
             distance[rounded] = exact.distance.numpy()
             normal[rounded] = exact.normal.numpy()
@@ -131,7 +132,7 @@ class PegGap:
 
 def _frames(pose: Tensor) -> tuple[Array, Array]:
     rotation = np.ascontiguousarray(poses.rotation_matrix(pose.detach()).numpy())
-    return rotation, np.ascontiguousarray(pose.detach()[:, :3].numpy())
+    return rotation, np.ascontiguousarray(pose.detach()[..., :3].numpy())
 
 
 def _corners(peg: Part) -> Array:
@@ -170,21 +171,21 @@ def _planes(peg: Part) -> tuple[Array, Numbers]:
     return np.concatenate(planes), np.cumsum([len(each) for each in planes])
 
 
-def _shared(work: object, particles: int) -> None:
+def _shared(work: object, particles: int, share: int) -> None:
     """Runs of particles shared among threads, which end with the call."""
     assert callable(work)
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    runs = iter(range(0, particles, _SHARE))
+    runs = iter(range(0, particles, share))
     errors: list[BaseException] = []
 
     def take() -> None:
         try:
             for first in runs:
-                work(first, min(first + _SHARE, particles))
+                work(first, min(first + share, particles))
         except BaseException as error:
             errors.append(error)
 
-    others = [threading.Thread(target=take) for _ in range(min(available, -(-particles // _SHARE)) - 1)]
+    others = [threading.Thread(target=take) for _ in range(min(available, -(-particles // share)) - 1)]
     for other in others:
         other.start()
     take()
@@ -216,13 +217,14 @@ def _measure(
     normal: Array,
     rounded: npt.NDArray[np.bool_],
 ) -> None:
-    stamps = len(peg_rotation)
+    stamps = peg_rotation.shape[1]
     slope = np.empty(3)
     for n in range(first, last):
+        own = n if len(peg_rotation) > 1 else 0
         for t in range(stamps):
             # part_from_peg
-            turn = part_rotation[n].T @ peg_rotation[t]
-            shift = part_rotation[n].T @ (peg_place[t] - part_place[n])
+            turn = part_rotation[n].T @ peg_rotation[own, t]
+            shift = part_rotation[n].T @ (peg_place[own, t] - part_place[n])
             least, which = np.inf, 0
             for c in range(len(corners)):
                 p = corners[c]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
+from bcppl.recordings.measurements import ProbeWindow
 
 
 @dataclass(frozen=True)
@@ -64,3 +67,13 @@ class Felt:
     def _agreed(self, held: Tensor) -> Tensor:
         padded = torch.nn.functional.pad(held, (self.beside, self.beside), value=True)
         return padded.unfold(0, 2 * self.beside + 1, 1).all(dim=1)
+
+
+def accelerations(windows: Sequence[ProbeWindow]) -> Tensor:
+    """What a probe's command asks for at the stamps of its windows, (T,): the most within 50 ms, m/s^2."""
+    probe = windows[0].probe
+    stamps = np.concatenate([probe.stamps[window.first : window.last] for window in windows])
+    near = stamps[:, None] + np.arange(-0.05, 0.051, 0.01)
+    place = np.stack([np.interp(near, probe.command_times, probe.command[:, axis]) for axis in range(3)])
+    speed = np.diff(place, axis=-1) / 0.01
+    return torch.from_numpy(np.linalg.norm(np.diff(speed, axis=-1) / 0.01, axis=0).max(axis=-1))
