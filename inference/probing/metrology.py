@@ -6,7 +6,7 @@ next side what is left. A peg that is pressed on and slides touches all the poin
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -49,6 +49,22 @@ class Pace(NamedTuple):
     longest: float = 0.012
 
 
+class Reach(Protocol):
+    """What says how long a stroke is: the fields of `Pace` of the same names."""
+
+    @property
+    def sure(self) -> float:
+        """Standard deviations."""
+
+    @property
+    def shortest(self) -> float:
+        """Metres."""
+
+    @property
+    def longest(self) -> float:
+        """Metres."""
+
+
 STIFFNESS = (2500.0, 2500.0, 2500.0, 150.0, 150.0, 150.0)
 DAMPING = (120.0, 120.0, 120.0, 2.5, 2.5, 2.5)
 _ABOVE = 0.06  # m above the top at which a plan begins
@@ -80,13 +96,13 @@ def three_two_one(belief: Belief, part: Part, peg: Part, pace: Pace | None = Non
     top = float(part.vertices[:, 2].max())
     height = top - min(pace.depth, 0.5 * float(part.extent[2]))
     across = float(np.linalg.norm(peg.vertices[:, :2], axis=1).max())
-    lateral = _stroke(belief, np.array([0.0, 0.0, top]), np.array([1.0, 0.0, 0.0]), pace)
+    lateral = half_stroke(belief, np.array([0.0, 0.0, top]), np.array([1.0, 0.0, 0.0]), pace)
     spots = spots_on_top(part, peg, lateral)
     first, second = _pair(sides(part, height), spots[2], across)
     one = _OnSide.of(belief, first, peg, height, pace)
     other = _OnSide.of(belief, second, peg, height, pace)
     begin, end = one.slide(spots[2], other.middle)
-    lift = _stroke(belief, np.array([*begin, top]), np.array([0.0, 0.0, 1.0]), pace)
+    lift = half_stroke(belief, np.array([*begin, top]), np.array([0.0, 0.0, 1.0]), pace)
     knots = [
         *_on_top(belief, spots, top, pace),
         _Knot(np.array([*begin, top + lift]) + one.clear, "free", pace.free),
@@ -124,7 +140,7 @@ class _OnSide(NamedTuple):
         normal = np.array([*face.normal, 0.0])
         reach = float((peg.vertices[:, :2] @ -face.normal).max())  # of the peg towards the face
         middle = 0.5 * (face.start + face.stop)
-        stroke = _stroke(belief, np.array([*middle, height]), normal, pace)
+        stroke = half_stroke(belief, np.array([*middle, height]), normal, pace)
         inset = min(0.5 * face.length, reach + 0.5 * pace.longest)
         return cls(
             face,
@@ -183,8 +199,15 @@ def _unit(vector: Array) -> Array:
     return vector / np.linalg.norm(vector)
 
 
-def _stroke(belief: Belief, place: Array, normal: Array, pace: Pace) -> float:
-    """Half a stroke (m) towards a surface at a place of the part, along its normal there."""
+def half_stroke(belief: Belief, place: Array, normal: Array, pace: Reach) -> float:
+    """Half a stroke (m) towards a surface, as long as a belief is unsure of where the surface is.
+
+    Args:
+        belief: over world_from_part.
+        place: (3,) on the surface, in the part's frame.
+        normal: (3,) of the surface there, in the part's frame.
+        pace: how many standard deviations that is, and its limits.
+    """
     there = poses.transform(belief.world_from_part, torch.as_tensor(place)[None])[:, 0]
     direction = poses.rotation_matrix(belief.mean) @ torch.as_tensor(normal)
     along = there @ direction
@@ -208,7 +231,7 @@ def _pair(faces: list[Side], near: Array, across: float) -> tuple[Side, Side]:
 
 def _on_top(belief: Belief, spots: Array, top: float, pace: Pace) -> list[_Knot]:
     a, b, c = (np.array([*spot, top]) for spot in spots)
-    stroke = _stroke(belief, a, np.array([0.0, 0.0, 1.0]), pace)
+    stroke = half_stroke(belief, a, np.array([0.0, 0.0, 1.0]), pace)
     up, down = np.array([0.0, 0.0, stroke]), np.array([0.0, 0.0, -stroke])
     on = down - np.array([0.0, 0.0, pace.press])
     return [
