@@ -19,6 +19,7 @@ from bcppl import poses
 from bcppl.arguments import number_within, seed_number
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.models.worlds.bench_parts import PARTS, BenchPart, bench_part
+from bcppl.models.worlds.bench_sensors import SensorErrors
 from bcppl.models.worlds.guarded_motion import CarriedOut, carry_out, stamps_of
 from bcppl.models.worlds.inserting import InsertionResult, insert, samples_of
 from bcppl.models.worlds.occlusion import occluder
@@ -43,7 +44,7 @@ from bcppl.simulators.shapes import block
 Array = npt.NDArray[np.float64]
 
 # What is drawn for a scene is drawn apart, so that giving a part or a plan changes nothing else.
-_CHOICE, _POSE, _CAMERAS, _CONTACT, _IMAGES, _WRENCH, _DRIFT, _WOBBLE = range(8)
+_CHOICE, _POSE, _CAMERAS, _CONTACT, _IMAGES = range(5)  # those after are in bench_sensors
 
 
 @dataclass(frozen=True)
@@ -169,38 +170,35 @@ class BenchScene:
 
     def probe(self, plan: Plan) -> Recording:
         """The recording of the same two views and of a plan carried out, in windows."""
-        carried, wrench, world_from_peg = self.carried_out(plan)
+        return self._recording(self.felt(plan))
+
+    def felt(self, plan: Plan, sensors: SensorErrors | None = None) -> list[Measurement]:
+        """The windows of a plan carried out; with the sensors' next errors, or those of their first use."""
+        carried, wrench, world_from_peg = self.carried_out(plan, sensors)
         probe, step = carried.probe, max(1, round(self.bench.window * plan.rate))
         windows = []
         for first in range(0, len(probe.stamps), step):
             rows = slice(first, min(first + step, len(probe.stamps)))
             touch = Touch(probe.stamps[rows], wrench[rows], world_from_peg[rows])
             windows.append(Measurement(ProbeWindow(probe, rows.start, rows.stop), touch))
-        return self._recording(windows)
+        return windows
 
-    def carried_out(self, plan: Plan) -> tuple[CarriedOut, Array, Array]:
+    def carried_out(self, plan: Plan, sensors: SensorErrors | None = None) -> tuple[CarriedOut, Array, Array]:
         """A plan as it was truly carried out, and the wrench (T, 6) and peg poses (T, 7) measured then."""
-        error, wobble = self._errors(len(stamps_of(plan)), plan.rate)
+        error, wobble = (sensors or self.sensors()).drawn(len(stamps_of(plan)), plan.rate)
         carried = carry_out(plan, self.part, self.peg, self.contact, self.truth, error)
         there = torch.from_numpy(carried.world_from_peg)
         return carried, carried.wrench + error, poses.retract(there, torch.from_numpy(wobble)).numpy()
 
-    def insert(self, plan: InsertionPlan) -> InsertionResult:
+    def insert(self, plan: InsertionPlan, sensors: SensorErrors | None = None) -> InsertionResult:
         """An insertion as it truly went."""
-        error, wobble = self._errors(samples_of(plan), plan.search.rate)
+        error, wobble = (sensors or self.sensors()).drawn(samples_of(plan), plan.search.rate)
         place = self.kind.part_from_hole
         return insert(plan, self.part, self.peg, self.contact, self.truth, place, error, wobble)
 
-    def _errors(self, count: int, rate: float) -> tuple[Array, Array]:
-        """What the sensors add to `count` samples of the wrench (T, 6) and of the peg's pose (T, 6)."""
-        bench = self.bench
-        bias = _drawn(self.seed, _WRENCH).normal(size=6) * _six(bench.force_bias, bench.torque_bias)
-        pace = _six(bench.force_drift, bench.torque_drift) / math.sqrt(bench.drift_time * rate)
-        drift = np.cumsum(_drawn(self.seed, _DRIFT, 0).normal(size=(count, 6)) * pace, axis=0)
-        noise = _drawn(self.seed, _DRIFT, 1).normal(size=(count, 6))
-        error = bias + drift + noise * _six(bench.force_noise, bench.torque_noise)
-        wobble = _drawn(self.seed, _WOBBLE).normal(size=(count, 6)) * _six(bench.peg_noise, bench.peg_turn)
-        return error, wobble
+    def sensors(self) -> SensorErrors:
+        """What the sensors will add, from the first sample on."""
+        return SensorErrors(self.bench, self.seed)
 
     def _recording(self, windows: Sequence[Measurement]) -> Recording:
         images, background = self._views
@@ -232,8 +230,12 @@ class BenchScene:
     def true_depth(self, view: int) -> Array:
         """The depth (H, W) in metres from where a camera truly stands, without noise or bias."""
         camera = replace(self.cameras[view], world_from_camera=self.world_from_cameras[view])
+        return self.depth_from(camera, hidden=view == self.hidden_view)
+
+    def depth_from(self, camera: Camera, hidden: bool = False) -> Array:
+        """The depth (H, W) in metres that a camera would read without error, past the occluder or not."""
         parts, stands = [self.part, _table()], [torch.from_numpy(self.truth), poses.identity()]
-        if view == self.hidden_view:
+        if hidden:
             angle = _drawn(self.seed, _CAMERAS, 1).uniform(0.0, 2.0 * math.pi)
             box, pose = occluder(camera, self.part, self.truth, self.bench.hidden, angle)
             parts.append(box)
