@@ -1,0 +1,194 @@
+"""The loop: look where to touch, touch there, take in what was felt, until it is enough; then insert.
+
+arm = BenchArm(scene)  # or whatever carries out plans: a robot
+asked = lambda belief, number: candidates(belief, scene.part, scene.peg, seed=number)
+for each in probing_loop(model, scene.look(), arm, asked, probes=3):
+    print(each.chosen.name, each.ranking.best.information_gain)
+print(arm.insert(insertion_plan(each.step.belief, scene.part, scene.peg)))
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from bcppl.arguments import number_within, whole_number
+from bcppl.beliefs import Belief
+from bcppl.errors import InputError
+from bcppl.inference import guided_smc
+from bcppl.inference.probing.candidates import refuse_settled
+from bcppl.inference.probing.filters import Candidate, Candidates, name_of, refuse_none
+from bcppl.inference.probing.ranking import Ranking
+from bcppl.inference.probing.rules import Rank, by_information
+from bcppl.inference.smc import Step
+from bcppl.recordings.measurements import DepthImage, Measurement, ProbeWindow, Recording, View
+from bcppl.recordings.plan import Plan
+from bcppl.traces import Model
+
+# What a model's scene finds out as it goes, by address or number of actions, and what hangs on solids alone.
+FOUND = ("fits", "near", "told")
+SOLID = ("gap", "proxy")
+
+# Candidates for a belief; the number counts rounds, from 0.
+CandidatesFrom = Callable[[Belief, int], Sequence[Candidate]]
+
+
+class World(Protocol):
+    """What plays the robot: a simulation such as `bcppl.models.worlds.bench_arm.BenchArm`, or a real one."""
+
+    def carry_out(self, candidate: Plan | View) -> Sequence[Measurement]:
+        """Do what is asked, and say what was measured.
+
+        The windows of one probe with the plan's name, or an image of the view's camera.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """One probe of the loop.
+
+    Attributes:
+        number: from 0.
+        candidates: among which was chosen.
+        ranking: of them.
+        chosen: what was carried out, under a name that nothing before it has.
+        recording: all that was measured so far.
+        before: the last step before it.
+        step: the last step after it.
+        chance: of an insertion after it; NaN where it was not asked for.
+    """
+
+    number: int
+    candidates: Sequence[Candidate]
+    ranking: Ranking
+    chosen: Candidate
+    recording: Recording
+    before: Step
+    step: Step
+    chance: float = math.nan
+
+
+def probing_loop(
+    model: Model,
+    recording: Recording,
+    world: World,
+    candidates_from: CandidatesFrom,
+    rank: Rank | None = None,
+    *,
+    infer: Callable[..., Iterator[Step]] = guided_smc.infer,
+    particles: int = 75,
+    seed: int = 0,
+    start: Step | None = None,
+    scene: Any = None,
+    probes: int = 3,
+    least_gain: float | None = None,
+    chance: Callable[[Belief], float] | None = None,
+    enough: float = 0.95,
+) -> Iterator[Round]:
+    """Choose, carry out, take in: yields after each probe.
+
+    What was taken in is not computed again: inference goes on from the last step.
+
+    Args:
+        model: what explains the recording; its program's arguments are its scene and the actions.
+        recording: what was measured before the first probe.
+        world: carries out what is chosen.
+        candidates_from: what may be done next, for a belief and the round's number.
+        rank: puts candidates in order; None: `by_information` of the model's pose.
+        infer: takes measurements in, from a step on, such as `bcppl.inference.guided_smc.infer`.
+        particles: how many, where there is no `start`.
+        seed: of inference, where there is no `start`.
+        start: a step that has taken in some or all of the recording.
+        scene: of the model, that `start` was run with.
+        probes: at most so many.
+        least_gain: nats; where the best candidate is expected to tell less, less its cost, it is over.
+        chance: of an insertion under a belief, such as `chance_of_success(...).success`; asked before the
+            first probe and after each.
+        enough: it is over once that chance reaches so much.
+
+    Raises:
+        InputError: there are no candidates; the belief has no weight or has collapsed to a point; a number is
+            out of range; the world measured nothing.
+    """
+    whole_number("the loop is to make {} probes at most", probes)
+    number_within("an insertion is tried from a chance of {} on", enough, least=0.0)
+    if least_gain is not None:
+        number_within("the loop ends below a gain of {}", least_gain)
+    rank = by_information(model.pose) if rank is None else rank
+    scene = _prepared(model, recording, scene)
+    step = _last(infer(model, recording, particles=particles, seed=seed, scene=scene, start=start), start)
+    if chance is not None and chance(step.belief) >= enough:
+        return
+    for number in range(probes):
+        refuse_settled(step.belief)
+        found = candidates_from(step.belief, number)
+        refuse_none(Candidates(tuple(found)))
+        scene = _prepared(model, with_views(recording, found), scene)
+        ranking = rank(step.population, found, scene)
+        if least_gain is not None and not ranking.best.value >= least_gain:
+            return
+        chosen = named_apart(ranking.best.candidate, recording)
+        measured = list(world.carry_out(chosen))
+        if not measured:
+            raise InputError(f"the world measured nothing when it was asked for {name_of(chosen)!r}.")
+        recording = replace(recording, measurements=[*recording.measurements, *measured])
+        scene, before = _prepared(model, recording, scene), step
+        count = len(before.population)
+        step = _last(infer(model, recording, particles=count, seed=seed, scene=scene, start=before), before)
+        likely = math.nan if chance is None else chance(step.belief)
+        yield Round(number, found, ranking, chosen, recording, before, step, likely)
+        if likely >= enough:
+            return
+
+
+def _last(steps: Iterator[Step], before: Step | None) -> Step:
+    for each in steps:
+        before = each
+    if before is None:
+        raise InputError("the loop's inference yields no step; give one that yields the prior's first.")
+    return before
+
+
+def named_apart(candidate: Candidate, recording: Recording) -> Candidate:
+    """The candidate under a name that no camera or probe of a recording has."""
+    actions = [m.action for m in recording.measurements]
+    if isinstance(candidate, View):
+        taken = {a.camera.name for a in actions if isinstance(a, View)}
+        name = _free(candidate.camera.name, taken)
+        camera = candidate.camera
+        # An instrument keeps its error from view to view.
+        device = camera.device or (camera.name if name != camera.name else "")
+        return candidate if name == camera.name else View(replace(camera, name=name, device=device))
+    taken = {a.probe.name for a in actions if isinstance(a, ProbeWindow)}
+    return replace(candidate, name=_free(candidate.name, taken))
+
+
+def _free(name: str, taken: set[str]) -> str:
+    number = 2
+    while (name if number == 2 else f"{name} ({number - 1})") in taken:
+        number += 1
+    return name if number == 2 else f"{name} ({number - 1})"
+
+
+def with_views(recording: Recording, candidates: Sequence[Candidate]) -> Recording:
+    """A recording with an empty image from each candidate's camera, so that a scene knows them."""
+    known = {m.action.camera.name for m in recording.measurements if isinstance(m.action, View)}
+    views = [c for c in candidates if isinstance(c, View) and c.camera.name not in known]
+    empty = [Measurement(v, DepthImage(np.full((v.camera.height, v.camera.width), np.nan))) for v in views]
+    return replace(recording, measurements=[*recording.measurements, *empty])
+
+
+def _prepared(model: Model, recording: Recording, before: Any) -> Any:
+    """The scene of a recording that goes on: what was found out is kept, solids are not measured again."""
+    scene = model.prepare(recording)
+    if before is None or type(before) is not type(scene) or not is_dataclass(scene):
+        return scene
+    names = {each.name for each in fields(scene)}
+    for name in names.intersection(FOUND):
+        getattr(scene, name).update(getattr(before, name))
+    kept = {name: getattr(before, name) for name in names.intersection(SOLID)}
+    return replace(scene, **{name: value for name, value in kept.items() if value is not None})  # type: ignore[type-var]

@@ -1,0 +1,96 @@
+"""Ways to choose what is done next: by what it is expected to tell, and simpler rules to compare with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from bcppl import poses
+from bcppl.arguments import seed_number
+from bcppl.beliefs import Belief
+from bcppl.inference.population import Population
+from bcppl.inference.probing.entropies import mode_entropy
+from bcppl.inference.probing.expected_entropy import expected_information_gain
+from bcppl.inference.probing.filters import Candidate
+from bcppl.inference.probing.ranking import Prospect, Ranking
+from bcppl.inference.probing.touching import leading_point, middle_of_stroke
+from bcppl.parts import Part
+from bcppl.recordings.measurements import View
+from bcppl.recordings.plan import action_of
+
+# Ranks candidates for a population, given a scene of the model that knows their cameras.
+Rank = Callable[[Population, Sequence[Candidate], Any], Ranking]
+
+
+def by_information(pose: str, **settings: Any) -> Rank:
+    """By the nats that each is expected to tell: `expected_information_gain` of `mode_entropy(pose)`.
+
+    Args:
+        pose: the address of the sought pose.
+        settings: further arguments, such as `hypotheses`, `cost` and `rate`.
+    """
+
+    def rank(population: Population, candidates: Sequence[Candidate], scene: Any) -> Ranking:
+        _, done = population.trace.args
+        entropy = settings.get("entropy", mode_entropy(pose))
+        others = {name: value for name, value in settings.items() if name != "entropy"}
+        return expected_information_gain(
+            population, candidates, lambda c: (scene, [*done, action_of(c)]), entropy, **others
+        )
+
+    return rank
+
+
+def at_random(seed: int = 0) -> Rank:
+    """In an order that is drawn anew each time."""
+    generator = np.random.default_rng(seed_number(seed))
+
+    def rank(population: Population, candidates: Sequence[Candidate], scene: Any) -> Ranking:
+        return in_order(candidates, list(generator.permutation(len(candidates))))
+
+    return rank
+
+
+def by_largest_variance(peg: Part, pose: str) -> Rank:
+    """The touch first that goes to where the belief is least sure of the surface, along its normal.
+
+    Args:
+        peg: what is held.
+        pose: the address of the sought pose.
+    """
+
+    def rank(population: Population, candidates: Sequence[Candidate], scene: Any) -> Ranking:
+        belief = population.belief(pose)
+        unsure = [surface_variance(belief, peg, each) for each in candidates]
+        return in_order(candidates, sorted(range(len(unsure)), key=lambda k: -unsure[k]))
+
+    return rank
+
+
+def surface_variance(belief: Belief, peg: Part, candidate: Candidate) -> float:
+    """The variance (m^2) of where a surface is that a plan is to meet, along its stroke; -inf for others."""
+    met = None if isinstance(candidate, View) else middle_of_stroke(candidate)
+    if met is None:
+        return -math.inf
+    world_from_peg, direction = torch.from_numpy(met[0]), torch.from_numpy(met[1])
+    led = poses.rotation_matrix(world_from_peg).T @ direction
+    place = poses.transform(world_from_peg, torch.from_numpy(leading_point(peg, led.numpy()))[None])
+    in_part = poses.transform(poses.inverse(belief.mean), place)
+    along = poses.transform(belief.world_from_part, in_part)[:, 0] @ direction
+    return float(belief.weights @ (along - belief.weights @ along) ** 2)
+
+
+def in_order(candidates: Sequence[Candidate], order: Sequence[int] | None = None) -> Ranking:
+    """A ranking by an order that is given, which foretells nothing: gains are NaN."""
+    none = torch.full((1,), math.nan, dtype=torch.float64)
+    return Ranking(
+        tuple(
+            Prospect(candidates[k], int(k), math.nan, math.nan, math.nan, 0.0, 1, none, torch.ones_like(none))
+            for k in (range(len(candidates)) if order is None else order)
+        ),
+        math.nan,
+    )
