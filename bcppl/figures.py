@@ -1,4 +1,4 @@
-"""Pictures of a belief: its error over time, and its particles around the part in space.
+"""Pictures of a belief: its error over time, its particles around the part, and what is to be done next.
 
 Every function returns a matplotlib `Figure` of its own, made without pyplot: nothing is shown or kept in a
 global state, and `figure.savefig("name.png")` works without a display.
@@ -10,35 +10,49 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-import torch
-import trimesh
 from matplotlib import rc_context
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
-from scipy.spatial.transform import Rotation
 
-from bcppl.beliefs import Belief
+from bcppl.drawn_in_3d import (
+    BODY,
+    PARTICLE,
+    STRONG,
+    arrows,
+    checked,
+    frame,
+    in_words,
+    limits_of,
+    outline,
+    placed,
+    rotation,
+)
 from bcppl.errors import InputError
 from bcppl.parts import Part
+from bcppl.recordings.measurements import View
+from bcppl.recordings.plan import Plan
 
 Array = npt.NDArray[np.float64]
 
 # Okabe and Ito's palette, told apart by people of every colour vision.
-STRONG = "#D55E00"
 TRUTH = "#00A6D6"
-PARTICLE = "#7F7F7F"
-BODY = "#9DB4C8"
 
 HEAVIEST = 10
 SMALLEST_ADD = 0.01  # mm: below it a logarithmic axis shows nothing of interest
-MANY_FACES = 4000  # more than this are drawn from vertices merged on a grid
-FEATURE_ANGLE = np.radians(25.0)
+# How a peg moves along a planned way, or that a camera looks.
+WAYS = {
+    "free": "#56B4E9",
+    "guarded": STRONG,
+    "held": "#CC79A7",
+    "searching": "#009E73",
+    "looking": STRONG,
+}
 
 
 def add_over_time(
@@ -152,36 +166,36 @@ def belief_in_3d(
     """
     if not beliefs:
         raise InputError("a picture of beliefs got none; give at least one (title, poses, log weights).")
-    panels = [(title, *_checked(title, poses, log_weights)) for title, poses, log_weights in beliefs]
+    panels = [(title, *checked(title, poses, log_weights)) for title, poses, log_weights in beliefs]
     true = None if truth is None else np.asarray(truth, dtype=np.float64)
     length = 0.45 * 1000.0 * part.diameter
-    body, edges = _outline(part)
+    body, edges = outline(part)
 
     figure = Figure(figsize=(max(4.6 * len(panels), 6.0), 4.8))
-    reached = [_limits_of(part, length, poses, mean) for _, poses, _, mean in panels]
+    reached = [limits_of(part, length, poses, mean) for _, poses, _, mean in panels]
     if true is not None:
-        reached.append(_limits_of(part, 1.15 * length, true[None], true))
+        reached.append(limits_of(part, 1.15 * length, true[None], true))
     shown = np.concatenate(reached)
     low, high = shown.min(axis=0), shown.max(axis=0)
     for k, (title, poses, weights, mean) in enumerate(panels):
         with rc_context({"grid.color": "0.88", "grid.linewidth": 0.6}):
             axes: Axes3D = figure.add_subplot(1, len(panels), k + 1, projection="3d", computed_zorder=False)
-        faces = _placed(mean, body)
+        faces = placed(mean, body)
         axes.add_collection3d(
             Poly3DCollection(faces, facecolors=BODY, linewidths=0.0, alpha=0.28, shade=True, zorder=1)
         )
         if len(edges):
             axes.add_collection3d(
-                Line3DCollection(_placed(mean, edges), colors="0.3", linewidths=0.6, zorder=2)
+                Line3DCollection(placed(mean, edges), colors="0.3", linewidths=0.6, zorder=2)
             )
         order = np.argsort(-weights, kind="stable")
         heavy, light = poses[order[:HEAVIEST]], poses[order[HEAVIEST:]]
-        _arrows(axes, light, length, PARTICLE, width=0.8, alpha=0.45, zorder=3)
-        _arrows(axes, heavy, length, STRONG, width=1.4, alpha=0.95, zorder=5)
+        arrows(axes, light, length, PARTICLE, width=0.8, alpha=0.45, zorder=3)
+        arrows(axes, heavy, length, STRONG, width=1.4, alpha=0.95, zorder=5)
         if true is not None:
-            _arrows(axes, true[None], 1.15 * length, TRUTH, width=4.5, alpha=1.0, zorder=4)
-        _frame(axes, low, high)
-        axes.set_title(f"{title}\n{_in_words(poses, weights, mean, true)}", fontsize=10)
+            arrows(axes, true[None], 1.15 * length, TRUTH, width=4.5, alpha=1.0, zorder=4)
+        frame(axes, low, high)
+        axes.set_title(f"{title}\n{in_words(poses, weights, mean, true)}", fontsize=10)
     heaviest = f"{HEAVIEST} heaviest (arrow: z axis, tick: x axis)"
     entries = {
         heaviest: Line2D([], [], color=STRONG, linewidth=1.6),
@@ -201,97 +215,65 @@ def belief_in_3d(
     return figure
 
 
-def _checked(title: str, poses: Array, log_weights: Array) -> tuple[Array, Array, Array]:
-    """Poses (N, 7), normalised weights (N,) and the mean pose (7,) of one panel."""
-    poses, log_weights = (np.asarray(values, dtype=np.float64) for values in (poses, log_weights))
-    if poses.ndim != 2 or poses.shape[1] != 7 or log_weights.shape != poses.shape[:1] or len(poses) == 0:
-        raise InputError(
-            f"belief {title!r} has poses {poses.shape} and log weights {log_weights.shape}; "
-            "give (N, 7) and (N,)."
-        )
-    largest = log_weights.max()
-    if not np.isfinite(largest):
-        raise InputError(f"belief {title!r} has log weights whose largest is {largest}; give a finite one.")
-    belief = Belief(torch.from_numpy(poses), torch.from_numpy(log_weights))
-    return poses, belief.weights.numpy(), belief.mean.numpy()
+def action_in_3d(
+    part: Part,
+    belief: tuple[str, Array, Array],
+    action: Plan | View,
+    peg: Part | None = None,
+    others: Sequence[Plan | View] = (),
+) -> Figure:
+    """What is to be done next: the part at a belief's mean, its particles, and the way of the peg's tip.
+
+    Args:
+        part: whose pose is sought.
+        belief: (title, `world_from_part` (N, 7), log weights (N,)); weights in any scale.
+        action: the plan or view that was chosen.
+        peg: what is held; without one the way of its frame's origin is drawn.
+        others: what else might have been done, drawn faintly.
+
+    Raises:
+        InputError: as `belief_in_3d`.
+    """
+    title, poses, weights, mean = belief[0], *checked(*belief)
+    length = 0.45 * 1000.0 * part.diameter
+    body, edges = outline(part)
+    figure = Figure(figsize=(7.0, 5.6))
+    with rc_context({"grid.color": "0.88", "grid.linewidth": 0.6}):
+        axes: Axes3D = figure.add_subplot(projection="3d", computed_zorder=False)
+    axes.add_collection3d(
+        Poly3DCollection(placed(mean, body), facecolors=BODY, linewidths=0.0, alpha=0.28, shade=True)
+    )
+    if len(edges):
+        axes.add_collection3d(Line3DCollection(placed(mean, edges), colors="0.3", linewidths=0.6, zorder=2))
+    arrows(
+        axes, poses[np.argsort(-weights, kind="stable")], length, PARTICLE, width=0.8, alpha=0.35, zorder=3
+    )
+    for other in others:
+        way = _way(other, peg, mean)
+        axes.plot(*way.T, color="0.6", linewidth=0.7, alpha=0.6, zorder=4)
+    way = _way(action, peg, mean)
+    manners = action.manners if isinstance(action, Plan) else ("looking",)
+    entries: dict[str, Line2D] = {}
+    for k, manner in enumerate(manners):
+        color = WAYS[manner]
+        wide, over = (1.4, 5) if manner == "free" else (2.6, 6)  # a way back must not hide the touch
+        axes.plot(*way[k : k + 2].T, color=color, linewidth=wide, zorder=over)
+        entries[manner] = Line2D([], [], color=color, linewidth=2.4)
+    entries["particles"] = Line2D([], [], color=PARTICLE, linewidth=1.0)
+    shown = np.concatenate([limits_of(part, length, poses, mean), way])
+    frame(axes, shown.min(axis=0), shown.max(axis=0))
+    axes.set_title(f"{title}\n{in_words(poses, weights, mean, None)}", fontsize=10)
+    figure.legend(entries.values(), entries.keys(), loc="lower center", ncols=5, frameon=False, fontsize=9)
+    figure.subplots_adjust(left=0.02, right=0.95, top=0.9, bottom=0.1)
+    return figure
 
 
-def _rotation(pose: Array) -> Rotation:
-    return Rotation.from_quat(pose[..., [4, 5, 6, 3]])
-
-
-def _outline(part: Part) -> tuple[Array, Array]:
-    """Triangles (F, 3, 3) and sharp or open edges (E, 2, 3) of the part, in its frame, metres."""
-    mesh = part.mesh
-    if len(mesh.faces) > MANY_FACES:
-        # merge_vertices rounds to decimals: in units of a cell, to the cell.
-        cell = float(part.extent.max()) / 40.0
-        mesh = trimesh.Trimesh(mesh.vertices / cell, mesh.faces, process=False)
-        mesh.merge_vertices(digits_vertex=0, merge_tex=True, merge_norm=True)
-        mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
-        mesh.apply_scale(cell)
-        return np.asarray(mesh.triangles), np.zeros((0, 2, 3))
-    sharp = mesh.face_adjacency_edges[mesh.face_adjacency_angles > FEATURE_ANGLE]
-    alone = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
-    edges = np.concatenate([sharp, mesh.edges_sorted[alone]])
-    return np.asarray(mesh.triangles), np.asarray(mesh.vertices[edges])
-
-
-def _placed(pose: Array, points: Array) -> Array:
-    """Points (..., 3) in metres of the part's frame, in millimetres of the world's."""
-    turned = _rotation(pose).apply(np.array(points.reshape(-1, 3))) + pose[:3]
-    return 1000.0 * turned.reshape(points.shape)
-
-
-def _arrows(
-    axes: Axes3D, poses: Array, length: float, color: str, width: float, alpha: float, zorder: int
-) -> None:
-    """One arrow (z axis) and one tick (x axis) for each pose, lengths in millimetres."""
-    if len(poses) == 0:
-        return
-    foot = 1000.0 * poses[:, :3]
-    turn = _rotation(poses).as_matrix()
-    up, side = length * turn[:, :, 2], 0.3 * length * turn[:, :, 0]
-    style = {"colors": to_rgba(color, alpha), "linewidths": width, "zorder": zorder}
-    axes.quiver(*foot.T, *up.T, arrow_length_ratio=0.15, **style)
-    axes.quiver(*foot.T, *side.T, arrow_length_ratio=0.0, **style)
-
-
-def _limits_of(part: Part, length: float, poses: Array, mean: Array) -> Array:
-    """Points (M, 3) in millimetres that a panel has to show: the part at the mean, arrows' feet and tips."""
-    corners = _placed(mean, trimesh.bounds.corners(np.stack([part.vertices.min(0), part.vertices.max(0)])))
-    feet = 1000.0 * poses[:, :3]
-    tips = feet + length * _rotation(poses).as_matrix()[:, :, 2]
-    return np.concatenate([corners, feet, tips])
-
-
-def _frame(axes: Axes3D, low: Array, high: Array) -> None:
-    """Equal millimetres along all axes, few ticks, quiet panes."""
-    for name, axis, start, end in zip("xyz", (axes.xaxis, axes.yaxis, axes.zaxis), low, high, strict=True):
-        getattr(axes, f"set_{name}lim")(start, end)
-        getattr(axes, f"set_{name}label")(f"{name} (mm)", fontsize=9)
-        axis.set_major_locator(MaxNLocator(4))
-        axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
-        axis.set_tick_params(labelsize=8)
-    axes.zaxis.labelpad = 1.0
-    axes.set_box_aspect(high - low, zoom=1.05)
-    axes.patch.set_visible(False)  # or it covers the labels of the panel to its left
-    axes.view_init(elev=28.0, azim=-60.0)
-
-
-def _in_words(poses: Array, weights: Array, mean: Array, truth: Array | None) -> str:
-    """How wide the belief is, and how far its mean is from the truth."""
-
-    def millimetres(center: Array) -> Array:
-        return 1000.0 * np.linalg.norm(poses[:, :3] - center[:3], axis=1)
-
-    def degrees(center: Array) -> Array:
-        return np.degrees((_rotation(center).inv() * _rotation(poses)).magnitude())
-
-    spread = [float(np.sqrt(weights @ measure(mean) ** 2)) for measure in (millimetres, degrees)]
-    words = f"spread {spread[0]:.2g} mm, {spread[1]:.2g}°"
-    if truth is not None:
-        off = 1000.0 * float(np.linalg.norm(mean[:3] - truth[:3]))
-        turn = float(np.degrees((_rotation(truth).inv() * _rotation(mean)).magnitude()))
-        words += f"; mean off by {off:.2g} mm, {turn:.2g}°"
-    return words
+def _way(action: Plan | View, peg: Part | None, mean: Array) -> Array:
+    """Where a plan leads the peg's tip (K, 3), or from where to where a camera looks, in millimetres."""
+    if isinstance(action, View):
+        return 1000.0 * np.stack([np.asarray(action.camera.world_from_camera)[:3], mean[:3]])
+    tip = np.zeros(3)
+    if peg is not None:
+        lowest = peg.vertices[peg.vertices[:, 2] < peg.vertices[:, 2].min() + 1e-6]
+        tip = lowest.mean(axis=0)
+    return np.asarray(1000.0 * (rotation(action.world_from_peg).apply(tip) + action.world_from_peg[:, :3]))

@@ -10,8 +10,9 @@ import trimesh
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
+from bcppl.drawn_in_3d import MANY_FACES
 from bcppl.errors import InputError
-from bcppl.figures import MANY_FACES, add_over_time, belief_in_3d
+from bcppl.figures import add_over_time, belief_in_3d
 from bcppl.parts import Part
 
 HALF = np.sqrt(0.5)

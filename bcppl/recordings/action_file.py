@@ -1,0 +1,210 @@
+"""Plans and views on disk: what an arm is asked to do, as HDF5 (.h5) or as JSON (.json).
+
+Both hold the same, a list of actions in SI units, frames in the names (schema version 1):
+
+    format, schema_version    "bcppl actions", 1
+    actions                   a list; in HDF5 a group actions/000000.. with one group for each
+
+    kind "plan"   name; times (K), world_from_peg (K, 7), manners (K - 1), force, stiffness (6), damping (6),
+                  rate, sink: the fields of `bcppl.recordings.plan.Plan`; rate and sink may be left out
+    kind "view"   name; width, height, fx, fy, cx, cy, near, far, world_from_camera (7): a camera, as in a
+                  recording; distortion, wrist_from_camera (7) and device where there is one
+
+Numbers come back bit for bit from either.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from bcppl.errors import InputError
+from bcppl.recordings.cameras import INTRINSICS, RANGE, read_camera, write_camera
+from bcppl.recordings.datasets import POSE_UNITS, array, number, put
+from bcppl.recordings.measurements import View
+from bcppl.recordings.plan import Plan
+from bcppl.simulators.camera import Camera
+
+FORMAT = "bcppl actions"
+SCHEMA_VERSION = 1
+SUFFIXES = (".h5", ".json")
+
+_PLAN_UNITS = {
+    "times": "s",
+    "world_from_peg": POSE_UNITS,
+    "force": "N",
+    "stiffness": "N/m N/m N/m N m/rad N m/rad N m/rad",
+    "damping": "N s/m N s/m N s/m N m s/rad N m s/rad N m s/rad",
+    "rate": "1/s",
+    "sink": "m",
+}
+_MAY_LACK = ("rate", "sink")
+
+Action = Plan | View
+
+
+def save_actions(actions: Sequence[Action], path: str | os.PathLike[str]) -> None:
+    """Write actions to a file, whole or not at all.
+
+    Raises:
+        InputError: the file's name ends in neither .h5 nor .json, or it cannot be written.
+    """
+    path = Path(path)
+    _refuse_suffix(path)
+    if not path.parent.is_dir():
+        raise InputError(f"{path} cannot be written: there is no folder {path.parent}; make it first.")
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        if path.suffix == ".json":
+            tree = {
+                "format": FORMAT,
+                "schema_version": SCHEMA_VERSION,
+                "actions": [_tree_of(action) for action in actions],
+            }
+            unfinished.write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
+        else:
+            with h5py.File(unfinished, "w") as file:
+                file.attrs.update(format=FORMAT, schema_version=SCHEMA_VERSION)
+                for k, action in enumerate(actions):
+                    _write(file.create_group(f"actions/{k:06d}"), action)
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error}.") from error
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def load_actions(path: str | os.PathLike[str]) -> list[Action]:
+    """Read actions that `save_actions` wrote, or that somebody wrote by hand as JSON.
+
+    Raises:
+        InputError: there is no such file, it holds no actions, or one of them lacks something or makes no sense.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"there is no file of actions {path}; give one ending in {' or '.join(SUFFIXES)}.")
+    _refuse_suffix(path)
+    return _from_json(path) if path.suffix == ".json" else _from_hdf5(path)
+
+
+def _refuse_suffix(path: Path) -> None:
+    if path.suffix not in SUFFIXES:
+        raise InputError(
+            f"actions are kept in files that end in {' or '.join(SUFFIXES)}, not {path.name}; rename it."
+        )
+
+
+def _refuse_header(path: Path, header: Mapping[str, Any]) -> None:
+    if header.get("format", FORMAT) != FORMAT:
+        raise InputError(f"{path} holds a {header['format']}, no actions; give a file of plans and views.")
+    version = header.get("schema_version", SCHEMA_VERSION)
+    if not isinstance(version, int | np.integer) or version > SCHEMA_VERSION:
+        raise InputError(f"{path} was written by a later bcppl; upgrade bcppl.")
+
+
+# ---- JSON
+
+
+def _tree_of(action: Action) -> dict[str, Any]:
+    if isinstance(action, Plan):
+        named: dict[str, Any] = {"kind": "plan", "name": action.name, "manners": list(action.manners)}
+        return named | {name: np.asarray(getattr(action, name)).tolist() for name in _PLAN_UNITS}
+    camera = action.camera
+    tree: dict[str, Any] = {"kind": "view", "name": camera.name}
+    for name in ("world_from_camera", *INTRINSICS, *RANGE):
+        tree[name] = np.asarray(getattr(camera, name)).tolist()
+    if camera.distortion:
+        tree["distortion"] = list(camera.distortion)
+    if camera.wrist_from_camera is not None:
+        tree["wrist_from_camera"] = np.asarray(camera.wrist_from_camera).tolist()
+    return tree | ({"device": camera.device} if camera.device else {})
+
+
+def _from_json(path: Path) -> list[Action]:
+    try:
+        tree = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} is no valid JSON ({error}); write it again.") from error
+    if not isinstance(tree, dict) or not isinstance(tree.get("actions"), list):
+        raise InputError(f'{path} holds no list of "actions"; see `bcppl.recordings.action_file` for one.')
+    _refuse_header(path, tree)
+    return [_action_of(entry, f"action {k} of {path}") for k, entry in enumerate(tree["actions"])]
+
+
+def _action_of(entry: Any, what: str) -> Action:
+    if not isinstance(entry, dict) or entry.get("kind") not in ("plan", "view"):
+        raise InputError(f'{what} is neither of kind "plan" nor "view"; say which it is.')
+    try:
+        if entry["kind"] == "plan":
+            given = {n: np.array(entry[n], dtype=np.float64) for n in _PLAN_UNITS if n in entry}
+            return _plan(str(entry["name"]), tuple(entry["manners"]), given)
+        numbers = {n: entry[n] for n in (*INTRINSICS, *RANGE)}
+        wrist = entry.get("wrist_from_camera")
+        return View(
+            Camera(
+                name=str(entry["name"]),
+                world_from_camera=np.array(entry["world_from_camera"], dtype=np.float64),
+                distortion=entry.get("distortion", ()),
+                wrist_from_camera=None if wrist is None else np.array(wrist, dtype=np.float64),
+                device=str(entry.get("device", "")),
+                **numbers,
+            )
+        )
+    except KeyError as error:
+        raise InputError(f"{what} lacks {error.args[0]!r}; add it.") from error
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what} holds what is no number ({error}); write numbers in SI units.") from error
+
+
+def _plan(name: str, manners: tuple[Any, ...], given: Mapping[str, Any]) -> Plan:
+    for needed in _PLAN_UNITS:
+        if needed not in given and needed not in _MAY_LACK:
+            raise KeyError(needed)
+    values: dict[str, Any] = {n: float(v) if np.ndim(v) == 0 else v for n, v in given.items()}
+    return Plan(name=name, manners=manners, **values)
+
+
+# ---- HDF5
+
+
+def _write(group: h5py.Group, action: Action) -> None:
+    if isinstance(action, View):
+        group.attrs.update(kind="view", name=action.camera.name)
+        write_camera(group, action.camera)
+        return
+    group.attrs.update(kind="plan", name=action.name)
+    group.attrs["manners"] = list(action.manners)
+    for name, units in _PLAN_UNITS.items():
+        put(group, name, getattr(action, name), units)
+
+
+def _from_hdf5(path: Path) -> list[Action]:
+    try:
+        with h5py.File(path, "r") as file:
+            header = dict(file.attrs)
+            if "format" not in header:
+                raise InputError(f"{path} is an HDF5 file but holds no actions; give one of plans and views.")
+            _refuse_header(path, header)
+            return [_read(group) for _, group in sorted(file["actions"].items())]
+    except KeyError as error:
+        raise InputError(f"{path} lacks {error.args[0]!r}; make it again.") from error
+    except (OSError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is damaged or no HDF5 file ({error}); make it again.") from error
+
+
+def _read(group: h5py.Group) -> Action:
+    name = str(group.attrs["name"])
+    if str(group.attrs["kind"]) == "view":
+        return View(read_camera(name, group))
+    given = {
+        each: number(group, each) if group[each].ndim == 0 else array(group, each)
+        for each in _PLAN_UNITS
+        if each in group
+    }
+    return _plan(name, tuple(str(manner) for manner in group.attrs["manners"]), given)
