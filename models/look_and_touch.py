@@ -35,7 +35,7 @@ from bcppl.recordings.measurements import DepthImage, Measurement, ProbeWindow, 
 from bcppl.simulators.camera import Camera, bin_depth
 from bcppl.simulators.effort import Effort
 from bcppl.simulators.gap import PegGap
-from bcppl.simulators.god_object import GodObject, along
+from bcppl.simulators.god_object import GodObject, WindowMotion
 from bcppl.simulators.region import region_of
 from bcppl.simulators.renderer import DepthRenderer
 from bcppl.simulators.sensing.felt import Felt, accelerations
@@ -160,7 +160,7 @@ def touch_of(
         math.hypot(settings.gap_shared, blur),
         settings.sink,
         settings.gap_outlier,
-        None if scene.proxy is None else partial(along, scene.proxy, window, settings.every),
+        None if scene.proxy is None else WindowMotion(scene.proxy, window, settings.every),
     )
 
 

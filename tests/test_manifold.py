@@ -50,8 +50,8 @@ def inside_out(world_from_part: Tensor, world_from_peg: Tensor) -> Ledge:
 class Sunk(ContactManifold):
     """Mutant: a sink of the wrong sign."""
 
-    def _of_contacts(self, distance: Tensor) -> Tensor:
-        return super()._of_contacts(distance - 2.0 * self.sink)
+    def _of_contacts(self, distance: Tensor, touching: Tensor) -> Tensor:
+        return super()._of_contacts(distance - 2.0 * self.sink, touching)
 
 
 def window(heights: list[float], felt: list[float], seed: int = 0) -> Tensor:

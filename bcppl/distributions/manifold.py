@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -104,45 +104,42 @@ class ContactManifold(LazyDistribution):
         super().__init__(len(pose), (stamps, 8), (pose,))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-likelihood (N,) of one window (T, 8)."""
-        stood, felt = self._read(value)
-        told = ~torch.isnan(felt)
-        if not bool(told.any()):
-            return torch.zeros(len(self.pose), dtype=torch.float64)
-        distance = self.gap(self.pose, stood[told]).distance
-        return self._of_contacts(distance[:, felt[told] == 1.0]) + self._of_free(
-            distance[:, felt[told] == 0.0]
-        )
+        """Log-likelihood (N,) of one window (T, 8), or of one for each particle (N, T, 8)."""
+        distance, felt, lost, _ = self._measured(value)
+        found = self._of_contacts(distance, felt == 1.0) + self._of_free(distance, felt == 0.0)
+        return torch.where(lost, torch.nan, found)
 
     def quadratic(self, value: Tensor) -> Quadratic:
-        """The log-likelihood of a window (T, 8) to second order.
+        """The log-likelihood of a window (T, 8), or of one for each particle (N, T, 8), to second order.
 
         Stamps with contact that are off by many standard deviations count for little.
         """
-        stood, felt = self._read(value)
-        told = ~torch.isnan(felt)
-        if not bool(told.any()):
-            count = len(self.pose)
+        distance, felt, lost, gaps = self._measured(value)
+        count = len(self.pose)
+        if gaps is None:
             return Quadratic(self.pose.new_zeros(count, 6), self.pose.new_zeros(count, 6, 6))
-        gaps = self.gap(self.pose, stood[told])
-        slope, touching = gaps.slope(self.pose), felt[told] == 1.0
-        error, rows = gaps.distance[:, touching] + self.sink, slope[:, touching]
+        slope, touching = gaps.slope(self.pose), (felt == 1.0).to(torch.float64)
         # The common error takes the mean of a window's contacts part of its weight.
         variance, common = self.noise**2, self.shared**2
-        count = int(touching.sum())
-        share = common / (variance + count * common) if count else 0.0
+        share = (common / (variance + touching.sum(dim=1) * common))[:, None, None]
         # What is far off, seen as wide as the errors are taken to be, hardly pulls.
-        trust = 1.0 / (1.0 + error**2 / (_FAR**2 * (variance + common)))
-        rows, error = rows * trust.sqrt()[..., None], error * trust.sqrt()
+        error = distance + self.sink
+        trust = (touching / (1.0 + error**2 / (_FAR**2 * (variance + common)))).sqrt()
+        rows, error = slope * trust[..., None], error * trust
         weighed = (rows - share * rows.sum(dim=1, keepdim=True)) / variance
         pull = (weighed * error[..., None]).sum(dim=1)
         information = weighed.transpose(-1, -2) @ rows
         spread = math.hypot(self.noise, self.shared)
-        score, free = gaps.distance[:, ~touching] / spread, slope[:, ~touching] / spread
+        score, free = distance / spread, slope / spread
         hazard = torch.exp(-0.5 * score**2 - 0.5 * math.log(2.0 * math.pi) - log_ndtr(score))
+        hazard = torch.where(felt == 0.0, hazard, 0.0)
         pull = pull - (hazard[..., None] * free).sum(dim=1)
         bend = (hazard * (hazard + score)).clamp(min=0.0)
-        return Quadratic(pull, information + free.transpose(-1, -2) @ (bend[..., None] * free))
+        information = information + free.transpose(-1, -2) @ (bend[..., None] * free)
+        return Quadratic(
+            torch.where(lost[:, None], torch.nan, pull),
+            torch.where(lost[:, None, None], torch.nan, information),
+        )
 
     def residual(self, value: Tensor) -> Tensor:
         """Gaps (N, T) that contradict what was felt, in metres; 0 where free, NaN where nothing can be told.
@@ -166,10 +163,26 @@ class ContactManifold(LazyDistribution):
         if self.motion is None:
             raise InputError(
                 "ContactManifold weighs poses of the part by where a peg got to and cannot say where it will "
-                "get to; give it a `motion`, such as bcppl.simulators.god_object.along a command, or "
+                "get to; give it a `motion`, such as bcppl.simulators.god_object.WindowMotion, or "
                 "simulate the probe with bcppl.simulators.track.ContactTrack."
             )
-        rows = self.motion(self.pose)
+        return self._with_errors(self.motion(self.pose))
+
+    @staticmethod
+    def samples(sites: Sequence[ContactManifold]) -> list[Tensor]:
+        """A sample of each of several, their motions all in one batch where they can be run together.
+
+        Raises:
+            InputError: one of them cannot be sampled.
+        """
+        kinds = {type(site.motion) for site in sites}
+        together = getattr(next(iter(kinds)), "together", None) if len(kinds) == 1 else None
+        if together is None:
+            return [site.sample() for site in sites]
+        moved = together([site.motion for site in sites], [site.pose for site in sites])
+        return [site._with_errors(rows) for site, rows in zip(sites, moved, strict=True)]
+
+    def _with_errors(self, rows: Tensor) -> Tensor:
         if tuple(rows.shape) != (*self.batch_shape, *self.event_shape):
             raise InputError(
                 f"ContactManifold's motion gives {tuple(rows.shape)}; "
@@ -186,27 +199,42 @@ class ContactManifold(LazyDistribution):
         return torch.cat([rows[..., :3] + shift, rows[..., 3:]], dim=-1)
 
     def _read(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        if tuple(value.shape) != tuple(self.event_shape):
+        shapes = tuple(self.event_shape), (*self.batch_shape, *self.event_shape)
+        if tuple(value.shape) not in shapes:
             raise InputError(
                 f"ContactManifold looks at {self.event_shape[0]} stamps but its observation has shape "
                 f"{tuple(value.shape)}; give ({self.event_shape[0]}, 8): peg pose, and whether it felt it."
             )
-        return value[:, :7], value[:, 7]
+        return value[..., :7], value[..., 7]
 
-    def _of_contacts(self, distance: Tensor) -> Tensor:
-        count = distance.shape[1]
-        if count == 0:
-            return distance.new_zeros(len(distance))
-        error = distance + self.sink
+    def _measured(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor, Gaps | None]:
+        """Distances (N, S), what was felt (N, S), which particles' observations are lost, and the gaps."""
+        stood, felt = self._read(value)
+        count = len(self.pose)
+        lost = torch.zeros(count, dtype=torch.bool)
+        if value.ndim == 3:  # a simulation that failed
+            lost = torch.isnan(stood).any(dim=2).any(dim=1)
+            stood = torch.where(lost[:, None, None], self.pose[:, None], stood)
+        told = ~torch.isnan(felt).reshape(-1, felt.shape[-1]).all(dim=0)
+        if not bool(told.any()):
+            none = torch.zeros(count, 0, dtype=torch.float64)
+            return none, none, lost, None
+        gaps = self.gap(self.pose, stood[..., told, :])
+        return gaps.distance, felt[..., told].expand(count, -1), lost, gaps
+
+    def _of_contacts(self, distance: Tensor, touching: Tensor) -> Tensor:
+        count = touching.sum(dim=1, dtype=torch.float64)
+        error = torch.where(touching, distance + self.sink, 0.0)
         variance, common = self.noise**2, self.shared**2
-        share = common / (variance + count * common)
-        squared = ((error**2).sum(dim=1) - share * error.sum(dim=1) ** 2) / variance
-        size = (count - 1) * math.log(variance) + math.log(variance + count * common)
+        whole = variance + count * common
+        squared = ((error**2).sum(dim=1) - common / whole * error.sum(dim=1) ** 2) / variance
+        size = (count - 1) * math.log(variance) + torch.log(whole)
         inlier = -0.5 * (squared + size + count * math.log(2.0 * math.pi)) + math.log1p(-self.outlier)
         stray = math.log(self.outlier) - count * math.log(FARTHEST)
-        return torch.logaddexp(inlier, torch.full_like(inlier, stray))
+        return torch.where(count > 0, torch.logaddexp(inlier, stray), 0.0)
 
-    def _of_free(self, distance: Tensor) -> Tensor:
+    def _of_free(self, distance: Tensor, free: Tensor) -> Tensor:
         score = distance / math.hypot(self.noise, self.shared)
         inlier = log_ndtr(score) + math.log1p(-self.outlier)
-        return torch.logaddexp(inlier, torch.full_like(inlier, math.log(self.outlier))).sum(dim=1)
+        found = torch.logaddexp(inlier, torch.full_like(inlier, math.log(self.outlier)))
+        return torch.where(free, found, 0.0).sum(dim=1)

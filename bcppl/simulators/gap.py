@@ -22,16 +22,12 @@ from bcppl.simulators.distance_grid import DistanceGrid, distance_grid, looked_u
 from bcppl.simulators.effort import Effort
 from bcppl.simulators.fidelity import solid_of
 from bcppl.simulators.placement import compiled
+from bcppl.simulators.sharp_edges import deepest, dot, is_beyond, may_be_nearer, sharp_edges, turned_back
 
 Array = npt.NDArray[np.float64]
 Numbers = npt.NDArray[np.int64]
 
-_RUN = 0.008  # m of an edge that are passed over together
-_ROUNDS = 12
-_EXACT = 1e-8  # m
-_CANCELLED = 0.1
 _NEAR = 0.002  # m: nearer than this, edges count, and what the grid cannot tell is measured exactly
-_SHARP = np.radians(5.0)
 _FLAT = 1e-9
 _MARGIN = 0.012  # m around the part that the grid covers
 _SHARE = 8  # particles that a thread takes at a time
@@ -62,6 +58,19 @@ class Gap(NamedTuple):
         return torch.cat([along, -torch.linalg.cross(self.place, self.normal)], dim=-1)
 
 
+class Frames(NamedTuple):
+    """Poses (...,) as rotation matrices (..., 3, 3) and places (..., 3) in metres."""
+
+    rotation: Array
+    place: Array
+
+
+def frames_of(pose: Tensor) -> Frames:
+    """Of poses (..., 7)."""
+    rotation = np.ascontiguousarray(poses.rotation_matrix(pose.detach()).numpy())
+    return Frames(rotation, np.ascontiguousarray(pose.detach()[..., :3].numpy()))
+
+
 class PegGap:
     """The gap between a part and a peg. Their meshes are closed; a peg that is not convex has convex pieces.
 
@@ -85,19 +94,23 @@ class PegGap:
         self._signed = SignedDistance(part)
         self._grid: DistanceGrid | None = None
         self._corners = _corners(peg)
-        self._edges, self._balls = _edges(part)
+        self._edges = sharp_edges(part)
         self._planes, self._ends = _planes(peg)
         self._box = np.stack([peg.vertices.min(axis=0), peg.vertices.max(axis=0)])
 
     def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gap:
         """Gaps for poses (N, 7) of the part and (T, 7) of the peg, or (N, T, 7): each particle its own."""
-        particles, stamps = len(world_from_part), world_from_peg.shape[-2]
+        distance, place, normal = self.measured(frames_of(world_from_part), frames_of(world_from_peg))
+        return Gap(torch.from_numpy(distance), torch.from_numpy(place), torch.from_numpy(normal))
+
+    def measured(self, part: Frames, peg: Frames) -> tuple[Array, Array, Array]:
+        """As a call, of frames (N,) of the part and (T,) or (N, T) of the peg: a gap's fields as arrays."""
+        peg = peg if peg.place.ndim == 3 else Frames(peg.rotation[None], peg.place[None])
+        particles, stamps = len(part.place), peg.place.shape[1]
         with self.effort.measure(items=particles * stamps):
             if self._grid is None:
                 self._grid = distance_grid(self.part, self._signed, _MARGIN)
-            grid = self._grid
-            part = _frames(world_from_part)
-            peg = _frames(world_from_peg if world_from_peg.ndim == 3 else world_from_peg[None])
+            grid, edges = self._grid, self._edges
             distance = np.empty((particles, stamps))
             place, normal = np.empty((particles, stamps, 3)), np.empty((particles, stamps, 3))
             rounded = np.empty((particles, stamps), dtype=np.bool_)
@@ -112,8 +125,10 @@ class PegGap:
                     grid.low,
                     grid.spacing,
                     grid.distance,
-                    self._edges,
-                    self._balls,
+                    edges.ends,
+                    edges.balls,
+                    edges.groups,
+                    edges.stops,
                     self._planes,
                     self._ends,
                     self._box,
@@ -124,39 +139,16 @@ class PegGap:
                 )
 
             _shared(work, particles, max(_SHARE, _PAIRS // max(1, stamps)))
-            exact = self._signed(torch.from_numpy(place[rounded]))
-            distance[rounded] = exact.distance.numpy()
-            normal[rounded] = exact.normal.numpy()
-        return Gap(torch.from_numpy(distance), torch.from_numpy(place), torch.from_numpy(normal))
-
-
-def _frames(pose: Tensor) -> tuple[Array, Array]:
-    rotation = np.ascontiguousarray(poses.rotation_matrix(pose.detach()).numpy())
-    return rotation, np.ascontiguousarray(pose.detach()[..., :3].numpy())
+            if rounded.any():
+                exact = self._signed(torch.from_numpy(place[rounded]))
+                distance[rounded] = exact.distance.numpy()
+                normal[rounded] = exact.normal.numpy()
+        return distance, place, normal
 
 
 def _corners(peg: Part) -> Array:
     """The peg's distinct vertices (V, 3)."""
     return np.unique(np.round(peg.vertices, 9), axis=0)
-
-
-def _edges(part: Part) -> tuple[Array, Array]:
-    """Stretches (E, 2, 3) of the edges at which the part is sharp and convex, from point to point.
-
-    Returns:
-        The stretches, and centre and radius (E, 4) of a ball around each.
-    """
-    mesh = part.mesh.copy()
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    sharp = mesh.face_adjacency_convex & (mesh.face_adjacency_angles > _SHARP)
-    stretches = [np.empty((0, 2, 3))]
-    for start, stop in np.asarray(mesh.vertices)[mesh.face_adjacency_edges[sharp]]:
-        count = max(1, int(np.ceil(np.linalg.norm(stop - start) / _RUN)))
-        points = np.linspace(start, stop, count + 1)
-        stretches.append(np.stack([points[:-1], points[1:]], axis=1))
-    edges = np.concatenate(stretches)
-    radii = 0.5 * np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
-    return edges, np.column_stack([edges.mean(axis=1), radii])
 
 
 def _planes(peg: Part) -> tuple[Array, Numbers]:
@@ -209,6 +201,8 @@ def _measure(
     grid: npt.NDArray[np.float32],
     edges: Array,
     balls: Array,
+    groups: Array,
+    stops: Numbers,
     planes: Array,
     ends: Numbers,
     box: Array,
@@ -218,7 +212,7 @@ def _measure(
     rounded: npt.NDArray[np.bool_],
 ) -> None:
     stamps = peg_rotation.shape[1]
-    slope = np.empty(3)
+    slope, start, stop, middle = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for n in range(first, last):
         own = n if len(peg_rotation) > 1 else 0
         for t in range(stamps):
@@ -239,95 +233,28 @@ def _measure(
             normal[n, t] = slope
             # An edge that is farther off than this would not touch either way.
             nearer = min(least, _NEAR)
-            for e in range(len(edges)):
-                if _may_be_nearer(balls[e], turn, shift, box, nearer):
-                    start, stop = turn.T @ (edges[e, 0] - shift), turn.T @ (edges[e, 1] - shift)
+            next_edge = 0
+            for g in range(len(groups)):
+                first_edge, next_edge = next_edge, stops[g]
+                if not may_be_nearer(groups[g], turn, shift, box, nearer):
+                    continue
+                for e in range(first_edge, next_edge):
+                    if not may_be_nearer(balls[e], turn, shift, box, nearer):
+                        continue
+                    turned_back(turn, shift, balls[e], middle)
+                    turned_back(turn, shift, edges[e, 0], start)
+                    turned_back(turn, shift, edges[e, 1], stop)
                     begin = 0
                     for s in range(len(ends)):
-                        inside, share = _deepest(start, stop, planes[begin : ends[s]], nearer, slope)
+                        solid = planes[begin : ends[s]]
+                        begin = ends[s]
+                        if is_beyond(middle, solid, balls[e, 3] + nearer):
+                            continue
+                        inside, share = deepest(start, stop, solid, nearer, slope)
                         if inside < nearer:
                             nearer = least = inside
                             rounded[n, t] = False
                             place[n, t] = edges[e, 0] + share * (edges[e, 1] - edges[e, 0])
-                            normal[n, t] = -(turn @ slope)
-                        begin = ends[s]
+                            for axis in range(3):
+                                normal[n, t, axis] = -dot(turn[axis], slope)
             distance[n, t] = least
-
-
-@compiled
-def _may_be_nearer(ball: Array, turn: Array, shift: Array, box: Array, least: float) -> bool:
-    """Whether a ball in the part's frame may be nearer than `least` to the peg's box, or deeper in it."""
-    reach = ball[3] + least
-    x, y, z = ball[0] - shift[0], ball[1] - shift[1], ball[2] - shift[2]
-    for axis in range(3):
-        along = turn[0, axis] * x + turn[1, axis] * y + turn[2, axis] * z
-        if along < box[0, axis] - reach or along > box[1, axis] + reach:
-            return False
-    return True
-
-
-@compiled
-def _deepest(start: Array, stop: Array, planes: Array, least: float, normal: Array) -> tuple[float, float]:
-    """Where a stretch of an edge is deepest in a convex solid, or nearest to it: by cutting planes.
-
-    How far a point is out of the solid, by the plane that it is farthest out of, is convex and piecewise
-    linear along the stretch. Where that is least between two planes, the stretch crosses the edge between
-    them: the distance is along the normal of both edges, a mixture of the planes' normals.
-
-    Args:
-        start: (3,) its one end in the peg's frame.
-        stop: (3,) the other.
-        planes: (P, 4) of the solid.
-        least: what it must be less than to matter.
-        normal: (3,) becomes the solid's outward unit normal there.
-
-    Returns:
-        The distance, negative inside, or one of at least `least`; where on the stretch, from 0 to 1.
-    """
-    step: Array = stop - start
-    low, high = 0.0, 1.0
-    at_low, plane_low = _out(start, planes)
-    slope_low = float(planes[plane_low, :3] @ step)
-    if slope_low >= 0.0:
-        normal[:] = planes[plane_low, :3]
-        return at_low, low
-    at_high, plane_high = _out(stop, planes)
-    slope_high = float(planes[plane_high, :3] @ step)
-    if slope_high <= 0.0:
-        normal[:] = planes[plane_high, :3]
-        return at_high, high
-    share, bound = low, at_low
-    for _ in range(_ROUNDS):
-        share = (at_low - at_high + slope_high * high - slope_low * low) / (slope_high - slope_low)
-        share = min(max(share, low), high)
-        bound = at_low + slope_low * (share - low)
-        # Along a normal that leans the distance is only longer.
-        if bound >= least and bound >= 0.0:
-            return bound, share
-        here, plane = _out(start + share * step, planes)
-        if here <= bound + _EXACT:
-            break
-        slope = float(planes[plane, :3] @ step)
-        if slope < 0.0:
-            low, at_low, slope_low, plane_low = share, here, slope, plane
-        else:
-            high, at_high, slope_high, plane_high = share, here, slope, plane
-    mixed = slope_high / (slope_high - slope_low)
-    normal[:] = mixed * planes[plane_low, :3] + (1.0 - mixed) * planes[plane_high, :3]
-    length = np.sqrt((normal * normal).sum())
-    if length < _CANCELLED:  # between opposite planes: the stretch crosses a thin solid
-        normal[:] = planes[plane_low, :3]
-        return bound, share
-    normal /= length
-    return bound / length, share
-
-
-@compiled
-def _out(point: Array, planes: Array) -> tuple[float, int]:
-    """How far a point is out of a convex solid, by the plane that it is farthest out of."""
-    farthest, plane = -np.inf, 0
-    for f in range(len(planes)):
-        away = planes[f, 0] * point[0] + planes[f, 1] * point[1] + planes[f, 2] * point[2] - planes[f, 3]
-        if away > farthest:
-            farthest, plane = away, f
-    return farthest, plane

@@ -10,6 +10,7 @@ part allows.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -23,20 +24,25 @@ from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.recordings.measurements import ProbeWindow
-from bcppl.simulators.gap import PegGap
+from bcppl.simulators.gap import Frames, PegGap, frames_of
 from bcppl.simulators.peg_model import commands
 from bcppl.simulators.placement import compiled
+from bcppl.simulators.tangent_planes import nearest_allowed
 
 Array = npt.NDArray[np.float64]
+Numbers = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 
 _LONGEST = 0.001  # m: of a step
 _SHORTEST = 0.0001
 _THIN = 0.4  # of the thinnest wall: a longer step might come out on its other side
-_DEEP = 2e-8  # m: a peg no deeper than this is out
 _TOUCHES = 2e-7  # m: nearer than this it touches
-_STILL = 1e-7  # m: a step shorter than this is none
-_ROUNDS = 60  # steps that a blocked peg may take towards one command
+_STILL = 1e-7  # m: a step shorter than this is none, a fifth of it no depth
+_ROUGH = 1e-5  # m: after so many
+_PATIENT = 10
+_ROUNDS = 40  # steps that a blocked peg may take towards one command
+_REFUTED = 1e-6  # m
+_LIKE = 0.99999  # a cosine; planes leant no more than this are one
 _PLANES = 4  # contacts that are kept in mind
 _SEEN = 0.0019  # m: a gap measured as larger may be smaller, for edges farther off are not looked at
 
@@ -116,28 +122,57 @@ class GodObject:
         return torch.cat([place + across.amin(-1) - half, -place - across.amax(-1) - half], dim=-1)
 
 
-def along(proxy: GodObject, window: ProbeWindow, every: int, world_from_part: Tensor) -> Tensor:
-    """Where a peg gets to in a window of a probe, (N, T, 8) at its stamps, `every` of them apart.
+class WindowMotion:
+    """Where a peg gets to in a window of a probe, at every so many of its stamps.
 
-    The whole way up to there is followed, from the probe's first stamp on.
+    The whole way up to there is followed, from the probe's first stamp on, by a command that nothing stops.
     """
-    stamps = np.arange(window.first % every, window.last, every)
-    command = torch.from_numpy(commands(window.probe, window.probe.stamps[stamps])[0])
-    return proxy(world_from_part, command)[:, window.first // every :]
+
+    def __init__(self, proxy: GodObject, window: ProbeWindow, every: int) -> None:
+        self.proxy, self.window, self.every = proxy, window, every
+
+    def __call__(self, world_from_part: Tensor) -> Tensor:
+        """(N, T, 8), as the god-object gives it, for poses (N, 7) of the part."""
+        return self.together([self], [world_from_part])[0]
+
+    @property
+    def command(self) -> Tensor:
+        """(S, 7) from the probe's beginning to the window's end."""
+        probe, first = self.window.probe, self.window.first % self.every
+        return torch.from_numpy(commands(probe, probe.stamps[first : self.window.last : self.every])[0])
+
+    @staticmethod
+    def together(motions: Sequence[WindowMotion], world_from_part: Sequence[Tensor]) -> list[Tensor]:
+        """The motions for poses (N_k, 7) each, (N_k, T_k, 8), those of one god-object in one batch."""
+        found: dict[int, Tensor] = {}
+        ways = [motion.command for motion in motions]
+        for proxy in {id(motion.proxy): motion.proxy for motion in motions}.values():
+            own = [k for k, motion in enumerate(motions) if motion.proxy is proxy]
+            longest = max(len(ways[k]) for k in own)
+            # A command that has ended is held.
+            padded = [torch.cat([ways[k], ways[k][-1:].expand(longest - len(ways[k]), 7)]) for k in own]
+            counts = [len(world_from_part[k]) for k in own]
+            command = torch.stack(padded).repeat_interleave(torch.tensor(counts), dim=0)
+            rows = proxy(torch.cat([world_from_part[k] for k in own]), command)
+            for k, row in zip(own, rows.split(counts), strict=True):
+                first = motions[k].window.first // motions[k].every
+                found[k] = row[:, first : len(ways[k])]
+        return [found[k] for k in range(len(motions))]
 
 
 class _Motion:
     """Pegs of N particles on their way."""
 
     def __init__(self, rules: GodObject, world_from_part: Tensor, command: Tensor) -> None:
-        self.rules, self.part, self.command = rules, world_from_part, command
+        self.rules, self.part, self.command = rules, frames_of(world_from_part), command
+        self.away = rules.clearance(world_from_part, command)
         self.place = command[:, 0, :3].clone()
         self.blocked = torch.ones(len(command), dtype=torch.bool)  # or not yet known not to be
         self.slack = torch.zeros(len(command), dtype=torch.float64)
 
     def followed(self) -> Tensor:
         rules, command = self.rules, self.command
-        away = rules.clearance(self.part, command)
+        away = self.away
         # Between stamps a straight way stays beyond a face that it is beyond at both ends; a turn sags.
         apart = torch.minimum(away[:, 1:], away[:, :-1]).amax(dim=-1)
         turned = _angles(command[:, :-1, 3:], command[:, 1:, 3:])
@@ -176,149 +211,89 @@ class _Motion:
     def _towards(self, chosen: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Where pegs (M,) get to on the way to a command (M, 7), and how far from the part they are then."""
         rules, count = self.rules, len(chosen)
-        part, place = self.part[chosen], self.place[chosen].numpy().copy()
-        turn = poses.rotation_matrix(part)
-        target = goal[:, :3].numpy()
-        normals, offsets = np.zeros((count, _PLANES, 3)), np.full((count, _PLANES), -np.inf)
+        on = chosen.numpy()
+        part = Frames(self.part.rotation[on], self.part.place[on])
+        turn = frames_of(goal).rotation
+        place, target = self.place[chosen].numpy().copy(), goal[:, :3].numpy()
+        normals, offsets = np.zeros((count, _PLANES, 3)), np.zeros((count, _PLANES))
         seen = np.full((count, _PLANES, 3), np.inf)
         distance = np.full(count, np.inf)
-        on = np.arange(count)
-        for turns in range(_ROUNDS):
-            there = torch.cat([torch.from_numpy(place[on]), goal[on, 3:]], dim=1)
-            gap = rules.gap(part[on], there[:, None])
-            normal = (turn[on] @ gap.normal[:, 0, :, None])[..., 0].numpy()
-            distance[on] = gap.distance[:, 0].numpy()
-            slot = turns % _PLANES
-            normals[on, slot], seen[on, slot] = normal, place[on]
-            offsets[on, slot] = (normal * place[on]).sum(axis=1) - distance[on]
-            moving = np.zeros(len(on), dtype=np.bool_)
-            ahead = np.empty((len(on), 3))
+        moving = np.arange(count)
+        for rounds in range(_ROUNDS):
+            peg = Frames(turn[moving, None], place[moving, None])
+            found, _, normal = rules.gap.measured(Frames(*(each[moving] for each in part)), peg)
+            distance[moving] = found[:, 0]
+            stays = np.zeros(len(moving), dtype=np.bool_)
             _stepped(
-                place[on],
-                target[on],
-                distance[on],
-                normals[on],
-                offsets[on],
-                seen[on],
+                moving,
+                place,
+                target,
+                found[:, 0],
+                np.einsum("nij,nj->ni", part.rotation[moving], normal[:, 0]),
+                normals,
+                offsets,
+                seen,
                 rules.step,
                 rules.friction,
                 rules.pressed,
-                ahead,
-                moving,
+                _STILL if rounds < _PATIENT else _ROUGH,
+                stays,
             )
-            if turns == _ROUNDS - 1:
-                break
-            place[on[moving]] = ahead[moving]
-            on = on[moving]
-            if len(on) == 0:
+            moving = moving[~stays]
+            if len(moving) == 0:
                 break
         return torch.from_numpy(place), torch.from_numpy(distance)
 
 
 @compiled
 def _stepped(
+    moving: Numbers,
     place: Array,
     target: Array,
     distance: Array,
+    normal: Array,
     normals: Array,
     offsets: Array,
     seen: Array,
     longest: float,
     friction: float,
     pressed: float,
-    ahead: Array,
-    moving: Mask,
+    still: float,
+    stays: Mask,
 ) -> None:
-    """The next step of each peg: out of the part if it is in it, else towards its target."""
-    for m in range(len(place)):
-        kept = np.zeros(normals.shape[1], np.bool_)
-        for p in range(normals.shape[1]):
-            # A plane is what the part is like near where it was seen.
+    """The next step of each moving peg: out of the part if it is in it, else towards its target."""
+    planes = normals.shape[1]
+    kept = np.zeros(planes, np.bool_)
+    for k in range(len(moving)):
+        m, slot, least, same = moving[k], 0, np.inf, False
+        for p in range(planes):
+            # A plane is what the part is like near where it was seen; a gap wider than it allows refutes it.
             kept[p] = ((place[m] - seen[m, p]) ** 2).sum() < 4.0 * longest * longest
-        if distance[m] < -_DEEP:
-            ahead[m] = _nearest(place[m], normals[m], offsets[m], kept)
-            moving[m] = True
-            continue
-        best = _nearest(target[m], normals[m], offsets[m], kept)
+            kept[p] &= (normals[m, p] * place[m]).sum() - offsets[m, p] > distance[k] - _REFUTED
+            # The newest takes the place of one like it, of one out of date, or of the least tight.
+            tight = -np.inf
+            if kept[p]:
+                tight = offsets[m, p] - (normals[m, p] * place[m]).sum()
+                if (normals[m, p] * normal[k]).sum() > _LIKE:
+                    slot, same = p, True
+            if not same and tight < least:
+                slot, least = p, tight
+        normals[m, slot], seen[m, slot], kept[slot] = normal[k], place[m], True
+        offsets[m, slot] = (normal[k] * place[m]).sum() - distance[k]
+        inside = distance[k] < -0.2 * still
+        best = nearest_allowed(place[m] if inside else target[m], normals[m], offsets[m], kept)
         step = best - place[m]
         size = np.sqrt((step * step).sum())
-        if friction > 0.0 and distance[m] < _TOUCHES:
-            # The command draws back to the cone's rim.
-            beyond = np.sqrt(((target[m] - best) ** 2).sum())
-            held = friction * min(beyond, pressed)
-            left = max(0.0, size - held)
-            step *= left / max(size, 1e-300)
-            size = left
-        if size > longest:
+        if not inside and friction > 0.0 and distance[k] < _TOUCHES:
+            # The command draws the peg no farther than the cone's rim.
+            held = friction * min(np.sqrt(((target[m] - best) ** 2).sum()), pressed)
+            step *= max(0.0, size - held) / max(size, 1e-300)
+            size = max(0.0, size - held)
+        if not inside and size > longest:
             step *= longest / size
-            size = longest
-        moving[m] = size > _STILL
-        ahead[m] = place[m] + step
-
-
-@compiled
-def _nearest(point: Array, normals: Array, offsets: Array, kept: Mask) -> Array:
-    """The point on the free side of kept planes that is nearest to a point, by trying which ones hold it."""
-    count = len(offsets)
-    best, least = point.copy(), np.inf
-    if _violation(point, normals, offsets, kept) <= _DEEP:
-        return best
-    least_violation = np.inf
-    for a in range(count):
-        if not kept[a]:
-            continue
-        for b in range(a, count):
-            if not kept[b]:
-                continue
-            for c in range(b, count):
-                if not kept[c]:
-                    continue
-                tried, sound = _on_planes(point, normals, offsets, a, b, c)
-                if not sound:
-                    continue
-                off = ((tried - point) ** 2).sum()
-                violation = _violation(tried, normals, offsets, kept)
-                if violation <= _DEEP:
-                    if off < least:
-                        best, least = tried, off
-                elif least == np.inf and violation < least_violation:
-                    best, least_violation = tried, violation
-    return best
-
-
-@compiled
-def _violation(point: Array, normals: Array, offsets: Array, kept: Mask) -> float:
-    worst = 0.0
-    for p in range(len(offsets)):
-        if kept[p]:
-            worst = max(worst, offsets[p] - (normals[p] * point).sum())
-    return worst
-
-
-@compiled
-def _on_planes(point: Array, normals: Array, offsets: Array, a: int, b: int, c: int) -> tuple[Array, bool]:
-    """The point of up to three planes nearest to a point: projections by Gram and Schmidt."""
-    chosen = (a, b, c)
-    basis, values = np.zeros((3, 3)), np.zeros(3)
-    rank = 0
-    for k in range(3):
-        if k > 0 and chosen[k] == chosen[k - 1]:
-            continue
-        normal = normals[chosen[k]].copy()
-        value = offsets[chosen[k]]
-        for r in range(rank):
-            share = (normal * basis[r]).sum()
-            normal -= share * basis[r]
-            value -= share * values[r]
-        length = np.sqrt((normal * normal).sum())
-        if length < 1e-3:
-            return point, False
-        basis[rank], values[rank] = normal / length, value / length
-        rank += 1
-    found = point.copy()
-    for r in range(rank):
-        found += (values[r] - (basis[r] * found).sum()) * basis[r]
-    return found, True
+        stays[k] = not inside and size <= still
+        if not stays[k]:
+            place[m] += step
 
 
 def _thickness(part: Part) -> float:
