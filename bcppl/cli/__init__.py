@@ -1,4 +1,4 @@
-"""The command line: `bcppl run`, `check`, `import`, `simulate`."""
+"""The command line: `bcppl run`, `probe`, `check`, `import`, `simulate`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from bcppl.cli import recordings, run
+from bcppl.cli import probe, recordings, run
 from bcppl.errors import InferenceError, InputError
 
 app = typer.Typer(
@@ -36,6 +36,7 @@ def _options(
 
 
 app.command("run")(run.run)
+app.command("probe")(probe.probe)
 app.command("check")(recordings.check)
 app.command("simulate")(recordings.simulate)
 app.add_typer(recordings.import_app, name="import")

@@ -84,7 +84,7 @@ def load_actions(path: str | os.PathLike[str]) -> list[Action]:
     """Read actions that `save_actions` wrote, or that somebody wrote by hand as JSON.
 
     Raises:
-        InputError: there is no such file, it holds no actions, or one of them lacks something or makes no sense.
+        InputError: there is no such file, it holds no actions, or one of them lacks something or is none.
     """
     path = Path(path)
     if not path.is_file():

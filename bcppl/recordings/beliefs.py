@@ -104,6 +104,25 @@ def load_latent(path: str | os.PathLike[str]) -> dict[str, Tensor]:
         return {str(site.attrs["address"]): torch.from_numpy(site[()]) for site in file[LATENT].values()}
 
 
+def load_label(path: str | os.PathLike[str]) -> str:
+    """The measurement after which a belief that `save_belief` wrote stands: "prior", "view 1", "window 7".
+
+    Raises:
+        InputError: there is no such file, or it holds no belief that this version reads.
+    """
+    with _opened(path) as file:
+        return str(file.attrs["label"])
+
+
+def is_belief(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is one that `save_belief` wrote, of whatever version."""
+    try:
+        with h5py.File(path, "r") as file:
+            return bool(file.attrs.get("format") == FORMAT)
+    except OSError:
+        return False
+
+
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
     path = Path(path)

@@ -119,7 +119,7 @@ def probing_loop(
     if least_gain is not None:
         number_within("the loop ends below a gain of {}", least_gain)
     rank = by_information(model.pose) if rank is None else rank
-    scene = _prepared(model, recording, scene)
+    scene = prepared(model, recording, scene)
     step = _last(infer(model, recording, particles=particles, seed=seed, scene=scene, start=start), start)
     if chance is not None and chance(step.belief) >= enough:
         return
@@ -127,7 +127,7 @@ def probing_loop(
         refuse_settled(step.belief)
         found = candidates_from(step.belief, number)
         refuse_none(Candidates(tuple(found)))
-        scene = _prepared(model, with_views(recording, found), scene)
+        scene = prepared(model, with_views(recording, found), scene)
         ranking = rank(step.population, found, scene)
         if least_gain is not None and not ranking.best.value >= least_gain:
             return
@@ -136,7 +136,7 @@ def probing_loop(
         if not measured:
             raise InputError(f"the world measured nothing when it was asked for {name_of(chosen)!r}.")
         recording = replace(recording, measurements=[*recording.measurements, *measured])
-        scene, before = _prepared(model, recording, scene), step
+        scene, before = prepared(model, recording, scene), step
         count = len(before.population)
         step = _last(infer(model, recording, particles=count, seed=seed, scene=scene, start=before), before)
         likely = math.nan if chance is None else chance(step.belief)
@@ -182,7 +182,7 @@ def with_views(recording: Recording, candidates: Sequence[Candidate]) -> Recordi
     return replace(recording, measurements=[*recording.measurements, *empty])
 
 
-def _prepared(model: Model, recording: Recording, before: Any) -> Any:
+def prepared(model: Model, recording: Recording, before: Any) -> Any:
     """The scene of a recording that goes on: what was found out is kept, solids are not measured again."""
     scene = model.prepare(recording)
     if before is None or type(before) is not type(scene) or not is_dataclass(scene):

@@ -1,0 +1,138 @@
+"""What is known before the next measurement: a recording that was run, or a belief that a run left."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+
+from bcppl.cli import loading
+from bcppl.errors import InputError
+from bcppl.inference.population import Population
+from bcppl.inference.progress import sole_bar
+from bcppl.recordings import Recording
+from bcppl.recordings.beliefs import is_belief, load_belief, load_label, load_latent
+from bcppl.traces import Model, Series, generate
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What candidates are ranked from.
+
+    Attributes:
+        recording: with the measurements that were taken in, and no others.
+        model: what explains it.
+        population: after them.
+        scene: of the model.
+    """
+
+    recording: Recording
+    model: Model
+    population: Population
+    scene: Any
+
+
+def known(
+    name: str,
+    of: str | None,
+    model: str | None,
+    inference: str | None,
+    particles: int,
+    seed: int,
+    console: Console,
+) -> Known:
+    """Run a recording, or read a belief.
+
+    Args:
+        name: a recording's file or name, or a belief's file.
+        of: the recording that a belief is of; None: what the run.json beside it says.
+        model: None: the one that the recording or the run.json names.
+        inference: None: the default one for the model.
+        particles: of a run.
+        seed: of a run.
+        console: shows how far a run is.
+
+    Raises:
+        InputError: something is not to be found, does not fit, or cannot be gone on from.
+    """
+    if Path(name).is_file() and is_belief(name):
+        return _read(Path(name), of, model)
+    if of is not None:
+        raise InputError(
+            f"--of says which recording a belief is of, but {name} is a recording; leave it out."
+        )
+    found = loading.recording(name)
+    chosen = _chosen(model or found.model)
+    infer = loading.inference(inference or ("tempered_smc" if chosen.arrival is None else "guided_smc"))
+    scene = chosen.prepare(found)
+    population = None
+    with sole_bar(console) as progress:
+        task = progress.add_task("prior", total=len(found.measurements) + 1)
+        for step in infer(chosen, found, particles=particles, seed=seed, scene=scene):
+            population = getattr(step, "population", None)
+            progress.update(task, advance=1, description=step.info.label)
+    if not isinstance(population, Population):
+        raise InputError(
+            "this inference shows no population, so nothing can be foretold from it; use another."
+        )
+    return Known(found, chosen, population, scene)
+
+
+def _chosen(name: str) -> Model:
+    found = loading.model(name)
+    if isinstance(found.program, Series):
+        raise InputError(
+            f"in model {name} the pose moves, so a plan made now would miss it; give a model of a part that "
+            "stays where it is."
+        )
+    return found
+
+
+def _read(path: Path, of: str | None, model: str | None) -> Known:
+    """The population of a belief's file, its sites observed as the recording has them."""
+    label, belief, latent = load_label(path), load_belief(path), load_latent(path)
+    noted = _noted(path)
+    of = of or noted.get("recording")
+    if of is None:
+        raise InputError(
+            f"{path} does not say which recording it is of, and no run.json lies beside it; "
+            "say so with --of RECORDING."
+        )
+    whole = loading.recording(of)
+    chosen = _chosen(model or noted.get("model") or whole.model)
+    taken = 0 if label == "prior" else int(label.rpartition(" ")[2])
+    if taken > len(whole.measurements):
+        raise InputError(
+            f"{path} stands after {label}, but {of} has {len(whole.measurements)} measurements; "
+            "give the recording that it was run on with --of."
+        )
+    measured = list(whole.measurements[:taken])
+    scene = chosen.prepare(whole)
+    observed = chosen.observe(scene, measured)
+    try:
+        trace, _ = generate(
+            chosen.program,
+            (scene, [m.action for m in measured]),
+            observed,
+            len(belief),
+            choices=latent,
+        )
+    except (KeyError, ValueError, InputError) as error:
+        raise InputError(
+            f"{path} does not fit the model or the recording ({error}); give --of and --model as it was run."
+        ) from error
+    recording = Recording(**{**vars(whole), "measurements": measured})
+    return Known(recording, chosen, Population(trace, belief.log_weights.to(torch.float64)), scene)
+
+
+def _noted(path: Path) -> dict[str, Any]:
+    """What the run that left a belief has written down, if that lies beside it."""
+    try:
+        found = json.loads((path.parent / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,240 @@
+"""`bcppl probe`: where to touch or look next, from a recording or a belief."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bcppl import poses
+from bcppl.arguments import number_within, whole_number
+from bcppl.beliefs import Belief
+from bcppl.cli import loading
+from bcppl.cli.known import Known, known
+from bcppl.errors import InputError
+from bcppl.figures import action_in_3d
+from bcppl.inference.probing.candidates import KINDS, MIXED, candidates, refuse_settled
+from bcppl.inference.probing.filters import (
+    Candidate,
+    Candidates,
+    Filter,
+    Mounted,
+    clear_of_table,
+    filtered,
+    from_within,
+    name_of,
+    no_harder_than,
+    refuse_none,
+    within_reach,
+)
+from bcppl.inference.probing.loop import named_apart, prepared, with_views
+from bcppl.inference.probing.ranking import Ranking
+from bcppl.inference.probing.rules import by_information
+from bcppl.models.robots import load_robot
+from bcppl.recordings.action_file import SUFFIXES, load_actions, save_actions
+from bcppl.recordings.measurements import View
+from bcppl.recordings.plan import Plan
+
+DEFAULT = ",".join(f"{kind}:{count}" for kind, count in MIXED.items())
+COUNT = 8  # of a kind that is named without a number
+NUMBERS = "x y z qw qx qy qz"
+
+
+def probe(
+    recording: Annotated[
+        str,
+        typer.Argument(
+            help="A recording (.h5), a shipped one's name, or a belief that `bcppl run` wrote (belief_*.h5)."
+        ),
+    ],
+    candidates: Annotated[
+        str,
+        typer.Option(help=f"Kinds and how many of each ({', '.join(KINDS)}), or a file of plans and views."),
+    ] = DEFAULT,
+    top: Annotated[int, typer.Option(help="How many of the best are shown.")] = 5,
+    output: Annotated[
+        Path | None,
+        typer.Option(help="File for the best action (.h5 or .json); a picture goes beside it (.png)."),
+    ] = None,
+    of: Annotated[str | None, typer.Option(help="The recording that a belief is of.")] = None,
+    model: Annotated[str | None, typer.Option(help="A model's name or file, as for `bcppl run`.")] = None,
+    inference: Annotated[
+        str | None, typer.Option(help="An inference program's name or file, as for `bcppl run`.")
+    ] = None,
+    particles: Annotated[int, typer.Option(help="How many particles; a belief has its own.")] = 75,
+    seed: Annotated[int, typer.Option(help="Same seed, same ranking.")] = 0,
+    hypotheses: Annotated[
+        int | None, typer.Option(help="How many particles play the truth; all by default.")
+    ] = None,
+    rate: Annotated[float, typer.Option(help="Nats that a second of the arm's time costs.")] = 0.0,
+    force: Annotated[float | None, typer.Option(help="N; plans that press harder are left out.")] = None,
+    table: Annotated[
+        float | None, typer.Option(help="Height (m) of a table that no plan may lead into.")
+    ] = None,
+    above: Annotated[
+        float | None,
+        typer.Option(help="Degrees; only touches and views from so near to straight above are kept."),
+    ] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(help="An arm (panda, iiwa or a URDF file): what it does not reach is left out."),
+    ] = None,
+    link: Annotated[str | None, typer.Option(help="The arm's link that holds the peg.")] = None,
+    link_from_peg: Annotated[str, typer.Option(help=f"How it is held there: {NUMBERS}.")] = "0 0 0 1 0 0 0",
+    world_from_base: Annotated[str, typer.Option(help=f"Where the arm stands: {NUMBERS}.")] = "0 0 0 1 0 0 0",
+) -> None:
+    """Say where to touch or look next: candidates by the nats that each is expected to tell."""
+    whole_number("--top is {}", top)
+    whole_number("--particles is {}", particles, least=2)
+    loading.refuse_seed(seed)
+    number_within("--rate is {}", rate, least=0.0)
+    output = Path(f"{Path(recording).stem}_next.json") if output is None else output
+    if output.suffix not in SUFFIXES:
+        raise InputError(f"--output is {output}; give a file that ends in {' or '.join(SUFFIXES)}.")
+    if not output.parent.is_dir():
+        raise InputError(f"there is no folder {output.parent} to write {output.name} into; make it first.")
+    own = load_actions(candidates) if _is_file(candidates) else None
+    kinds = _kinds(candidates) if own is None else {}
+    filters = _filters(force, above, robot, link, link_from_peg, world_from_base, seed)
+    console = Console(highlight=False)
+    before = known(recording, of, model, inference, particles, seed, console)
+    found = _found(before, own, kinds, [*_table(before, table), *filters], seed)
+    console.print(escape(str(found)), soft_wrap=True)
+    scene = prepared(before.model, with_views(before.recording, found), before.scene)
+    with console.status("ranking"):
+        rank = by_information(before.model.pose, hypotheses=hypotheses, cost=seconds_of, rate=rate, seed=seed)
+        ranking = rank(before.population, found, scene)
+    console.print(_shown(ranking, top))
+    best = named_apart(ranking.best.candidate, before.recording)
+    save_actions([best], output)
+    picture = output.with_suffix(".png")
+    _draw(before, best, found).savefig(picture, dpi=150)
+    console.print(f"the best is in {output}, its picture in {picture}", soft_wrap=True)
+
+
+def seconds_of(candidate: Candidate) -> float:
+    """How long a plan takes; a view takes none."""
+    return 0.0 if isinstance(candidate, View) else float(candidate.times[-1] - candidate.times[0])
+
+
+def _is_file(words: str) -> bool:
+    return Path(words).suffix in SUFFIXES or "/" in words
+
+
+def _kinds(words: str) -> dict[str, int]:
+    """Numbers by kind, of words such as touch:20,slide."""
+    found: dict[str, int] = {}
+    for word in filter(None, (each.strip() for each in words.split(","))):
+        kind, _, count = word.partition(":")
+        if kind not in KINDS or (count and not count.isdecimal()):
+            raise InputError(
+                f"--candidates has {word!r}; give kinds ({', '.join(KINDS)}), each with a number if you like "
+                "(touch:20,slide:12), or a file that ends in .h5 or .json."
+            )
+        found[kind] = found.get(kind, 0) + int(count or COUNT)
+    if not found:
+        raise InputError("--candidates names none; give kinds such as touch:20,slide:12, or a file of plans.")
+    return found
+
+
+def _filters(
+    force: float | None,
+    above: float | None,
+    robot: str | None,
+    link: str | None,
+    link_from_peg: str,
+    world_from_base: str,
+    seed: int,
+) -> list[Filter]:
+    found = [] if force is None else [no_harder_than(force)]
+    if above is not None:
+        number_within("--above is {}", above, least=0.0, most=180.0)
+        says = f"come from more than {above:g}° beside straight above"
+        found.append(from_within((0.0, 0.0, -1.0), math.radians(above), says))
+    if robot is not None:
+        if link is None:
+            raise InputError("--robot is given without --link; say which link of the arm holds the peg.")
+        arm = load_robot(robot, tip=link)
+        held, stands = _pose("--link-from-peg", link_from_peg), _pose("--world-from-base", world_from_base)
+        found.append(within_reach(Mounted(arm, link, held, stands), seed=seed))
+    return found
+
+
+def _pose(option: str, words: str) -> Any:
+    try:
+        numbers = np.array([float(word) for word in words.replace(",", " ").split()])
+    except ValueError:
+        raise InputError(f"{option} is {words!r}; give seven numbers, {NUMBERS}, in metres.") from None
+    if numbers.shape != (7,):
+        raise InputError(f"{option} has {numbers.size} numbers; give seven, {NUMBERS}, in metres.")
+    return poses.as_pose(numbers, option).numpy()
+
+
+def _table(before: Known, height: float | None) -> list[Filter]:
+    if height is None or before.recording.peg is None:
+        return []
+    return [clear_of_table(before.recording.peg, height)]
+
+
+def _found(
+    before: Known,
+    own: Sequence[Plan | View] | None,
+    kinds: dict[str, int],
+    filters: Sequence[Filter],
+    seed: int,
+) -> Candidates:
+    """A user's own list, or candidates of kinds."""
+    belief = _belief(before)
+    if own is not None:
+        refuse_none(Candidates(tuple(own)))
+        names = [name_of(each) for each in own]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"two candidates are called {twice!r}; give each a name of its own.")
+        return filtered(own, filters)
+    recording = before.recording
+    cameras = [m.action.camera for m in recording.measurements if isinstance(m.action, View)]
+    return candidates(
+        belief,
+        recording.part,
+        recording.peg,
+        kinds,
+        filters=filters,
+        camera=cameras[0] if cameras else None,
+        seed=seed,
+    )
+
+
+def _belief(before: Known) -> Belief:
+    belief = before.population.belief(before.model.pose)
+    refuse_settled(belief)
+    return belief
+
+
+def _shown(ranking: Ranking, top: int) -> Table:
+    shown = Table(
+        title=f"entropy now: {ranking.entropy:.2f} nats", title_justify="left", box=None, pad_edge=False
+    )
+    for k, name in enumerate(("rank", "what", "gain (nats)", "error", "cost (nats)", "time (s)")):
+        shown.add_column(name, justify="left" if k == 1 else "right", no_wrap=True)
+    for k, each in enumerate(ranking[:top]):
+        cells = (each.information_gain, each.standard_error, each.cost)
+        numbers = [f"{value:.2f}" for value in cells]
+        numbers[1] = f"± {numbers[1]}"
+        name = escape(name_of(each.candidate))
+        shown.add_row(str(k + 1), name, *numbers, f"{seconds_of(each.candidate):.2f}")
+    return shown
+
+
+def _draw(before: Known, best: Candidate, found: Sequence[Candidate]) -> Any:
+    belief = _belief(before)
+    shown = f"next: {name_of(best)}", belief.world_from_part.numpy(), belief.log_weights.numpy()
+    others = [c for c in found if isinstance(c, Plan)] if isinstance(best, Plan) else []
+    return action_in_3d(before.recording.part, shown, best, before.recording.peg, others)
