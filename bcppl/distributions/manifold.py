@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -14,6 +16,7 @@ from bcppl.arguments import number_within
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 
+_LATER: ContextVar[bool] = ContextVar("_LATER", default=False)
 _FAR = 4.0  # standard deviations
 FARTHEST = 0.02  # m: the range over which an outlier's gap is spread evenly
 
@@ -166,7 +169,19 @@ class ContactManifold(LazyDistribution):
                 "get to; give it a `motion`, such as bcppl.simulators.god_object.WindowMotion, or "
                 "simulate the probe with bcppl.simulators.track.ContactTrack."
             )
+        if _LATER.get():
+            return torch.full((*self.batch_shape, *self.event_shape), torch.nan, dtype=torch.float64)
         return self._with_errors(self.motion(self.pose))
+
+    @staticmethod
+    @contextmanager
+    def drawn_later() -> Iterator[None]:
+        """Samples within are NaN, and cost nothing: what they are is asked for with `samples` afterwards."""
+        token = _LATER.set(True)
+        try:
+            yield
+        finally:
+            _LATER.reset(token)
 
     @staticmethod
     def samples(sites: Sequence[ContactManifold]) -> list[Tensor]:

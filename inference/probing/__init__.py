@@ -9,6 +9,7 @@ from bcppl.inference.probing.entropies import (
     weight_entropy,
 )
 from bcppl.inference.probing.expected_entropy import expected_information_gain
+from bcppl.inference.probing.linearised import linearised_information_gain
 from bcppl.inference.probing.observations import Batched
 from bcppl.inference.probing.ranking import Prospect, Ranking
 
@@ -19,6 +20,7 @@ __all__ = [
     "Prospect",
     "Ranking",
     "expected_information_gain",
+    "linearised_information_gain",
     "mode_entropy",
     "neighbour_entropy",
     "value_entropy",

@@ -68,7 +68,7 @@ def value_entropy(address: str) -> Entropy:
         carrying = torch.softmax(population.log_weights, 0) > 0
         values = values_at(population, address)[carrying]
         distinct, which = torch.unique(values, dim=0, return_inverse=True)
-        _refuse_collapsed(address, len(distinct))
+        refuse_collapsed(address, len(distinct))
         summed = _summing(carrying, which, len(distinct))
         return lambda weights: torch.special.entr(summed(weights)).sum(dim=1)
 
@@ -110,12 +110,9 @@ def mode_entropy(
         if is_pose(population, address):
             freedom = population.belief(address).freedom
             distinct, which = distinct_poses(population[address][carrying])
-            _refuse_collapsed(address, len(distinct))
+            refuse_collapsed(address, len(distinct))
             share = _summed(weights, which, len(distinct))
-            # The few particles of a wide belief are farther apart than modes are, and no modes for that.
-            sparse = SPARSE * float(nearest(distinct, translation, rotation, symmetries).median())
-            gap = (max(1.0, sparse) * translation, max(1.0, sparse) * rotation)
-            label = cluster(distinct, *gap, symmetries)
+            label, gap = parted(distinct, translation, rotation, symmetries)
             linked = links(distinct, *gap, symmetries)
             tangent = distinct.new_zeros(len(distinct), 6)
             for mode in range(int(label.max()) + 1):
@@ -136,6 +133,16 @@ def mode_entropy(
         return lambda weights: mixtures.entropy(summed(weights))
 
     return fitted
+
+
+def parted(
+    distinct: Tensor, translation: float, rotation: float, symmetries: Tensor | None = None
+) -> tuple[Tensor, tuple[float, float]]:
+    """Which mode each of distinct poses (K, 7) is in, (K,) int64, and the gap between modes that was used."""
+    # The few particles of a wide belief are farther apart than modes are, and no modes for that.
+    sparse = SPARSE * float(nearest(distinct, translation, rotation, symmetries).median())
+    gap = (max(1.0, sparse) * translation, max(1.0, sparse) * rotation)
+    return cluster(distinct, *gap, symmetries), gap
 
 
 def neighbour_entropy(address: str, neighbours: int = 3) -> Entropy:
@@ -171,7 +178,7 @@ def neighbour_entropy(address: str, neighbours: int = 3) -> Entropy:
             coordinates, which = _distinct_reals(population, address, carrying)
             log_base = torch.zeros(len(coordinates), dtype=torch.float64)
         count, dimension = coordinates.shape
-        _refuse_collapsed(address, count)
+        refuse_collapsed(address, count)
         if count <= neighbours:
             raise InputError(
                 f"the belief over {address!r} has {count} distinct particles, too few for an entropy by "
@@ -238,11 +245,12 @@ def _distinct_reals(population: Population, address: str, carrying: Tensor) -> t
     distinct, which = torch.unique(
         values[carrying].to(torch.float64).reshape(int(carrying.sum()), -1), dim=0, return_inverse=True
     )
-    _refuse_collapsed(address, len(distinct))
+    refuse_collapsed(address, len(distinct))
     return distinct, which
 
 
-def _refuse_collapsed(address: str, distinct: int) -> None:
+def refuse_collapsed(address: str, distinct: int) -> None:
+    """Raises where a belief has fewer than two distinct particles."""
     if distinct < 2:
         raise InputError(
             f"the belief over {address!r} has collapsed to a point: all particles with weight are the same, "

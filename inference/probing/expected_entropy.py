@@ -119,7 +119,7 @@ def expected_information_gain(
         first = one.log_likelihoods(one.drawn(truths.particles, seeds[1]))
         second = one.log_likelihoods(one.drawn(truths.particles, seeds[2])) if depth == 2 else None
         after = entropies(population.log_weights, first, entropy_of)
-        _warn_of_lost(k, torch.isnan(after))
+        warn_of_lost(k, torch.isnan(after))
         steps.append(Step(first, second, after, costs[k]))
         gain, error = mean_and_error(now - after, truths.weights)
         prospects.append(
@@ -159,7 +159,8 @@ def _after_both(first: Prospect, then: Following) -> Prospect:
     )
 
 
-def _warn_of_lost(number: int, lost: Tensor) -> None:
+def warn_of_lost(number: int, lost: Tensor) -> None:
+    """Says how many hypotheses (H,) tell nothing of a candidate."""
     if bool(lost.any()):
         warnings.warn(
             f"{int(lost.sum())} of {len(lost)} hypotheses are left out of what candidate {number} is "
