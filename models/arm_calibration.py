@@ -69,7 +69,17 @@ class Arm:
         return self.robot.position(self.link, angles, offsets, ball, values.get("errors"))
 
     def log_volume(self, values: Mapping[str, Tensor], angles: Tensor) -> Tensor:
-        """Log of d(places) / d(angles), summed over the stamps, (N,)."""
+        """Log of d(places) / d(angles), summed over the stamps, (N,).
+
+        Raises:
+            InputError: the angles are of another number of joints.
+        """
+        joints = self.robot.joints
+        if angles.shape[-1] != len(joints):
+            raise InputError(
+                f"a seating of {self.robot.name} has {angles.shape[-1]} angles for each stamp; give "
+                f"{len(joints)}, in the order {', '.join(joint.name for joint in joints)}."
+            )
         offsets = values["offsets"]
         kept = torch.is_grad_enabled() and any(v.requires_grad for v in values.values())
         with torch.enable_grad():

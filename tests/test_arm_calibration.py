@@ -172,3 +172,9 @@ def test_seatings_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
         (tmp_path / f"hole_{number}.csv").write_text(f"{number},0\n{number},1\n")
     (tmp_path / "hole_notes.csv").write_text("a,b\n")
     assert [int(q[0, 0]) for q in read_seatings(tmp_path)] == list(range(12))
+
+
+def test_another_number_of_joints_is_refused() -> None:
+    arm = Arm(load_robot("panda", tip="panda_hand"))
+    with pytest.raises(InputError, match="has 6 angles for each stamp; give 7, in the order panda_joint1,"):
+        linearised(arm, [torch.zeros(5, 6).double()])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,11 @@ def test_a_convex_part_needs_no_coacd(monkeypatch: pytest.MonkeyPatch, tmp_path:
     with pytest.raises(InputError, match=r"not convex.*pip install 'bcppl\[mesh\]'") as told:
         decomposed(angle(), clearance=0.0001, cache=tmp_path)
     assert "\n" not in str(told.value)
+    # The folder of results is found by a package that is installed together with CoACD.
+    monkeypatch.setitem(sys.modules, "platformdirs", None)
+    assert decomposed(replace(block((0.06, 0.04, 0.02)), pieces=()), clearance=0.0001).error.largest < 1e-12
+    with pytest.raises(InputError, match=r"not convex.*pip install 'bcppl\[mesh\]'"):
+        decomposed(angle(), clearance=0.0001)
 
 
 def test_pieces_are_kept_by_content_and_damage_is_told(

@@ -100,7 +100,7 @@ def decomposed(
     ]
     if not levels:
         raise InputError(f"{task} without thresholds; give at least one, such as 0.05.")
-    seed, folder = seed_number(seed), _user_cache() if cache is None else Path(cache)
+    seed = seed_number(seed)
     hulls = [np.asarray(body.convex_hull.vertices) for body in bodies_of(part.mesh)]
     whole = replace(part, pieces=tuple(Piece("hull", corners) for corners in hulls))
     error = geometric_error(whole, seed=seed)
@@ -110,7 +110,7 @@ def decomposed(
     with _told(part, progress) as tell:
         for threshold in levels:
             tell(f"CoACD at threshold {threshold:g}")
-            found.append(_kept(part, threshold, seed, folder))
+            found.append(_kept(part, threshold, seed, cache))
             if found[-1].error.largest <= bound:
                 return found[-1]
             expected = found[-1].error.largest * min(levels) / threshold
@@ -148,9 +148,11 @@ def _told(part: Part, progress: bool | None) -> Iterator[Callable[[str], None]]:
         yield lambda what: bar.update(task, description=f"{part.name}: {what}")
 
 
-def _kept(part: Part, threshold: float, seed: int, folder: Path) -> Decomposition:
+def _kept(part: Part, threshold: float, seed: int, cache: str | Path | None) -> Decomposition:
     """A decomposition from the cache, or made anew and put there."""
     version = _version(part)
+    # Only now: what finds the folder is installed together with CoACD.
+    folder = _user_cache() if cache is None else Path(cache)
     settings = {"form": _FORM, "coacd": version, "threshold": threshold, "seed": seed, **_SEARCH}
     content = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for array in (part.vertices.astype("<f8"), part.faces.astype("<i8")):
