@@ -160,6 +160,10 @@ class DepthDistribution(LazyDistribution):
         region = None if self.region is None else np.asarray(self.region, dtype=bool).reshape(-1)
         return HitsOfPoses(partial(self.renderer.hits, self.camera, self.seen_pose), region)
 
+    def all_hits(self) -> HitsOfPoses:
+        """What the camera sees of the parts at every pixel, for another site that hangs on the same."""
+        return self._hits.keep_all()
+
     @cached_property
     def _biases(self) -> Array | None:
         """The biases (N,), metres; None where there is none."""

@@ -72,6 +72,11 @@ class HitsOfPoses:
         self._asked = False
         self._every: PixelHits | None = None
 
+    def keep_all(self) -> HitsOfPoses:
+        """Itself, which renders every pixel when it is first asked: for several that count different ones."""
+        self._asked, self._region = True, None
+        return self
+
     def __call__(self, counted: Mask) -> PixelHits:
         """The hits at the counted pixels (H * W,)."""
         if self._every is None:
