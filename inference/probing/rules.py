@@ -16,6 +16,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.probing.entropies import mode_entropy
 from bcppl.inference.probing.expected_entropy import expected_information_gain
 from bcppl.inference.probing.filters import Candidate
+from bcppl.inference.probing.linearised import linearised_information_gain
 from bcppl.inference.probing.ranking import Prospect, Ranking
 from bcppl.inference.probing.touching import leading_point, middle_of_stroke
 from bcppl.parts import Part
@@ -27,19 +28,34 @@ Rank = Callable[[Population, Sequence[Candidate], Any], Ranking]
 
 
 def by_information(pose: str, **settings: Any) -> Rank:
-    """By the nats that each is expected to tell: `expected_information_gain` of `mode_entropy(pose)`.
+    """By the nats that each is expected to tell of a pose: `linearised_information_gain`.
 
     Args:
         pose: the address of the sought pose.
-        settings: further arguments, such as `hypotheses`, `cost` and `rate`.
+        settings: further arguments, such as `hypotheses`, `information`, `cost` and `rate`.
     """
 
     def rank(population: Population, candidates: Sequence[Candidate], scene: Any) -> Ranking:
         _, done = population.trace.args
-        entropy = settings.get("entropy", mode_entropy(pose))
-        others = {name: value for name, value in settings.items() if name != "entropy"}
+        return linearised_information_gain(
+            population, candidates, lambda c: (scene, [*done, action_of(c)]), pose, **settings
+        )
+
+    return rank
+
+
+def by_reweighing(pose: str, **settings: Any) -> Rank:
+    """By the same, particles reweighed: for likelihoods that are not linearised, and not sharp.
+
+    Args:
+        pose: the address of the sought pose.
+        settings: further arguments of `expected_information_gain`; the entropy is `mode_entropy(pose)`.
+    """
+
+    def rank(population: Population, candidates: Sequence[Candidate], scene: Any) -> Ranking:
+        _, done = population.trace.args
         return expected_information_gain(
-            population, candidates, lambda c: (scene, [*done, action_of(c)]), entropy, **others
+            population, candidates, lambda c: (scene, [*done, action_of(c)]), mode_entropy(pose), **settings
         )
 
     return rank
