@@ -129,21 +129,20 @@ def compared(
             scene = bench_scene(seed)
             found.name = scene.name
             look = scene.look()
-            known = model.prepare(look)
-            *_, seen = taken_in(look, particles, seed, known)
+            *_, seen = taken_in(look, particles, seed)
         except Exception as error:
             for course in found.courses.values():
                 course.failed = one_line(error)
             return found
         for way, course in found.courses.items():
             try:
-                follow(course, scene, seen, known, *way_of(way, scene, hypotheses))
+                follow(course, scene, seen, *way_of(way, scene, hypotheses))
             except Exception as error:
                 course.failed = one_line(error)
     return found
 
 
-def follow(course: Course, scene: BenchScene, seen: Step, known: Any, asked: Any, rank: Rank) -> None:
+def follow(course: Course, scene: BenchScene, seen: Step, asked: Any, rank: Rank) -> None:
     """The loop from vision on, put down as it goes."""
     judge(course, scene, seen)
     begun = [time.perf_counter()]
@@ -158,9 +157,7 @@ def follow(course: Course, scene: BenchScene, seen: Step, known: Any, asked: Any
         return asked(belief, number)
 
     look = scene.look()
-    for each in probing_loop(
-        model, look, BenchArm(scene), planned_anew, timed, start=seen, scene=known, probes=PROBES
-    ):
+    for each in probing_loop(model, look, BenchArm(scene), planned_anew, timed, start=seen, probes=PROBES):
         judge(course, scene, each.step)
         course.names.append(name_of(each.chosen))
         course.met.append(touched(each))

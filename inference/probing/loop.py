@@ -83,7 +83,6 @@ def probing_loop(
     particles: int = 75,
     seed: int = 0,
     start: Step | None = None,
-    scene: Any = None,
     probes: int = 3,
     least_gain: float | None = None,
     chance: Callable[[Belief], float] | None = None,
@@ -103,7 +102,6 @@ def probing_loop(
         particles: how many, where there is no `start`.
         seed: of inference, where there is no `start`.
         start: a step that has taken in some or all of the recording.
-        scene: of the model, that `start` was run with.
         probes: at most so many.
         least_gain: nats; where the best candidate is expected to tell less, less its cost, it is over.
         chance: of an insertion under a belief, such as `chance_of_success(...).success`; asked before the
@@ -119,7 +117,7 @@ def probing_loop(
     if least_gain is not None:
         number_within("the loop ends below a gain of {}", least_gain)
     rank = by_information(model.pose) if rank is None else rank
-    scene = prepared(model, recording, scene)
+    scene = prepared(model, recording, None if start is None else start.population.trace.args[0])
     step = _last(infer(model, recording, particles=particles, seed=seed, scene=scene, start=start), start)
     if chance is not None and chance(step.belief) >= enough:
         return
