@@ -29,7 +29,7 @@ from bcppl.simulators.gap import PegGap
 from bcppl.simulators.holes import Hole
 
 KINDS = tuple(SOURCES)
-MIXED: Mapping[str, int] = {"touch": 20, "slide": 12}
+MIXED: Mapping[str, int] = {"touch": 14, "slide": 10, "pair": 8}
 _DRAWS = 8  # times as many places as candidates that are asked for are looked at, at most
 
 
@@ -56,7 +56,8 @@ def candidates(
         belief: over world_from_part.
         part: its z axis points out of its top.
         peg: what is held, its frame at the wrench sensor and its tip at its lowest z; None for views alone.
-        kinds: how many of "touch", "slide", "search", "attempt" and "view"; None: 20 touches and 12 slides.
+        kinds: how many of "touch", "slide", "pair" (two touches), "search", "attempt" and "view"; None: 14
+            touches, 10 slides and 8 pairs.
         filters: further ones (`bcppl.inference.probing.filters`).
         gap: of part and peg, if it is at hand.
         hole: the one that is searched for; None: the part's only one.
@@ -146,7 +147,7 @@ def _usual(kind: str, setup: Setup) -> list[Filter]:
     assert setup.gap is not None
     mean = setup.belief.mean
     found = [not_from_below(), clear_of_part(setup.gap, mean)]
-    return [*found, meeting(setup.gap, mean)] if kind in ("touch", "slide") else found
+    return [*found, meeting(setup.gap, mean)] if kind in ("touch", "slide", "pair") else found
 
 
 def _numbered(candidate: Candidate, number: int) -> Candidate:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.errors import InputError
-from bcppl.inference.probing.touching import middle_of_stroke
+from bcppl.inference.probing.touching import middles_of_strokes
 from bcppl.parts import Part
 from bcppl.recordings.measurements import View
 from bcppl.recordings.plan import Plan
@@ -30,7 +30,6 @@ from bcppl.simulators.robot import Robot
 Array = npt.NDArray[np.float64]
 Candidate = Plan | View
 
-PRESSING = ("guarded", "held", "searching")
 _APART = 0.002  # m between the places at which a free motion is looked at
 _MET = 0.0005  # m: a stroke whose middle is so near to the part meets it there
 
@@ -132,7 +131,7 @@ def refuse_none(candidates: Candidates) -> None:
 
 
 def from_within(direction: Sequence[float], angle: float, removes: str = "") -> Filter:
-    """Keeps plans whose first guarded motion, and views that look, along a direction within an angle.
+    """Keeps plans whose guarded motions are, and views that look, along a direction within an angle.
 
     Args:
         direction: (3,) in the world, of any length; for touches from above [0, 0, -1].
@@ -151,13 +150,10 @@ def from_within(direction: Sequence[float], angle: float, removes: str = "") -> 
     def keeps(candidate: Candidate) -> bool:
         if isinstance(candidate, View):
             pose = torch.as_tensor(candidate.camera.world_from_camera)
-            way = poses.rotation_matrix(pose)[:, 2].numpy()
+            ways = [poses.rotation_matrix(pose)[:, 2].numpy()]
         else:
-            met = middle_of_stroke(candidate)
-            if met is None:
-                return True
-            way = met[1]
-        return bool(way @ along > math.cos(angle) - 1e-9)
+            ways = [way for _, way in middles_of_strokes(candidate)]
+        return all(bool(way @ along > math.cos(angle) - 1e-9) for way in ways)
 
     says = removes or f"come from more than {math.degrees(angle):.3g}° beside the direction that was asked"
     return Filter(says, lambda candidates: [keeps(c) for c in candidates])
@@ -192,7 +188,7 @@ def clear_of_part(gap: PegGap, world_from_part: Array | torch.Tensor) -> Filter:
 
 
 def meeting(gap: PegGap, world_from_part: Array | torch.Tensor) -> Filter:
-    """Keeps plans whose first guarded motion meets the part half-way, where it is thought to be.
+    """Keeps plans whose guarded motions meet the part half-way, where it is thought to be.
 
     Args:
         gap: of the part and the peg.
@@ -201,13 +197,13 @@ def meeting(gap: PegGap, world_from_part: Array | torch.Tensor) -> Filter:
     there = torch.as_tensor(world_from_part)[None]
 
     def keeps(candidates: Sequence[Candidate]) -> list[bool]:
-        met = [middle_of_stroke(c) if isinstance(c, Plan) else None for c in candidates]
-        at = [k for k, each in enumerate(met) if each is not None]
-        kept = np.ones(len(candidates), dtype=bool)
-        if at:
-            middle = torch.from_numpy(np.stack([each[0] for each in met if each is not None]))
-            kept[at] = np.abs(gap(there, middle).distance[0].numpy()) < _MET
-        return [bool(each) for each in kept]
+        met = [middles_of_strokes(c) if isinstance(c, Plan) else [] for c in candidates]
+        middles = [middle for strokes in met for middle, _ in strokes]
+        if not middles:
+            return [True] * len(candidates)
+        distance = gap(there, torch.from_numpy(np.stack(middles))).distance[0].abs().numpy()
+        ends = np.cumsum([len(strokes) for strokes in met])[:-1]
+        return [bool((each < _MET).all()) for each in np.split(distance, ends)]
 
     return Filter("would meet the part elsewhere or not at all", keeps)
 
@@ -241,15 +237,19 @@ def pressing_force(plan: Plan) -> float:
     It is what stops its guarded motions, and what its spring adds where it is led on beyond that. An impact
     may be more.
     """
-    met, worst, base = middle_of_stroke(plan), 0.0, plan.world_from_peg[0, :3]
+    worst, onto = 0.0, np.zeros(3)
     for k, manner in enumerate(plan.manners):
+        way = plan.world_from_peg[k + 1, :3] - plan.world_from_peg[k, :3]
         if manner == "guarded":
-            worst, base = max(worst, plan.force), plan.world_from_peg[k + 1, :3]
-        elif manner in ("held", "searching") and met is not None and worst > 0.0:
-            onto = float((plan.world_from_peg[k + 1, :3] - base) @ met[1])
+            worst, onto = max(worst, plan.force), way / max(float(np.linalg.norm(way)), 1e-12)
+            base = plan.world_from_peg[k + 1, :3]
+        elif manner in ("held", "searching") and onto.any():
+            beyond = float((plan.world_from_peg[k + 1, :3] - base) @ onto)
             held = poses.rotation_matrix(torch.from_numpy(plan.world_from_peg[k + 1])).numpy()
-            spring = float(np.square(held.T @ met[1]) @ np.asarray(plan.stiffness)[:3])
-            worst = max(worst, plan.force + spring * max(onto, 0.0))
+            spring = float(np.square(held.T @ onto) @ np.asarray(plan.stiffness)[:3])
+            worst = max(worst, plan.force + spring * max(beyond, 0.0))
+        elif manner == "free":
+            onto = np.zeros(3)
     return worst
 
 

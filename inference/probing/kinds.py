@@ -18,7 +18,8 @@ from bcppl.inference.probing.touching import (
     Spot,
     Touching,
     face_of,
-    middle_of_stroke,
+    middles_of_strokes,
+    pair,
     slide,
     spots_of,
     touch,
@@ -37,6 +38,8 @@ SHORT = Attempt(above=0.01, landing=0.03, longest=1.5, widest=0.006, press=0.004
 CAMERA = Camera("camera", 160, 120, 160.0, 160.0, 79.5, 59.5, poses.identity().numpy(), near=0.1, far=2.0)
 _SHARES = (1.0, -1.0, 0.6, -0.6)  # of a slide's length that are tried, either way
 _ON = 0.0003  # m: a peg so near to the part slides on it
+_NEAR = 20  # places from among which the second touch of a pair is chosen
+_DOWNWARD = -0.5  # z of a normal that looks down
 _LOOKED_AT = 9  # places of a slide
 _DISTANCE = 0.45  # m from the part of a view's camera that no recording says
 _HEIGHTS = (50.0, 70.0, 35.0)  # degrees above the horizon, in turn
@@ -96,20 +99,31 @@ def _slides(setup: Setup, most: int) -> Iterator[Plan | View]:
     for spot in spots_of(setup.part, most, int(generator.integers(2**31))):
         along = _tangent(spot, generator)
         landed = touch(setup.belief, setup.part, setup.held, spot, setup.touching)
-        met = middle_of_stroke(landed)
-        if met is None:
-            continue
+        met, _ = middles_of_strokes(landed)[0]
         length = next(
             (
                 share * setup.touching.length
                 for share in _SHARES
-                if _stays_on(setup, met[0], share * setup.touching.length * along)
+                if _stays_on(setup, met, share * setup.touching.length * along)
             ),
             0.0,
         )
         name = f"slide #: {face_of(spot.normal)}"
         if length != 0.0:
             yield slide(setup.belief, setup.part, setup.held, spot, length * along, setup.touching, name)
+
+
+def _pairs(setup: Setup, most: int) -> Iterator[Plan | View]:
+    """Two touches of faces that stand across one another, near the edge or corner that they share."""
+    generator = np.random.default_rng([setup.seed, 4])
+    firsts = spots_of(setup.part, most, int(generator.integers(2**31)))
+    for first in firsts:
+        others = spots_of(setup.part, _NEAR, int(generator.integers(2**31)))
+        across = [o for o in others if abs(float(o.normal @ first.normal)) < 0.5 and o.normal[2] > _DOWNWARD]
+        if across:
+            second = min(across, key=lambda o: float(np.linalg.norm(o.place - first.place)))
+            name = f"pair #: {face_of(first.normal)}, {face_of(second.normal)}"
+            yield pair(setup.belief, setup.part, setup.held, first, second, setup.touching, name)
 
 
 def _tangent(spot: Spot, generator: np.random.Generator) -> Array:
@@ -217,6 +231,7 @@ def _views(setup: Setup, most: int) -> Iterator[Plan | View]:
 SOURCES: Mapping[str, Callable[[Setup, int], Iterator[Plan | View]]] = {
     "touch": _touches,
     "slide": _slides,
+    "pair": _pairs,
     "search": _searches,
     "attempt": _attempts,
     "view": _views,

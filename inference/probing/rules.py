@@ -18,7 +18,7 @@ from bcppl.inference.probing.expected_entropy import expected_information_gain
 from bcppl.inference.probing.filters import Candidate
 from bcppl.inference.probing.linearised import linearised_information_gain
 from bcppl.inference.probing.ranking import Prospect, Ranking
-from bcppl.inference.probing.touching import leading_point, middle_of_stroke
+from bcppl.inference.probing.touching import leading_point, middles_of_strokes
 from bcppl.parts import Part
 from bcppl.recordings.measurements import View
 from bcppl.recordings.plan import action_of
@@ -88,16 +88,20 @@ def by_largest_variance(peg: Part, pose: str) -> Rank:
 
 
 def surface_variance(belief: Belief, peg: Part, candidate: Candidate) -> float:
-    """The variance (m^2) of where a surface is that a plan is to meet, along its stroke; -inf for others."""
-    met = None if isinstance(candidate, View) else middle_of_stroke(candidate)
-    if met is None:
-        return -math.inf
-    world_from_peg, direction = torch.from_numpy(met[0]), torch.from_numpy(met[1])
-    led = poses.rotation_matrix(world_from_peg).T @ direction
-    place = poses.transform(world_from_peg, torch.from_numpy(leading_point(peg, led.numpy()))[None])
-    in_part = poses.transform(poses.inverse(belief.mean), place)
-    along = poses.transform(belief.world_from_part, in_part)[:, 0] @ direction
-    return float(belief.weights @ (along - belief.weights @ along) ** 2)
+    """The variance (m^2) of where a surface is that a plan is to meet, along its stroke.
+
+    Of several strokes the largest; -inf where there is none, and for views.
+    """
+    strokes = [] if isinstance(candidate, View) else middles_of_strokes(candidate)
+    found = [-math.inf]
+    for middle, way in strokes:
+        world_from_peg, direction = torch.from_numpy(middle), torch.from_numpy(way)
+        led = poses.rotation_matrix(world_from_peg).T @ direction
+        place = poses.transform(world_from_peg, torch.from_numpy(leading_point(peg, led.numpy()))[None])
+        in_part = poses.transform(poses.inverse(belief.mean), place)
+        along = poses.transform(belief.world_from_part, in_part)[:, 0] @ direction
+        found.append(float(belief.weights @ (along - belief.weights @ along) ** 2))
+    return max(found)
 
 
 def in_order(candidates: Sequence[Candidate], order: Sequence[int] | None = None) -> Ranking:

@@ -70,6 +70,8 @@ _STILL = 0.15  # s before anything moves, in which the wrench is tared
 _QUICKEST = 0.05  # s that a motion takes at least
 _ALIKE = 2e-5  # m: vertices of a peg so near to its farthest one are as far
 _UPRIGHT = 0.5  # a normal whose z is less is a side's
+_OVER = 0.006  # m above the part, beyond what the belief is unsure of, between two touches
+_SHORTER = 0.6  # of the dwell, where there are two
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -155,44 +157,121 @@ def slide(
         InputError: a number of `touching` is not positive.
     """
     chosen = _checked(Touching() if touching is None else touching)
-    normal = spot.normal
-    met = _met(belief, part, peg, spot, chosen)
-    half = half_stroke(belief, spot.place, normal, chosen)
-    lift = half_stroke(belief, np.array([0.0, 0.0, _top(part)]), _UP, chosen) + chosen.safe
-    clear = met + half * normal
-    pressed = met - (half + chosen.press) * normal
-    above = np.array([*clear[:2], max(clear[2], _top(part) + lift - float(peg.vertices[:, 2].min()))])
-    led: list[tuple[Array, Manner, float]] = []
+    stroke = _Stroke.of(belief, part, peg, spot, chosen)
+    led: list[_Knot] = []
     if np.linalg.norm(way) > 0.0:
-        led.append((pressed + way, "held", _span(way, np.zeros(3), chosen.sliding)))
-    knots: list[tuple[Array, Manner, float]] = [
-        (above, "free", _STILL),
-        (clear, "free", _span(above, clear, chosen.free)),
-        (met - half * normal, "guarded", _span(clear, met - half * normal, chosen.guarded)),
-        (pressed, "held", _span(met - half * normal, pressed, chosen.guarded)),
-        (pressed, "held", chosen.dwell),
+        led.append(_Knot(stroke.pressed + way, "held", chosen.sliding))
+    knots = [
+        *stroke.down(chosen),
         *led,
-        (clear + way, "free", _span(clear, pressed, chosen.free)),
-        (above + way, "free", _span(clear, above, chosen.free)),
+        _Knot(stroke.clear + way, "free", chosen.free),
+        _Knot(stroke.above + way, "free", chosen.free),
     ]
-    return _plan(belief, name, [above, *(place for place, _, _ in knots)], knots, chosen)
+    return _plan(belief, name, stroke.above, knots, chosen)
 
 
-def middle_of_stroke(plan: Plan) -> tuple[Array, Array] | None:
-    """Where a plan is thought to meet the surface; None where nothing is guarded.
+def pair(
+    belief: Belief,
+    part: Part,
+    peg: Part,
+    first: Spot,
+    second: Spot,
+    touching: Touching | None = None,
+    name: str = "pair",
+) -> Plan:
+    """Two touches in one plan, of two faces of the part; between them the peg is lifted over the part.
+
+    Args:
+        belief: over world_from_part.
+        part: its z axis points out of its top.
+        peg: what is held.
+        first: where it touches first.
+        second: where then.
+        touching: speeds and forces.
+        name: of the plan.
+
+    Raises:
+        InputError: a number of `touching` is not positive.
+    """
+    chosen = _checked(Touching() if touching is None else touching)
+    chosen = chosen._replace(dwell=_SHORTER * chosen.dwell)
+    one, other = (_Stroke.of(belief, part, peg, spot, chosen) for spot in (first, second))
+    over = min(one.above[2], other.above[2]) - chosen.safe + _OVER
+    knots = [
+        *one.down(chosen),
+        _Knot(one.clear, "free", chosen.free),
+        _Knot(np.array([*one.clear[:2], max(one.clear[2], over)]), "free", chosen.free),
+        _Knot(np.array([*other.clear[:2], max(other.clear[2], over)]), "free", chosen.free),
+        *other.down(chosen),
+        _Knot(other.clear, "free", chosen.free),
+        _Knot(other.above, "free", chosen.free),
+    ]
+    return _plan(belief, name, one.above, knots, chosen)
+
+
+class _Knot(NamedTuple):
+    """Where (3,) the peg's origin is led in the part's frame, how, and how fast (m/s)."""
+
+    place: Array
+    manner: Manner
+    speed: float
+
+
+class _Stroke(NamedTuple):
+    """A guarded stroke onto a spot: where (3,) the peg's origin is, in the part's frame.
+
+    Attributes:
+        above: it begins and ends there, high enough above the part.
+        clear, stop: between which the stroke lies.
+        pressed: to where the command goes on.
+    """
+
+    above: Array
+    clear: Array
+    stop: Array
+    pressed: Array
+
+    @classmethod
+    def of(cls, belief: Belief, part: Part, peg: Part, spot: Spot, touching: Touching) -> _Stroke:
+        """For a belief over where the surface is."""
+        normal, met = spot.normal, _met(belief, part, peg, spot, touching)
+        half = half_stroke(belief, spot.place, normal, touching)
+        lift = half_stroke(belief, np.array([0.0, 0.0, _top(part)]), _UP, touching) + touching.safe
+        clear = met + half * normal
+        height = _top(part) + lift - float(peg.vertices[:, 2].min())
+        return cls(
+            np.array([*clear[:2], max(clear[2], height)]),
+            clear,
+            met - half * normal,
+            met - (half + touching.press) * normal,
+        )
+
+    def down(self, touching: Touching) -> list[_Knot]:
+        """To the surface, and pressed on."""
+        return [
+            _Knot(self.clear, "free", touching.free),
+            _Knot(self.stop, "guarded", touching.guarded),
+            _Knot(self.pressed, "held", touching.guarded),
+            _Knot(self.pressed, "held", touching.guarded),
+        ]
+
+
+def middles_of_strokes(plan: Plan) -> list[tuple[Array, Array]]:
+    """Where a plan is thought to meet surfaces.
 
     Returns:
-        The peg's pose (7,) in the middle of its first guarded motion, and that motion's direction (3,) in the
-        world.
+        For each of its guarded motions, the peg's pose (7,) in the middle of it, and its direction (3,) in
+        the world.
     """
+    found = []
     for k, manner in enumerate(plan.manners):
         way = plan.world_from_peg[k + 1, :3] - plan.world_from_peg[k, :3]
         length = float(np.linalg.norm(way))
         if manner == "guarded" and length > 0.0:
             middle = plan.world_from_peg[k].copy()
             middle[:3] += 0.5 * way
-            return middle, way / length
-    return None
+            found.append((middle, way / length))
+    return found
 
 
 def _checked(touching: Touching) -> Touching:
@@ -217,26 +296,21 @@ def _met(belief: Belief, part: Part, peg: Part, spot: Spot, touching: Touching) 
     return place - leading_point(peg, -spot.normal)
 
 
-def _span(start: Array, stop: Array, speed: float) -> float:
-    """Seconds that a way takes."""
-    return max(float(np.linalg.norm(stop - start)) / speed, _QUICKEST)
-
-
-def _plan(
-    belief: Belief,
-    name: str,
-    places: Sequence[Array],
-    knots: Sequence[tuple[Array, Manner, float]],
-    touching: Touching,
-) -> Plan:
-    """The plan of a peg whose origin is led through places in the part's frame, its axes the part's."""
+def _plan(belief: Belief, name: str, start: Array, knots: Sequence[_Knot], touching: Touching) -> Plan:
+    """The plan of a peg whose origin is led from a place through knots, its axes the part's."""
+    places = np.stack([start, start, *(knot.place for knot in knots)])
+    ways = np.linalg.norm(np.diff(places[1:], axis=0), axis=1)
+    spans = [_STILL]
+    for way, knot in zip(ways, knots, strict=True):
+        stays = way == 0.0 and knot.manner == "held"
+        spans.append(touching.dwell if stays else max(float(way) / knot.speed, _QUICKEST))
     world_from_peg = belief.mean.expand(len(places), 7).clone()
-    world_from_peg[:, :3] = poses.transform(belief.mean, torch.from_numpy(np.stack(places)))
+    world_from_peg[:, :3] = poses.transform(belief.mean, torch.from_numpy(places))
     return Plan(
         name,
-        np.concatenate([[0.0], np.cumsum([span for _, _, span in knots])]),
+        np.concatenate([[0.0], np.cumsum(spans)]),
         world_from_peg.numpy(),
-        tuple(manner for _, manner, _ in knots),
+        ("free", *(knot.manner for knot in knots)),
         touching.force,
         np.array(touching.stiffness),
         np.array(touching.damping),
