@@ -20,7 +20,7 @@ NEAR = (0.0005, math.radians(0.5))  # m and rad: a pose is reached that is misse
 _LEVER = 0.3  # m that a radian is worth where both are brought down together
 _DAMPING = 1e-4
 _FARTHEST = 0.4  # rad or m by which a joint is moved in one step
-_FIRST, _NEXT = 60, 25  # steps to the first pose of a path, and from one to the next
+_FIRST, _NEXT = 50, 25  # steps to the first pose of a path, and from one to the next
 
 
 def joint_paths(
@@ -29,7 +29,7 @@ def joint_paths(
     base_from_tool: Array,
     link_from_tool: Array | None = None,
     *,
-    tries: int = 12,
+    tries: int = 8,
     seed: int = 0,
 ) -> Array:
     """Joint angles along paths of poses, within the joints' limits.

@@ -144,10 +144,9 @@ def _usual(kind: str, setup: Setup) -> list[Filter]:
     """The filters that every candidate of a kind passes."""
     if kind == "view":
         return []
-    assert setup.gap is not None
-    mean = setup.belief.mean
-    found = [not_from_below(), clear_of_part(setup.gap, mean)]
-    return [*found, meeting(setup.gap, mean)] if kind in ("touch", "slide", "pair") else found
+    mean, gap = setup.belief.mean, setup.measured
+    found = [not_from_below(), clear_of_part(gap, mean)]
+    return [*found, meeting(gap, mean)] if kind in ("touch", "slide", "pair") else found
 
 
 def _numbered(candidate: Candidate, number: int) -> Candidate:

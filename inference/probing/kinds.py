@@ -85,6 +85,15 @@ class Setup:
             )
         return self.peg
 
+    @property
+    def measured(self) -> PegGap:
+        """The gap of part and peg.
+
+        Raises:
+            InputError: there is no peg.
+        """
+        return PegGap(self.part, self.held) if self.gap is None else self.gap
+
 
 def _touches(setup: Setup, most: int) -> Iterator[Plan | View]:
     for spot in spots_of(setup.part, most, setup.seed):
@@ -94,7 +103,6 @@ def _touches(setup: Setup, most: int) -> Iterator[Plan | View]:
 
 def _slides(setup: Setup, most: int) -> Iterator[Plan | View]:
     """Slides along a face that they do not leave, at the belief's mean."""
-    assert setup.gap is not None
     generator = np.random.default_rng([setup.seed, 1])
     for spot in spots_of(setup.part, most, int(generator.integers(2**31))):
         along = _tangent(spot, generator)
@@ -139,12 +147,11 @@ def _tangent(spot: Spot, generator: np.random.Generator) -> Array:
 
 def _stays_on(setup: Setup, world_from_peg: Array, way: Array) -> bool:
     """Whether a peg that is led along (3,) in the part's frame stays on its surface, at the mean."""
-    assert setup.gap is not None
     mean = setup.belief.mean
     turned = poses.rotation_matrix(mean).numpy() @ way
     path = np.repeat(world_from_peg[None], _LOOKED_AT, axis=0)
     path[:, :3] += np.linspace(0.0, 1.0, _LOOKED_AT)[:, None] * turned
-    return bool((setup.gap(mean[None], torch.from_numpy(path)).distance.abs() < _ON).all())
+    return bool((setup.measured(mean[None], torch.from_numpy(path)).distance.abs() < _ON).all())
 
 
 def _aims(setup: Setup, most: int) -> Iterator[Belief]:

@@ -1,0 +1,266 @@
+"""What may be done next: candidates touch where they say, and filters keep what may be carried out."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.errors import InputError
+from bcppl.inference.probing.candidates import candidates
+from bcppl.inference.probing.filters import (
+    Candidates,
+    Mounted,
+    clear_of_part,
+    clear_of_table,
+    filtered,
+    from_within,
+    meeting,
+    name_of,
+    no_harder_than,
+    pressing_force,
+    within_reach,
+)
+from bcppl.inference.probing.rules import surface_variance
+from bcppl.inference.probing.touching import Spot, face_of, middles_of_strokes, slide, touch
+from bcppl.models.robots import load_robot
+from bcppl.models.worlds.bench import BenchScene, bench_scene
+from bcppl.recordings.action_file import load_actions, save_actions
+from bcppl.recordings.measurements import View
+from bcppl.recordings.plan import Plan
+from bcppl.simulators.gap import PegGap
+from bcppl.simulators.reach import joint_paths
+from tests.made_recordings import assert_one_sentence
+
+KINDS = {"touch": 5, "slide": 3, "pair": 3, "search": 1, "attempt": 1, "view": 2}
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def about(scene: BenchScene, spread: float) -> Belief:
+    """A belief about the truth, of so many metres and twenty times as many radians."""
+    torch.manual_seed(scene.seed)
+    away = spread * torch.randn(40, 6, dtype=torch.float64) * torch.tensor([1.0] * 3 + [5.0] * 3)
+    return Belief(
+        poses.retract(torch.from_numpy(scene.truth), away - away.mean(dim=0)),
+        torch.zeros(40, dtype=torch.float64),
+    )
+
+
+@functools.cache
+def planned(seed: int) -> tuple[BenchScene, PegGap, Candidates]:
+    scene = bench_scene(seed)
+    gap = PegGap(scene.part, scene.peg)
+    found = candidates(about(scene, 0.001), scene.part, scene.peg, KINDS, gap=gap, camera=scene.cameras[0])
+    return scene, gap, found
+
+
+@pytest.mark.parametrize("seed", [5, 7])  # blocks with a square and a D-shaped hole
+def test_candidates_touch_the_faces_they_name_and_nothing_on_their_way(seed: int) -> None:
+    scene, gap, found = planned(seed)
+    truth = torch.from_numpy(scene.truth)[None]
+    names = [name_of(c) for c in found]
+    assert len(set(names)) == len(names) == sum(KINDS.values())
+    for plan in found:
+        if not isinstance(plan, Plan) or plan.name.split()[0] not in ("touch", "slide", "pair"):
+            continue
+        carried, wrench, world_from_peg = scene.carried_out(plan)
+        force = np.linalg.norm(wrench[:, :3] - wrench[:10, :3].mean(axis=0), axis=1)
+        met = gap(truth, torch.from_numpy(world_from_peg))
+        strokes = [k for k, manner in enumerate(plan.manners) if manner == "guarded"]
+        assert sorted(carried.stops) == strokes, plan.name
+        faces = plan.name.split(": ")[1].split(", ")
+        for k, face in zip(strokes, faces, strict=True):
+            stamps = carried.probe.stamps
+            until = (stamps >= plan.times[k]) & (stamps < carried.stops[k])
+            before = (stamps > (plan.times[k - 1] if k > 1 else 0.0)) & (stamps < plan.times[k] - 0.1)
+            pressed = (stamps > carried.stops[k]) & (stamps < plan.times[k + 3]) & (force > 3.0)
+            assert until.any() and force[before].max(initial=0.0) < 3.0, plan.name
+            # Half of the stroke is over where the mean has the surface, which here is the truth.
+            assert abs(carried.stops[k] - 0.5 * (plan.times[k] + plan.times[k + 1])) < 0.12
+            normals = met.normal[0, pressed].numpy()
+            along = middles_of_strokes(plan)[strokes.index(k)][1]
+            outward = -poses.rotation_matrix(truth[0]).numpy().T @ along
+            assert face_of(outward) == face
+            assert np.median(normals @ outward) > 0.95, (plan.name, np.median(normals @ outward))
+
+
+def test_a_slide_stays_on_its_face_and_an_attempt_ends_in_the_hole() -> None:
+    scene, gap, found = planned(5)
+    truth = torch.from_numpy(scene.truth)[None]
+    hole = poses.compose(truth[0], torch.from_numpy(scene.kind.part_from_hole))
+    tip = torch.tensor([[0.0, 0.0, -0.08]], dtype=torch.float64)
+    for plan in found:
+        if not isinstance(plan, Plan) or plan.name.startswith(("touch", "pair")):
+            continue
+        _, wrench, world_from_peg = scene.carried_out(plan)
+        force = np.linalg.norm(wrench[:, :3] - wrench[:10, :3].mean(axis=0), axis=1)
+        if plan.name.startswith("slide"):
+            pressed = world_from_peg[force > 1.5]
+            assert gap(truth, torch.from_numpy(pressed)).distance.abs().median() < 1e-4
+            assert np.linalg.norm(np.ptp(pressed[:, :3], axis=0)) > 0.010
+        else:  # aimed at the mean, with one millimetre of clearance
+            lowest = poses.transform(torch.from_numpy(world_from_peg), tip)[:, 0]
+            depth = -poses.transform(poses.inverse(hole), lowest)[:, 2]
+            assert float(depth.max()) > 0.003, plan.name
+
+
+def test_views_look_at_the_part_from_where_they_say() -> None:
+    scene, _, found = planned(5)
+    views = [c for c in found if isinstance(c, View)]
+    assert len({v.camera.name for v in views}) == 2
+    corners = poses.transform(torch.from_numpy(scene.truth), torch.from_numpy(scene.part.vertices))
+    for view in views:
+        seen = poses.transform(poses.inverse(view.camera.stated_pose()), corners)
+        pixels = view.camera.project(seen.numpy())
+        assert ((pixels > 0) & (pixels < [view.camera.width, view.camera.height])).all()
+
+
+def test_the_same_seed_plans_the_same_and_strokes_grow_with_the_spread() -> None:
+    scene, gap, _ = planned(5)
+    kinds, belief = {"touch": 4, "slide": 2}, about(scene, 0.001)
+    first, again, other = (
+        candidates(belief, scene.part, scene.peg, kinds, gap=gap, seed=seed) for seed in (1, 1, 2)
+    )
+    assert all(np.array_equal(a.world_from_peg, b.world_from_peg) for a, b in zip(first, again, strict=True))
+    assert not np.array_equal(first[0].world_from_peg, other[0].world_from_peg)
+    spot, lengths = Spot(np.zeros(3), UP), []
+    for spread in (0.0001, 0.002, 0.02):
+        plan = touch(about(scene, spread), scene.part, scene.peg, spot)
+        lengths.append(np.linalg.norm(plan.world_from_peg[3, :3] - plan.world_from_peg[2, :3]))
+    assert lengths[0] == pytest.approx(0.006) and lengths[2] == pytest.approx(0.028)
+    assert lengths[0] < lengths[1] < lengths[2]
+
+
+def test_filters_say_how_many_they_remove_and_why() -> None:
+    scene, gap, _ = planned(5)
+    belief = about(scene, 0.001)
+    top, side = Spot(np.array([-0.02, -0.02, 0.0]), UP), Spot(np.array([0.03, 0.0, -0.01]), np.eye(3)[0])
+    bottom = Spot(np.array([0.0, 0.0, -0.025]), -UP)
+    inside = Spot(np.array([0.0114, 0.005, -0.01]), -np.eye(3)[0])  # the hole's own wall, from within
+    plans = [
+        touch(belief, scene.part, scene.peg, spot, name=name)
+        for name, spot in (("top", top), ("side", side), ("bottom", bottom), ("inside", inside))
+    ]
+    down = (0.0, 0.0, -1.0)
+
+    def left(*filters: object) -> list[str]:
+        return [name_of(c) for c in filtered(plans, filters)]  # type: ignore[arg-type]
+
+    assert left(from_within(down, math.radians(30.0))) == ["top"]
+    assert left(from_within(down, math.radians(120.0))) == ["top", "side", "inside"]
+    assert set(left(clear_of_part(gap, scene.truth))) == {"top", "side"}
+    assert "inside" not in left(clear_of_part(gap, scene.truth), meeting(gap, scene.truth))
+    lowest = scene.truth[2] - 0.012 + 0.005
+    assert left(clear_of_table(scene.peg, lowest)) == ["top"]
+    hard = dataclasses.replace(plans[0], name="hard", force=20.0)
+    assert pressing_force(plans[0]) == pytest.approx(4.0 + 2500.0 * 0.0015, rel=0.01)
+    found = filtered([*plans, hard], [no_harder_than(10.0), from_within(down, 0.5, "come from aside")])
+    assert found.removed == {"press with more than 10 N": 1, "come from aside": 3}
+    assert str(found) == "1 candidates; 1 press with more than 10 N; 3 come from aside"
+
+
+def test_what_an_arm_does_not_reach_is_left_out() -> None:
+    arm = load_robot("panda", tip="panda_hand_tcp")
+    held = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])  # the hand's z axis points down, the peg's up
+    scene, _, _ = planned(5)
+    plan = touch(about(scene, 0.001), scene.part, scene.peg, Spot(np.array([-0.02, -0.02, 0.0]), UP))
+    far = dataclasses.replace(plan, name="far", world_from_peg=plan.world_from_peg + np.eye(7)[0])
+    here = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    found = filtered([plan, far], [within_reach(Mounted(arm, "panda_hand_tcp", held, here))])
+    assert [c.name for c in found] == [plan.name]
+    assert found.removed == {"are out of panda's reach": 1}
+    angles = joint_paths(arm, "panda_hand_tcp", plan.world_from_peg[None], held)[0]
+    reached = arm.base_from_link("panda_hand_tcp", angles, link_from_tool=held)
+    assert poses.local(torch.from_numpy(plan.world_from_peg), reached).abs().max() < 0.01
+    limits = np.array([[joint.lower, joint.upper] for joint in arm.joints])
+    assert (angles >= limits[:, 0] - 1e-9).all() and (angles <= limits[:, 1] + 1e-9).all()
+    with pytest.raises(
+        InputError, match=r"none of 1 candidate is left .* 1 are out of panda's reach"
+    ) as caught:
+        filtered([far], [within_reach(Mounted(arm, "panda_hand_tcp", held, here))])
+    assert_one_sentence(str(caught.value))
+
+
+def test_the_largest_variance_is_of_the_surface_along_the_stroke() -> None:
+    scene, _, _ = planned(5)
+    torch.manual_seed(0)
+    away = torch.zeros(400, 6, dtype=torch.float64)
+    turned = poses.rotation_matrix(torch.from_numpy(scene.truth))
+    away[:, :3] = torch.randn(400, 3).double() * 0.003 @ torch.diag(torch.tensor([1.0, 0.1, 0.1])).double()
+    away[:, :3] = away[:, :3] @ turned.T  # along the part's x axis
+    belief = Belief(poses.retract(torch.from_numpy(scene.truth), away), torch.zeros(400).double())
+    spots = [np.eye(3)[0], np.eye(3)[1], UP]
+    plans = [touch(belief, scene.part, scene.peg, Spot(0.025 * n, n)) for n in spots]
+    found = [math.sqrt(surface_variance(belief, scene.peg, plan)) for plan in plans]
+    np.testing.assert_allclose(found, [0.003, 0.0003, 0.0003], rtol=0.15)
+
+
+def test_what_leaves_no_choice_is_refused_in_a_sentence() -> None:
+    scene, gap, _ = planned(5)
+    belief = about(scene, 0.001)
+    point = Belief(belief.world_from_part[:1].expand(5, 7), torch.zeros(5, dtype=torch.float64))
+    nothing = Belief(belief.world_from_part, torch.full((40,), -torch.inf, dtype=torch.float64))
+    calls = {
+        "there are no candidates": lambda: filtered([], []),
+        "no candidates of kind 'poke'": lambda: candidates(belief, scene.part, scene.peg, {"poke": 1}),
+        "collapsed to a point": lambda: candidates(point, scene.part, scene.peg),
+        "has no weight": lambda: candidates(nothing, scene.part, scene.peg),
+        "no peg to touch the part": lambda: candidates(belief, scene.part, None, {"touch": 1}),
+        "out of|beside the direction": lambda: candidates(
+            belief, scene.part, scene.peg, {"touch": 2}, gap=gap, filters=[from_within((0, 0, 1.0), 0.1)]
+        ),
+    }
+    for says, call in calls.items():
+        with pytest.raises(InputError, match=says) as caught:
+            call()
+        assert_one_sentence(str(caught.value))
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".json"])
+def test_actions_come_back_from_a_file_bit_for_bit(suffix: str, tmp_path: Path) -> None:
+    scene, _, found = planned(5)
+    device = dataclasses.replace(
+        scene.cameras[0], device="wrist", distortion=(0.1, 0.0, 0.0, 0.0), wrist_from_camera=scene.truth
+    )
+    actions = [*found, View(device)]
+    save_actions(actions, tmp_path / f"actions{suffix}")
+    back = load_actions(tmp_path / f"actions{suffix}")
+    for there, here in zip(actions, back, strict=True):
+        assert type(there) is type(here)
+        ours, theirs = (vars(a.camera if isinstance(a, View) else a) for a in (there, here))
+        assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_files_of_actions_that_make_no_sense_are_refused_in_a_sentence(tmp_path: Path) -> None:
+    written = {
+        "none.json": '{"actions": 3}',
+        "kind.json": '{"actions": [{"kind": "dance"}]}',
+        "lacks.json": '{"actions": [{"kind": "plan", "name": "a", "manners": []}]}',
+        "words.json": '{"actions": [{"kind": "view", "name": "a", "width": 3}]}',
+        "cut.json": '{"actions": [',
+        "cut.h5": "no HDF5",
+        "plans.txt": "",
+    }
+    for name, text in written.items():
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=name.split(".")[0]) as caught:
+            load_actions(tmp_path / name)
+        assert_one_sentence(str(caught.value))
+    with pytest.raises(InputError, match="there is no file"):
+        load_actions(tmp_path / "absent.json")
+
+
+def test_a_slide_goes_as_far_as_it_is_asked_to() -> None:
+    scene, _, _ = planned(5)
+    way = np.array([0.0, 0.01, 0.0])
+    plan = slide(about(scene, 0.001), scene.part, scene.peg, Spot(np.array([-0.02, -0.02, 0.0]), UP), way)
+    led = plan.world_from_peg[6, :3] - plan.world_from_peg[5, :3]
+    turned = poses.rotation_matrix(torch.from_numpy(plan.world_from_peg[0])).numpy()
+    np.testing.assert_allclose(led, turned @ way, atol=1e-12)
