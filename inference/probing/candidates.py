@@ -29,7 +29,8 @@ from bcppl.simulators.gap import PegGap
 from bcppl.simulators.holes import Hole
 
 KINDS = tuple(SOURCES)
-MIXED: Mapping[str, int] = {"touch": 14, "slide": 10, "pair": 8}
+MIXED: Mapping[str, int] = {"touch": 16, "slide": 12, "pair": 4}
+_AT_ONCE = 8  # places that are looked at together, at least
 _DRAWS = 8  # times as many places as candidates that are asked for are looked at, at most
 
 
@@ -56,8 +57,8 @@ def candidates(
         belief: over world_from_part.
         part: its z axis points out of its top.
         peg: what is held, its frame at the wrench sensor and its tip at its lowest z; None for views alone.
-        kinds: how many of "touch", "slide", "pair" (two touches), "search", "attempt" and "view"; None: 14
-            touches, 10 slides and 8 pairs.
+        kinds: how many of "touch", "slide", "pair" (two touches), "search", "attempt" and "view"; None: 16
+            touches, 12 slides and 4 pairs.
         filters: further ones (`bcppl.inference.probing.filters`).
         gap: of part and peg, if it is at hand.
         hole: the one that is searched for; None: the part's only one.
@@ -130,7 +131,7 @@ def _of_kind(kind: str, count: int, setup: Setup, filters: Sequence[Filter]) -> 
     kept: list[Candidate] = []
     removed: dict[str, int] = {}
     while len(kept) < count:
-        batch = list(islice(source, 2 * (count - len(kept))))
+        batch = list(islice(source, max(2 * (count - len(kept)), _AT_ONCE)))
         if not batch:
             break
         found = sifted(batch, every)

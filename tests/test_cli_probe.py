@@ -1,0 +1,167 @@
+"""`bcppl probe`: what it ranks, writes and refuses."""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bcppl.beliefs import Belief
+from bcppl.inference.guided_smc import infer
+from bcppl.models.look_and_touch import model
+from bcppl.models.worlds.bench import bench_scene
+from bcppl.recordings import save
+from bcppl.recordings.action_file import load_actions, save_actions
+from bcppl.recordings.beliefs import load_belief, load_latent, save_belief
+from bcppl.recordings.plan import Plan
+from tests.command_line import SHIPPED, Ran
+
+KINDS = "touch:2,pair:1"
+
+
+@functools.cache
+def saved() -> tuple[bytes, dict[str, bytes]]:
+    """A recording of two views, and the beliefs of a run over it, as files hold them."""
+    with tempfile.TemporaryDirectory() as folder:
+        look = bench_scene(5).look()
+        save(look, f"{folder}/look.h5")
+        beliefs = {}
+        for k, step in enumerate(infer(model, look, particles=30, seed=0)):
+            path = Path(folder) / f"belief_{k:03d}.h5"
+            save_belief(
+                step.belief,
+                path,
+                label=step.info.label,
+                log_evidence=step.info.log_evidence,
+                random_state=step.random_state,
+                latent=dict(step.population.trace.choices),
+            )
+            beliefs[path.name] = path.read_bytes()
+        return Path(f"{folder}/look.h5").read_bytes(), beliefs
+
+
+@pytest.fixture
+def here(tmp_path: Path) -> Path:
+    """A folder with the recording and what a run of it left."""
+    recording, beliefs = saved()
+    (tmp_path / "look.h5").write_bytes(recording)
+    (tmp_path / "runs").mkdir()
+    for name, content in beliefs.items():
+        (tmp_path / "runs" / name).write_bytes(content)
+    noted = {"recording": str(tmp_path / "look.h5"), "model": "look_and_touch"}
+    (tmp_path / "runs/run.json").write_text(json.dumps(noted))
+    return tmp_path
+
+
+def ranked(ran: Ran) -> list[tuple[str, float]]:
+    """Names and gains of the table."""
+    rows = re.findall(r"^ *\d+  (\S.*?) {2,}(-?[\d.]+) +± ", ran.out, flags=re.MULTILINE)
+    return [(name, float(gain)) for name, gain in rows]
+
+
+def test_a_recording_is_run_ranked_and_its_best_action_written(bcppl: Callable[..., Ran], here: Path) -> None:
+    words = ("--candidates", KINDS, "--particles", 30, "--hypotheses", 4, "--top", 3)
+    ran = bcppl("probe", "look.h5", *words, "--output", "next.h5")
+    assert ran.code == 0, ran.err
+    table = ranked(ran)
+    assert "3 candidates" in ran.out and "entropy now: -" in ran.out and len(table) == 3
+    assert [gain for _, gain in table] == sorted((gain for _, gain in table), reverse=True)
+    (best,) = load_actions("next.h5")
+    assert isinstance(best, Plan) and best.name == table[0][0]
+    assert (here / "next.png").stat().st_size > 10_000
+    # The belief that a run left ranks as the run does, and a file of one's own is taken.
+    own = bcppl("probe", "runs/belief_002.h5", "--candidates", "next.h5", "--hypotheses", 4)
+    assert own.code == 0, own.err
+    ((name, gain),) = ranked(own)
+    assert name == best.name and gain == pytest.approx(table[0][1], abs=0.02)
+    (again,) = load_actions(here / "belief_002_next.json")
+    assert np.array_equal(again.world_from_peg, best.world_from_peg)
+
+
+def refused(ran: Ran, says: str) -> None:
+    lines = ran.err.strip().splitlines()
+    assert ran.code == 2, (ran.code, ran.out, ran.err)
+    assert len(lines) == 1 and lines[0].startswith("bcppl: ") and lines[0].endswith("."), ran.err
+    assert says in lines[0], lines[0]
+
+
+WRONG = {
+    "none": (["--candidates", ""], "--candidates names none"),
+    "kind": (["--candidates", "poke:3"], "'poke:3'; give kinds (touch"),
+    "number": (["--candidates", "touch:x"], "'touch:x'"),
+    "zero": (["--candidates", "touch:0"], "there are no candidates"),
+    "no file": (["--candidates", "plans.json"], "no file of actions plans.json"),
+    "top": (["--top", "0"], "--top is 0"),
+    "rate": (["--rate", "-1"], "--rate is -1"),
+    "output": (["--output", "next.txt"], "ends in .h5 or .json"),
+    "folder": (["--output", "nowhere/next.h5"], "no folder nowhere"),
+    "force": (["--force", "3"], "press with more than 3 N"),
+    "below": (["--above", "0", "--candidates", "slide:1"], "beside straight above"),
+    "table": (["--table", "0.5"], "lead into the table"),
+    "robot": (["--robot", "panda"], "without --link"),
+    "robot's name": (["--robot", "hal", "--link", "x"], "no URDF file and no shipped robot"),
+    "held": (["--robot", "panda", "--link", "panda_hand", "--link-from-peg", "1 2"], "has 2 numbers"),
+    "reach": (
+        ["--robot", "panda", "--link", "panda_hand", "--world-from-base", "9 0 0 1 0 0 0"],
+        "are out of panda's reach",
+    ),
+    "of": (["--of", "nothing"], "there is no recording 'nothing'"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
+    what: str, bcppl: Callable[..., Ran], here: Path
+) -> None:
+    words, says = WRONG[what]
+    before = sorted(here.rglob("*"))
+    given = words if "--candidates" in words else [*words, "--candidates", "touch:1"]
+    refused(bcppl("probe", "runs/belief_002.h5", *given), says)
+    assert sorted(here.rglob("*")) == before
+
+
+def test_beliefs_that_say_nothing_are_refused(bcppl: Callable[..., Ran], here: Path) -> None:
+    belief = load_belief("runs/belief_002.h5")
+    count, latent = len(belief), load_latent("runs/belief_002.h5")
+
+    def written(name: str, changed: Belief, values: dict[str, torch.Tensor]) -> str:
+        state = torch.Generator().get_state()
+        save_belief(
+            changed, f"runs/{name}", label="view 2", log_evidence=0.0, random_state=state, latent=values
+        )
+        return f"runs/{name}"
+
+    none = torch.full((count,), -torch.inf, dtype=torch.float64)
+    weightless = written("none.h5", Belief(belief.world_from_part, none), latent)
+    same = {a: v[:1].expand_as(v).clone() for a, v in latent.items()}
+    point = written("point.h5", Belief(same["part"], torch.zeros_like(none)), same)
+    refused(bcppl("probe", weightless, "--candidates", "touch:1"), "has no weight")
+    refused(bcppl("probe", point, "--candidates", "touch:1"), "collapsed to a point")
+    (here / "runs/run.json").unlink()
+    refused(bcppl("probe", point), "say so with --of RECORDING")
+    refused(bcppl("probe", "look.h5", "--of", "look.h5"), "leave it out")
+    refused(bcppl("probe", point, "--of", SHIPPED), "does not fit the model or the recording")
+    twice = load_twice(here)
+    refused(bcppl("probe", "runs/belief_002.h5", "--of", "look.h5", "--candidates", twice), "two candidates")
+
+
+def load_twice(folder: Path) -> Path:
+    """A file of two plans of one name."""
+    plan = Plan(
+        "same",
+        np.array([0.0, 1.0]),
+        np.tile([0.5, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0], (2, 1)),
+        ("free",),
+        4.0,
+        np.full(6, 100.0),
+        np.full(6, 1.0),
+    )
+    save_actions([plan, plan], folder / "twice.json")
+    return folder / "twice.json"

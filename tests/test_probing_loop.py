@@ -1,0 +1,175 @@
+"""The loop on the bench: what it yields, where it goes on from, and the arm that carries it out."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from bcppl.beliefs import Belief
+from bcppl.errors import InputError
+from bcppl.inference.guided_smc import infer
+from bcppl.inference.probing.candidates import candidates
+from bcppl.inference.probing.filters import Candidate, name_of
+from bcppl.inference.probing.insertion import insertion_plan
+from bcppl.inference.probing.loop import Round, named_apart, probing_loop
+from bcppl.inference.probing.rules import at_random, by_information, in_order
+from bcppl.inference.smc import Step
+from bcppl.models.look_and_touch import model
+from bcppl.models.worlds.bench import BenchScene, bench_scene
+from bcppl.models.worlds.bench_arm import BenchArm
+from bcppl.recordings import Recording, View, problems
+from bcppl.recordings.measurements import ProbeWindow
+from bcppl.simulators.gap import PegGap
+from tests.made_recordings import assert_one_sentence
+
+PARTICLES = 30
+
+
+@functools.cache
+def seen() -> tuple[BenchScene, Recording, Step, PegGap]:
+    scene = bench_scene(5)
+    look = scene.look()
+    *_, last = infer(model, look, particles=PARTICLES, seed=0)
+    return scene, look, last, PegGap(scene.part, scene.peg)
+
+
+def asked(belief: Belief, number: int) -> list[Candidate]:
+    scene, _, _, gap = seen()
+    return list(candidates(belief, scene.part, scene.peg, {"touch": 3, "pair": 4}, gap=gap, seed=number))
+
+
+@functools.cache
+def followed() -> list[Round]:
+    scene, look, last, _ = seen()
+    rank = by_information(model.pose, hypotheses=6, seed=0)
+    return list(probing_loop(model, look, BenchArm(scene), asked, rank, start=last, probes=2))
+
+
+def test_chosen_probes_lower_the_error_to_a_fraction_and_the_peg_goes_in() -> None:
+    scene, _, last, _ = seen()
+    points = scene.part.surface_points()
+    adds = [
+        1e3 * step.belief.weighted_add(points, scene.truth) for step in (last, *(r.step for r in followed()))
+    ]
+    assert len(followed()) == 2 and adds[0] > 3.0
+    assert adds[2] < 0.25 * adds[0] and adds[2] < 1.0, adds
+    last_round = followed()[-1]
+    plan = insertion_plan(last_round.step.belief, scene.part, scene.peg)
+    assert BenchArm(scene).insert(plan).inserted
+
+
+def test_what_is_yielded_is_the_best_of_the_ranking_and_the_recording_grows() -> None:
+    _, look, _, _ = seen()
+    taken = len(look.measurements)
+    for number, each in enumerate(followed()):
+        best = each.ranking.best
+        assert each.number == number and name_of(each.chosen).startswith(name_of(best.candidate))
+        assert best.value == max(p.value for p in each.ranking) > 1.0
+        assert each.before.taken == taken < each.step.taken == len(each.recording.measurements)
+        names = [m.action.probe.name for m in each.recording.measurements[taken:]]
+        assert set(names) == {name_of(each.chosen)}
+        taken = each.step.taken
+    assert not problems(followed()[-1].recording)
+
+
+def test_the_loops_belief_is_that_of_a_run_over_all_it_measured() -> None:
+    first, second = followed()
+    *_, whole = infer(model, first.recording, particles=PARTICLES, seed=0)
+    assert torch.equal(whole.belief.world_from_part, first.step.belief.world_from_part)
+    assert torch.equal(whole.belief.log_weights, first.step.belief.log_weights)
+    assert second.before is first.step
+
+
+def test_the_loop_ends_by_gain_by_chance_and_by_number() -> None:
+    scene, look, last, _ = seen()
+
+    def rounds(**settings: object) -> int:
+        return len(
+            list(
+                probing_loop(  # type: ignore[call-overload]
+                    model, look, BenchArm(scene), asked, at_random(0), start=last, **settings
+                )
+            )
+        )
+
+    assert rounds(probes=1) == 1
+    assert rounds(probes=3, least_gain=0.1) == 0  # a random order foretells no gain
+    assert rounds(probes=3, chance=lambda belief: 1.0) == 0
+    spreads: list[float] = []
+
+    def surer(belief: Belief) -> float:
+        spreads.append(float(belief.spread[:3].norm()))
+        return 1.0 if len(spreads) == 2 else 0.5
+
+    assert rounds(probes=3, chance=surer, enough=0.9) == 1 and spreads[1] < spreads[0]
+
+
+def test_a_probe_that_is_chosen_twice_gets_a_name_of_its_own_and_an_arm_goes_on() -> None:
+    scene, look, _, _ = seen()
+    plan = asked(seen()[2].belief, 0)[0]
+    arm, recording = BenchArm(scene), look
+    first = arm.carry_out(named_apart(plan, recording))
+    recording = dataclasses.replace(recording, measurements=[*recording.measurements, *first])
+    again = named_apart(plan, recording)
+    assert name_of(again) == f"{name_of(plan)} (2)"
+    second = arm.carry_out(again)
+    whole = scene.probe(plan)  # the first plan is felt as the scene alone has it
+    for ours, theirs in zip(first, whole.measurements[2:], strict=True):
+        assert np.array_equal(ours.observation.wrench, theirs.observation.wrench)
+        assert np.array_equal(ours.observation.world_from_peg, theirs.observation.world_from_peg)
+    assert second[0].observation.times[0] > first[-1].observation.times[-1]
+    noise = [m[0].observation.wrench[:5] for m in (first, second)]
+    assert not np.allclose(noise[0], noise[1], atol=1e-3)
+    view = View(dataclasses.replace(scene.cameras[0], name="camera_0"))
+    moved = named_apart(view, recording)
+    assert isinstance(moved, View) and moved.camera.name == "camera_0 (2)"
+    assert moved.camera.instrument == "camera_0"
+    image = arm.carry_out(moved)[0].observation.depth
+    # The same camera looks from the same place once more: only its noise is new.
+    before = look.measurements[0].observation.depth
+    assert abs(np.nanmedian(image - before)) < 0.001 and not np.array_equal(image, before)
+
+
+def test_a_view_may_be_chosen_and_is_taken_in() -> None:
+    scene, look, last, _ = seen()
+
+    def views(belief: Belief, number: int) -> list[Candidate]:
+        return list(candidates(belief, scene.part, None, {"view": 1}, camera=scene.cameras[0], seed=number))
+
+    (only,) = probing_loop(
+        model,
+        look,
+        BenchArm(scene),
+        views,
+        lambda population, found, known: in_order(found),
+        start=last,
+        probes=1,
+    )
+    assert only.step.info.label == "view 3" and math.isnan(only.ranking.best.information_gain)
+    assert float(only.step.belief.spread[:3].norm()) < 1.2 * float(last.belief.spread[:3].norm())
+    assert not any(isinstance(m.action, ProbeWindow) for m in only.recording.measurements)
+
+
+def test_a_loop_without_candidates_or_world_says_so() -> None:
+    scene, look, last, _ = seen()
+
+    class Silent:
+        def carry_out(self, candidate: object) -> list[object]:
+            return []
+
+    for says, world, source in (
+        ("there are no candidates", BenchArm(scene), lambda belief, number: []),
+        ("measured nothing when it was asked for 'touch 1", Silent(), asked),
+    ):
+        with pytest.raises(InputError, match=says) as caught:
+            list(
+                probing_loop(
+                    model, look, world, source, lambda population, found, known: in_order(found), start=last
+                )
+            )
+        assert_one_sentence(str(caught.value))
