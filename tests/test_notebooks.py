@@ -101,3 +101,16 @@ def test_swap_kernels_puts_four_programs_side_by_side(tmp_path: Path) -> None:
     assert len(table) == 4
     assert all(1 <= ess <= 60 and 1 <= distinct <= 60 for ess, distinct, *_ in table.values())
     assert table["random walk"][3] < 3.0 < table["BayesContact"][3]
+
+
+def test_where_to_touch_chooses_and_ends_in_the_hole(tmp_path: Path) -> None:
+    said, drawn = run("where_to_touch", tmp_path)
+    assert drawn == {"chosen", "beliefs"}
+    gains = [
+        float(gain) for gain in re.findall(r"([\d.]+)(?: ± [\d.]+)? nats$", said["ranking"], re.MULTILINE)
+    ]
+    assert len(gains) == 6 and gains == sorted(gains, reverse=True) and gains[0] > gains[-1] + 0.5
+    (before,) = re.findall(r"ADD ([\d.]+) mm", said["look"])
+    after = re.findall(r"ADD ([\d.]+) mm", said["touch"])
+    assert len(after) == 3 and float(after[-1]) < 0.25 * float(before)
+    assert "inserted: True" in said["insert"]
