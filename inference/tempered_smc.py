@@ -78,6 +78,7 @@ def infer(
     sweeps: tuple[int | Until, int | Until] | None = None,
     share: tuple[float, float] = (0.8, 0.6),
     scene: Any = None,
+    start: Step | None = None,
 ) -> Iterator[Step]:
     """Beliefs over a recording, one step for each measurement, the prior first.
 
@@ -93,6 +94,7 @@ def infer(
         share: particles are resampled below this effective sample size, and a likelihood is let in by steps
             that keep this conditional one, as shares of N: without, and with physics.
         scene: what `model.prepare(recording)` gives, if it is at hand.
+        start: a step to go on from, as `bcppl.inference.smc.smc` does.
 
     Raises:
         InputError: a number is out of range.
@@ -115,4 +117,4 @@ def infer(
         resample=resample,
         share=lambda trace: share[by_physics(trace)],
     )
-    return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene)
+    return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)

@@ -316,8 +316,11 @@ def _between(first: Tensor, second: Tensor, share: float) -> Tensor:
     """Poses (N, 7) on the way from one to the other: straight, and along the geodesic."""
     if share == 1.0:
         return second
+    place = torch.lerp(first[:, :3], second[:, :3], share)
+    if torch.equal(first[:, 3:], second[:, 3:]):
+        return torch.cat([place, first[:, 3:]], dim=1)
     start, stop = poses.quaternion_xyzw(first), poses.quaternion_xyzw(second)
     stop = torch.where((start * stop).sum(dim=-1, keepdim=True) < 0.0, -stop, stop)
     step = share * roma.unitquat_to_rotvec(roma.quat_product(roma.quat_conjugation(start), stop))
     turned = roma.quat_product(start, roma.rotvec_to_unitquat(step))
-    return poses.from_translation_quaternion_xyzw(torch.lerp(first[:, :3], second[:, :3], share), turned)
+    return poses.from_translation_quaternion_xyzw(place, turned)

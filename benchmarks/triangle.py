@@ -1,0 +1,163 @@
+"""Where to push next, on real pushes: one contact leaves a triangle free to slide along an edge.
+
+The triangle lies within 20 mm and 3 degrees of the guess. A push is drawn from a log of real ones and taken
+in; what is left is a belief that is long along the edge that was touched. The next push is chosen among
+others of the log, by what each is expected to tell; what was truly felt in it is then taken in. Asked is on
+which edge the chosen push lay (by the true pose, which nobody is told), and what is left of the slide.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jobs import each
+from report import Row, cores, finish, options, show
+from torch import Tensor
+from touches import LOGS, OTHER, learnt
+
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.inference.probing import Entropy, expected_information_gain, mode_entropy, weight_entropy
+from bcppl.inference.smc import Step
+from bcppl.inference.tempered_smc import infer
+from bcppl.models.point_probe import felt, model
+from bcppl.recordings.importers.point_probe import command
+from bcppl.recordings.measurements import Push, Recording, Touch
+from bcppl.simulators.distance import SignedDistance
+
+LOG = "10_90"
+YAW = 3.0  # degrees; with more, another contact on the same edge is worth as much as one on another
+PARTICLES, CANDIDATES, HYPOTHESES = 75, 12, 16
+GONE = 1.0 / 3.0  # of how far it could slide
+WAYS: dict[str, Entropy] = {"of weights": weight_entropy(), "of the pose": mode_entropy("part")}
+
+
+class Chosen(NamedTuple):
+    """What came of one draw and one way to choose.
+
+    Attributes:
+        another: whether the second push lay on another edge than the first.
+        before, after: how far the part could slide along the edge first touched: standard deviations, mm.
+        by_chance: the same after the first candidate, for which nobody asked.
+        share: of the candidates that lay on another edge.
+    """
+
+    another: bool
+    before: float
+    after: float
+    by_chance: float
+    share: float
+
+    @property
+    def gone(self) -> bool:
+        """Whether it can slide no more."""
+        return self.after <= GONE * self.before
+
+
+def edge_of(recording: Recording, push: int, settings: Any) -> Tensor:
+    """The outward normal (3,), in the part's frame, of the edge that a push met, by the true pose."""
+    one, truth = recording.measurements[push], torch.as_tensor(recording.truth)
+    assert isinstance(one.action, Push) and isinstance(one.observation, Touch)
+    onset = felt(one.action, one.observation, settings).onset
+    place = poses.transform(poses.inverse(truth), onset[None])
+    return SignedDistance(recording.part)(place).normal[0]
+
+
+def slide(belief: Belief, recording: Recording, normal: Tensor) -> float:
+    """How far (mm, a standard deviation) the part's middle may be along an edge with a normal (3,)."""
+    middle = torch.tensor(recording.part.mesh.centroid, dtype=torch.float64)
+    turn = poses.rotation_matrix(torch.as_tensor(recording.truth))
+    along = turn @ torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), normal)
+    there = poses.transform(belief.world_from_part, middle[None])[:, 0] @ along
+    return 1e3 * float((belief.weights @ (there - belief.weights @ there).square()).sqrt())
+
+
+def after(recording: Recording, numbers: Sequence[int], scene: Any, seed: int, start: Any = None) -> Step:
+    """The last step of a run over some of the pushes, in their order, or of what is left after a step."""
+    some = replace(recording, measurements=[recording.measurements[k] for k in numbers])
+    *_, last = infer(model, some, particles=PARTICLES, seed=seed, scene=scene, start=start)
+    return last
+
+
+def chosen(seed: int) -> list[Chosen]:
+    """One draw, each way."""
+    logs = sorted(LOGS.glob(f"{LOG}_10_10*"))
+    recording = command(logs, pushes=1 + CANDIDATES, seed=seed, yaw=YAW)
+    settings = learnt(OTHER[LOG])
+    scene = model.prepare(recording, **asdict(settings))
+    first = after(recording, [0], scene, seed)
+    edges = torch.stack([edge_of(recording, k, settings) for k in range(1 + CANDIDATES)])
+    another = (edges @ edges[0] < math.cos(math.radians(45.0))).tolist()
+    others = range(1, 1 + CANDIDATES)
+    done = [recording.measurements[0].action]
+    before = slide(first.belief, recording, edges[0])
+
+    @cache
+    def left(second: int) -> float:
+        step = after(recording, [0, second], scene, seed, first)
+        return slide(step.belief, recording, edges[0])
+
+    found = []
+    for entropy in WAYS.values():
+        ranking = expected_information_gain(
+            first.population,
+            [recording.measurements[k].action for k in others],
+            lambda push: (scene, [*done, push]),
+            entropy,
+            hypotheses=HYPOTHESES,
+            seed=seed,
+        )
+        best = others[ranking.best.number]
+        found.append(Chosen(another[best], before, left(best), left(1), float(np.mean(another[1:]))))
+    return found
+
+
+def main() -> None:
+    parser: argparse.ArgumentParser = options(__doc__ or "")
+    parser.add_argument("--jobs", type=int, default=cores(), help="processes, of one thread each if several")
+    arguments = parser.parse_args()
+    if not LOGS.is_dir():
+        print(f"skipped: the push logs are not at {LOGS}.")
+        return
+    draws = 3 if arguments.quick else 20
+    results = each(chosen, range(arguments.seed, arguments.seed + draws), arguments.jobs)
+    rows, lines = [], []
+    for k, name in enumerate(WAYS):
+        own = [one[k] for one in results]
+        counts = sum(one.another for one in own), sum(one.gone for one in own)
+        numbers = [float(np.median([getattr(one, field) for one in own])) for field in Chosen._fields[1:4]]
+        share = float(np.mean([one.share for one in own]))
+        lines.append([name, *counts, *numbers, share])
+        goal = 0.9 * draws
+        rows += [
+            Row(f"entropy {name}: next push on another edge", counts[0], f"of {draws}", goal, "min"),
+            Row(f"entropy {name}: slide gone after it", counts[1], f"of {draws}", goal, "min"),
+            Row(f"entropy {name}: slide before, median", numbers[0], "mm"),
+            Row(f"entropy {name}: slide after, median", numbers[1], "mm"),
+            Row(f"entropy {name}: slide after a push by chance, median", numbers[2], "mm"),
+            Row(f"entropy {name}: candidates on another edge", share, "", direction="min"),
+        ]
+    columns = [
+        "entropy",
+        "another edge",
+        "gone",
+        "slide mm",
+        "after mm",
+        "by chance mm",
+        "candidates on another",
+    ]
+    show(
+        f"one real push, then the best of {CANDIDATES}: {draws} draws, {PARTICLES} particles", columns, lines
+    )
+    finish(rows, arguments.json)
+
+
+if __name__ == "__main__":
+    main()
