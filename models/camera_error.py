@@ -131,12 +131,17 @@ def farther(camera: Camera, part: Tensor, bias: Tensor) -> Tensor:
     return torch.cat([moved, part[..., 3:]], dim=-1)
 
 
-def given_seen(scene: Any, looks: Mapping[str, tuple[Camera, Tensor, Tensor]]) -> NormalPose:
+def given_seen(
+    scene: Any,
+    looks: Mapping[str, tuple[Camera, Tensor, Tensor]],
+    unsure: Mapping[str, Tensor] | None = None,
+) -> NormalPose:
     """Nearly the conditional of the part's pose, given where cameras see it and their biases, by instrument.
 
     The product of the densities of `seen_by_*`, each taken as normal in the tangent space about the product's
     mean, on the axes that the prior leaves free. It hangs on nothing else, so a proposal that draws from it
-    is nearly always accepted.
+    is nearly always accepted. Where only an estimate of what a camera sees is known, `unsure` has its
+    covariance (6, 6), which adds to the camera's error.
     """
     settings, prior = scene.settings, scene.prior
     free = prior.freedom
@@ -147,8 +152,9 @@ def given_seen(scene: Any, looks: Mapping[str, tuple[Camera, Tensor, Tensor]]) -
     for _ in range(2):  # the first centre is a few millimetres off, which changes the covariances by 1 %
         precision: Any = 0.0
         pull: Any = 0.0
-        for camera, seen, bias in looks.values():
+        for name, (camera, seen, bias) in looks.items():
             covariance = apparent_covariance(camera, center, settings.camera_shift, settings.camera_turn)
+            covariance = covariance if unsure is None else covariance + unsure[name]
             own = torch.linalg.inv(covariance)[..., axes, :]
             precision = precision + own[..., axes]
             pull = pull + own @ poses.local(center, farther(camera, seen, -bias))[..., None]

@@ -226,16 +226,21 @@ def told_by_touches(
 def placed_by_images(scene: Scene, actions: Sequence[View | ProbeWindow]) -> Normal:
     """Where the images' fits place the part, and how surely; the prior where there is none."""
     looks: dict[str, tuple[Camera, Tensor, Tensor]] = {}
+    unsure: dict[str, Tensor] = {}
     for k, action in enumerate(actions):
-        if isinstance(action, View) and f"depth_{k}" in scene.fits:
-            mean = scene.fits[f"depth_{k}"].mean
-            seen = poses.retract(scene.prior.center, mean[None, :6])
-            camera = scene.looks[action.camera.name].camera
-            looks.setdefault(action.camera.instrument, (camera, seen, mean[6:]))
+        if isinstance(action, View) and f"depth_{k}" in scene.fits and action.camera.instrument not in looks:
+            name, camera = action.camera.instrument, scene.looks[action.camera.name].camera
+            point = scene.fits[f"depth_{k}"].around()
+            seen, bias = poses.retract(scene.prior.center, point[:, :6]), point[:, 6]
+            looks[name] = camera, seen[:1], bias[:1]
+            # Where the image leaves the part's pose open, so does what is known beside the touches.
+            part = farther(camera, seen, -bias)
+            away = poses.local(part[:1], part[1:])
+            unsure[name] = 0.5 * away.T @ away
     if not looks:
         expected = normal_like(scene.prior)
         return Normal(expected.center[None], torch.linalg.inv(expected.covariance)[None])
-    said = camera_error.given_seen(scene, looks)
+    said = camera_error.given_seen(scene, looks, unsure)
     return Normal(said.center, torch.linalg.inv(said.covariance))
 
 

@@ -27,6 +27,15 @@ class FittedNormal(NamedTuple):
     mean: Tensor
     covariance: Tensor
 
+    def around(self) -> Tensor:
+        """The mean, then a deviation up and down each column of a root of the covariance: (1 + 2 d, d).
+
+        Half the sum of the squares of the deviations is the covariance, and remains so where they are mapped
+        by something linear.
+        """
+        columns = torch.linalg.cholesky(self.covariance).T
+        return torch.cat([self.mean[None], self.mean + columns, self.mean - columns])
+
 
 def fitted_normal(
     log_density: Callable[[Tensor], Tensor],

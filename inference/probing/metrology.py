@@ -29,6 +29,7 @@ class Pace(NamedTuple):
         first: seconds; when the first contact is expected.
         last: seconds; when the plan ends.
         guarded, free, sliding: m/s, at most. Faster is made only as far as the plan would not end in time.
+        slowest: m/s; with time to spare slides become slower, down to this.
         force: newtons at which a guarded motion stops.
         press: metres that a command goes on towards a surface once it was met: an impact may have stopped it.
         depth: metres below the top at which sides are touched, where the part is high enough.
@@ -41,8 +42,9 @@ class Pace(NamedTuple):
     guarded: float = 0.06
     free: float = 0.25
     sliding: float = 0.09
+    slowest: float = 0.02
     force: float = 4.0
-    press: float = 0.002
+    press: float = 0.003
     depth: float = 0.012
     sure: float = 3.0
     shortest: float = 0.003
@@ -78,7 +80,7 @@ class _Knot(NamedTuple):
 
 
 def three_two_one(belief: Belief, part: Part, peg: Part, pace: Pace | None = None) -> Plan:
-    """Three touches on the part's top, two on one side and one on the next, joined by slides.
+    """Three touches on the part's top, two on one side and two on the next, joined by slides.
 
     The plan is laid out around the belief's mean; the peg keeps the part's orientation there. Strokes towards
     a face are as long as the belief is unsure of where that face is.
@@ -102,6 +104,7 @@ def three_two_one(belief: Belief, part: Part, peg: Part, pace: Pace | None = Non
     one = _OnSide.of(belief, first, peg, height, pace)
     other = _OnSide.of(belief, second, peg, height, pace)
     begin, end = one.slide(spots[2], other.middle)
+    here, there = other.slide(end, end)
     lift = half_stroke(belief, np.array([*begin, top]), np.array([0.0, 0.0, 1.0]), pace)
     knots = [
         *_on_top(belief, spots, top, pace),
@@ -109,8 +112,9 @@ def three_two_one(belief: Belief, part: Part, peg: Part, pace: Pace | None = Non
         *one.touch(begin),
         _Knot(one.at(end) + one.stop - one.press, "held", pace.sliding),
         _Knot(one.at(end) + one.clear, "free", pace.free),
-        *_around(section(part, height), one.at(end) + one.clear, other, one, across, top + lift),
-        *other.touch(other.middle),
+        *_around(section(part, height), one.at(end) + one.clear, other, here, one, across, top + lift),
+        *other.touch(here),
+        _Knot(other.at(there) + other.stop - other.press, "held", pace.sliding),
     ]
     return _timed(belief, knots, peg, pace)
 
@@ -141,7 +145,8 @@ class _OnSide(NamedTuple):
         reach = float((peg.vertices[:, :2] @ -face.normal).max())  # of the peg towards the face
         middle = 0.5 * (face.start + face.stop)
         stroke = half_stroke(belief, np.array([*middle, height]), normal, pace)
-        inset = min(0.5 * face.length, reach + 0.5 * pace.longest)
+        tangent = np.array([-normal[1], normal[0], 0.0])
+        inset = min(face.length / 3.0, half_stroke(belief, np.array([*middle, height]), tangent, pace))
         return cls(
             face,
             height,
@@ -180,11 +185,17 @@ class _OnSide(NamedTuple):
 
 
 def _around(
-    outline: shapely.Polygon, start: Array, other: _OnSide, one: _OnSide, across: float, above: float
+    outline: shapely.Polygon,
+    start: Array,
+    other: _OnSide,
+    place: Array,
+    one: _OnSide,
+    across: float,
+    above: float,
 ) -> list[_Knot]:
-    """The way from beside one side to beside the other that does not touch the part."""
+    """The way from beside one side to beside a place of the other that does not touch the part."""
     body = outline.convex_hull.buffer(across + _AWAY)
-    goal = other.at(other.middle) + other.clear
+    goal = other.at(place) + other.clear
     corner = start + ((goal - start) @ _unit(other.clear)) * _unit(other.clear)
     for ways in ([], [corner]):
         places = [start, *ways, goal]
@@ -264,6 +275,11 @@ def _timed(belief: Belief, knots: list[_Knot], peg: Part, pace: Pace) -> Plan:
             shrink = np.full(len(after), left / after.sum())
         needed[touched - 1 :] *= shrink
     begin = pace.first - needed[: touched - 1].sum() - 0.5 * needed[touched - 1]
+    spare = pace.last - (begin + needed.sum())
+    slides = np.array([knot.manner == "held" for knot in knots[1:]]) & (ways > 1.01 * pace.press)
+    if spare > 0.0 and slides.any():  # where there is time to spare, slides are slower and tell more
+        slower = needed * (1.0 + spare / needed[slides].sum())
+        needed = np.where(slides, np.maximum(needed, np.minimum(slower, ways / pace.slowest)), needed)
     times = begin + np.concatenate([[0.0], np.cumsum(needed)])
     times = np.concatenate([[0.0], times])
     places = np.concatenate([places[:1], places])
