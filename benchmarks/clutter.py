@@ -80,14 +80,14 @@ def setting(text: str) -> tuple[str, float]:
     return name, int(value) if value.isdigit() else float(value)
 
 
-def rows_of(seeds: range, jobs: int, settings: dict[str, Any]) -> list[Row]:
+def rows_of(seeds: range, jobs: int, settings: dict[str, Any], objects: Sequence[int] = OBJECTS) -> list[Row]:
     """Looks for every object from the guess of every seed, and shows a line for each."""
-    asked = [(object_id, seed, settings) for object_id in OBJECTS for seed in seeds]
+    asked = [(object_id, seed, settings) for object_id in objects for seed in seeds]
     results = each(run, asked, jobs)
 
     rows: list[Row] = []
     lines: list[list[Any]] = []
-    for k, object_id in enumerate(OBJECTS):
+    for k, object_id in enumerate(objects):
         of_object = results[k * len(seeds) : (k + 1) * len(seeds)]
         columns = {n: np.array(c) for n, c in zip(Result._fields, zip(*of_object, strict=True), strict=True)}
         found = {name: int((columns[name] < FOUND).sum()) for name in ("guess", "mean")}
@@ -123,12 +123,13 @@ def main() -> None:
     parser.add_argument(
         "--set", type=setting, nargs="*", default=[], metavar="NAME=NUMBER", help="of the model"
     )
+    parser.add_argument("--objects", type=int, nargs="*", choices=OBJECTS, default=OBJECTS)
     arguments = parser.parse_args()
     if not SCENE.is_dir():
         print(f"skipped: the scene is not at {SCENE}.")
         return
     seeds = range(arguments.seed, arguments.seed + (1 if arguments.quick else 5))
-    finish(rows_of(seeds, arguments.jobs, dict(arguments.set)), arguments.json)
+    finish(rows_of(seeds, arguments.jobs, dict(arguments.set), arguments.objects), arguments.json)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """A part is seen by a depth camera, among clutter that nobody has modelled.
 
 The pose of a part is drawn from the prior, and every view is a depth image of it: Laplace noise where the ray
-meets the part, any depth at all where it does not or where something stands in the way. No mask is needed.
+meets the part, something unknown where it does not or where something stands in the way. What is unknown goes
+on from one pixel to the next. No mask is needed.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.distributions.depth import RobustDepth
+from bcppl.distributions.depth import ClutteredDepth, RobustDepth
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.errors import InputError
 from bcppl.parts import Part
@@ -35,16 +36,24 @@ class Settings:
 
     Attributes:
         scale: of the Laplace noise, metres.
-        outlier: the probability that a pixel on the part shows something else.
-        effective_pixels: how many independent pixels a whole image is worth, those that do not show the part
-            included; None for all. Neighbouring pixels err together: with all, a belief is sure of errors.
-        stride: every stride-th pixel in each direction is looked at.
+        clutter: whether unknown things stand about the part and before it, that go on from pixel to pixel
+            (`ClutteredDepth`). Otherwise, and wherever a background was measured, what is unknown is
+            independent from pixel to pixel (`RobustDepth`).
+        temperature: with clutter, what the log-likelihood is divided by.
+        stride: every stride-th row and column is looked at with clutter, else every stride-th pixel in each
+            direction.
+        outlier: without clutter, the probability that a pixel on the part shows something else.
+        effective_pixels: without clutter, how many independent pixels a whole image is worth, those that do
+            not show the part included; None for all. Neighbouring pixels err together: with all, a belief is
+            sure of errors.
     """
 
     scale: float = 0.005
     outlier: float = 0.05
     effective_pixels: float | None = 500.0
     stride: int = 4
+    clutter: bool = True
+    temperature: float = 1.0
 
     def __post_init__(self) -> None:
         number_within("a site's spread must be positive and scale is {}", self.scale, above=0.0)
@@ -80,17 +89,31 @@ def part_in_view(scene: Scene, actions: Sequence[View]) -> None:
     """The program: the part's pose, then a depth image for every view."""
     part = pyro.sample("part", scene.prior)
     for k, view in enumerate(actions):
-        depth = RobustDepth(
+        pyro.sample(f"depth_{k}", depth(scene, view.camera, part))
+
+
+def depth(scene: Scene, camera: Camera, part: Tensor) -> ClutteredDepth | RobustDepth:
+    """The depth image of one view."""
+    settings, background = scene.settings, scene.background.get(camera.name)
+    if settings.clutter and background is None:
+        return ClutteredDepth(
             scene.renderer,
-            view.camera,
+            camera,
             part,
-            scale=scene.settings.scale,
-            outlier=scene.settings.outlier,
-            background=scene.background.get(view.camera.name),
-            effective_pixels=scene.settings.effective_pixels,
-            region=scene.region(view.camera),
+            settings.scale,
+            lines=settings.stride,
+            temperature=settings.temperature,
         )
-        pyro.sample(f"depth_{k}", depth)
+    return RobustDepth(
+        scene.renderer,
+        camera,
+        part,
+        scale=settings.scale,
+        outlier=settings.outlier,
+        background=background,
+        effective_pixels=settings.effective_pixels,
+        region=scene.region(camera),
+    )
 
 
 def prepare(

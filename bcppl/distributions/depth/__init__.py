@@ -5,6 +5,7 @@ that is nearer or the ray misses the part; where nothing is known to stand, the 
 pixels (0, NaN, out of range) never count, and which are missing depends on the observation only.
 """
 
+from bcppl.distributions.depth.cluttered import ClutteredDepth
 from bcppl.distributions.depth.image import DepthDistribution
 from bcppl.distributions.depth.laplace import LaplaceDepth
 from bcppl.distributions.depth.observed import Observed
@@ -13,6 +14,7 @@ from bcppl.distributions.depth.rendering import PixelHits, RendersDepth
 from bcppl.distributions.depth.robust import RobustDepth
 
 __all__ = [
+    "ClutteredDepth",
     "DepthDistribution",
     "LaplaceDepth",
     "Observed",
