@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,16 @@ import torch
 import trimesh
 from torch import Tensor
 
+from bcppl import poses
 from bcppl.distributions.depth import ClutteredDepth, RobustDepth
 from bcppl.errors import InputError
+from bcppl.models import part_in_view
 from bcppl.parts import Part
+from bcppl.recordings.importers import bop
 from bcppl.simulators.camera import Camera
 from bcppl.simulators.renderer import DepthRenderer
+
+CLUTTER = Path(__file__).parents[2] / "shared/data/lmo_scene2_frame3"
 
 BOX = trimesh.creation.box((0.06, 0.04, 0.03))
 RENDERER = DepthRenderer(Part("box", np.asarray(BOX.vertices), np.asarray(BOX.faces, dtype=np.int64)))
@@ -176,3 +182,26 @@ def test_a_pose_that_is_none_and_an_image_of_another_size_are_refused() -> None:
         ClutteredDepth(RENDERER, lens, at((0.0, 0.0, 0.0)), SCALE).log_prob(image[1:])
     with pytest.raises(InputError, match="sample_shape"):
         ClutteredDepth(RENDERER, lens, at((0.0, 0.0, 0.0)), SCALE).sample(torch.Size([2]))
+
+
+@pytest.mark.skipif(not CLUTTER.is_dir(), reason=f"the BOP scene is not at {CLUTTER}")
+@pytest.mark.parametrize(
+    ("object_id", "millimetres", "degrees"),
+    [(1, (-50.2, 58.0, -1.2), (-5.2, 11.9, 10.0)), (10, (8.0, -9.7, -35.6), (14.7, 8.8, 41.5))],
+)
+def test_a_real_part_is_not_mistaken_for_the_tool_before_it(
+    object_id: int, millimetres: tuple[float, ...], degrees: tuple[float, ...]
+) -> None:
+    """An ape of which a fifth shows behind a drill, and where it best fits the drill's foot; an egg box under
+    a toy car, and where it best fits the two together: what pixels prefer that are independent."""
+    recording = bop.command(CLUTTER, object_id=object_id)
+    truth = torch.as_tensor(recording.truth)
+    step = [1e-3 * x for x in millimetres] + [math.radians(x) for x in degrees]
+    both = torch.stack([truth, poses.retract(truth, torch.tensor(step, dtype=torch.float64))])
+    image = torch.from_numpy(recording.measurements[0].observation.depth)
+    gains = []
+    for settings in ({}, {"clutter": False, "effective_pixels": None}):
+        prepared = part_in_view.prepare(recording, **settings)
+        said = part_in_view.depth(prepared, recording.measurements[0].action.camera, both).log_prob(image)
+        gains.append(float(said[0] - said[1]))
+    assert gains[0] > 40.0 and gains[1] < -200.0
