@@ -11,6 +11,8 @@ scatter of several runs, so copies of a particle count once.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,6 +34,8 @@ SCENE = DATA / "lmo_scene2_frame3"
 OBJECT = 5
 PARTICLES = 75
 COUNTS = (75, 1000, 10_000)
+# Moves that align a part to depth read likelihoods of independent pixels.
+IN_VIEW = replace(part_in_view.model, prepare=partial(part_in_view.prepare, clutter=False))
 
 
 class Posed(NamedTuple):
@@ -124,7 +128,7 @@ def look(asked: tuple[str, int, int]) -> Posed:
     name, recording_seed, seed = asked
     recording = command(SCENE, object_id=OBJECT, seed=recording_seed)
     make, sweeps = POSES[name]
-    return posed(part_in_view.model, recording, make("part"), sweeps, 0.6, seed)
+    return posed(IN_VIEW, recording, make("part"), sweeps, 0.6, seed)
 
 
 def posed(model: Any, recording: Any, kernel: Kernel, sweeps: int, share: float, seed: int) -> Posed:

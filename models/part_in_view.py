@@ -39,7 +39,9 @@ class Settings:
         clutter: whether unknown things stand about the part and before it, that go on from pixel to pixel
             (`ClutteredDepth`). Otherwise, and wherever a background was measured, what is unknown is
             independent from pixel to pixel (`RobustDepth`).
-        temperature: with clutter, what the log-likelihood is divided by.
+        temperature: with clutter, what the log-likelihood is divided by. At 1 it tells where the part is;
+            around there a belief is too sure, for a mesh, a camera's bias and a stated truth are off for all
+            pixels together (on real images the truth has 15 to 350 nats less than the best particle).
         stride: every stride-th row and column is looked at with clutter, else every stride-th pixel in each
             direction.
         outlier: without clutter, the probability that a pixel on the part shows something else.

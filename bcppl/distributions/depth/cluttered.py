@@ -55,6 +55,10 @@ class ClutteredDepth(LazyDistribution):
     - the part: Laplace error of the given `scale`, which after a pixel of the part goes on by an
       autoregression, or, with probability `rough`, starts anew.
 
+    The defaults are about what a Kinect's image of a table at 1.1 m shows: jumps at one pixel of a hundred,
+    steps of 1.3 mm on average between them, errors on parts in full view of 4 to 6.4 mm with a correlation of
+    0.81 to 0.89 from pixel to pixel. `step` is three times as wide: what stands about is not all that flat.
+
     The log-density is the mean of that of the rows and that of the columns, of every `lines`-th of each. That
     is no density of the image: evidence that contains it is a surrogate's. `sample` draws the rows alone.
 
