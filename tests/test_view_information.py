@@ -1,0 +1,109 @@
+"""What views are expected to tell: a plane's closed form, the camera's own errors, and the ranking."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bcppl import poses
+from bcppl.inference.population import Population
+from bcppl.inference.probing import linearised_information_gain
+from bcppl.models.look_and_touch import model
+from bcppl.models.view_information import pixel_information, view_information
+from bcppl.models.worlds.bench import bench_scene
+from bcppl.recordings.measurements import View
+from bcppl.recordings.plan import action_of
+from bcppl.simulators.camera import Camera, looking_at
+from bcppl.simulators.renderer import DepthRenderer
+from bcppl.simulators.shapes import block
+from bcppl.traces import generate
+
+
+def from_above(height: float, name: str = "camera") -> Camera:
+    pose = looking_at(np.array([0.0, 0.0, height]), np.zeros(3), (0.0, 1.0, 0.0))
+    return Camera(name, 80, 60, 100.0, 100.0, 39.5, 29.5, pose, near=0.05, far=2.0)
+
+
+def test_of_a_plane_that_fills_the_image_it_is_the_closed_form() -> None:
+    """Each pixel reads the depth of a plane: it tells of height and tilt, and of nothing else."""
+    renderer, camera = DepthRenderer(block((1.0, 1.0, 0.02))), from_above(0.3)
+    found = pixel_information(renderer, camera, poses.identity(2))
+    top = 0.3 - float(renderer.part.vertices[:, 2].max())
+    rays = np.stack(np.meshgrid((np.arange(80) - 39.5) / 100, (np.arange(60) - 29.5) / 100), -1).reshape(
+        -1, 2
+    )
+    places = torch.from_numpy(top * rays)
+    assert float(found[0, 2, 2]) == pytest.approx(80 * 60, rel=1e-3)
+    assert float(found[0, 2, 6]) == pytest.approx(-80 * 60, rel=1e-3)  # nearer is higher
+    size = float(places.square().sum())
+    assert float(found[0, 3, 3] + found[0, 4, 4]) == pytest.approx(size, rel=0.01)
+    assert float(found[0, [0, 1, 5]][:, [0, 1, 5]].abs().max()) < 1e-3 * size
+    torch.testing.assert_close(found[0], found[1])
+
+
+def test_the_cameras_error_bounds_what_it_tells_and_a_second_image_tells_less() -> None:
+    recording = bench_scene(2, part="square 8 mm").look()
+    scene = model.prepare(recording)
+    views = [m.action for m in recording.measurements]
+    torch.manual_seed(0)
+    trace, _ = generate(model.program, (scene, []), {}, 12)
+    first = view_information(views[0], trace)
+    assert first is not None and view_information(object(), trace) is None
+    assert bool((torch.linalg.eigvalsh(first) > -1e-6).all())
+    bound = torch.linalg.inv(_error(scene, views[0].camera, trace["part"]))
+    assert bool((torch.linalg.eigvalsh(bound - first) > -1e-3 * float(bound.abs().max())).all())
+    observed = model.observe(scene, recording.measurements[:1])
+    looked, _ = generate(model.program, (scene, views[:1]), observed, 12, choices={"part": trace["part"]})
+    again, other = (view_information(v, looked) for v in views)
+    assert again is not None and other is not None
+    size = [
+        float(torch.linalg.slogdet(torch.eye(6) * 1e4 + each)[1].mean()) for each in (first, again, other)
+    ]
+    assert size[1] < size[2] and size[1] < size[0]
+
+
+def _error(scene: object, camera: Camera, part: torch.Tensor) -> torch.Tensor:
+    from bcppl.simulators.stated_cameras import apparent_covariance
+
+    settings = scene.settings  # type: ignore[attr-defined]
+    return apparent_covariance(camera, part, settings.camera_shift, settings.camera_turn)
+
+
+def test_views_and_touches_stand_in_one_ranking() -> None:
+    world = bench_scene(2, part="square 8 mm")
+    recording = world.look()
+    scene = model.prepare(recording)
+    torch.manual_seed(1)
+    trace, _ = generate(model.program, (scene, []), {}, 40)
+    spread = torch.tensor([2e-3] * 3 + [0.02] * 3, dtype=torch.float64)
+    near = poses.retract(torch.from_numpy(world.truth), spread * torch.randn(40, 6, dtype=torch.float64))
+    population = Population(trace.at({"part": near}), torch.zeros(40, dtype=torch.float64))
+    away = replace(recording.measurements[0].action.camera, name="away", device="")
+    blind = replace(away, world_from_camera=looking_at(np.array([0.5, 0.5, 1.9]), np.array([0.5, 0.0, 0.1])))
+    plan = _down(world)
+    ranking = linearised_information_gain(
+        population,
+        [plan, recording.measurements[0].action, View(blind)],
+        lambda one: (scene, [action_of(one)]),
+        information=view_information,
+        seed=0,
+    )
+    gain = [ranking.of(k).information_gain for k in range(3)]
+    assert gain[0] > 2.0 and gain[1] > 1.0
+    assert 0.0 <= gain[2] < gain[1]
+    assert all(math.isfinite(each) for each in gain)
+
+
+def _down(world: object) -> object:
+    from bcppl.recordings.plan import Plan
+
+    tip = -float(world.peg.vertices[:, 2].min())  # type: ignore[attr-defined]
+    top = float(world.part.vertices[:, 2].max())  # type: ignore[attr-defined]
+    at = poses.as_pose(world.truth).expand(2, 7).clone()  # type: ignore[attr-defined]
+    places = torch.tensor([[0.02, 0.02, top + tip + 0.012], [0.02, 0.02, top + tip - 0.012]]).double()
+    at[:, :3] = poses.transform(at[0], places)
+    return Plan("down", np.array([0.0, 1.0]), at.numpy(), ("guarded",), 4.0, np.ones(6), np.ones(6))
