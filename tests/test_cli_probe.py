@@ -21,7 +21,7 @@ from bcppl.recordings import save
 from bcppl.recordings.action_file import load_actions, save_actions
 from bcppl.recordings.beliefs import load_belief, load_latent, save_belief
 from bcppl.recordings.plan import Plan
-from tests.command_line import SHIPPED, Ran
+from tests.command_line import SHIPPED, Ran, short
 
 KINDS = "touch:2,pair:1"
 
@@ -83,6 +83,21 @@ def test_a_recording_is_run_ranked_and_its_best_action_written(bcppl: Callable[.
     assert name == best.name and gain == pytest.approx(table[0][1], abs=0.02)
     (again,) = load_actions(here / "belief_002_next.json")
     assert np.array_equal(again.world_from_peg, best.world_from_peg)
+
+
+def test_views_and_touches_are_ranked_together_and_other_models_by_reweighing(
+    bcppl: Callable[..., Ran], here: Path
+) -> None:
+    words = ("--candidates", "touch:1,view:2", "--hypotheses", 4)
+    table = dict(ranked(bcppl("probe", "runs/belief_002.h5", *words)))
+    views = [gain for name, gain in table.items() if name.startswith("view")]
+    (touched,) = (gain for name, gain in table.items() if name.startswith("touch"))
+    # A third view of a camera that is off by millimetres tells less than a touch.
+    assert len(views) == 2 and 0.5 < max(views) < touched
+    save(short(1), here / "push.h5")
+    for kind, says in (("view", "model point_probe cannot foretell these"), ("touch", "there is no peg")):
+        refused(bcppl("probe", "push.h5", "--candidates", f"{kind}:1", "--particles", 6), says)
+    refused(bcppl("probe", "runs/belief_002.h5", "--by", "luck"), "--by is 'luck'")
 
 
 def refused(ran: Ran, says: str) -> None:

@@ -36,13 +36,16 @@ from bcppl.inference.probing.filters import (
 )
 from bcppl.inference.probing.loop import named_apart, prepared, with_views
 from bcppl.inference.probing.ranking import Ranking
-from bcppl.inference.probing.rules import by_information
+from bcppl.inference.probing.rules import Rank, by_information, by_reweighing
+from bcppl.models.foreseen_views import information_of_views
+from bcppl.models.look_and_touch import Scene
 from bcppl.models.robots import load_robot
 from bcppl.recordings.action_file import SUFFIXES, load_actions, save_actions
 from bcppl.recordings.measurements import View
 from bcppl.recordings.plan import Plan
 
 DEFAULT = ",".join(f"{kind}:{count}" for kind, count in MIXED.items())
+WAYS = ("linearised", "reweighing")
 COUNT = 8  # of a kind that is named without a number
 NUMBERS = "x y z qw qx qy qz"
 
@@ -73,6 +76,12 @@ def probe(
     hypotheses: Annotated[
         int | None, typer.Option(help="How many particles play the truth; all by default.")
     ] = None,
+    by: Annotated[
+        str | None,
+        typer.Option(
+            help="How gains are foretold: linearised (default for look_and_touch) or reweighing (others)."
+        ),
+    ] = None,
     rate: Annotated[float, typer.Option(help="Nats that a second of the arm's time costs.")] = 0.0,
     force: Annotated[float | None, typer.Option(help="N; plans that press harder are left out.")] = None,
     table: Annotated[
@@ -95,6 +104,8 @@ def probe(
     whole_number("--particles is {}", particles, least=2)
     loading.refuse_seed(seed)
     number_within("--rate is {}", rate, least=0.0)
+    if by not in (None, *WAYS):
+        raise InputError(f"--by is {by!r}; give one of {', '.join(WAYS)}.")
     output = Path(f"{Path(recording).stem}_next.json") if output is None else output
     if output.suffix not in SUFFIXES:
         raise InputError(f"--output is {output}; give a file that ends in {' or '.join(SUFFIXES)}.")
@@ -109,14 +120,30 @@ def probe(
     console.print(escape(str(found)), soft_wrap=True)
     scene = prepared(before.model, with_views(before.recording, found), before.scene)
     with console.status("ranking"):
-        rank = by_information(before.model.pose, hypotheses=hypotheses, cost=seconds_of, rate=rate, seed=seed)
-        ranking = rank(before.population, found, scene)
+        settings = {"hypotheses": hypotheses, "cost": seconds_of, "rate": rate, "seed": seed}
+        rank = _rank(by, before, scene, settings)
+        try:
+            ranking = rank(before.population, found, scene)
+        except (AttributeError, KeyError, TypeError) as error:
+            raise InputError(
+                f"model {model or before.recording.model} cannot foretell these candidates ({error}); give "
+                "kinds that it explains, or a model of depth images and of a peg's touches: look_and_touch."
+            ) from error
+    console.width = max(console.width, 100)  # no number is cut, also where the output is no terminal
     console.print(_shown(ranking, top))
     best = named_apart(ranking.best.candidate, before.recording)
     save_actions([best], output)
     picture = output.with_suffix(".png")
     _draw(before, best, found).savefig(picture, dpi=150)
     console.print(f"the best is in {output}, its picture in {picture}", soft_wrap=True)
+
+
+def _rank(by: str | None, before: Known, scene: Any, settings: dict[str, Any]) -> Rank:
+    """By the linearised likelihoods of touches where the model has them, else by reweighing."""
+    felt = isinstance(scene, Scene)
+    if by == "reweighing" or (by is None and not felt):
+        return by_reweighing(before.model.pose, **settings)
+    return by_information(before.model.pose, information_of_views if felt else None, **settings)
 
 
 def seconds_of(candidate: Candidate) -> float:
