@@ -42,9 +42,11 @@ def by_information(
 
     def rank(population: Population, candidates: Sequence[Candidate], scene: Any) -> Ranking:
         _, done = population.trace.args
-        told = {} if views is None else {"information": views(scene, population.belief(pose).mean)}
+        told: dict[str, Any] = dict(settings)
+        if views is not None:
+            told["information"] = views(scene, population.belief(pose).mean)
         return linearised_information_gain(
-            population, candidates, lambda c: (scene, [*done, action_of(c)]), pose, **settings, **told
+            population, candidates, lambda c: (scene, [*done, action_of(c)]), pose, **told
         )
 
     return rank
