@@ -1,10 +1,12 @@
 """The loop: look where to touch, touch there, take in what was felt, until it is enough; then insert.
 
-arm = BenchArm(scene)  # or whatever carries out plans: a robot
-asked = lambda belief, number: candidates(belief, scene.part, scene.peg, seed=number)
-for each in probing_loop(model, scene.look(), arm, asked, probes=3):
-    print(each.chosen.name, each.ranking.best.information_gain)
-print(arm.insert(insertion_plan(each.step.belief, scene.part, scene.peg)))
+In short, with any robot or world that carries out plans:
+
+    arm = BenchArm(scene)
+    asked = lambda belief, number: candidates(belief, scene.part, scene.peg, seed=number)
+    for each in probing_loop(model, scene.look(), arm, asked, probes=3):
+        print(each.chosen.name, each.ranking.best.information_gain)
+    print(arm.insert(insertion_plan(each.step.belief, scene.part, scene.peg)))
 """
 
 from __future__ import annotations
