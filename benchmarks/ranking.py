@@ -26,7 +26,8 @@ from bcppl.inference.population import Population
 from bcppl.inference.probing import Ranking, expected_information_gain, linearised_information_gain
 from bcppl.inference.probing.candidates import candidates
 from bcppl.inference.schemes import systematic
-from bcppl.models.look_and_touch import Scene, model, touch_of
+from bcppl.models.look_and_touch import model
+from bcppl.models.look_and_touch_scene import Scene, touch_of
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.recordings.plan import Plan, action_of, probe_of
 from bcppl.simulators.peg_model import ContactParameters

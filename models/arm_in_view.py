@@ -3,11 +3,13 @@
 The camera's pose in the arm's base frame is drawn from the prior, and what the sensor adds to every range.
 Each view is a depth image of the arm at other joint angles: its links are drawn where its joints put them.
 No mask is needed: what stands still behind the arm (table, floor, room) is what the other views show there.
+Where a segmentation has marked the arm's pixels, these masks are measurements too: they say where the outline
+is, and the depth image is left to say how far away the arm is within it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,11 +19,15 @@ import pyro
 import pyro.distributions as dist
 import torch
 import trimesh
+from scipy.ndimage import binary_erosion
 from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.depth import RobustDepth
+from bcppl.distributions.fitted import fitted_normal
+from bcppl.distributions.pose_normals import normal_like, within
 from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.silhouette import Silhouette, binned_mask
 from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.simulators.camera import Camera, bin_depth
@@ -31,6 +37,10 @@ from bcppl.simulators.robot import Robot
 from bcppl.traces import Trace
 
 Array = npt.NDArray[np.float64]
+
+WIDER = 1.3  # than the fit: of what is proposed
+# What images say is taken for no surer than this: metres, radians, metres of bias, pixels of rim.
+SHARPEST = torch.tensor([5e-4] * 3 + [5e-4] * 3 + [5e-4, 0.05], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -45,7 +55,14 @@ class Settings:
             and the nearer surface wins half a window: 4 pixels are 5.5 mm at 1.25 m. Without it the arm looks
             too near, the more so the sharper the likelihood.
         effective_pixels: how many independent pixels a whole image is worth, those beside the arm included.
+        effective_inside: the same of an image of which only what a mask encloses counts.
         bins: so many pixels in each direction are read as one, the median of them.
+        mask_width: how far the outline of a mask wanders, pixels of the whole image.
+        mask_rim: standard deviation of how far masks reach beyond the arm all along, pixels.
+        mask_wrong: the probability that a pixel of a mask says the opposite.
+        mask_temperature: how much less a block of a mask is worth than it seems: a segmentation errs by
+            whole patches, and the arm is not quite built as drawn.
+        inside: so many pixels from a mask's outline depth begins to count: there is no window beyond it.
     """
 
     scale: float = 0.02
@@ -53,7 +70,13 @@ class Settings:
     bias: float = 0.005
     widening: float = 0.0055
     effective_pixels: float | None = 200.0
+    effective_inside: float | None = 10.0
     bins: int = 8
+    mask_width: float = 8.0
+    mask_rim: float = 1.5
+    mask_wrong: float = 0.05
+    mask_temperature: float = 32.0
+    inside: int = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +88,7 @@ class Scene:
         prior: over `base_from_camera`.
         renderers: of the arm at each view's joint angles, one rigid part each.
         backgrounds: (H, W) metres, what stands behind the arm in each view, NaN where unknown.
+        insides: (H, W) where depth counts in each view; None where no mask says.
         settings: of the likelihood.
     """
 
@@ -72,6 +96,7 @@ class Scene:
     prior: Any
     renderers: Sequence[DepthRenderer]
     backgrounds: Sequence[Array]
+    insides: Sequence[npt.NDArray[np.bool_]] | None
     settings: Settings
 
     @property
@@ -81,24 +106,46 @@ class Scene:
 
 
 def arm_in_view(scene: Scene, views: int) -> None:
-    """The program: where the camera stands, its bias, and a depth image for each of the first views."""
+    """The program: where the camera stands, its bias, the masks' rim, and the images of the first views."""
     settings = scene.settings
     camera = pyro.sample("camera", scene.prior)
     bias = pyro.sample("bias", dist.Normal(torch.zeros(()).double(), settings.bias))
-    camera_from_base = poses.inverse(camera)
+    rim = None
+    if scene.insides is not None:
+        rim = pyro.sample("rim", dist.Normal(torch.zeros(()).double(), settings.mask_rim))
+    for address, site in sites(scene, views, camera, bias, rim).items():
+        pyro.sample(address, site)
+
+
+def sites(scene: Scene, views: int, camera: Tensor, bias: Tensor, rim: Tensor | None) -> dict[str, Any]:
+    """The likelihoods of the first views' images, by address, of cameras at poses (N, 7)."""
+    settings, camera_from_base = scene.settings, poses.inverse(camera)
+    found: dict[str, Any] = {}
     for k, (renderer, behind) in enumerate(zip(scene.renderers[:views], scene.backgrounds, strict=False)):
-        depth = RobustDepth(
+        depth = found[f"depth_{k}"] = RobustDepth(
             renderer,
             scene.camera,
             camera_from_base,
             scale=settings.scale,
             outlier=settings.outlier,
-            effective_pixels=settings.effective_pixels,
-            background=behind,
-            background_is_measured=True,
-            bias=bias + settings.widening,  # the drawn surface is nearer by that much
+            effective_pixels=settings.effective_pixels
+            if scene.insides is None
+            else settings.effective_inside,
+            region=None if scene.insides is None else scene.insides[k],
+            background=behind if scene.insides is None else None,
+            background_is_measured=scene.insides is None,
+            # The drawn surface is nearer by the widening.
+            bias=bias + (settings.widening if scene.insides is None else 0.0),
         )
-        pyro.sample(f"depth_{k}", depth)
+        if rim is not None:
+            found[f"mask_{k}"] = Silhouette.beside(
+                depth,
+                settings.mask_width / settings.bins,
+                settings.mask_wrong,
+                rim=rim / settings.bins,
+                temperature=settings.mask_temperature,
+            )
+    return found
 
 
 def prepare(
@@ -107,6 +154,7 @@ def prepare(
     prior: Any,
     angles: Sequence[Array],
     images: Sequence[Array],
+    masks: Sequence[npt.ArrayLike] | None = None,
     **settings: Any,
 ) -> Scene:
     """The scene of some views by a camera that stands still.
@@ -117,10 +165,11 @@ def prepare(
         prior: over `base_from_camera`, such as `prior_from_guess` gives.
         angles: (J,) joint angles of each view, radians.
         images: (H, W) depth image of each view, metres, NaN or 0 where missing.
+        masks: (H, W) which pixels show the arm in each view, 0 where not; None where that is not known.
         settings: fields of `Settings`.
 
     Raises:
-        InputError: as `Robot.drawn`, or there is not one image for each view.
+        InputError: as `Robot.drawn`, or there is not one image, or one mask of its size, for each view.
     """
     if len(images) != len(angles):
         raise InputError(
@@ -128,10 +177,43 @@ def prepare(
         )
     chosen = Settings(**settings)
     still = replace(camera, world_from_camera=poses.identity().numpy())
-    renderers = [DepthRenderer(widened(robot.drawn(q), chosen.widening)) for q in angles]
+    small = still.binned(chosen.bins)
     binned = _binned(images, still, chosen.bins)
     backgrounds = [still_behind(binned, view) for view in range(len(binned))]
-    return Scene(still.binned(chosen.bins), prior, renderers, backgrounds, chosen)
+    drawn = [robot.drawn(q) for q in angles]
+    if masks is None:
+        # Where no mask says where the arm ends, depth has to, and smears it.
+        renderers = [DepthRenderer(widened(part, chosen.widening)) for part in drawn]
+        return Scene(small, prior, renderers, backgrounds, None, chosen)
+    shown = checked_masks(still, masks, len(angles))
+    insides = [_inside(mask, chosen) for mask in shown]
+    return Scene(small, prior, [DepthRenderer(part) for part in drawn], backgrounds, insides, chosen)
+
+
+def checked_masks(camera: Camera, masks: Sequence[npt.ArrayLike], views: int) -> list[npt.NDArray[np.bool_]]:
+    """The masks (H, W) of some views, true where they show the arm.
+
+    Raises:
+        InputError: there is not one for each view, or one is not of the camera's size.
+    """
+    shown = [np.asarray(mask) != 0 for mask in masks]
+    if len(shown) != views:
+        raise InputError(
+            f"{views} views of the arm are given {len(shown)} masks; give one for each, or none."
+        )
+    for k, mask in enumerate(shown):
+        if mask.shape != (camera.height, camera.width):
+            raise InputError(
+                f"mask {k} has shape {mask.shape} and the images of camera {camera.name!r} have "
+                f"{(camera.height, camera.width)}; give the mask of the depth image's own pixels."
+            )
+    return shown
+
+
+def _inside(mask: npt.NDArray[np.bool_], settings: Settings) -> npt.NDArray[np.bool_]:
+    """The blocks (H, W) that lie within a mask, off its outline."""
+    within = binary_erosion(mask, iterations=settings.inside) if settings.inside else mask
+    return np.asarray(binned_mask(~within, settings.bins) == 0.0)
 
 
 def _binned(images: Sequence[Array], camera: Camera, bins: int) -> list[Array]:
@@ -161,10 +243,62 @@ def widened(part: Part, by: float) -> Part:
     return replace(part, vertices=vertices, faces=np.asarray(mesh.faces, dtype=np.int64))
 
 
-def observations(scene: Scene, images: Sequence[Array]) -> Mapping[str, Tensor]:
-    """The depth images (H, W) of the views, metres, NaN or 0 where missing, by address."""
-    binned = _binned(images, scene.camera, scene.settings.bins)
-    return {f"depth_{k}": torch.from_numpy(image) for k, image in enumerate(binned)}
+def observations(
+    scene: Scene, images: Sequence[Array], masks: Sequence[npt.ArrayLike] | None = None
+) -> Mapping[str, Tensor]:
+    """The depth images and masks (H, W) of the views as `prepare` takes them, by address."""
+    bins = scene.settings.bins
+    seen = {f"depth_{k}": torch.from_numpy(x) for k, x in enumerate(_binned(images, scene.camera, bins))}
+    for k, mask in enumerate(() if masks is None else masks):
+        seen[f"mask_{k}"] = torch.from_numpy(binned_mask(mask, bins))
+    return seen
+
+
+def fitted(scene: Scene, seen: Mapping[str, Tensor], draws: int = 100) -> Callable[[Scene, int], None]:
+    """A program that proposes the latent values: a normal that is fitted to what images and masks say.
+
+    Camera and ranges lie along a valley: the camera may stand lower and look up, or farther and read less.
+    Particles that walk do not settle along it; a normal is as long as the valley is.
+
+    Args:
+        scene: what is known.
+        seen: what `observations` gives.
+        draws: poses that are looked at in each round of the fit.
+
+    Returns:
+        A program `proposal(scene, views)` for `bcppl.inference.importance.importance_sampling`.
+    """
+    settings, prior = scene.settings, scene.prior
+    views = sum(address.startswith("depth_") for address in seen)
+    own = [settings.bias] if scene.insides is None else [settings.bias, settings.mask_rim]
+    start = torch.cat([normal_like(prior).covariance.diagonal().sqrt(), torch.tensor(own).double()])
+
+    def log_density(point: Tensor) -> Tensor:
+        camera = poses.retract(prior.center, point[:, :6].contiguous())
+        likelihoods = sites(scene, views, camera, point[:, 6], point[:, 7] if len(own) > 1 else None)
+        said = torch.stack([likelihoods[address].log_prob(value) for address, value in seen.items()])
+        return torch.where(prior.log_prob(camera) > -torch.inf, said.sum(dim=0), -torch.inf)
+
+    fit = fitted_normal(log_density, start, SHARPEST[: len(start)], draws=draws, first=3 * draws)
+    mean, covariance = fit.mean, fit.covariance
+
+    def proposal(scene: Scene, views: int) -> None:
+        away = mean.new_zeros(0)
+        for k, address in enumerate(["bias", "rim"][: len(own)]):
+            # Each given those before it.
+            before, at = slice(6, 6 + k), 6 + k
+            gain = torch.linalg.solve(covariance[before, before], covariance[before, at])
+            spread = (covariance[at, at] - gain @ covariance[before, at]).sqrt()
+            value = pyro.sample(address, dist.Normal(mean[at] + (away @ gain if k else 0.0), WIDER * spread))
+            step = (value - mean[at])[..., None]
+            away = torch.cat([away, step], dim=-1) if k else step
+        gain = torch.linalg.solve(covariance[6:, 6:], covariance[6:, :6])
+        left = covariance[:6, :6] - gain.T @ covariance[6:, :6]
+        center = poses.retract(prior.center, mean[:6] + away @ gain)
+        spread = WIDER**2 * (0.5 * (left + left.T)).expand(len(center), 6, 6)
+        pyro.sample("camera", within(prior, NormalPose(center, spread)))
+
+    return proposal
 
 
 def along_the_view(trace: Trace) -> None:

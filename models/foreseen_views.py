@@ -16,7 +16,8 @@ from bcppl import poses
 from bcppl.distributions.fitted import fitted_normal
 from bcppl.distributions.pose_normals import normal_like
 from bcppl.models.camera_error import farther
-from bcppl.models.look_and_touch import SHARPEST, Scene, image_of
+from bcppl.models.look_and_touch_proposals import SHARPEST
+from bcppl.models.look_and_touch_scene import Scene, image_of
 from bcppl.recordings.measurements import View
 from bcppl.simulators.stated_cameras import apparent_covariance
 from bcppl.traces import Trace

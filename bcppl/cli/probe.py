@@ -38,7 +38,7 @@ from bcppl.inference.probing.loop import named_apart, prepared, with_views
 from bcppl.inference.probing.ranking import Ranking
 from bcppl.inference.probing.rules import Rank, by_information, by_reweighing
 from bcppl.models.foreseen_views import information_of_views
-from bcppl.models.look_and_touch import Scene
+from bcppl.models.look_and_touch_scene import Scene
 from bcppl.models.robots import load_robot
 from bcppl.recordings.action_file import SUFFIXES, load_actions, save_actions
 from bcppl.recordings.measurements import View
