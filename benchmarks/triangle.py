@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,19 +24,26 @@ from touches import LOGS, OTHER, learnt
 
 from bcppl import poses
 from bcppl.beliefs import Belief
-from bcppl.inference.probing import Entropy, expected_information_gain, mode_entropy, weight_entropy
+from bcppl.inference.probing import (
+    expected_information_gain,
+    linearised_information_gain,
+    mode_entropy,
+    weight_entropy,
+)
 from bcppl.inference.smc import Step
 from bcppl.inference.tempered_smc import infer
 from bcppl.models.point_probe import felt, model
 from bcppl.recordings.importers.point_probe import command
 from bcppl.recordings.measurements import Push, Recording, Touch
 from bcppl.simulators.distance import SignedDistance
+from bcppl.simulators.gap import Gap
+from bcppl.traces import Trace, extend
 
 LOG = "10_90"
 YAW = 3.0  # degrees; with more, another contact on the same edge is worth as much as one on another
 PARTICLES, CANDIDATES, HYPOTHESES = 75, 12, 16
 GONE = 1.0 / 3.0  # of how far it could slide
-WAYS: dict[str, Entropy] = {"of weights": weight_entropy(), "of the pose": mode_entropy("part")}
+WAYS = ("entropy of weights", "entropy of the pose", "information added up")
 
 
 class Chosen(NamedTuple):
@@ -44,7 +51,7 @@ class Chosen(NamedTuple):
 
     Attributes:
         another: whether the second push lay on another edge than the first.
-        before, after: how far the part could slide along the edge first touched: standard deviations, mm.
+        before, after: how far the part could slide along the edge first touched (`slide`), mm.
         by_chance: the same after the first candidate, for which nobody asked.
         share: of the candidates that lay on another edge.
     """
@@ -71,12 +78,19 @@ def edge_of(recording: Recording, push: int, settings: Any) -> Tensor:
 
 
 def slide(belief: Belief, recording: Recording, normal: Tensor) -> float:
-    """How far (mm, a standard deviation) the part's middle may be along an edge with a normal (3,)."""
+    """How far (mm, a standard deviation) the part may slide along an edge with a normal (3,).
+
+    That is how far its middle may be along the edge once its yaw is known: what it owes to its yaw by linear
+    regression is left out, for no slide is needed for it.
+    """
     middle = torch.tensor(recording.part.mesh.centroid, dtype=torch.float64)
-    turn = poses.rotation_matrix(torch.as_tensor(recording.truth))
-    along = turn @ torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), normal)
+    truth = torch.as_tensor(recording.truth)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    along = poses.rotation_matrix(truth) @ torch.linalg.cross(up, normal)
     there = poses.transform(belief.world_from_part, middle[None])[:, 0] @ along
-    return 1e3 * float((belief.weights @ (there - belief.weights @ there).square()).sqrt())
+    yaw = poses.local(truth, belief.world_from_part)[:, 5]
+    covariance = torch.cov(torch.stack([there, yaw]), correction=0, aweights=belief.weights)
+    return 1e3 * float((covariance[0, 0] - covariance[0, 1] ** 2 / covariance[1, 1]).clamp(min=0.0).sqrt())
 
 
 def after(recording: Recording, numbers: Sequence[int], scene: Any, seed: int, start: Any = None) -> Step:
@@ -84,6 +98,19 @@ def after(recording: Recording, numbers: Sequence[int], scene: Any, seed: int, s
     some = replace(recording, measurements=[recording.measurements[k] for k in numbers])
     *_, last = infer(model, some, particles=PARTICLES, seed=seed, scene=scene, start=start)
     return last
+
+
+def told(arguments: Callable[[Any], tuple[Any, ...]], push: Push, trace: Trace) -> Tensor:
+    """What an onset tells of the pose, (H, 6, 6): the distance of the finger from the edge that it meets."""
+    scene, pushes = arguments(push)
+    longer, _ = extend(trace, (scene, pushes), {})
+    onset, part = longer[f"onset_{len(pushes) - 1}"], longer["part"]
+    felt_at = torch.where(torch.isnan(onset), part[:, :3], onset)
+    place = poses.transform(poses.inverse(part), felt_at[:, None])
+    near = scene.distance(place[:, 0])
+    slope = Gap(near.distance[:, None], place, near.normal[:, None]).slope(part)
+    slope = torch.where(torch.isnan(onset).any(dim=1)[:, None, None], 0.0, slope) / scene.settings.spread
+    return slope.transpose(-1, -2) @ slope
 
 
 def chosen(seed: int) -> list[Chosen]:
@@ -96,7 +123,12 @@ def chosen(seed: int) -> list[Chosen]:
     edges = torch.stack([edge_of(recording, k, settings) for k in range(1 + CANDIDATES)])
     another = (edges @ edges[0] < math.cos(math.radians(45.0))).tolist()
     others = range(1, 1 + CANDIDATES)
+    actions = [recording.measurements[k].action for k in others]
     done = [recording.measurements[0].action]
+
+    def arguments(push: Any) -> tuple[Any, ...]:
+        return scene, [*done, push]
+
     before = slide(first.belief, recording, edges[0])
 
     @cache
@@ -105,15 +137,18 @@ def chosen(seed: int) -> list[Chosen]:
         return slide(step.belief, recording, edges[0])
 
     found = []
-    for entropy in WAYS.values():
-        ranking = expected_information_gain(
-            first.population,
-            [recording.measurements[k].action for k in others],
-            lambda push: (scene, [*done, push]),
-            entropy,
-            hypotheses=HYPOTHESES,
-            seed=seed,
-        )
+    rankings = [
+        *(
+            expected_information_gain(
+                first.population, actions, arguments, entropy, hypotheses=HYPOTHESES, seed=seed
+            )
+            for entropy in (weight_entropy(), mode_entropy("part"))
+        ),
+        linearised_information_gain(
+            first.population, actions, arguments, information=partial(told, arguments), seed=seed
+        ),
+    ]
+    for ranking in rankings:
         best = others[ranking.best.number]
         found.append(Chosen(another[best], before, left(best), left(1), float(np.mean(another[1:]))))
     return found
@@ -135,14 +170,14 @@ def main() -> None:
         numbers = [float(np.median([getattr(one, field) for one in own])) for field in Chosen._fields[1:4]]
         share = float(np.mean([one.share for one in own]))
         lines.append([name, *counts, *numbers, share])
-        goal = 0.9 * draws
+        goal = 0.9 * draws if k == 0 else None
         rows += [
-            Row(f"entropy {name}: next push on another edge", counts[0], f"of {draws}", goal, "min"),
-            Row(f"entropy {name}: slide gone after it", counts[1], f"of {draws}", goal, "min"),
-            Row(f"entropy {name}: slide before, median", numbers[0], "mm"),
-            Row(f"entropy {name}: slide after, median", numbers[1], "mm"),
-            Row(f"entropy {name}: slide after a push by chance, median", numbers[2], "mm"),
-            Row(f"entropy {name}: candidates on another edge", share, "", direction="min"),
+            Row(f"{name}: next push on another edge", counts[0], f"of {draws}", goal, "min"),
+            Row(f"{name}: slide gone after it", counts[1], f"of {draws}", goal, "min"),
+            Row(f"{name}: slide before, median", numbers[0], "mm"),
+            Row(f"{name}: slide after, median", numbers[1], "mm"),
+            Row(f"{name}: slide after a push by chance, median", numbers[2], "mm"),
+            Row(f"{name}: candidates on another edge", share, "", direction="min"),
         ]
     columns = [
         "entropy",
