@@ -14,7 +14,8 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.poses import prior_from_guess
-from bcppl.inference.importance import tempered_importance_sampling
+from bcppl.errors import InputError
+from bcppl.inference.importance import importance_sampling, tempered_importance_sampling
 from bcppl.inference.kernels import metropolis_hastings, mixture
 from bcppl.inference.tempered_smc import kernel
 from bcppl.inference.tempering import tempered
@@ -22,6 +23,7 @@ from bcppl.models.arm_in_view import (
     Scene,
     along_the_view,
     arm_in_view,
+    fitted,
     observations,
     prepare,
     still_behind,
@@ -48,7 +50,7 @@ def near_the_truth(shift: float, angle: float) -> Guess:
     return Guess(poses.retract(TRUTH, moved.double()).numpy(), np.full(3, shift), angle=angle)
 
 
-def drawn(bias: float, **settings: float) -> tuple[Scene, dict[str, Tensor]]:
+def drawn(added: float, masked: bool = False, **settings: float) -> tuple[Scene, dict[str, Tensor]]:
     """A scene, and what its camera at the truth would see before a wall 3 m away, without noise."""
     robot = load_robot("panda", tip="panda_hand")
     prior = prior_from_guess(near_the_truth(0.03, 0.05))
@@ -57,10 +59,11 @@ def drawn(bias: float, **settings: float) -> tuple[Scene, dict[str, Tensor]]:
     for q in angles:
         renderer = DepthRenderer(robot.drawn(q))
         small = renderer.images(CAMERA.binned(2), poses.inverse(TRUTH)[None])[0]
-        image = np.where(np.isfinite(small), small + bias, 3.0)
+        image = np.where(np.isfinite(small), small + added, 3.0)
         images.append(np.kron(image, np.ones((2, 2))))  # read back by blocks
-    scene = prepare(robot, CAMERA, prior, angles, images, bins=2, **settings)
-    return scene, dict(observations(scene, images))
+    masks = [image < 2.9 for image in images] if masked else None
+    scene = prepare(robot, CAMERA, prior, angles, images, masks, bins=2, **settings)
+    return scene, dict(observations(scene, images, masks))
 
 
 def log_likelihood(scene: Scene, seen: dict[str, Tensor], camera: Tensor, bias: float) -> Tensor:
@@ -87,6 +90,40 @@ def test_camera_and_bias_are_found_together() -> None:
     before = poses.local(TRUTH, torch.from_numpy(near_the_truth(0.03, 0.05).world_from_part))
     assert float(off[:3].norm()) < 0.01 < 0.5 * float(before[:3].norm()) + 0.01
     assert math.degrees(float(off[3:].norm())) < 1.0
+
+
+MASKED = {"mask_width": 2.0, "mask_temperature": 20.0, "inside": 0, "effective_inside": 10.0, "bias": 0.02}
+
+
+def test_masks_place_the_camera_whatever_the_ranges_have_in_common() -> None:
+    scene, seen = drawn(0.012, masked=True, **MASKED)
+    assert set(seen) == {"depth_0", "depth_1", "mask_0", "mask_1"}
+    steps = torch.diag(torch.tensor([0.02] * 3 + [0.02] * 3)).double()
+    moved = poses.retract(TRUTH, torch.cat([torch.zeros(1, 6).double(), steps, -steps]))
+    given = {"camera": moved, "bias": torch.zeros(13).double(), "rim": torch.zeros(13).double()}
+    trace, _ = generate(arm_in_view, (scene, 2), seen, 13, given)
+    assert int(trace.log_prob("mask_0", "mask_1").argmax()) == 0
+
+
+def test_what_is_fitted_is_near_the_posterior() -> None:
+    scene, seen = drawn(0.012, masked=True, **MASKED)
+    torch.manual_seed(0)
+    population = importance_sampling(arm_in_view, (scene, 2), seen, 200, fitted(scene, seen, draws=200))
+    assert population.effective_sample_size > 20.0
+    belief = population.belief("camera")
+    off = poses.local(TRUTH, belief.mean)
+    assert bool((off.abs() < 3.0 * belief.spread).all())
+    assert float(off[:3].norm()) < 0.03 and math.degrees(float(off[3:].norm())) < 1.5
+
+
+def test_masks_that_do_not_fit_are_refused() -> None:
+    scene, _ = drawn(0.0)
+    robot, angles = load_robot("panda", tip="panda_hand"), [np.array(q) for q in POSTURES]
+    images = [np.ones((72, 96))] * 2
+    with pytest.raises(InputError, match="2 views of the arm are given 1 masks; give one for each, or none"):
+        prepare(robot, CAMERA, scene.prior, angles, images, images[:1])
+    with pytest.raises(InputError, match=r"mask 1 has shape \(96, 72\) and the images of camera 'c' have"):
+        prepare(robot, CAMERA, scene.prior, angles, images, [images[0], images[0].T])
 
 
 def test_a_part_is_widened_on_all_sides() -> None:
