@@ -37,9 +37,9 @@ from bcppl.inference.probing.filters import (
 from bcppl.inference.probing.loop import named_apart, prepared, with_views
 from bcppl.inference.probing.ranking import Ranking
 from bcppl.inference.probing.rules import Rank, by_information, by_reweighing
-from bcppl.models.foreseen_views import information_of_views
 from bcppl.models.look_and_touch_scene import Scene
 from bcppl.models.robots import load_robot
+from bcppl.models.view_information import view_information
 from bcppl.recordings.action_file import SUFFIXES, load_actions, save_actions
 from bcppl.recordings.measurements import View
 from bcppl.recordings.plan import Plan
@@ -143,7 +143,8 @@ def _rank(by: str | None, before: Known, scene: Any, settings: dict[str, Any]) -
     felt = isinstance(scene, Scene)
     if by == "reweighing" or (by is None and not felt):
         return by_reweighing(before.model.pose, **settings)
-    return by_information(before.model.pose, information_of_views if felt else None, **settings)
+    information = view_information if felt else None
+    return by_information(before.model.pose, information=information, **settings)
 
 
 def seconds_of(candidate: Candidate) -> float:

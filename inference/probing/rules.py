@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import seed_number
@@ -17,7 +16,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.probing.entropies import mode_entropy
 from bcppl.inference.probing.expected_entropy import expected_information_gain
 from bcppl.inference.probing.filters import Candidate
-from bcppl.inference.probing.linearised import Information, linearised_information_gain
+from bcppl.inference.probing.linearised import linearised_information_gain
 from bcppl.inference.probing.ranking import Prospect, Ranking
 from bcppl.inference.probing.touching import leading_point, middles_of_strokes
 from bcppl.parts import Part
@@ -28,25 +27,20 @@ from bcppl.recordings.plan import action_of
 Rank = Callable[[Population, Sequence[Candidate], Any], Ranking]
 
 
-def by_information(
-    pose: str, views: Callable[[Any, Tensor], Information] | None = None, **settings: Any
-) -> Rank:
+def by_information(pose: str, **settings: Any) -> Rank:
     """By the nats that each is expected to tell of a pose: `linearised_information_gain`.
 
     Args:
         pose: the address of the sought pose.
-        views: what views tell, for a scene and the belief's mean (7,), where there are views among the
-            candidates: `bcppl.models.foreseen_views.information_of_views` for look_and_touch.
-        settings: further arguments, such as `hypotheses`, `cost` and `rate`.
+        settings: further arguments, such as `hypotheses`, `cost` and `rate`; where there are views among the
+            candidates, `information`, which for look_and_touch is
+            `bcppl.models.view_information.view_information`.
     """
 
     def rank(population: Population, candidates: Sequence[Candidate], scene: Any) -> Ranking:
         _, done = population.trace.args
-        told: dict[str, Any] = dict(settings)
-        if views is not None:
-            told["information"] = views(scene, population.belief(pose).mean)
         return linearised_information_gain(
-            population, candidates, lambda c: (scene, [*done, action_of(c)]), pose, **told
+            population, candidates, lambda c: (scene, [*done, action_of(c)]), pose, **settings
         )
 
     return rank
