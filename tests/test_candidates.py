@@ -163,7 +163,7 @@ def test_filters_say_how_many_they_remove_and_why() -> None:
     assert pressing_force(plans[0]) == pytest.approx(4.0 + 2500.0 * 0.0015, rel=0.01)
     found = filtered([*plans, hard], [no_harder_than(10.0), from_within(down, 0.5, "come from aside")])
     assert found.removed == {"press with more than 10 N": 1, "come from aside": 3}
-    assert str(found) == "1 candidates; 1 press with more than 10 N; 3 come from aside"
+    assert str(found) == "1 candidate; 1 press with more than 10 N; 3 come from aside"
 
 
 def test_what_an_arm_does_not_reach_is_left_out() -> None:

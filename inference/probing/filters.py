@@ -66,7 +66,7 @@ class Candidates(Sequence[Candidate]):
 
     def __str__(self) -> str:
         gone = "".join(f"; {count} {why}" for why, count in self.removed.items() if count)
-        return f"{len(self)} candidates{gone}"
+        return f"{len(self)} candidate{'s' * (len(self) != 1)}{gone}"
 
 
 class Mounted(NamedTuple):
