@@ -7,6 +7,7 @@ such a step leaves too few particles with weight, it is undone and the likelihoo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -34,13 +35,15 @@ CERTAIN = 0.01  # nats: what is expected for sure tells nothing
 
 
 def kernel(pose: str, proposals: Sequence[Program]) -> Kernel:
-    """Every other latent value walks, then the pose is drawn anew by the model's proposals, then it walks."""
+    """One other latent value walks, then the pose is drawn anew by the model's proposals, then it walks."""
 
     def moved(population: Population) -> Move:
         others = [address for address in continuous(population.trace) if address != pose]
         walks = [metropolis_hastings(drift(other, WALK)) for other in others]
         given = [metropolis_hastings(proposal) for proposal in proposals]
-        return sequence([*walks, *given, metropolis_hastings(drift(pose, WALK))])(population)
+        # One for all: drawn for each particle, every walk would have to run.
+        chosen = [walks[int(torch.randint(len(walks), ()))]] if walks else []
+        return sequence([*chosen, *given, metropolis_hastings(drift(pose, WALK))])(population)
 
     return moved
 
@@ -52,7 +55,7 @@ def guided(
     sweeps: int = 1,
     share: float = 0.5,
     few: float = 0.2,
-    tries: Sequence[int] = (1, 8, 40),
+    most: int = 40,
     least: float = 0.015,
 ) -> StepFunction:
     """A step that takes a measurement in by a pair of programs, resamples when needed, and moves.
@@ -63,8 +66,8 @@ def guided(
         sweeps: how many of them.
         share: particles are resampled below this effective sample size, as a share of N.
         few: so many are to be left effective by the pair, as a share of N.
-        tries: it is run with so many copies of each particle, one number after the other, until they are; N
-            of all are kept.
+        most: it is run anew with more copies of each particle, as many as seem needed and at most so many,
+            until they are; N of all are kept.
         least: where even then fewer are left effective, as a share of N, the measurement is tempered in.
     """
     by_pair = smcp3(pair, resample=never)
@@ -93,10 +96,13 @@ def guided(
         stayed = as_expected(population, observed)
         if stayed is not None:
             return Stepped(stayed, _info(population, stayed, stayed.effective_sample_size))
-        for times in tries:
+        times, goal = 1, few * count
+        reached = weighed(population, observed)
+        while times < most and (reached is None or reached.effective_sample_size < goal):
+            each = 0.0 if reached is None else reached.effective_sample_size / times
+            # Effective sizes are often taken for too large: ask for more than would just do.
+            times = min(most, max(2 * times, math.ceil(1.5 * goal / max(each, goal / most))))
             reached = weighed(replicated(population, times), observed)
-            if reached is not None and reached.effective_sample_size >= few * count:
-                break
         if reached is None or reached.effective_sample_size < least * count:
             return by_tempering(population, observed)
         effective = reached.effective_sample_size

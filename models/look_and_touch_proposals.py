@@ -31,7 +31,8 @@ from bcppl.traces import Trace
 
 # What an image says is taken for no surer than this: metres, radians, metres of bias.
 SHARPEST = torch.tensor([5e-5] * 3 + [1e-3] * 3 + [1e-4], dtype=torch.float64)
-ARRIVING, WALKING = 0.95, 0.9
+# Correlations of deviations after a proposal with those before: of the part, and of where cameras see it.
+MOVED, ARRIVING, WALKING = 0.9, 0.98, 0.9
 WALK = torch.tensor([0.1, 1.5], dtype=torch.float64).log()  # of the scale of a walk
 NEAR = 0.02  # m: a window in which the peg stays farther off says nothing
 
@@ -121,7 +122,7 @@ def taken_in(trace: Trace) -> None:
     scene, actions = trace.args
     newest, k = actions[-1], len(actions) - 1
     if isinstance(newest, ProbeWindow):
-        carried_along(trace, actions, part_by_all(trace, actions))
+        carried_along(trace, actions, moved_on(trace, actions[:-1], actions))
         return
     values: dict[str, Tensor] = {}
     name = newest.camera.instrument
@@ -141,15 +142,34 @@ def left_out(trace: Trace) -> None:
     """The way back: the part, and after a touch what cameras see, as likely before the newest measurement."""
     actions = trace.args[1]
     if isinstance(actions[-1], ProbeWindow):
-        carried_along(trace, actions[:-1], part_by_all(trace, actions[:-1]))
+        carried_along(trace, actions[:-1], moved_on(trace, actions, actions[:-1]))
     else:
         pyro.sample("part", part_given(trace, actions[:-1]))
 
 
-def part_by_all(trace: Trace, actions: Sequence[View | ProbeWindow]) -> MixturePose:
-    """Where images' fits and touches place the part, whatever the particles hold of the cameras."""
-    center, covariance = placed_by_all(trace, actions)
-    return widened(center.expand(trace.particles, 7), covariance.expand(trace.particles, 6, 6))
+def moved_on(
+    trace: Trace, before: Sequence[View | ProbeWindow], after: Sequence[View | ProbeWindow]
+) -> MixturePose:
+    """Where a part that is known by some measurements will be known to be by others.
+
+    Normals resemble both beliefs. The linear map that carries the one to the other by the shortest ways
+    (Gaussian optimal transport: Olkin and Pukelsheim, Linear Algebra and its Applications 48, 1982) carries
+    the particles, and some noise is added: a measurement that tells little moves them little.
+    """
+    start, spread = placed_by_all(trace, before)
+    end, goal = placed_by_all(trace, after)
+    root = _root(spread)
+    back = torch.linalg.inv(root)
+    carried = back @ _root(root @ goal @ root) @ back
+    away = poses.local(start.expand(trace.particles, 7), trace["part"]) @ carried
+    center = poses.retract(end, MOVED * away)
+    return widened(center, ((1.0 - MOVED**2) * goal).expand(trace.particles, 6, 6))
+
+
+def _root(matrix: Tensor) -> Tensor:
+    """The symmetric root of a symmetric positive matrix."""
+    values, vectors = torch.linalg.eigh(0.5 * (matrix + matrix.T))
+    return vectors @ torch.diag(values.clamp(min=0.0).sqrt()) @ vectors.T
 
 
 def placed_by_all(trace: Trace, actions: Sequence[View | ProbeWindow]) -> tuple[Tensor, Tensor]:
