@@ -43,8 +43,8 @@ class Settings(camera_error.Settings):
 
     bins: int = 1
     temperature: float = 6.0
-    gap_noise: float = 0.00007
-    gap_shared: float = 0.00003
+    gap_noise: float = 0.00006
+    gap_shared: float = 0.00002
     sink: float = 0.00002
     gap_outlier: float = 0.001
     every: int = 5
