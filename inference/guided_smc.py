@@ -56,7 +56,7 @@ def guided(
     share: float = 0.5,
     few: float = 0.2,
     most: int = 40,
-    least: float = 0.015,
+    least: float = 0.03,
 ) -> StepFunction:
     """A step that takes a measurement in by a pair of programs, resamples when needed, and moves.
 
