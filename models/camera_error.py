@@ -39,7 +39,7 @@ SIZES = torch.tensor([0.1, 1.5], dtype=torch.float64).log()
 
 
 @dataclass(frozen=True)
-class Settings:
+class Cameras:
     """What is known of the cameras.
 
     Attributes:
@@ -48,8 +48,6 @@ class Settings:
         bias: standard deviation of what a camera adds to every range, metres.
         scale: of the Laplace noise, metres.
         outlier: the probability that a pixel shows something else than what is rendered.
-        effective_pixels: how many independent pixels an image is worth, all that are looked at; None for all:
-            the errors hold what all pixels have in common, not what neighbours at an edge have.
         bins: so many pixels in each direction are read as one, the median of them.
     """
 
@@ -58,7 +56,6 @@ class Settings:
     bias: float = 0.002
     scale: float = 0.002
     outlier: float = 0.1
-    effective_pixels: float | None = 100.0
     bins: int = 3
 
     def __post_init__(self) -> None:
@@ -66,7 +63,19 @@ class Settings:
             number_within(
                 f"a site's spread must be positive and {name} is {{}}", getattr(self, name), above=0.0
             )
-        whole_number("camera_error is given bins {}", self.bins)
+        whole_number("a camera's images are read with bins {}", self.bins)
+
+
+@dataclass(frozen=True)
+class Settings(Cameras):
+    """What is known of the cameras (`Cameras`), and what an image is worth.
+
+    Attributes:
+        effective_pixels: how many independent pixels an image is worth, all that are looked at; None for all:
+            the errors hold what all pixels have in common, not what neighbours at an edge have.
+    """
+
+    effective_pixels: float | None = 100.0
 
 
 class Look(NamedTuple):

@@ -19,7 +19,7 @@ from bcppl import poses
 from bcppl.distributions.fitted import FittedNormal, fitted_normal
 from bcppl.distributions.manifold_fit import Normal, Told, Window, told_by
 from bcppl.distributions.mixture import MixturePose
-from bcppl.distributions.pose_normals import allowed, normal_like, product, widened, within
+from bcppl.distributions.pose_normals import allowed, normal_like, product, transport, widened, within
 from bcppl.distributions.poses import NormalPose
 from bcppl.models import camera_error
 from bcppl.models.camera_error import farther
@@ -152,24 +152,14 @@ def moved_on(
 ) -> MixturePose:
     """Where a part that is known by some measurements will be known to be by others.
 
-    Normals resemble both beliefs. The linear map that carries the one to the other by the shortest ways
-    (Gaussian optimal transport: Olkin and Pukelsheim, Linear Algebra and its Applications 48, 1982) carries
-    the particles, and some noise is added: a measurement that tells little moves them little.
+    Normals resemble both beliefs. What carries the one to the other by the shortest ways carries the
+    particles, and some noise is added: a measurement that tells little moves them little.
     """
     start, spread = placed_by_all(trace, before)
     end, goal = placed_by_all(trace, after)
-    root = _root(spread)
-    back = torch.linalg.inv(root)
-    carried = back @ _root(root @ goal @ root) @ back
-    away = poses.local(start.expand(trace.particles, 7), trace["part"]) @ carried
+    away = poses.local(start.expand(trace.particles, 7), trace["part"]) @ transport(spread, goal)
     center = poses.retract(end, MOVED * away)
     return widened(center, ((1.0 - MOVED**2) * goal).expand(trace.particles, 6, 6))
-
-
-def _root(matrix: Tensor) -> Tensor:
-    """The symmetric root of a symmetric positive matrix."""
-    values, vectors = torch.linalg.eigh(0.5 * (matrix + matrix.T))
-    return vectors @ torch.diag(values.clamp(min=0.0).sqrt()) @ vectors.T
 
 
 def placed_by_all(trace: Trace, actions: Sequence[View | ProbeWindow]) -> tuple[Tensor, Tensor]:

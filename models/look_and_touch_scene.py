@@ -14,8 +14,7 @@ from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import FittedNormal
 from bcppl.distributions.manifold import ContactManifold, MeasuresGap
 from bcppl.distributions.manifold_fit import Told
-from bcppl.models import camera_error
-from bcppl.models.camera_error import Look
+from bcppl.models.camera_error import Cameras, Look
 from bcppl.recordings.measurements import ProbeWindow
 from bcppl.simulators.camera import Camera
 from bcppl.simulators.effort import Effort
@@ -27,8 +26,8 @@ from bcppl.simulators.wrench import Sensing
 
 
 @dataclass(frozen=True)
-class Settings(camera_error.Settings):
-    """What is known of the cameras (`camera_error.Settings`) and of the arm.
+class Settings(Cameras):
+    """What is known of the cameras (`bcppl.models.camera_error.Cameras`) and of the arm.
 
     Attributes:
         temperature: how much less a pixel is worth than it seems; the errors hold what all have in common.

@@ -42,6 +42,24 @@ def product(first: NormalPose, second: NormalPose) -> NormalPose:
     return NormalPose(center, 0.5 * (covariance + covariance.transpose(-1, -2)))
 
 
+def transport(first: Tensor, second: Tensor) -> Tensor:
+    """The symmetric matrix (d, d) that carries a normal with one covariance to another by the shortest ways.
+
+    Points (..., d) about the mean are multiplied by it. Gaussian optimal transport: Olkin and Pukelsheim, The
+    distance between two random vectors with given dispersion matrices, Linear Algebra and its Applications
+    48, 1982.
+    """
+    root = _root(first)
+    back = torch.linalg.inv(root)
+    return back @ _root(root @ second @ root) @ back
+
+
+def _root(matrix: Tensor) -> Tensor:
+    """The symmetric root of a symmetric positive matrix."""
+    values, vectors = torch.linalg.eigh(0.5 * (matrix + matrix.T))
+    return vectors @ torch.diag(values.clamp(min=0.0).sqrt()) @ vectors.T
+
+
 def normal_like(prior: Any) -> NormalPose:
     """A normal with about the spread of a prior that is uniform within limits."""
     angle = getattr(prior, "angle", None)
