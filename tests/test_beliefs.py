@@ -126,3 +126,15 @@ def test_weights_of_any_size_are_normalised_and_none_is_an_error() -> None:
 def test_poses_and_weights_that_do_not_fit(poses_given: Any, weights_given: Any, says: str) -> None:
     with pytest.raises(InputError, match=says):
         Belief(torch.zeros(poses_given), torch.zeros(weights_given))
+
+
+def test_a_belief_of_single_precision_is_made_double_and_one_that_is_not_finite_refused() -> None:
+    particles = torch.stack([pose(1.0), pose(2.0), pose(3.0)])
+    single = Belief(particles.float(), weights(1, 1, 2).float())
+    torch.testing.assert_close(single.mean, Belief(particles, weights(1, 1, 2)).mean, atol=1e-6, rtol=0.0)
+    assert single.world_from_part.dtype == single.log_weights.dtype == torch.float64
+    particles[1, 0] = math.nan
+    with pytest.raises(InputError, match="pose 1 of a belief is not finite"):
+        Belief(particles, weights(1, 1, 2))
+    with pytest.raises(InputError, match="world_from_part as a ndarray; give a tensor"):
+        Belief(particles.numpy(), weights(1, 1, 2))  # type: ignore[arg-type]

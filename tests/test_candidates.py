@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -207,11 +209,20 @@ def test_what_leaves_no_choice_is_refused_in_a_sentence() -> None:
     belief = about(scene, 0.001)
     point = Belief(belief.world_from_part[:1].expand(5, 7), torch.zeros(5, dtype=torch.float64))
     nothing = Belief(belief.world_from_part, torch.full((40,), -torch.inf, dtype=torch.float64))
+    unknown = Belief(belief.world_from_part, torch.full((40,), torch.nan, dtype=torch.float64))
     calls = {
         "there are no candidates": lambda: filtered([], []),
         "no candidates of kind 'poke'": lambda: candidates(belief, scene.part, scene.peg, {"poke": 1}),
         "collapsed to a point": lambda: candidates(point, scene.part, scene.peg),
         "has no weight": lambda: candidates(nothing, scene.part, scene.peg),
+        "weight that is no number": lambda: candidates(unknown, scene.part, scene.peg),
+        "say how many of each": lambda: candidates(belief, scene.part, scene.peg, ["touch"]),  # type: ignore[arg-type]
+        "probably in millimetres": lambda: candidates(
+            belief,
+            scene.part,
+            dataclasses.replace(scene.peg, vertices=1000.0 * scene.peg.vertices),
+            {"touch": 1},
+        ),
         "no peg to touch the part": lambda: candidates(belief, scene.part, None, {"touch": 1}),
         "out of|beside the direction": lambda: candidates(
             belief, scene.part, scene.peg, {"touch": 2}, gap=gap, filters=[from_within((0, 0, 1.0), 0.1)]
@@ -255,6 +266,29 @@ def test_files_of_actions_that_make_no_sense_are_refused_in_a_sentence(tmp_path:
         assert_one_sentence(str(caught.value))
     with pytest.raises(InputError, match="there is no file"):
         load_actions(tmp_path / "absent.json")
+    plan = {
+        "kind": "plan",
+        "name": "a",
+        "times": [0.0, 1.0],
+        "world_from_peg": [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]] * 2,
+        "manners": ["free"],
+        "force": 4.0,
+        "stiffness": [100.0] * 6,
+        "damping": [1.0] * 6,
+    }
+    wrong: dict[str, dict[str, Any]] = {
+        "has 'Rate', which a plan does not have": plan | {"Rate": 50.0},
+        "has 'distorsion', which a view does not have": {"kind": "view", "distorsion": []},
+        "plan.json: plan 'a' stops at -4.0 N": plan | {"force": -4.0},
+        "times that are no array of numbers|holds what is no number": plan | {"times": [0.0, "a"]},
+    }
+    for says, action in wrong.items():
+        (tmp_path / "plan.json").write_text(json.dumps({"actions": [action]}))
+        with pytest.raises(InputError, match=says) as caught:
+            load_actions(tmp_path / "plan.json")
+        assert_one_sentence(str(caught.value))
+    (tmp_path / "plan.json").write_text(json.dumps({"actions": [plan]}))
+    assert len(load_actions(tmp_path / "plan.json")) == 1
 
 
 def test_a_slide_goes_as_far_as_it_is_asked_to() -> None:

@@ -144,6 +144,10 @@ def test_the_chance_is_nothing_where_no_particle_has_the_hole_and_rises_with_the
     elsewhere[:, 0] += 0.015
     away = Belief(elsewhere, belief.log_weights)
     assert chance_of_success(away, plan, PegPhysics(scene.part, scene.peg), particles=4).success == 0.0
+    # A peg that sinks beside the part has found no hole.
+    elsewhere[:, 0] += 0.5
+    beside = chance_of_success(Belief(elsewhere, belief.log_weights), plan, PegPhysics(scene.part, scene.peg))
+    assert beside.success == 0.0 and beside.found == 0.0
 
 
 def test_a_search_that_has_found_its_hole_leaves_the_rest_undone() -> None:
@@ -184,6 +188,10 @@ def test_what_cannot_be_inserted_is_refused_in_one_sentence() -> None:
         hole_from_peg(hole, bench_part("round 16 mm").peg(0.0001))
     with pytest.raises(InputError, match="the insertion has press 0"):
         insertion_plan(touched(), scene.part, scene.peg, attempt=Attempt(press=0.0))
+    with pytest.raises(InputError, match=r"search_stiffness .*; give six numbers"):
+        insertion_plan(touched(), scene.part, scene.peg, attempt=Attempt(search_stiffness=(4000.0, 150.0)))
+    with pytest.raises(InputError, match="search_stiffness with 0"):
+        insertion_plan(touched(), scene.part, scene.peg, attempt=Attempt(search_stiffness=(0.0,) * 6))
     with pytest.raises(InputError, match="searches until the peg has sunk by 0 m"):
         replace(plan.search, sink=0.0)
     with pytest.raises(InputError, match="has no searching motion"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any
 
 import numpy as np
@@ -87,8 +88,19 @@ def plan_of(**changed: Any) -> Plan:
         ({"times": np.array([0.0, 2.0, 1.0])}, "times that do not increase"),
         ({"times": np.array([0.0, NAN, 1.0])}, "times that do not increase"),
         ({"world_from_peg": np.full((3, 7), NAN)}, "not finite"),
-        ({"force": 0.0}, "stops at 0 N"),
+        ({"force": 0.0}, "stops at 0.0 N"),
         ({"force": NAN}, "stops at nan N"),
+        ({"force": math.inf}, "stops at inf N"),
+        ({"force": "4"}, "stops at '4' N"),
+        ({"rate": 0.0}, "a rate of 0.0 a second"),
+        ({"rate": "100"}, "a rate of '100' a second"),
+        ({"sink": math.inf}, "a sink of inf m"),
+        ({"times": 1.0}, "0 times"),
+        ({"times": ["a", "b", "c"]}, "times that are no array of numbers"),
+        ({"world_from_peg": [[0.0], [0.0, 1.0], []]}, "world_from_peg that are no array"),
+        ({"times": np.array([0.0, 900.0, 2000.0])}, "lasts 2000 s: .* milliseconds"),
+        ({"world_from_peg": poses.identity(3).numpy() + 10.0 * np.eye(3, 7)}, "leads 10 m .* millimetres"),
+        ({"world_from_peg": poses.identity(3).numpy() + 506.0 * np.eye(1, 7)}, "to 506 m .* millimetres"),
     ],
 )
 def test_a_plan_that_makes_no_sense_is_refused_by_name(changed: dict[str, Any], said: str) -> None:
@@ -96,6 +108,13 @@ def test_a_plan_that_makes_no_sense_is_refused_by_name(changed: dict[str, Any], 
     with pytest.raises(InputError, match=rf"plan 'press' .*{said}") as caught:
         plan_of(**changed)
     assert_one_sentence(str(caught.value))
+
+
+def test_a_plan_of_lists_is_one_of_arrays() -> None:
+    plan = plan_of()
+    lists = plan_of(times=plan.times.tolist(), world_from_peg=plan.world_from_peg.tolist())
+    assert np.array_equal(lists.times, plan.times) and lists.world_from_peg.dtype == np.float64
+    assert np.array_equal(lists.world_from_peg, plan.world_from_peg)
 
 
 # ---------------------------------------------------------------- what is felt

@@ -26,12 +26,12 @@ class Belief:
     """Weighted particles over the pose of a part.
 
     Attributes:
-        world_from_part: (N, 7) poses.
-        log_weights: (N,) unnormalised.
+        world_from_part: (N, 7) poses, float64 (made so, if they are of another type).
+        log_weights: (N,) unnormalised, float64 (likewise).
         freedom: which axes of the pose are free.
 
     Raises:
-        InputError: the poses are not (N, 7), or the weights not (N,).
+        InputError: the poses are not (N, 7) or not finite, or the weights not (N,).
     """
 
     world_from_part: Tensor
@@ -39,6 +39,14 @@ class Belief:
     freedom: Freedom = FREE
 
     def __post_init__(self) -> None:
+        for name in ("world_from_part", "log_weights"):
+            values: object = getattr(self, name)
+            if not isinstance(values, Tensor):
+                raise InputError(
+                    f"a belief is given {name} as a {type(values).__name__}; give a tensor, such as "
+                    "torch.as_tensor makes of it."
+                )
+            object.__setattr__(self, name, values.to(torch.float64))
         given, weights = tuple(self.world_from_part.shape), tuple(self.log_weights.shape)
         if len(given) != 2 or given[1] != 7:
             raise InputError(
@@ -47,6 +55,12 @@ class Belief:
         if weights != given[:1]:
             raise InputError(
                 f"a belief of {given[0]} poses is given log weights of shape {weights}; give one for each."
+            )
+        finite = torch.isfinite(self.world_from_part).all(dim=1)
+        if not bool(finite.all()):
+            raise InputError(
+                f"pose {int((~finite).nonzero()[0])} of a belief is not finite; give each as "
+                "[x y z qw qx qy qz], in metres."
             )
 
     def __len__(self) -> int:

@@ -45,6 +45,11 @@ _PLAN_UNITS = {
     "sink": "m",
 }
 _MAY_LACK = ("rate", "sink")
+_PLAN_KEYS = ("kind", "name", "manners", *_PLAN_UNITS)
+_VIEW_KEYS = (
+    *("kind", "name", "world_from_camera", *INTRINSICS, *RANGE),
+    *("distortion", "wrist_from_camera", "device"),
+)
 
 Action = Plan | View
 
@@ -140,8 +145,15 @@ def _from_json(path: Path) -> list[Action]:
 def _action_of(entry: Any, what: str) -> Action:
     if not isinstance(entry, dict) or entry.get("kind") not in ("plan", "view"):
         raise InputError(f'{what} is neither of kind "plan" nor "view"; say which it is.')
+    is_plan = entry["kind"] == "plan"
+    unknown = set(entry) - set(_PLAN_KEYS if is_plan else _VIEW_KEYS)
+    if unknown:
+        raise InputError(
+            f"{what} has {', '.join(map(repr, sorted(unknown)))}, which a {entry['kind']} does not have; its "
+            f"fields are {', '.join(_PLAN_KEYS if is_plan else _VIEW_KEYS)}."
+        )
     try:
-        if entry["kind"] == "plan":
+        if is_plan:
             given = {n: np.array(entry[n], dtype=np.float64) for n in _PLAN_UNITS if n in entry}
             return _plan(str(entry["name"]), tuple(entry["manners"]), given)
         numbers = {n: entry[n] for n in (*INTRINSICS, *RANGE)}
@@ -156,6 +168,8 @@ def _action_of(entry: Any, what: str) -> Action:
                 **numbers,
             )
         )
+    except InputError as error:
+        raise InputError(f"{what}: {error}") from None
     except KeyError as error:
         raise InputError(f"{what} lacks {error.args[0]!r}; add it.") from error
     except (TypeError, ValueError) as error:
@@ -192,6 +206,8 @@ def _from_hdf5(path: Path) -> list[Action]:
                 raise InputError(f"{path} is an HDF5 file but holds no actions; give one of plans and views.")
             _refuse_header(path, header)
             return [_read(group) for _, group in sorted(file["actions"].items())]
+    except InputError:
+        raise
     except KeyError as error:
         raise InputError(f"{path} lacks {error.args[0]!r}; make it again.") from error
     except (OSError, TypeError, ValueError) as error:

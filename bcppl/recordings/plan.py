@@ -12,12 +12,17 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.recordings.measurements import Probe, ProbeWindow, View
 
 Array = npt.NDArray[np.float64]
 Manner = Literal["free", "guarded", "held", "searching"]
 MANNERS: tuple[Manner, ...] = ("free", "guarded", "held", "searching")
+
+LONGEST = 600.0  # s: a plan that lasts longer is in milliseconds
+WIDEST = 5.0  # m between its knots, and
+FARTHEST = 100.0  # m from the world's origin: beyond either it is in millimetres
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +50,8 @@ class Plan:
 
     Raises:
         InputError: shapes do not fit, times do not increase, a manner is unknown, the force is not positive,
-            or a motion searches and nothing says what it finds.
+            times or places are so large that they are in milliseconds or millimetres, or a motion searches
+            and nothing says what it finds.
     """
 
     name: str
@@ -59,7 +65,16 @@ class Plan:
     sink: float = 0.0
 
     def __post_init__(self) -> None:
-        knots = len(self.times)
+        for name in ("times", "world_from_peg", "stiffness", "damping"):
+            try:
+                numbers = np.asarray(getattr(self, name), dtype=np.float64)
+            except (TypeError, ValueError):
+                raise InputError(
+                    f"plan {self.name!r} has {name} that are no array of numbers; give numbers in SI units, "
+                    "as many in each row."
+                ) from None
+            object.__setattr__(self, name, numbers)
+        knots = self.times.size if self.times.ndim == 1 else 0
         if knots < 2 or self.world_from_peg.shape != (knots, 7) or len(self.manners) != knots - 1:
             raise InputError(
                 f"plan {self.name!r} has {knots} times, poses {self.world_from_peg.shape} and "
@@ -74,26 +89,39 @@ class Plan:
                 raise InputError(
                     f"plan {self.name!r} has a motion that is {manner!r}; give one of {', '.join(MANNERS)}."
                 )
-        if not (np.isfinite(self.rate) and self.rate > 0.0):
-            raise InputError(f"plan {self.name!r} has a rate of {self.rate:g} a second; give more than 0.")
+        number_within(f"plan {self.name!r} has a rate of {{}} a second", self.rate, above=0.0)
         lengths = np.linalg.norm(self.world_from_peg[:, 3:], axis=1)
         if not (np.abs(lengths - 1.0) < 1e-3).all():
             raise InputError(
                 f"plan {self.name!r} has a pose whose quaternion is not of unit length; "
                 "give x y z (m) qw qx qy qz."
             )
-        for name, values in (("stiffness", self.stiffness), ("damping", self.damping)):
-            given = np.asarray(values, dtype=np.float64)
+        self._refuse_units()
+        for name, given in (("stiffness", self.stiffness), ("damping", self.damping)):
             if given.shape != (6,) or not (np.isfinite(given).all() and (given >= 0.0).all()):
                 raise InputError(
                     f"plan {self.name!r} has {name} {given.tolist()}; give six numbers, none negative."
                 )
-        if not self.force > 0.0:
-            raise InputError(f"plan {self.name!r} stops at {self.force:g} N; give a positive force.")
+        number_within(f"plan {self.name!r} stops at {{}} N", self.force, above=0.0)
+        number_within(f"plan {self.name!r} has a sink of {{}} m", self.sink)
         if "searching" in self.manners and not self.sink > 0.0:
             raise InputError(
                 f"plan {self.name!r} searches until the peg has sunk by {self.sink:g} m; give a positive "
                 "`sink`, less than how far the command lies below the surface."
+            )
+
+    def _refuse_units(self) -> None:
+        lasts, places = float(self.times[-1] - self.times[0]), self.world_from_peg[:, :3]
+        if lasts > LONGEST:
+            raise InputError(
+                f"plan {self.name!r} lasts {lasts:.0f} s: its times are probably in milliseconds; "
+                "scale them by 0.001 to seconds."
+            )
+        way, away = float(np.ptp(places, axis=0).max()), float(np.abs(places).max())
+        if way > WIDEST or away > FARTHEST:
+            raise InputError(
+                f"plan {self.name!r} leads {way:.4g} m far, to {away:.4g} m from the world's origin: its "
+                "poses are probably in millimetres; scale x, y and z by 0.001 to metres."
             )
 
 

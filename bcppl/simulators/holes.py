@@ -157,6 +157,27 @@ def depth_reached(hole: Hole, peg: Part, part_from_peg: Array) -> Array:
     return np.asarray(hole.part_from_hole[2] - there[..., 2].numpy())
 
 
+def aside_of(hole: Hole, peg: Part, part_from_peg: Array) -> Array:
+    """How far (...) a peg's tip is from the hole's axis, beyond what its clearance leaves it, metres.
+
+    It is 0 for a peg in its hole, but for what a tilt adds; depth alone does not tell a peg in a hole from
+    one beside the part.
+
+    Args:
+        hole: in the part.
+        peg: what is held.
+        part_from_peg: (..., 7).
+
+    Raises:
+        InputError: the peg does not fit.
+    """
+    stands = torch.from_numpy(hole_from_peg(hole, peg))
+    tip = poses.inverse(stands)[None, :3]
+    there = poses.transform(torch.as_tensor(part_from_peg), tip)[..., 0, :2].numpy()
+    off = np.linalg.norm(there - hole.part_from_hole[:2], axis=-1)
+    return np.asarray(np.maximum(off - clearance_in(hole, peg), 0.0))
+
+
 def _levels(part: Part) -> Array:
     """The heights at which a mesh has corners, the highest first, metres."""
     heights = np.sort(part.vertices[:, 2])[::-1]

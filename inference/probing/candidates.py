@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 
+import torch
+
 from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief
 from bcppl.errors import InferenceError, InputError
@@ -68,11 +70,16 @@ def candidates(
         seed: same seed, same candidates.
 
     Raises:
-        InputError: a kind is unknown or its number is none; the belief has no weight or has collapsed to a
-            point; no candidate is left; a search is asked for and the part has no hole.
+        InputError: a kind is unknown or its number is none; a mesh is broken or in millimetres; the
+            belief has no weight or has collapsed to a point; no candidate is left; a search is asked for and
+            the part has no hole.
     """
     refuse_settled(belief)
     asked = MIXED if kinds is None else kinds
+    if not isinstance(asked, Mapping):
+        raise InputError(f"kinds of candidates are given as {asked!r}; say how many of each: {{'touch': 8}}.")
+    if peg is not None:
+        peg.check(closed=False)
     for kind, count in asked.items():
         if kind not in KINDS:
             raise InputError(f"there are no candidates of kind {kind!r}; kinds are {', '.join(KINDS)}.")
@@ -111,6 +118,11 @@ def refuse_settled(belief: Belief) -> None:
     try:
         distinct = belief.distinct
     except InferenceError as error:
+        if not bool((belief.log_weights < torch.inf).all()):
+            raise InputError(
+                "the belief has a weight that is no number (NaN or +inf); give log weights, -inf for a "
+                "particle without weight."
+            ) from error
         raise InputError(
             "the belief has no weight: every particle's is zero, so it says nothing of where to touch; "
             "widen the prior, use more particles, or check the measurements (`bcppl check`)."

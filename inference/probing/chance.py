@@ -18,12 +18,13 @@ from bcppl.parts import Part
 from bcppl.recordings.insertion_plan import InsertionPlan
 from bcppl.recordings.measurements import Probe
 from bcppl.recordings.plan import Plan
-from bcppl.simulators.holes import Hole, depth_reached, hole_of
+from bcppl.simulators.holes import Hole, aside_of, depth_reached, hole_of
 from bcppl.simulators.physics import PegPhysics, Rollout
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
+_BESIDE = 0.002  # m: a tip farther from the hole's axis is not in the hole
 _AT_ONCE = 50  # stamps that are simulated before those that have found the hole are left out
 
 
@@ -65,7 +66,8 @@ def chance_of_success(
         seed: of that draw.
 
     Raises:
-        InputError: the part has no hole or several, or the number of particles is not positive.
+        InputError: the part has no hole or several, the peg does not fit, or the number of particles is not
+            positive.
     """
     whole_number("the chance of an insertion is asked for {} particles", particles)
     hole = hole_of(physics.part) if hole is None else hole
@@ -120,13 +122,14 @@ def _search(
         rollout.advance(min(first + _AT_ONCE, len(probe.stamps)))
         seen = rollout.world_from_peg[:, first:]
         part_from_world = poses.inverse(world_from_part[left])[:, None].expand(*seen.shape[:2], 7)
-        deep = depth_reached(
-            hole, physics.peg, poses.compose(part_from_world, torch.from_numpy(seen)).numpy()
-        )
+        part_from_peg = poses.compose(part_from_world, torch.from_numpy(seen)).numpy()
+        deep = depth_reached(hole, physics.peg, part_from_peg)
         near = (deep > plan.search.sink) & searching[first : rollout.count]
         yields = near.any(axis=1)
-        stands[left[yields]] = seen[np.flatnonzero(yields), near[yields].argmax(axis=1)]
-        found[left[yields]] = True
+        rows, first_sunk = np.flatnonzero(yields), near[yields].argmax(axis=1)
+        stands[left[yields]] = seen[rows, first_sunk]
+        # Beside the part, or in another pocket of it, a peg sinks too, and the search ends there.
+        found[left[yields]] = aside_of(hole, physics.peg, part_from_peg[rows, first_sunk]) < _BESIDE
         if yields.all():
             break
         left, rollout = left[~yields], rollout[~yields]

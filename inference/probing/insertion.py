@@ -8,6 +8,7 @@ the hole.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ import torch
 from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.beliefs import Belief
+from bcppl.errors import InputError
 from bcppl.parts import Part
 from bcppl.recordings.insertion_plan import InsertionPlan
 from bcppl.recordings.plan import Manner, Plan
@@ -136,7 +138,13 @@ def insertion_plan(
 
 def _checked(attempt: Attempt) -> Attempt:
     for name, value in attempt._asdict().items():
-        if not isinstance(value, tuple):
+        if name.endswith(("stiffness", "damping")):
+            given = value if isinstance(value, Sequence) and not isinstance(value, str) else ()
+            if len(given) != 6:
+                raise InputError(f"the insertion has {name} {value!r}; give six numbers.")
+            for each in given:
+                number_within(f"the insertion has {name} with {{}} in it", each, above=0.0)
+        else:
             number_within(f"the insertion has {name} {{}}", value, above=0.0)
     return attempt
 
