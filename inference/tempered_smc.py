@@ -16,6 +16,8 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.support import support_of
+from bcppl.errors import InputError
+from bcppl.inference.climbing import Modes, jumps, modes
 from bcppl.inference.kernels import Kernel, Until, metropolis_hastings, mixture, sequence, until
 from bcppl.inference.kernels.kernel import Move, takes
 from bcppl.inference.population import Population
@@ -23,13 +25,14 @@ from bcppl.inference.proposals import Program, drift, independent, prior, spread
 from bcppl.inference.proposals.together import continuous, drift_together
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.inference.smc import Step, smc
+from bcppl.inference.step import Observed, Stepped
 from bcppl.inference.tempering import tempered
-from bcppl.traces import Model, Trace
+from bcppl.traces import Model, Series, Trace, generate
 
 PHYSICS = 2  # the cost of a site that simulates contact (`bcppl.distributions.lazy`)
 
 
-def kernel(pose: str, proposals: Sequence[Program] = ()) -> Kernel:
+def kernel(pose: str, proposals: Sequence[Program] = (), modes: Modes | None = None) -> Kernel:
     """How a pose is moved: by a random walk, some of its steps long ones, or to wherever the others are.
 
     Discrete values (which of several holes it is) are drawn anew from the program.
@@ -40,10 +43,12 @@ def kernel(pose: str, proposals: Sequence[Program] = ()) -> Kernel:
     Args:
         pose: its address.
         proposals: programs that the model's author gives along (`bcppl.traces.Model`); each is used once.
+        modes: that were found; then a third of the moves of the pose are jumps to one of them.
     """
     # A fifth of the draws are three times as wide as the particles: few particles may have missed a mode.
     anew = independent(pose, 1, inflation=1.2, wide=(0.2, 3.0))
-    alone = mixture([metropolis_hastings(drift(pose, (0.2, 2.0))), metropolis_hastings(anew)])
+    far = [] if modes is None else [metropolis_hastings(jumps(pose, modes))]
+    alone = mixture([metropolis_hastings(drift(pose, (0.2, 2.0))), metropolis_hastings(anew), *far])
 
     def moved(population: Population) -> Move:
         others = [address for address in continuous(population.trace) if address != pose]
@@ -77,6 +82,7 @@ def infer(
     seed: int = 0,
     sweeps: tuple[int | Until, int | Until] | None = None,
     share: tuple[float, float] = (0.8, 0.6),
+    climbs: int | None = None,
     scene: Any = None,
     start: Step | None = None,
 ) -> Iterator[Step]:
@@ -93,6 +99,9 @@ def infer(
             at most 60.
         share: particles are resampled below this effective sample size, and a likelihood is let in by steps
             that keep this conditional one, as shares of N: without, and with physics.
+        climbs: how many draws of the prior climb before a measurement is let in, to find the modes between
+            which particles jump (`bcppl.inference.climbing`; it needs depth images). 0 for none; by default
+            as many as the model asks for.
         scene: what `model.prepare(recording)` gives, if it is at hand.
         start: a step to go on from, as `bcppl.inference.smc.smc` does.
 
@@ -103,6 +112,11 @@ def infer(
     for kept in share:
         number_within("a share of {} of the particles is to be kept", kept, least=0.0, below=1.0)
     enough = until(displacement=0.5, distinct=max(1, round(0.8 * particles)), most=60)
+    climbing = whole_number(
+        "{} climbs are to find modes", model.climbs if climbs is None else climbs, least=0
+    )
+    if climbing and isinstance(model.program, Series):
+        raise InputError("climbs find modes of one pose, and the model's is a series; give climbs=0.")
     moves = (6 if model.proposals else 12, enough) if sweeps is None else sweeps
 
     def by_physics(trace: Trace) -> int:
@@ -111,10 +125,17 @@ def infer(
     def resample(population: Population) -> tuple[Population, Tensor | None]:
         return adaptive(systematic, share[by_physics(population.trace)])(population)
 
-    step = tempered(
-        kernel(model.pose, model.proposals),
-        sweeps=lambda trace: moves[by_physics(trace)],
-        resample=resample,
-        share=lambda trace: share[by_physics(trace)],
-    )
+    def step(population: Population, observed: Observed) -> Stepped:
+        found = None
+        if climbing:
+            known = {**population.trace.observations, **observed.observations}
+            start, _ = generate(model.program, observed.args, known, climbing)
+            found = modes(start, model.pose)
+        return tempered(
+            kernel(model.pose, model.proposals, found),
+            sweeps=lambda trace: moves[by_physics(trace)],
+            resample=resample,
+            share=lambda trace: share[by_physics(trace)],
+        )(population, observed)
+
     return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)

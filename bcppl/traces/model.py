@@ -37,6 +37,8 @@ class Model:
             observations and chooses the latent values that come with them, and new ones in place of old ones;
             `back(trace)` chooses the old ones, as they were before. None where the model has none. No answer
             hangs on it either.
+        climbs: how many climbs from the prior should look for modes before depth images are let in
+            (`bcppl.inference.tempered_smc.infer`): where the best mode may be narrow. 0 for none.
     """
 
     program: Program | Series
@@ -46,3 +48,4 @@ class Model:
     invent: Callable[..., Any] | None = None
     proposals: Sequence[Callable[..., Any]] = ()
     arrival: tuple[Callable[[Any], Any], Callable[[Any], Any]] | None = None
+    climbs: int = 0

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within, whole_number
-from bcppl.distributions.depth import LaplaceDepth, RobustDepth
+from bcppl.distributions.depth import ClutteredDepth, LaplaceDepth, RobustDepth
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
-from bcppl.inference.proposals.least_squares import Equations, aligned
+from bcppl.inference.proposals.least_squares import Alignment, Equations, aligned
 from bcppl.inference.proposals.proposal import Fitted
 from bcppl.inference.proposals.spread import spread_of
 from bcppl.parts import Part
@@ -46,7 +46,8 @@ def depth_alignment(address: str, sites: str = "depth_*", *, steps: int = 1, rea
 
     Args:
         address: of the pose.
-        sites: a pattern of the addresses of its depth images, `LaplaceDepth` or `RobustDepth`.
+        sites: a pattern of the addresses of its depth images, `LaplaceDepth`, `RobustDepth` or
+            `ClutteredDepth`.
         steps: of Gauss-Newton.
         reach: the steps are damped towards staying, with a covariance that is the particles' own times this
             squared.
@@ -63,19 +64,8 @@ def depth_alignment(address: str, sites: str = "depth_*", *, steps: int = 1, rea
         damping = torch.linalg.inv(reach**2 * spread(population))
 
         def towards_depth(trace: Trace) -> None:
-            images = [a for a in trace.addresses if fnmatchcase(a, sites)]
-            if not images:
-                raise InputError(
-                    f"depth_alignment is to read {sites!r}, which fits no address; "
-                    f"the program visits {', '.join(trace.addresses)}."
-                )
             freedom = freedom_of(trace.distributions[address]) or FREE
-            pose = trace[address]
-            for _ in range(steps):
-                each = [_equations(trace, address, image, pose) for image in images]
-                equations = reduce(add, (said for said, _ in each))
-                answer = aligned(pose, equations, damping, freedom, reduce(add, (sure for _, sure in each)))
-                pose = answer.pose
+            answer = depth_aligned(trace, address, damping, sites, steps=steps)
             pyro.sample(address, answer.around(freedom))
 
         return towards_depth
@@ -83,12 +73,43 @@ def depth_alignment(address: str, sites: str = "depth_*", *, steps: int = 1, rea
     return Fitted(fit)
 
 
+def depth_aligned(
+    trace: Trace, address: str, damping: Tensor, sites: str = "depth_*", *, steps: int = 1
+) -> Alignment:
+    """Where `depth_alignment` takes each particle.
+
+    Args:
+        trace: of the particles.
+        address: of the pose.
+        sites: a pattern of the addresses of its depth images.
+        steps: of Gauss-Newton.
+        damping: (d, d) precision over the free axes of staying where a step begins.
+
+    Raises:
+        InputError: no depth image is at such an address, or one is of another pose than that at `address`.
+    """
+    images = [a for a in trace.addresses if fnmatchcase(a, sites)]
+    if not images:
+        raise InputError(
+            f"depth_alignment is to read {sites!r}, which fits no address; "
+            f"the program visits {', '.join(trace.addresses)}."
+        )
+    freedom = freedom_of(trace.distributions[address]) or FREE
+    pose = trace[address]
+    for _ in range(steps):
+        each = [_equations(trace, address, image, pose) for image in images]
+        equations = reduce(add, (said for said, _ in each))
+        answer = aligned(pose, equations, damping, freedom, reduce(add, (sure for _, sure in each)))
+        pose = answer.pose
+    return answer
+
+
 def _equations(trace: Trace, address: str, image: str, pose: Tensor) -> tuple[Equations, Tensor]:
     """What one depth image says of poses (N, 7), and how sure its likelihood is of that, (N, 6, 6)."""
     site: Any = trace.distributions[image]
     renderer: Any = getattr(site, "renderer", None)
     of_one_part = isinstance(getattr(renderer, "part", None), Part)
-    if not isinstance(site, LaplaceDepth | RobustDepth) or not of_one_part:
+    if not isinstance(site, ClutteredDepth | LaplaceDepth | RobustDepth) or not of_one_part:
         raise InputError(
             f"depth_alignment reads site {image!r}, which is a {type(site).__name__} and no depth image; "
             "name those that are with `sites`."

@@ -12,7 +12,9 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from bcppl.arguments import number_within, whole_number
+from bcppl.distributions.depth.observed import Observed
 from bcppl.distributions.depth.rendering import Array, Mask, RendersDepth
+from bcppl.distributions.depth.robust import RobustDepth
 from bcppl.distributions.depth.scanlines import Chances, Line, Lines, draw, gains, read
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
@@ -150,6 +152,19 @@ class ClutteredDepth(LazyDistribution):
         With every row looked at it is a density of the image, the one that `sample` draws from.
         """
         return self._of_lines(value)[0]
+
+    def observed(self, value: Tensor) -> Observed:
+        """What an image (H, W), or one for each particle, says without any pose, where the lines cross.
+
+        It is what alignments read (`bcppl.inference.proposals.depth_alignment`), not `log_prob`.
+
+        Raises:
+            InputError: the image has another shape.
+        """
+        crossings = np.zeros(tuple(self.event_shape), dtype=bool)
+        crossings[self.lines // 2 :: self.lines, self.lines // 2 :: self.lines] = True
+        alone = RobustDepth(self.renderer, self.camera, self.pose, self.scale, outlier=0.05, region=crossings)
+        return alone.observed(value)
 
     def _of_lines(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """Log-densities (N,) of the rows and of the columns."""
