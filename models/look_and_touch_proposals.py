@@ -163,16 +163,19 @@ def moved_on(
 
 
 def placed_by_all(trace: Trace, actions: Sequence[View | ProbeWindow]) -> tuple[Tensor, Tensor]:
-    """As a normal: centre (7,) and covariance (6, 6)."""
-    known = placed_by_images(trace.args[0], actions)
-    center, precision = known.center[0], known.precision[0]
-    if any(isinstance(action, ProbeWindow) for action in actions):
-        told = told_by_touches(trace.args[0], actions, trace.observations)
-        pull = precision @ poses.local(told.around, center) - told.slope
-        precision = precision + told.information
-        center = poses.retract(told.around, torch.linalg.solve(precision, pull))
-    covariance = torch.linalg.inv(precision)
-    return center, 0.5 * (covariance + covariance.T)
+    """Where images' fits and touches place the part, whatever the particles hold: centre (7,), covariance."""
+    scene = trace.args[0]
+    if len(actions) not in scene.placed:
+        known = placed_by_images(scene, actions)
+        center, precision = known.center[0], known.precision[0]
+        if any(isinstance(action, ProbeWindow) for action in actions):
+            told = told_by_touches(scene, actions, trace.observations)
+            pull = precision @ poses.local(told.around, center) - told.slope
+            precision = precision + told.information
+            center = poses.retract(told.around, torch.linalg.solve(precision, pull))
+        covariance = torch.linalg.inv(precision)
+        scene.placed[len(actions)] = center, 0.5 * (covariance + covariance.T)
+    return scene.placed[len(actions)]
 
 
 def carried_along(

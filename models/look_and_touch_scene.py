@@ -65,6 +65,7 @@ class Scene:
             the guess, and of the camera's bias.
         near: by address, whether a window's peg came near where images place the part.
         told: by the number of actions, what all of their touches say to second order.
+        placed: by the number of actions, the normal that resembles what all of them say of the part.
     """
 
     prior: Any
@@ -76,6 +77,7 @@ class Scene:
     settings: Settings
     fits: dict[str, FittedNormal] = field(default_factory=dict)
     told: dict[int, Told] = field(default_factory=dict)
+    placed: dict[int, tuple[Tensor, Tensor]] = field(default_factory=dict)
     near: dict[str, bool] = field(default_factory=dict)
 
     @property
