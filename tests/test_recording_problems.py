@@ -71,6 +71,10 @@ def push_with_path_times(times: Any) -> Recording:
 
 replace = dataclasses.replace
 WRONG: dict[str, tuple[Recording, str]] = {
+    "pegs and paths in millimetres": (
+        with_measurement(1, world_from_peg=changed(at(1, "world_from_peg"), 1, 2, to=280.0)),
+        "measurement 1's peg pose .* is 280 m from the world's origin at row 1, probably millimetres",
+    ),
     "mesh in millimetres": (replace(full(), part=scaled(full().part)), "millimetres"),
     "open mesh": (replace(full(), part=opened(full().part)), "open mesh"),
     "open peg": (replace(full(), peg=opened(block("rod"))), "'rod' has an open mesh"),

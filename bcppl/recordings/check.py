@@ -13,6 +13,7 @@ from bcppl.parts import LARGEST_EXTENT, Part
 from bcppl.poses import as_pose, inverse, transform
 from bcppl.recordings.file import same
 from bcppl.recordings.measurements import DepthImage, Guess, Probe, ProbeWindow, Push, Recording, Touch, View
+from bcppl.recordings.plan import FARTHEST
 from bcppl.simulators.camera import Camera
 from bcppl.simulators.distortion import coefficients
 
@@ -262,6 +263,12 @@ def _rows(what: str, poses: Array, times: Array, remedy: str = LEAVE_OUT) -> Ite
     if (np.abs(length - 1) > 1e-3).any():
         row = _first(np.abs(length - 1) > 1e-3)
         yield f"{what} has a quaternion of length {length[row]:.4g} at row {row}; give it unit length."
+    away = np.abs(poses[:, :3]).max(axis=1)
+    if (away > FARTHEST).any():
+        yield (
+            f"{what} is {away.max():.4g} m from the world's origin at row {int(away.argmax())}, probably "
+            "millimetres; scale x, y and z by 0.001 to metres."
+        )
 
 
 def _probe(what: str, probe: Probe) -> Iterator[str]:
