@@ -163,14 +163,23 @@ def test_a_loop_without_candidates_or_world_says_so() -> None:
         def carry_out(self, candidate: object) -> list[object]:
             return []
 
+    class Junk:
+        def carry_out(self, candidate: object) -> list[object]:
+            return [1]
+
     for says, world, source in (
         ("there are no candidates", BenchArm(scene), lambda belief, number: []),
         ("measured nothing when it was asked for 'touch 1", Silent(), asked),
+        ("gave a int when it was asked for 'touch 1", Junk(), lambda *now: (c for c in asked(*now))),
+        ("candidates are given as a NoneType", BenchArm(scene), lambda belief, number: None),
+        ("a candidate is a str", BenchArm(scene), lambda belief, number: ["touch"]),
+        ("no peg to carry out 'touch 1", None, asked),
     ):
+        known = dataclasses.replace(look, peg=None) if world is None else look
         with pytest.raises(InputError, match=says) as caught:
             list(
                 probing_loop(
-                    model, look, world, source, lambda population, found, known: in_order(found), start=last
+                    model, known, world, source, lambda population, found, known: in_order(found), start=last
                 )
             )
         assert_one_sentence(str(caught.value))

@@ -12,7 +12,7 @@ In short, with any robot or world that carries out plans:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Protocol
 
@@ -111,8 +111,9 @@ def probing_loop(
         enough: it is over once that chance reaches so much.
 
     Raises:
-        InputError: there are no candidates; the belief has no weight or has collapsed to a point; a number is
-            out of range; the world measured nothing.
+        InputError: there are no candidates, or what is given as one is none, or a plan needs a peg that the
+            recording lacks; the belief has no weight or has collapsed to a point; a number is out of range;
+            the world measured nothing.
     """
     whole_number("the loop is to make {} probes at most", probes)
     number_within("an insertion is tried from a chance of {} on", enough, least=0.0)
@@ -125,16 +126,13 @@ def probing_loop(
         return
     for number in range(probes):
         refuse_settled(step.belief)
-        found = candidates_from(step.belief, number)
-        refuse_none(Candidates(tuple(found)))
+        found = _listed(candidates_from(step.belief, number), recording)
         scene = prepared(model, with_views(recording, found), scene)
         ranking = rank(step.population, found, scene)
         if least_gain is not None and not ranking.best.value >= least_gain:
             return
         chosen = named_apart(ranking.best.candidate, recording)
-        measured = list(world.carry_out(chosen))
-        if not measured:
-            raise InputError(f"the world measured nothing when it was asked for {name_of(chosen)!r}.")
+        measured = _measured(world.carry_out(chosen), chosen)
         recording = replace(recording, measurements=[*recording.measurements, *measured])
         scene, before = prepared(model, recording, scene), step
         count = len(before.population)
@@ -151,6 +149,36 @@ def _last(steps: Iterator[Step], before: Step | None) -> Step:
     if before is None:
         raise InputError("the loop's inference yields no step; give one that yields the prior's first.")
     return before
+
+
+def _listed(found: object, recording: Recording) -> Sequence[Candidate]:
+    """Candidates that may be indexed and gone through as often as is needed."""
+    if not isinstance(found, Iterable) or isinstance(found, str):
+        raise InputError(f"candidates are given as a {type(found).__name__}; give a list of plans and views.")
+    listed = found if isinstance(found, Candidates) else tuple(found)
+    for each in listed:
+        if not isinstance(each, Plan | View):
+            raise InputError(f"a candidate is a {type(each).__name__}; give plans and views.")
+        if isinstance(each, Plan) and recording.peg is None:
+            raise InputError(
+                f"there is no peg to carry out {each.name!r} with; add the peg to the recording, or ask for "
+                "views."
+            )
+    refuse_none(Candidates(tuple(listed)))
+    return listed
+
+
+def _measured(given: object, chosen: Candidate) -> list[Measurement]:
+    measured: list[Any] = list(given) if isinstance(given, Iterable) else [given]
+    if given is None or not measured:
+        raise InputError(f"the world measured nothing when it was asked for {name_of(chosen)!r}.")
+    for each in measured:
+        if not isinstance(each, Measurement):
+            raise InputError(
+                f"the world gave a {type(each).__name__} when it was asked for {name_of(chosen)!r}; give "
+                "measurements, each an action and what was observed."
+            )
+    return measured
 
 
 def named_apart(candidate: Candidate, recording: Recording) -> Candidate:
