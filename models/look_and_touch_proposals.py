@@ -230,7 +230,8 @@ def seen_before(trace: Trace, view: Camera, bias: Tensor) -> NormalPose | None:
     if before is scene.prior:
         return None
     if isinstance(before, MixturePose):
-        center, covariance = before.components.center[:, 0], before.components.covariance[:, 0]
+        parts = before.components  # the first of them is the normal itself
+        center, covariance = parts.center[..., 0, :], parts.covariance[..., 0, :, :]
     else:
         center, covariance = before.center, before.covariance
     seen = seen_from(scene, scene.looks[view.name].camera, center, bias)

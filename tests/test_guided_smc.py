@@ -208,6 +208,11 @@ def test_a_second_camera_after_a_touch_is_taken_in() -> None:
     assert last.taken == 3
 
 
+def test_a_first_camera_after_touches_is_taken_in() -> None:
+    *_, last = infer(look_and_touch.model, some(8, VIEW), particles=6, seed=0)
+    assert last.taken == 2 and math.isfinite(last.info.log_evidence)
+
+
 def test_touches_alone_place_the_part() -> None:
     """Contact-only recordings: the top, one side and the next, no image."""
     *_, last = infer(look_and_touch.model, some(*TOUCHES), particles=20, seed=0)
