@@ -129,8 +129,8 @@ def infer(
         found = None
         if climbing:
             known = {**population.trace.observations, **observed.observations}
-            start, _ = generate(model.program, observed.args, known, climbing)
-            found = modes(start, model.pose)
+            climbers, _ = generate(model.program, observed.args, known, climbing)
+            found = modes(climbers, model.pose)
         return tempered(
             kernel(model.pose, model.proposals, found),
             sweeps=lambda trace: moves[by_physics(trace)],

@@ -41,7 +41,7 @@ class Settings:
             independent from pixel to pixel (`RobustDepth`).
         temperature: with clutter, what the log-likelihood is divided by. At 1 it tells where the part is;
             around there a belief is too sure, for a mesh, a camera's bias and a stated truth are off for all
-            pixels together (on a real frame the stated truth has up to 461 nats less than the best particle,
+            pixels together (on a real frame the stated truth has up to 463 nats less than the best particle,
             so a belief's spread there is not to be trusted).
         stride: every stride-th row and column is looked at with clutter, else every stride-th pixel in each
             direction.
