@@ -86,7 +86,7 @@ def scripted(scene: BenchScene) -> Callable[[Belief, int], list[Candidate]]:
     height = top - min(SIDE, 0.5 * float(part.extent[2]))
     faces = sides(part, height)
     across = next((f for f in faces if abs(float(f.normal @ faces[0].normal)) < 0.5), faces[-1])
-    spots = [Spot(np.array([*spots_on_top(part, peg, ROOM)[0], top]), np.array([0.0, 0.0, 1.0]))]
+    spots = [Spot(np.array([*spots_on_top(part, peg, ROOM).places[0], top]), np.array([0.0, 0.0, 1.0]))]
     for face in (faces[0], across):
         place = np.array([*(0.5 * (face.start + face.stop)), height])
         spots.append(Spot(place, np.array([*face.normal, 0.0])))

@@ -43,7 +43,7 @@ class Settings(Cameras):
     bins: int = 1
     temperature: float = 6.0
     gap_noise: float = 0.00006
-    gap_shared: float = 0.00002
+    gap_shared: float = 0.00001
     sink: float = 0.00002
     gap_outlier: float = 0.001
     every: int = 5

@@ -15,6 +15,7 @@ from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.inference.probing.metrology import Pace, three_two_one
+from bcppl.models.parts import insert_peg, insert_tray
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.guarded_motion import CarriedOut
 from bcppl.recordings.plan import Plan
@@ -32,7 +33,8 @@ NAN = float("nan")
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.007, 0.005), (-0.008, 0.004)])
 def test_spots_and_the_ways_between_them_keep_their_margins(offset: tuple[float, float]) -> None:
     part, peg, margin = block_with_square_hole(hole=0.0105, offset=offset), round_peg(0.005, 0.08), 0.004
-    spots = spots_on_top(part, peg, margin)
+    spots, lifted = spots_on_top(part, peg, margin)
+    assert not lifted
     way = shapely.LineString(spots)
     hole = shapely.box(-0.00525, -0.00525, 0.00525, 0.00525)
     outline = shapely.box(-0.03, -0.03, 0.03, 0.03)
@@ -41,6 +43,22 @@ def test_spots_and_the_ways_between_them_keep_their_margins(offset: tuple[float,
     assert way.distance(shapely.affinity.translate(hole, *offset)) > 0.005 + 0.002 - 2e-4
     area = 0.5 * abs(np.linalg.det(spots[1:] - spots[0]))
     assert area > 0.4 * (0.06 - 2 * 0.009) ** 2  # of a square's corners any three span half of it
+
+
+def test_on_a_narrow_rim_the_peg_is_lifted_to_the_third_spot() -> None:
+    part, peg = insert_tray("rectangular"), insert_peg("rectangular")
+    spots, lifted = spots_on_top(part, peg, 0.003)
+    assert lifted
+    assert 0.5 * abs(np.linalg.det(spots[1:] - spots[0])) > 80e-6  # slides alone reach 12 mm2
+    belief = Belief(poses.identity(8), torch.full((8,), 0.125, dtype=torch.float64))
+    plan = three_two_one(belief, part, peg)
+    top = float(part.vertices[:, 2].max())
+    tips = plan.world_from_peg[:, :3] + [0.0, 0.0, float(peg.vertices[:, 2].min())]
+    met = [k for k, manner in enumerate(plan.manners, start=1) if manner == "guarded" and tips[k, 2] < top]
+    above = [k for k, tip in enumerate(tips) if tip[2] > top and np.isclose(tip[:2], spots[2]).all()]
+    assert met[1] - met[0] > 2 and above[0] < met[1] < above[-1]
+    np.testing.assert_allclose(tips[met[1], :2], spots[2], atol=1e-9)
+    assert plan.times[-1] == pytest.approx(6.0, abs=1e-6)
 
 
 def test_sides_of_a_block_are_its_four_faces() -> None:

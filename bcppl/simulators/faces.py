@@ -20,6 +20,7 @@ _BELOW = 0.0002  # m below the top at which its outline is taken
 _HOLE = 0.002  # m
 _TRIES = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the margin that is asked for
 _CANDIDATES = 60
+_WORTH_A_LIFT = 2.0  # times as large must the triangle be that a lift makes possible
 
 
 class Side(NamedTuple):
@@ -40,6 +41,18 @@ class Side(NamedTuple):
         return float(np.linalg.norm(self.stop - self.start))
 
 
+class Spots(NamedTuple):
+    """Where a top is touched, in the part's x-y plane.
+
+    Attributes:
+        places: (3, 2) metres; a peg can slide from the first to the second.
+        lifted: whether the peg must be lifted from the second to the third; else it can slide there too.
+    """
+
+    places: Array
+    lifted: bool
+
+
 def section(part: Part, height: float) -> shapely.Polygon:
     """The cross section of a part at a height z in its frame, the largest piece of it, metres.
 
@@ -57,11 +70,12 @@ def section(part: Part, height: float) -> shapely.Polygon:
     return shapely.simplify(max(pieces, key=lambda p: p.area), 1e-5)
 
 
-def spots_on_top(part: Part, peg: Part, margin: float) -> Array:
-    """Three spots (3, 2) on a part's top, far apart, between which a peg can slide on it, in that order.
+def spots_on_top(part: Part, peg: Part, margin: float) -> Spots:
+    """Three spots on a part's top, far apart, between which a peg can slide on it, in that order.
 
     The peg's whole cross section stays on the top, `margin` metres from its outer edge where there is room
-    for so much, and 2 mm from holes. Of all such triples of candidates, the one whose triangle is largest.
+    for so much, and 2 mm from holes. Of all such triples of candidates, the one whose triangle is largest;
+    where slides lead nowhere, as on a narrow rim, the peg is lifted to the third.
 
     Raises:
         InputError: the top has no room for the peg.
@@ -85,17 +99,19 @@ def spots_on_top(part: Part, peg: Part, margin: float) -> Array:
         )
     candidates = _boundary_points(room)
     reachable = _straight_ways(room, candidates)
-    best, largest = (0, 0, 0), -1.0
-    for b in range(len(candidates)):
-        ends = np.flatnonzero(reachable[b])
-        if len(ends) < 2:
-            continue
-        arms = candidates[ends] - candidates[b]
-        areas = np.abs(np.outer(arms[:, 0], arms[:, 1]) - np.outer(arms[:, 1], arms[:, 0]))
-        i, j = np.unravel_index(int(areas.argmax()), areas.shape)
-        if areas[i, j] > largest:
-            largest, best = float(areas[i, j]), (int(ends[i]), b, int(ends[j]))
-    return candidates[list(best)]
+    from_middle = candidates[None] - candidates[:, None]
+    sizes = np.abs(  # (M, M, M): twice the area, by the second spot, the first and the third
+        from_middle[:, :, None, 0] * from_middle[:, None, :, 1]
+        - from_middle[:, :, None, 1] * from_middle[:, None, :, 0]
+    )
+    slid, lifted = (
+        np.where(ways, sizes, -1.0)
+        for ways in (reachable[:, :, None] & reachable[:, None, :], reachable[:, :, None])
+    )
+    worth = bool(lifted.max() > _WORTH_A_LIFT * slid.max())
+    found = lifted if worth else slid
+    second, first, third = np.unravel_index(int(found.argmax()), found.shape)
+    return Spots(candidates[[first, second, third]], worth)
 
 
 def sides(part: Part, height: float) -> list[Side]:
@@ -117,14 +133,17 @@ def _spread(room: shapely.Geometry) -> float:
 
 
 def _boundary_points(room: shapely.Geometry) -> Array:
-    """Points (M, 2) along the outer boundary: three points far apart lie there."""
-    largest = max(polygons_of(room), key=lambda p: p.area)
-    ring = shapely.Polygon(largest.exterior)
-    inner = ring.buffer(-1e-6) if not ring.buffer(-1e-6).is_empty else ring
-    line = inner.exterior
-    corners = np.asarray(shapely.simplify(line, 1e-4).coords)
-    along = [line.interpolate(share, normalized=True).coords[0] for share in np.linspace(0, 1, _CANDIDATES)]
-    return np.unique(np.round(np.concatenate([corners, np.asarray(along)]), 7), axis=0)
+    """Points (M, 2) along the outer boundaries: three points far apart lie there."""
+    pieces = [shapely.Polygon(piece.exterior) for piece in polygons_of(room)]
+    whole = sum(piece.length for piece in pieces)
+    points = []
+    for ring in pieces:
+        inner = ring.buffer(-1e-6) if not ring.buffer(-1e-6).is_empty else ring
+        line = inner.exterior
+        shares = np.linspace(0, 1, max(3, round(_CANDIDATES * ring.length / whole)))
+        points.append(np.asarray(shapely.simplify(line, 1e-4).coords))
+        points.append(np.asarray([line.interpolate(share, normalized=True).coords[0] for share in shares]))
+    return np.unique(np.round(np.concatenate(points), 7), axis=0)
 
 
 def _straight_ways(room: shapely.Geometry, points: Array) -> npt.NDArray[np.bool_]:
