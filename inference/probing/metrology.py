@@ -17,7 +17,7 @@ from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.parts import Part
 from bcppl.recordings.plan import Manner, Plan
-from bcppl.simulators.faces import Side, section, sides, spots_on_top
+from bcppl.simulators.faces import Side, Spots, section, sides, spots_on_top
 
 Array = npt.NDArray[np.float64]
 
@@ -100,10 +100,11 @@ def three_two_one(belief: Belief, part: Part, peg: Part, pace: Pace | None = Non
     across = float(np.linalg.norm(peg.vertices[:, :2], axis=1).max())
     lateral = half_stroke(belief, np.array([0.0, 0.0, top]), np.array([1.0, 0.0, 0.0]), pace)
     spots = spots_on_top(part, peg, lateral)
-    first, second = _pair(sides(part, height), spots[2], across)
+    last = spots.places[2]
+    first, second = _pair(sides(part, height), last, across)
     one = _OnSide.of(belief, first, peg, height, pace)
     other = _OnSide.of(belief, second, peg, height, pace)
-    begin, end = one.slide(spots[2], other.middle)
+    begin, end = one.slide(last, other.middle)
     here, there = other.slide(end, end)
     lift = half_stroke(belief, np.array([*begin, top]), np.array([0.0, 0.0, 1.0]), pace)
     knots = [
@@ -240,18 +241,25 @@ def _pair(faces: list[Side], near: Array, across: float) -> tuple[Side, Side]:
     return first, second
 
 
-def _on_top(belief: Belief, spots: Array, top: float, pace: Pace) -> list[_Knot]:
-    a, b, c = (np.array([*spot, top]) for spot in spots)
+def _on_top(belief: Belief, spots: Spots, top: float, pace: Pace) -> list[_Knot]:
+    a, b, c = (np.array([*spot, top]) for spot in spots.places)
     stroke = half_stroke(belief, a, np.array([0.0, 0.0, 1.0]), pace)
     up, down = np.array([0.0, 0.0, stroke]), np.array([0.0, 0.0, -stroke])
     on = down - np.array([0.0, 0.0, pace.press])
+
+    def touch(spot: Array) -> list[_Knot]:
+        return [
+            _Knot(spot + up, "free", pace.free),
+            _Knot(spot + down, "guarded", pace.guarded),
+            _Knot(spot + on, "held", pace.guarded),
+        ]
+
+    to_last = [_Knot(b + up, "free", pace.free), *touch(c)]
     return [
         _Knot(a + np.array([0.0, 0.0, _ABOVE]), "free", pace.free),
-        _Knot(a + up, "free", pace.free),
-        _Knot(a + down, "guarded", pace.guarded),
-        _Knot(a + on, "held", pace.guarded),
+        *touch(a),
         _Knot(b + on, "held", pace.sliding),
-        _Knot(c + on, "held", pace.sliding),
+        *(to_last if spots.lifted else [_Knot(c + on, "held", pace.sliding)]),
         _Knot(c + up, "free", pace.free),
     ]
 
