@@ -6,8 +6,6 @@ part makes of that is a distance: about zero where contact was felt and positive
 
 from __future__ import annotations
 
-import os
-import threading
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +21,7 @@ from bcppl.simulators.effort import Effort
 from bcppl.simulators.fidelity import solid_of
 from bcppl.simulators.placement import compiled
 from bcppl.simulators.sharp_edges import deepest, dot, is_beyond, may_be_nearer, sharp_edges, turned_back
+from bcppl.simulators.threads import shared, thread_count
 
 Array = npt.NDArray[np.float64]
 Numbers = npt.NDArray[np.int64]
@@ -115,7 +114,7 @@ class PegGap:
             place, normal = np.empty((particles, stamps, 3)), np.empty((particles, stamps, 3))
             rounded = np.empty((particles, stamps), dtype=np.bool_)
 
-            def work(first: int, last: int) -> None:
+            def work(first: int, last: int) -> int:
                 _measure(
                     first,
                     last,
@@ -137,8 +136,9 @@ class PegGap:
                     normal,
                     rounded,
                 )
+                return 0
 
-            _shared(work, particles, max(_SHARE, _PAIRS // max(1, stamps)))
+            shared(work, 0, particles, max(_SHARE, _PAIRS // max(1, stamps)), thread_count())
             if rounded.any():
                 exact = self._signed(torch.from_numpy(place[rounded]))
                 distance[rounded] = exact.distance.numpy()
@@ -161,30 +161,6 @@ def _planes(peg: Part) -> tuple[Array, Numbers]:
         whole = np.round(np.column_stack([normals, offsets]), 9)
         planes.append(np.unique(whole, axis=0))
     return np.concatenate(planes), np.cumsum([len(each) for each in planes])
-
-
-def _shared(work: object, particles: int, share: int) -> None:
-    """Runs of particles shared among threads, which end with the call."""
-    assert callable(work)
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    runs = iter(range(0, particles, share))
-    errors: list[BaseException] = []
-
-    def take() -> None:
-        try:
-            for first in runs:
-                work(first, min(first + share, particles))
-        except BaseException as error:
-            errors.append(error)
-
-    others = [threading.Thread(target=take) for _ in range(min(available, -(-particles // share)) - 1)]
-    for other in others:
-        other.start()
-    take()
-    for other in others:
-        other.join()
-    if errors:
-        raise errors[0]
 
 
 @compiled

@@ -7,8 +7,6 @@ work goes with the number of triangles and of pixels drawn into, so it suits all
 
 from __future__ import annotations
 
-import os
-import threading
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -26,6 +24,7 @@ from bcppl.simulators.effort import Effort
 from bcppl.simulators.placement import Grid, Placed
 from bcppl.simulators.renderer import Hits, counted_pixels
 from bcppl.simulators.scan_conversion import bound
+from bcppl.simulators.threads import shared, thread_count
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -61,7 +60,7 @@ class DepthRasteriser:
         part.check(closed=False)
         self.part = part
         self.effort = Effort()
-        self.threads = _threads() if threads is None else threads
+        self.threads = thread_count() if threads is None else threads
         # Vertices that are doubled at seams become one: fewer to project, and a closed mesh is seen to be.
         vertices, which = np.unique(np.asarray(part.vertices, np.float64), axis=0, return_inverse=True)
         faces = which.reshape(-1)[part.faces]
@@ -200,31 +199,7 @@ class DepthRasteriser:
         return filled
 
     def _shared(self, work: Callable[[int, int], int], begin: int, end: int) -> int:
-        """The sum of `work(first, last)` over runs of particles, shared among the threads.
-
-        The threads end with the call: a pool that is kept would not survive a fork of the process.
-        """
-        threads = min(self.threads, -(-(end - begin) // SHARE))
-        if threads <= 1:
-            return work(begin, end) if end > begin else 0
-        runs, sums, errors = iter(range(begin, end, SHARE)), [0] * threads, list[BaseException]()
-
-        def take(thread: int) -> None:
-            try:
-                for first in runs:  # `next` of a range holds Python's lock, so each run is taken once
-                    sums[thread] += work(first, min(first + SHARE, end))
-            except BaseException as error:
-                errors.append(error)
-
-        others = [threading.Thread(target=take, args=(k,)) for k in range(1, threads)]
-        for other in others:
-            other.start()
-        take(0)
-        for other in others:
-            other.join()
-        if errors:
-            raise errors[0]
-        return sum(sums)
+        return shared(work, begin, end, SHARE, self.threads)
 
 
 class _Found:
@@ -277,13 +252,6 @@ def _counts(kept: Indices, length: int) -> npt.NDArray[np.int32]:
     is_kept = np.zeros(length + 1, dtype=np.int32)
     is_kept[kept + 1] = 1
     return np.cumsum(is_kept, dtype=np.int32)
-
-
-def _threads() -> int:
-    """One on each core that this process may use, or as many as OMP_NUM_THREADS says."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    asked = os.environ.get("OMP_NUM_THREADS", "")
-    return min(cores, max(int(asked), 1)) if asked.isdecimal() else cores
 
 
 def _solid(vertices: Array, faces: Indices, step: float) -> bool:

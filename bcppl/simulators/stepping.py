@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import functools
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -17,6 +16,7 @@ from bcppl.recordings.measurements import Probe
 from bcppl.simulators.grasp import as_gripped
 from bcppl.simulators.model_copies import ModelCopies
 from bcppl.simulators.peg_model import SENSED, controls, hold, steps_of
+from bcppl.simulators.threads import thread_count
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice
@@ -31,11 +31,7 @@ POSE, WRENCH = slice(0, 7), slice(7, 13)  # places in a sensor row
 
 @functools.cache
 def _pool() -> mujoco.rollout.Rollout:
-    return mujoco.rollout.Rollout(nthread=_threads())
-
-
-def _threads() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return mujoco.rollout.Rollout(nthread=thread_count())
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +69,7 @@ class Clock:
         steps = self.step_after(len(self._high))
         self._controls = controls(probe, probe.command_times[0] + time_step * np.arange(max(1, steps)))
         self._copies = ModelCopies(self.model)
-        self._data = [mujoco.MjData(self.model) for _ in range(_threads())]
+        self._data = [mujoco.MjData(self.model) for _ in range(thread_count())]
 
     def step_after(self, stamps: int) -> int:
         """The step at which a simulation stands once its first `stamps` stamps have been read."""
