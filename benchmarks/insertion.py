@@ -1,4 +1,7 @@
-"""One insertion attempt in each scene of the bench: by vision alone, and after the fixed probe."""
+"""One insertion attempt in each scene: by vision alone, after the fixed probe, and after chosen ones.
+
+Chosen probes are those from which bcppl expects most, one after another, as many as 6 s hold.
+"""
 
 from __future__ import annotations
 
@@ -11,32 +14,42 @@ import numpy as np
 import torch
 from jobs import each
 from report import Row, cores, finish, options, show
+from scenes import PARTICLES, gone_on, taken_in
 from scipy.stats import binomtest
 
 from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.errors import InferenceError, InputError
-from bcppl.inference.guided_smc import infer
+from bcppl.inference.probing.candidates import MIXED, candidates
 from bcppl.inference.probing.chance import chance_of_success
+from bcppl.inference.probing.filters import Candidate
 from bcppl.inference.probing.insertion import insertion_plan
+from bcppl.inference.probing.loop import probing_loop
 from bcppl.inference.probing.metrology import three_two_one
+from bcppl.inference.probing.rules import by_information
+from bcppl.inference.smc import Step
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
-from bcppl.recordings import Recording
+from bcppl.models.worlds.bench_arm import BenchArm
+from bcppl.simulators.gap import PegGap
 from bcppl.simulators.physics import PegPhysics
 
 CLEARANCES = Bench().clearances
-KNOWN = ("vision", "3-2-1 probe")
+VISION, FIXED, CHOSEN = "vision", "3-2-1 probe", "chosen probes"
+KNOWN = (VISION, FIXED, CHOSEN)
+SECONDS, PROBES = 6.0, 6  # that probes may last altogether, and their number
+HYPOTHESES = 25
 CONFIDENCE = 0.95
 OVERALL, TIGHTEST = 0.97, 0.94  # shares that are to succeed
 CHANCES = 12  # particles by which the chance of an attempt is foretold
 
 
 class Task(NamedTuple):
-    """One scene at one clearance (m), and whether the chance of its attempts is foretold."""
+    """One scene at one clearance (m), what is to be known, and whether the chance of attempts is foretold."""
 
     seed: int
     clearance: float
+    known: tuple[str, ...]
     foretell: bool
 
 
@@ -72,31 +85,45 @@ class Outcome(NamedTuple):
 def attempts(task: Task) -> list[Outcome]:
     """The scene's attempts, one for each of what is known."""
     scene = bench_scene(task.seed, clearance=task.clearance)
+    outcomes: list[Outcome] = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        outcomes, belief = [], None
-        for known in KNOWN:
+        look = scene.look()
+        looked, seen = model.prepare(look), None
+        for known in task.known:
             try:
-                recording = scene.look()
-                if known == "3-2-1 probe":
-                    if belief is None:
-                        raise InferenceError("there is no belief from vision to plan the probe from.")
-                    recording = scene.probe(three_two_one(belief, scene.part, scene.peg))
-                belief = _believed(recording, task.seed)
-                outcomes.append(_attempt(scene, belief, known, task.foretell))
+                if seen is None:
+                    *_, seen = taken_in(look, PARTICLES, task.seed, looked)
+                arm = BenchArm(scene)
+                if known == FIXED:
+                    recording = scene.probe(three_two_one(seen.belief, scene.part, scene.peg))
+                    *_, last = gone_on(recording, looked, seen)
+                else:
+                    last = seen if known == VISION else _probed(scene, arm, seen)
+                outcomes.append(_attempt(scene, arm, last.belief, known, task.foretell))
             except (InputError, InferenceError) as error:
                 outcomes.append(Outcome(task.seed, task.clearance, scene.name, known, failed=str(error)))
     return outcomes
 
 
-def _believed(recording: Recording, seed: int) -> Belief:
-    *_, last = infer(model, recording, seed=seed)
-    return last.belief
+def _probed(scene: BenchScene, arm: BenchArm, seen: Step) -> Step:
+    """Where chosen probes lead to."""
+    gap, last = PegGap(scene.part, scene.peg), seen
+
+    def asked(belief: Belief, number: int) -> Sequence[Candidate]:
+        return candidates(belief, scene.part, scene.peg, MIXED, gap=gap, seed=number)
+
+    rank = by_information(model.pose, hypotheses=HYPOTHESES, seed=scene.seed)
+    for made in probing_loop(
+        model, scene.look(), arm, asked, rank, start=seen, probes=PROBES, seconds=SECONDS
+    ):
+        last = made.step
+    return last
 
 
-def _attempt(scene: BenchScene, belief: Belief, known: str, foretell: bool) -> Outcome:
+def _attempt(scene: BenchScene, arm: BenchArm, belief: Belief, known: str, foretell: bool) -> Outcome:
     plan = insertion_plan(belief, scene.part, scene.peg)
-    result = scene.insert(plan)
+    result = arm.insert(plan)
     chance = math.nan
     if foretell:
         physics = PegPhysics(scene.part, scene.peg)
@@ -177,32 +204,34 @@ def main() -> None:
     parser = options(__doc__ or "")
     parser.add_argument("--scenes", type=int, default=100, help="at each clearance")
     parser.add_argument("--jobs", type=int, default=cores(), help="scenes at a time")
+    parser.add_argument("--known", nargs="+", choices=KNOWN, default=list(KNOWN))
     parser.add_argument("--foretell", action="store_true", help="compute the chance of each attempt as well")
     arguments = parser.parse_args()
     count = 2 if arguments.quick else arguments.scenes
     seeds = range(arguments.seed, arguments.seed + count)
-    tasks = [Task(seed, clearance, arguments.foretell) for clearance in CLEARANCES for seed in seeds]
+    known = tuple(arguments.known)
+    tasks = [Task(seed, clearance, known, arguments.foretell) for clearance in CLEARANCES for seed in seeds]
     outcomes = [outcome for made in each(attempts, tasks, arguments.jobs) for outcome in made]
     lines, rows = [], []
-    for known in KNOWN:
-        mine = [o for o in outcomes if o.known == known]
+    for what in known:
+        mine = [o for o in outcomes if o.known == what]
         for clearance in (*CLEARANCES, None):
             some = [o for o in mine if clearance in (None, o.clearance)]
             where = "all" if clearance is None else f"{1e3 * clearance:g} mm"
-            lines.append(_line(f"{known}, {where}", some))
+            lines.append(_line(f"{what}, {where}", some))
             share, low, high = rate(some)
             goal = None
-            if known != "vision":
+            if what != VISION:
                 goal = OVERALL if clearance is None else TIGHTEST if clearance == min(CLEARANCES) else None
             rows += [
-                Row(f"inserted, {known}, {where}", share, "share", goal, "min"),
-                Row(f"inserted, {known}, {where}, lower end", low, "share", None, "min"),
-                Row(f"inserted, {known}, {where}, upper end", high, "share", None, "min"),
-                Row(f"force held for two samples, {known}, {where}, median", float(lines[-1][7]), "N"),
-                Row(f"peak force, {known}, {where}, median", float(lines[-1][9]), "N"),
+                Row(f"inserted, {what}, {where}", share, "share", goal, "min"),
+                Row(f"inserted, {what}, {where}, lower end", low, "share", None, "min"),
+                Row(f"inserted, {what}, {where}, upper end", high, "share", None, "min"),
+                Row(f"force held for two samples, {what}, {where}, median", float(lines[-1][7]), "N"),
+                Row(f"peak force, {what}, {where}, median", float(lines[-1][9]), "N"),
             ]
     show(f"one attempt each, scenes {seeds[0]} to {seeds[-1]} at each clearance", COLUMNS, lines)
-    missed = [o for o in outcomes if not o.inserted and o.known != "vision"]
+    missed = [o for o in outcomes if not o.inserted and o.known != VISION]
     for o in missed:
         why = o.failed or f"depth {1e3 * o.depth:.1f} mm, {'found' if o.found else 'hole not found'}"
         print(

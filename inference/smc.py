@@ -7,6 +7,7 @@ a recording is run by `bcppl.inference.step.steps`.
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.step import Observed, StepFunction, StepInfo
 from bcppl.inference.tempering import tempered
+from bcppl.recordings import Recording, problems
 from bcppl.traces import Model, Series, Trace, extend, generate
 
 
@@ -125,14 +127,27 @@ def smc(
     Raises:
         InferenceError: no particle is left with any weight; names the measurement.
         InputError: the particles or the seed are no whole number, the program samples no pose at
-            `model.pose`, or `start` has taken more measurements in
-            than there are.
+            `model.pose`, or `start` has taken more measurements in than there are.
+
+    Warns:
+        RuntimeWarning: the recording has a problem (`bcppl.recordings.problems`, which is asked where no
+            scene is given): two cameras of one name, places in millimetres, times that go back. The run
+            goes on; `bcppl run` refuses such a recording.
     """
     whole_number("SMC is to run {} particles", particles)
     seed_number(seed)
     steps = _steps(model, recording, step, particles, seed, scene, start)
     left = len(recording.measurements) + (1 if start is None else -start.taken)
     return watched(steps, total=left, describe=lambda each: each.info.label, progress=progress)
+
+
+def _warn_of_problems(recording: Any) -> None:
+    if not isinstance(recording, Recording) or not recording.measurements:
+        return
+    found = problems(recording)
+    if found:
+        more = f" ({len(found) - 1} more: bcppl.recordings.problems)" if len(found) > 1 else ""
+        warnings.warn(f"{found[0].rstrip('.')}{more}.", RuntimeWarning, stacklevel=4)
 
 
 def _steps(
@@ -144,7 +159,9 @@ def _steps(
     scene: Any,
     start: Step | None,
 ) -> Iterator[Step]:
-    scene = model.prepare(recording) if scene is None else scene
+    if scene is None:
+        _warn_of_problems(recording)
+        scene = model.prepare(recording)
     if start is None:
         state = [torch.Generator().manual_seed(seed).get_state()]
         with _own_state(state, particles):

@@ -19,6 +19,7 @@ from bcppl.errors import InputError
 from bcppl.inference.probing.candidates import candidates
 from bcppl.inference.probing.filters import (
     Candidates,
+    Filter,
     Mounted,
     clear_of_part,
     clear_of_table,
@@ -226,6 +227,10 @@ def test_what_leaves_no_choice_is_refused_in_a_sentence() -> None:
         "no peg to touch the part": lambda: candidates(belief, scene.part, None, {"touch": 1}),
         "out of|beside the direction": lambda: candidates(
             belief, scene.part, scene.peg, {"touch": 2}, gap=gap, filters=[from_within((0, 0, 1.0), 0.1)]
+        ),
+        "a filter is a function": lambda: filtered(planned(5)[2], [lambda found: [True]]),  # type: ignore[list-item]
+        "candidates that are dull does not say of each": lambda: filtered(
+            planned(5)[2], [Filter("are dull", lambda found: [True])]
         ),
     }
     for says, call in calls.items():

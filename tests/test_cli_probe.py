@@ -20,6 +20,7 @@ from bcppl.models.worlds.bench import bench_scene
 from bcppl.recordings import save
 from bcppl.recordings.action_file import load_actions, save_actions
 from bcppl.recordings.beliefs import load_belief, load_latent, save_belief
+from bcppl.recordings.fingerprint import fingerprint
 from bcppl.recordings.plan import Plan
 from tests.command_line import SHIPPED, Ran, short
 
@@ -42,6 +43,7 @@ def saved() -> tuple[bytes, dict[str, bytes]]:
                 log_evidence=step.info.log_evidence,
                 random_state=step.random_state,
                 latent=dict(step.population.trace.choices),
+                of=fingerprint(look, k),
             )
             beliefs[path.name] = path.read_bytes()
         return Path(f"{folder}/look.h5").read_bytes(), beliefs
@@ -95,7 +97,10 @@ def test_views_and_touches_are_ranked_together_and_other_models_by_reweighing(
     # A third view of a camera that is off by millimetres tells less than a touch.
     assert len(views) == 2 and 0.5 < max(views) < touched
     save(short(1), here / "push.h5")
-    for kind, says in (("view", "model point_probe cannot foretell these"), ("touch", "there is no peg")):
+    for kind, says in (
+        ("view", "model point_probe cannot foretell these"),
+        ("touch", "holds no peg to carry out 'touch' with"),
+    ):
         refused(bcppl("probe", "push.h5", "--candidates", f"{kind}:1", "--particles", 6), says)
     refused(bcppl("probe", "runs/belief_002.h5", "--by", "luck"), "--by is 'luck'")
 
@@ -140,6 +145,20 @@ def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
     given = words if "--candidates" in words else [*words, "--candidates", "touch:1"]
     refused(bcppl("probe", "runs/belief_002.h5", *given), says)
     assert sorted(here.rglob("*")) == before
+
+
+def test_another_recording_and_a_plan_through_the_part_are_noticed(
+    bcppl: Callable[..., Ran], here: Path
+) -> None:
+    save(bench_scene(6).look(), here / "other.h5")
+    ran = bcppl("probe", "runs/belief_002.h5", "--of", "other.h5", "--candidates", "touch:1")
+    refused(ran, "is of another recording than other.h5")
+    refused(bcppl("probe", "runs/belief_000.h5", "--of", "other.h5"), "is of another recording")
+    down = load_belief("runs/belief_002.h5").mean.expand(2, 7).clone()
+    down[0, 2] += 0.2
+    plan = Plan("down", np.array([0.0, 1.0]), down.numpy(), ("free",), 4.0, np.ones(6), np.ones(6))
+    save_actions([plan], here / "down.json")
+    refused(bcppl("probe", "runs/belief_002.h5", "--candidates", "down.json"), "1 lead through the part")
 
 
 def test_beliefs_that_say_nothing_are_refused(bcppl: Callable[..., Ran], here: Path) -> None:

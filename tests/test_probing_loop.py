@@ -14,7 +14,7 @@ from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.inference.guided_smc import infer
 from bcppl.inference.probing.candidates import candidates
-from bcppl.inference.probing.filters import Candidate, name_of
+from bcppl.inference.probing.filters import Candidate, lasting, name_of
 from bcppl.inference.probing.insertion import insertion_plan
 from bcppl.inference.probing.loop import Round, named_apart, probing_loop
 from bcppl.inference.probing.rules import at_random, by_information, in_order
@@ -108,6 +108,18 @@ def test_the_loop_ends_by_gain_by_chance_and_by_number() -> None:
 
     assert rounds(probes=3, chance=surer, enough=0.9) == 1
     assert asked_of[0] is last.belief and asked_of[1] is not last.belief
+    assert rounds(probes=3, seconds=0.5) == 0  # no touch is so short
+
+
+def test_probes_together_last_no_longer_than_they_may() -> None:
+    scene, look, last, _ = seen()
+    begin = probing_loop(model, look, BenchArm(scene), asked, at_random(0), start=last, probes=4, seconds=3.0)
+    made = list(begin)
+    left = 3.0
+    for each in made:
+        assert all(lasting(candidate) <= left + 1e-9 for candidate in each.candidates)
+        left -= lasting(each.chosen)
+    assert 0.0 <= left < 3.0 and 1 <= len(made) < 4
 
 
 def test_a_probe_that_is_chosen_twice_gets_a_name_of_its_own_and_an_arm_goes_on() -> None:
@@ -173,9 +185,10 @@ def test_a_loop_without_candidates_or_world_says_so() -> None:
         ("gave a int when it was asked for 'touch 1", Junk(), lambda *now: (c for c in asked(*now))),
         ("candidates are given as a NoneType", BenchArm(scene), lambda belief, number: None),
         ("a candidate is a str", BenchArm(scene), lambda belief, number: ["touch"]),
-        ("no peg to carry out 'touch 1", None, asked),
+        ("no peg to carry out 'touch 1", BenchArm(scene), asked),
+        ("world is a int", 1, asked),
     ):
-        known = dataclasses.replace(look, peg=None) if world is None else look
+        known = dataclasses.replace(look, peg=None) if "no peg" in says else look
         with pytest.raises(InputError, match=says) as caught:
             list(
                 probing_loop(
@@ -183,3 +196,19 @@ def test_a_loop_without_candidates_or_world_says_so() -> None:
                 )
             )
         assert_one_sentence(str(caught.value))
+
+
+@pytest.mark.parametrize("chance", [math.nan, "likely", 1.5])
+def test_a_chance_that_is_none_is_refused(chance: object) -> None:
+    scene, look, last, _ = seen()
+    loop = probing_loop(
+        model,
+        look,
+        BenchArm(scene),
+        asked,
+        start=last,
+        chance=lambda belief: chance,  # type: ignore[arg-type, return-value]
+    )
+    with pytest.raises(InputError, match="the chance of an insertion is said to be") as caught:
+        next(loop)
+    assert_one_sentence(str(caught.value))

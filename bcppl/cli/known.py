@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.progress import sole_bar
 from bcppl.recordings import Recording
-from bcppl.recordings.beliefs import is_belief, load_belief, load_label, load_latent
+from bcppl.recordings.beliefs import is_belief, load_belief, load_fingerprint, load_label, load_latent
+from bcppl.recordings.fingerprint import fingerprint
 from bcppl.traces import Model, Series, generate
 
 
@@ -44,6 +46,7 @@ def known(
     particles: int,
     seed: int,
     console: Console,
+    check: Callable[[Recording], None] = lambda recording: None,
 ) -> Known:
     """Run a recording, or read a belief.
 
@@ -55,17 +58,19 @@ def known(
         particles: of a run.
         seed: of a run.
         console: shows how far a run is.
+        check: refuses a recording before anything is run.
 
     Raises:
         InputError: something is not to be found, does not fit, or cannot be gone on from.
     """
     if Path(name).is_file() and is_belief(name):
-        return _read(Path(name), of, model)
+        return _read(Path(name), of, model, check)
     if of is not None:
         raise InputError(
             f"--of says which recording a belief is of, but {name} is a recording; leave it out."
         )
     found = loading.recording(name)
+    check(found)
     chosen = _chosen(model or found.model)
     infer = loading.inference(inference or ("tempered_smc" if chosen.arrival is None else "guided_smc"))
     scene = chosen.prepare(found)
@@ -92,7 +97,7 @@ def _chosen(name: str) -> Model:
     return found
 
 
-def _read(path: Path, of: str | None, model: str | None) -> Known:
+def _read(path: Path, of: str | None, model: str | None, check: Callable[[Recording], None]) -> Known:
     """The population of a belief's file, its sites observed as the recording has them."""
     label, belief, latent = load_label(path), load_belief(path), load_latent(path)
     noted = _noted(path)
@@ -110,6 +115,11 @@ def _read(path: Path, of: str | None, model: str | None) -> Known:
             f"{path} stands after {label}, but {of} has {len(whole.measurements)} measurements; "
             "give the recording that it was run on with --of."
         )
+    if load_fingerprint(path) not in ("", fingerprint(whole, taken)):
+        raise InputError(
+            f"{path} is of another recording than {of}: part, guess or measurements differ; give the "
+            "one that it was run on with --of."
+        )
     measured = list(whole.measurements[:taken])
     scene = chosen.prepare(whole)
     observed = chosen.observe(scene, measured)
@@ -125,6 +135,7 @@ def _read(path: Path, of: str | None, model: str | None) -> Known:
         raise InputError(
             f"{path} does not fit the model or the recording ({error}); give --of and --model as it was run."
         ) from error
+    check(whole)
     recording = Recording(**{**vars(whole), "measurements": measured})
     return Known(recording, chosen, Population(trace, belief.log_weights.to(torch.float64)), scene)
 

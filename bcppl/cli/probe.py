@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,9 +26,11 @@ from bcppl.inference.probing.filters import (
     Candidates,
     Filter,
     Mounted,
+    clear_of_part,
     clear_of_table,
     filtered,
     from_within,
+    lasting,
     name_of,
     no_harder_than,
     refuse_none,
@@ -40,9 +42,11 @@ from bcppl.inference.probing.rules import Rank, by_information, by_reweighing
 from bcppl.models.look_and_touch_scene import Scene
 from bcppl.models.robots import load_robot
 from bcppl.models.view_information import view_information
+from bcppl.recordings import Recording
 from bcppl.recordings.action_file import SUFFIXES, load_actions, save_actions
 from bcppl.recordings.measurements import View
 from bcppl.recordings.plan import Plan
+from bcppl.simulators.gap import PegGap
 
 DEFAULT = ",".join(f"{kind}:{count}" for kind, count in MIXED.items())
 WAYS = ("linearised", "reweighing")
@@ -115,12 +119,13 @@ def probe(
     kinds = _kinds(candidates) if own is None else {}
     filters = _filters(force, above, robot, link, link_from_peg, world_from_base, seed)
     console = Console(highlight=False)
-    before = known(recording, of, model, inference, particles, seed, console)
+    pegless = _pegless(own, kinds)
+    before = known(recording, of, model, inference, particles, seed, console, pegless)
     found = _found(before, own, kinds, [*_table(before, table), *filters], seed)
     console.print(escape(str(found)), soft_wrap=True)
     scene = prepared(before.model, with_views(before.recording, found), before.scene)
     with console.status("ranking"):
-        settings = {"hypotheses": hypotheses, "cost": seconds_of, "rate": rate, "seed": seed}
+        settings = {"hypotheses": hypotheses, "cost": lasting, "rate": rate, "seed": seed}
         rank = _rank(by, before, scene, settings)
         try:
             ranking = rank(before.population, found, scene)
@@ -147,9 +152,20 @@ def _rank(by: str | None, before: Known, scene: Any, settings: dict[str, Any]) -
     return by_information(before.model.pose, information=information, **settings)
 
 
-def seconds_of(candidate: Candidate) -> float:
-    """How long a plan takes; a view takes none."""
-    return 0.0 if isinstance(candidate, View) else float(candidate.times[-1] - candidate.times[0])
+def _pegless(own: Sequence[Plan | View] | None, kinds: dict[str, int]) -> Callable[[Recording], None]:
+    """Refuses a recording without a peg where one is needed, before anything is run."""
+    asked = [name_of(each) for each in own or () if isinstance(each, Plan)] or [
+        kind for kind, count in kinds.items() if count and kind != "view"
+    ]
+
+    def check(recording: Recording) -> None:
+        if asked and recording.peg is None:
+            raise InputError(
+                f"the recording holds no peg to carry out {asked[0]!r} with; add the peg, or ask for views "
+                "(--candidates view:8)."
+            )
+
+    return check
 
 
 def _is_file(words: str) -> bool:
@@ -226,6 +242,9 @@ def _found(
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise InputError(f"two candidates are called {twice!r}; give each a name of its own.")
+        if before.recording.peg is not None and any(isinstance(each, Plan) for each in own):
+            gap = PegGap(before.recording.part, before.recording.peg)
+            filters = [clear_of_part(gap, belief.mean), *filters]
         return filtered(own, filters)
     recording = before.recording
     cameras = [m.action.camera for m in recording.measurements if isinstance(m.action, View)]
@@ -257,7 +276,7 @@ def _shown(ranking: Ranking, top: int) -> Table:
         numbers = [f"{value:.2f}" for value in cells]
         numbers[1] = f"± {numbers[1]}"
         name = escape(name_of(each.candidate))
-        shown.add_row(str(k + 1), name, *numbers, f"{seconds_of(each.candidate):.2f}")
+        shown.add_row(str(k + 1), name, *numbers, f"{lasting(each.candidate):.2f}")
     return shown
 
 

@@ -24,6 +24,7 @@ from bcppl.figures import add_over_time, belief_in_3d
 from bcppl.inference.progress import sole_bar
 from bcppl.recordings import Recording
 from bcppl.recordings.beliefs import save_belief
+from bcppl.recordings.fingerprint import fingerprint
 from bcppl.traces import Model
 
 HEADER = (
@@ -109,7 +110,7 @@ def run(
                 if not steps:
                     _start(folder)
                     progress.console.print(_row(HEADER), style="bold", soft_wrap=True)
-                _keep(folder, len(steps), step)
+                _keep(folder, len(steps), step, found)
                 steps.append(step)
                 rows.append(_cells(step, found, watch.cell(step)))
                 _write_record(folder, made, steps, rows)
@@ -147,7 +148,7 @@ def _start(folder: Path) -> None:
         old.unlink()
 
 
-def _keep(folder: Path, number: int, step: Any) -> None:
+def _keep(folder: Path, number: int, step: Any, recording: Recording) -> None:
     save_belief(
         step.belief,
         folder / f"belief_{number:03d}.h5",
@@ -155,6 +156,7 @@ def _keep(folder: Path, number: int, step: Any) -> None:
         log_evidence=step.info.log_evidence,
         random_state=step.random_state,
         latent=latent_sites.values_of(step),
+        of=fingerprint(recording, number),
     )
 
 

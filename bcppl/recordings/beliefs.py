@@ -38,6 +38,7 @@ def save_belief(
     log_evidence: float,
     random_state: Tensor,
     latent: Mapping[str, Tensor] | None = None,
+    of: str = "",
 ) -> None:
     """Write a belief, whole or not at all.
 
@@ -48,6 +49,7 @@ def save_belief(
         log_evidence: of all measurements so far.
         random_state: torch's generator, so that a run can be gone on with.
         latent: values (N, *event) at the latent addresses, the pose's own among them if you like.
+        of: the `bcppl.recordings.fingerprint.fingerprint` of the recording as far as it was taken in.
     """
     path = Path(path)
     unfinished = path.with_name(path.name + ".part")
@@ -56,6 +58,7 @@ def save_belief(
             file.attrs.update(
                 format=FORMAT, schema_version=SCHEMA_VERSION, label=label, log_evidence=log_evidence
             )
+            file.attrs["of"] = of
             file.attrs.update(
                 free_translation=belief.freedom.translation, free_rotation=belief.freedom.rotation
             )
@@ -112,6 +115,16 @@ def load_label(path: str | os.PathLike[str]) -> str:
     """
     with _opened(path) as file:
         return str(file.attrs["label"])
+
+
+def load_fingerprint(path: str | os.PathLike[str]) -> str:
+    """What `save_belief` was told of the recording that a belief is of; empty where it was told nothing.
+
+    Raises:
+        InputError: there is no such file, or it holds no belief that this version reads.
+    """
+    with _opened(path) as file:
+        return str(file.attrs.get("of", ""))
 
 
 def is_belief(path: str | os.PathLike[str]) -> bool:

@@ -13,6 +13,7 @@ import torch
 from bcppl import poses
 from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief
+from bcppl.errors import InputError
 from bcppl.inference.schemes import systematic
 from bcppl.parts import Part
 from bcppl.recordings.insertion_plan import InsertionPlan
@@ -66,9 +67,14 @@ def chance_of_success(
         seed: of that draw.
 
     Raises:
-        InputError: the part has no hole or several, the peg does not fit, or the number of particles is not
-            positive.
+        InputError: the plan is of another kind, the part has no hole or several, the peg does not fit, or the
+            number of particles is not positive.
     """
+    if not isinstance(plan, InsertionPlan):
+        raise InputError(
+            f"the chance of an insertion is asked of a {type(plan).__name__}; give what `insertion_plan` "
+            "makes."
+        )
     whole_number("the chance of an insertion is asked for {} particles", particles)
     hole = hole_of(physics.part) if hole is None else hole
     world_from_part = _drawn(belief, particles, seed)

@@ -105,11 +105,26 @@ def sifted(candidates: Iterable[Candidate], filters: Sequence[Filter]) -> Candid
     """As `filtered`, also where none is left."""
     left, removed = list(candidates), dict[str, int]()
     for each in filters:
+        if not isinstance(each, Filter):
+            raise InputError(
+                f"a filter is a {type(each).__name__}; give Filter(removes, keeps): what is true of those it "
+                "leaves out, in words, and a function of all candidates that says which it keeps."
+            )
         if left:
-            kept = [c for c, keep in zip(left, each.keeps(left), strict=True) if keep]
+            kept = [c for c, keep in zip(left, _kept(each, left), strict=True) if keep]
             removed[each.removes] = removed.get(each.removes, 0) + len(left) - len(kept)
             left = kept
     return Candidates(tuple(left), removed)
+
+
+def _kept(each: Filter, candidates: Sequence[Candidate]) -> Sequence[bool]:
+    says = each.keeps(candidates)
+    if not isinstance(says, Iterable) or len(list(says)) != len(candidates):
+        raise InputError(
+            f"the filter of candidates that {each.removes} does not say of each whether it is kept; let it "
+            f"give {len(candidates)} booleans for {len(candidates)} candidates."
+        )
+    return says
 
 
 def refuse_none(candidates: Candidates) -> None:
@@ -220,6 +235,20 @@ def clear_of_table(peg: Part, height: float, margin: float = 0.002) -> Filter:
         return bool(lowest > height + margin)
 
     return Filter("lead into the table", lambda candidates: [keeps(c) for c in candidates])
+
+
+def no_longer_than(seconds: float) -> Filter:
+    """Keeps views, and plans that last no longer than so many seconds."""
+    number_within("candidates may last {} s", seconds, least=0.0)
+    return Filter(
+        f"last longer than {seconds:.3g} s",
+        lambda candidates: [lasting(c) <= seconds + 1e-9 for c in candidates],
+    )
+
+
+def lasting(candidate: Candidate) -> float:
+    """Seconds from a plan's beginning to its end; a view takes none."""
+    return 0.0 if isinstance(candidate, View) else float(candidate.times[-1] - candidate.times[0])
 
 
 def no_harder_than(force: float) -> Filter:

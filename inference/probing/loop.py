@@ -23,7 +23,15 @@ from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.inference import guided_smc
 from bcppl.inference.probing.candidates import refuse_settled
-from bcppl.inference.probing.filters import Candidate, Candidates, name_of, refuse_none
+from bcppl.inference.probing.filters import (
+    Candidate,
+    Candidates,
+    lasting,
+    name_of,
+    no_longer_than,
+    refuse_none,
+    sifted,
+)
 from bcppl.inference.probing.ranking import Ranking
 from bcppl.inference.probing.rules import Rank, by_information
 from bcppl.inference.smc import Step
@@ -86,6 +94,7 @@ def probing_loop(
     seed: int = 0,
     start: Step | None = None,
     probes: int = 3,
+    seconds: float | None = None,
     least_gain: float | None = None,
     chance: Callable[[Belief], float] | None = None,
     enough: float = 0.95,
@@ -105,6 +114,8 @@ def probing_loop(
         seed: of inference, where there is no `start`.
         start: a step that has taken in some or all of the recording.
         probes: at most so many.
+        seconds: that all plans together last at most; those that last longer than what is left are not
+            ranked, and where none is left it is over.
         least_gain: nats; where the best candidate is expected to tell less, less its cost, it is over.
         chance: of an insertion under a belief, such as `chance_of_success(...).success`; asked before the
             first probe and after each.
@@ -113,31 +124,42 @@ def probing_loop(
     Raises:
         InputError: there are no candidates, or what is given as one is none, or a plan needs a peg that the
             recording lacks; the belief has no weight or has collapsed to a point; a number is out of range;
-            the world measured nothing.
+            the world cannot carry out anything, or measured nothing; a chance is no number from 0 to 1.
     """
     whole_number("the loop is to make {} probes at most", probes)
     number_within("an insertion is tried from a chance of {} on", enough, least=0.0)
+    left = math.inf if seconds is None else number_within("the loop is given {} s", seconds, least=0.0)
     if least_gain is not None:
         number_within("the loop ends below a gain of {}", least_gain)
+    if not callable(getattr(world, "carry_out", None)):
+        raise InputError(
+            f"the loop's world is a {type(world).__name__}, which cannot carry out anything; give one with "
+            "`carry_out(candidate)`, such as bcppl.models.worlds.bench_arm.BenchArm."
+        )
     rank = by_information(model.pose) if rank is None else rank
     scene = prepared(model, recording, None if start is None else start.population.trace.args[0])
     step = _last(infer(model, recording, particles=particles, seed=seed, scene=scene, start=start), start)
-    if chance is not None and chance(step.belief) >= enough:
+    if chance is not None and _likely(chance, step.belief) >= enough:
         return
     for number in range(probes):
         refuse_settled(step.belief)
         found = _listed(candidates_from(step.belief, number), recording)
+        if math.isfinite(left):
+            found = sifted(found, [no_longer_than(left)])
+            if not found:
+                return
         scene = prepared(model, with_views(recording, found), scene)
         ranking = rank(step.population, found, scene)
         if least_gain is not None and not ranking.best.value >= least_gain:
             return
         chosen = named_apart(ranking.best.candidate, recording)
         measured = _measured(world.carry_out(chosen), chosen)
+        left -= lasting(chosen)
         recording = replace(recording, measurements=[*recording.measurements, *measured])
         scene, before = prepared(model, recording, scene), step
         count = len(before.population)
         step = _last(infer(model, recording, particles=count, seed=seed, scene=scene, start=before), before)
-        likely = math.nan if chance is None else chance(step.belief)
+        likely = math.nan if chance is None else _likely(chance, step.belief)
         yield Round(number, found, ranking, chosen, recording, before, step, likely)
         if likely >= enough:
             return
@@ -149,6 +171,10 @@ def _last(steps: Iterator[Step], before: Step | None) -> Step:
     if before is None:
         raise InputError("the loop's inference yields no step; give one that yields the prior's first.")
     return before
+
+
+def _likely(chance: Callable[[Belief], float], belief: Belief) -> float:
+    return number_within("the chance of an insertion is said to be {}", chance(belief), least=0.0, most=1.0)
 
 
 def _listed(found: object, recording: Recording) -> Sequence[Candidate]:

@@ -1,0 +1,5 @@
+"""`python -m bcppl`."""
+
+from bcppl.cli import main
+
+main()
