@@ -2,7 +2,7 @@
 
 Every seed is a new bench, simulated by `bcppl.models.worlds.two_cameras`: two cameras whose stated poses are
 off by 2 mm and half a degree (standard deviations for each axis), whose ranges are biased by 2 mm, one image
-each. Both models are given the same recording and the default inference, without climbs: one part stands alone.
+each. Both models are given the same recording and the default inference, without climbs.
 """
 
 from __future__ import annotations
