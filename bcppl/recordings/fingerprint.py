@@ -19,8 +19,11 @@ def fingerprint(recording: Recording, taken: int) -> str:
     found = hashlib.sha256()
     measured = [m.observation for m in recording.measurements[:taken]]
     numbers = [recording.part.vertices, recording.guess.world_from_part]
-    for each in measured:
-        numbers += [each.depth] if isinstance(each, DepthImage) else [each.times, each.wrench]
+    for each in measured:  # depth as a file holds it: what was saved and loaded is the same recording
+        if isinstance(each, DepthImage):
+            numbers.append(each.depth.astype(np.float32))
+        else:
+            numbers += [each.times, each.wrench]
     for array in numbers:
         found.update(np.ascontiguousarray(array, dtype=np.float64).tobytes())
     return found.hexdigest()
