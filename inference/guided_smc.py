@@ -32,6 +32,7 @@ from bcppl.traces import Model, extend
 
 WALK = (0.2, 2.0)  # scales of the random walks
 CERTAIN = 0.01  # nats: what is expected for sure tells nothing
+ASKED = 4  # particles that are asked first whether all had to expect a measurement
 
 
 def kernel(pose: str, proposals: Sequence[Program]) -> Kernel:
@@ -57,6 +58,7 @@ def guided(
     few: float = 0.2,
     most: int = 40,
     least: float = 0.03,
+    room: int = 40_000,
 ) -> StepFunction:
     """A step that takes a measurement in by a pair of programs, resamples when needed, and moves.
 
@@ -68,7 +70,9 @@ def guided(
         few: so many are to be left effective by the pair, as a share of N.
         most: it is run anew with more copies of each particle, as many as seem needed and at most so many,
             until they are; N of all are kept.
-        least: where even then fewer are left effective, as a share of N, the measurement is tempered in.
+        least: where even with `most` copies fewer would be left effective, as a share of N, the measurement
+            is tempered in.
+        room: so many copies in all at most: memory and time grow with them.
     """
     by_pair = smcp3(pair, resample=never)
     resample = adaptive(systematic, share)
@@ -83,11 +87,16 @@ def guided(
 
     def as_expected(population: Population, observed: Observed) -> Population | None:
         """The particles as they are, where all had to expect the measurement and nothing latent comes."""
+        alive = (population.log_weights > -torch.inf).nonzero()[:, 0]
+        few = population.trace.chosen(alive[:ASKED])
+        with torch.random.fork_rng(devices=[]):
+            asked, gained = extend(few, *observed)
+        if len(asked.choices) == len(few.choices) and not bool((gained.abs() < CERTAIN).all()):
+            return None  # mostly so, and a few are asked in no time
         longer, gained = extend(population.trace, *observed)
         if len(longer.choices) > len(population.trace.choices):
             return None
-        alive = gained[population.log_weights > -torch.inf]
-        certain = bool((alive.abs() < CERTAIN).all())
+        certain = bool((gained[alive].abs() < CERTAIN).all())
         return population.with_trace(longer).reweighed(gained) if certain else None
 
     def step(population: Population, observed: Observed) -> Stepped:
@@ -97,13 +106,14 @@ def guided(
         if stayed is not None:
             return Stepped(stayed, _info(population, stayed, stayed.effective_sample_size))
         times, goal = 1, few * count
+        allowed = max(1, min(most, room // count))
         reached = weighed(population, observed)
-        while times < most and (reached is None or reached.effective_sample_size < goal):
+        while times < allowed and (reached is None or reached.effective_sample_size < goal):
             each = 0.0 if reached is None else reached.effective_sample_size / times
             # Effective sizes are often taken for too large: ask for more than would just do.
-            times = min(most, max(2 * times, math.ceil(1.5 * goal / max(each, goal / most))))
+            times = min(allowed, max(2 * times, math.ceil(1.5 * goal / max(each, goal / most))))
             reached = weighed(replicated(population, times), observed)
-        if reached is None or reached.effective_sample_size < least * count:
+        if reached is None or reached.effective_sample_size < least * count * times / most:
             return by_tempering(population, observed)
         effective = reached.effective_sample_size
         if len(reached) > count:
