@@ -117,9 +117,10 @@ def sifted(candidates: Iterable[Candidate], filters: Sequence[Filter]) -> Candid
     return Candidates(tuple(left), removed)
 
 
-def _kept(each: Filter, candidates: Sequence[Candidate]) -> Sequence[bool]:
-    says = each.keeps(candidates)
-    if not isinstance(says, Iterable) or len(list(says)) != len(candidates):
+def _kept(each: Filter, candidates: Sequence[Candidate]) -> list[bool]:
+    given: object = each.keeps(candidates)
+    says = list(given) if isinstance(given, Iterable) else []
+    if len(says) != len(candidates):
         raise InputError(
             f"the filter of candidates that {each.removes} does not say of each whether it is kept; let it "
             f"give {len(candidates)} booleans for {len(candidates)} candidates."
