@@ -122,6 +122,16 @@ def test_probes_together_last_no_longer_than_they_may() -> None:
     assert 0.0 <= left < 3.0 and 1 <= len(made) < 4
 
 
+def test_a_probe_may_last_all_that_is_left() -> None:
+    scene, look, last, _ = seen()
+    only = asked(last.belief, 0)[:1]
+    seconds = lasting(only[0]) - 5e-10  # rounding must not leave less than none
+    loop = probing_loop(
+        model, look, BenchArm(scene), lambda *now: only, at_random(0), start=last, seconds=seconds
+    )
+    assert len(list(loop)) == 1
+
+
 def test_a_probe_that_is_chosen_twice_gets_a_name_of_its_own_and_an_arm_goes_on() -> None:
     scene, look, _, _ = seen()
     plan = asked(seen()[2].belief, 0)[0]

@@ -154,7 +154,7 @@ def probing_loop(
             return
         chosen = named_apart(ranking.best.candidate, recording)
         measured = _measured(world.carry_out(chosen), chosen)
-        left -= lasting(chosen)
+        left = max(0.0, left - lasting(chosen))
         recording = replace(recording, measurements=[*recording.measurements, *measured])
         scene, before = prepared(model, recording, scene), step
         count = len(before.population)
