@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -22,6 +23,8 @@ from bcppl.simulators.renderer import DepthRenderer
 from bcppl.simulators.stated_cameras import apparent_covariance
 from bcppl.traces import Trace
 
+Array = npt.NDArray[np.float64]
+
 # Differences are taken over this much: less, and a ray's jumps from face to face are all there is.
 STEPS = (5e-4, 5e-4, 5e-4, 5e-3, 5e-3, 5e-3)
 JUMP = 0.01  # m: pixels that change by more go from the part to what is behind it, and are outliers
@@ -31,7 +34,8 @@ WITHIN = 0.01  # m around the mean pose that is looked at
 def view_information(candidate: Any, trace: Trace) -> Tensor | None:
     """What a view would tell of the part beside what the trace's views told: (N, 6, 6) at its particles.
 
-    For `information` of `bcppl.inference.probing.linearised_information_gain`, and populations of
+    It says what is told about one place of the part, nothing of which of several is right. For `information`
+    of `bcppl.inference.probing.linearised_information_gain`, and populations of
     `bcppl.models.look_and_touch`. Images of one instrument are taken to share its error as it appears at the
     part, wherever it looks from.
 
@@ -69,7 +73,8 @@ def _told(scene: Any, cameras: Sequence[Camera], part: Tensor) -> Tensor:
 def pixel_information(renderer: DepthRenderer, camera: Camera, part: Tensor, bins: int = 1) -> Tensor:
     """Sums (N, 7, 7) of products of how pixels' depths change with a part's pose (N, 7) and a range bias.
 
-    Pixels at which the part comes or goes are left out. With `bins` a pixel is read for so many squared.
+    Pixels at which the part comes or goes, or is out of the sensor's range, are left out. With `bins` a pixel
+    is read for so many squared.
     """
     middle = part[0].numpy()
     spread = float((part[:, :3] - part[0, :3]).norm(dim=1).max())
@@ -78,11 +83,18 @@ def pixel_information(renderer: DepthRenderer, camera: Camera, part: Tensor, bin
     for axis, step in enumerate(STEPS):
         away = torch.zeros(6, dtype=torch.float64)
         away[axis] = step
-        ahead, behind = (renderer.images(near, poses.retract(part, s * away)) for s in (1.0, -1.0))
+        ahead, behind = (_read(renderer, near, poses.retract(part, s * away)) for s in (1.0, -1.0))
         with np.errstate(invalid="ignore"):
             change = ahead - behind
         change = np.where(np.isfinite(change) & (np.abs(change) < JUMP), change, 0.0)
         slopes.append(torch.from_numpy(change.reshape(len(part), -1) / (2.0 * step)))
-    sees = np.isfinite(renderer.images(near, part)).reshape(len(part), -1)
+    sees = np.isfinite(_read(renderer, near, part)).reshape(len(part), -1)
     rows = torch.stack([*slopes, torch.from_numpy(sees.astype(np.float64))], dim=1)
     return rows @ rows.transpose(-1, -2)
+
+
+def _read(renderer: DepthRenderer, camera: Camera, part: Tensor) -> Array:
+    """Depths (N, height, width) as the sensor reads them: none out of its range."""
+    depth = renderer.images(camera, part)
+    with np.errstate(invalid="ignore"):
+        return np.where((depth >= camera.near) & (depth <= camera.far), depth, np.nan)

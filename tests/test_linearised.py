@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import pyro
 import pytest
@@ -127,6 +128,37 @@ def test_costs_and_two_steps() -> None:
         assert prospect.then is not None and int(prospect.then[0]) == other
 
 
+def test_a_second_step_that_is_lost_for_some_adds_what_it_adds_for_the_others() -> None:
+    population = drawn(400, 6)
+
+    def information(candidate: str, trace: Trace) -> Tensor:
+        far = trace["part"][:, 0] > CENTER[0]
+        tells = torch.where(far, 1e9, 1e3) if candidate == "unequal" else torch.where(far, 0.0, math.nan)
+        return tells[:, None, None] * torch.eye(6, dtype=torch.float64)
+
+    def of(candidates: list[str], depth: int) -> float:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the lost ones
+            ranking = linearised_information_gain(
+                population, candidates, lambda c: (SPREADS, []), information=information, depth=depth, seed=0
+            )
+        return ranking.of(0).information_gain
+
+    assert of(["unequal", "lost"], 2) == pytest.approx(of(["unequal", "unequal"], 2))
+    alone = of(["unequal"], 1)
+    assert alone <= of(["unequal", "lost"], 2) < alone + 0.7 * 6
+
+
+def test_of_two_orders_the_one_that_tells_more_at_once_comes_first() -> None:
+    population = drawn(200, 2)
+    for asked in (ASKED, ASKED[::-1]):
+        ranking = linearised_information_gain(population, asked, arguments, depth=2, seed=0)
+        alone = linearised_information_gain(population, asked, arguments, seed=0)
+        assert ranking.best.number == alone.best.number
+        assert ranking[0].value == pytest.approx(ranking[1].value, abs=1e-9)
+        assert ranking.best.immediate == pytest.approx(alone.best.value)
+
+
 def test_what_tells_two_modes_apart_is_worth_that_as_well() -> None:
     centers = torch.zeros(2, 6, dtype=torch.float64)
     centers[:, 0] = torch.tensor([-0.05, 0.05])
@@ -157,6 +189,31 @@ def test_information_that_is_given_is_taken() -> None:
     ranking = linearised_information_gain(population, ASKED, arguments, information=information, seed=0)
     size = float(torch.cov(poses.local(CENTER, population["part"]).T, correction=0)[0, 0])
     assert ranking.of(3).information_gain == pytest.approx(0.5 * math.log1p(1e8 * size), abs=2e-3)
+    uneven = torch.triu(torch.ones(6, 6, dtype=torch.float64)) * 1e4
+    for wrong, says in (
+        (-known.expand(100, 6, 6), "check the sign"),
+        (uneven.expand(100, 6, 6), "to be symmetric"),
+        (known, r"has shape \(6, 6\)"),
+        ("much", "is a str"),
+    ):
+        with pytest.raises(InputError, match=f"what candidate 0 is said to tell .*{says}"):
+            linearised_information_gain(
+                population,
+                ["view"],
+                lambda c: (SPREADS, []),
+                information=lambda c, trace, wrong=wrong: wrong,  # type: ignore[misc]
+                seed=0,
+            )
+
+
+def test_what_given_information_leaves_out_of_several_modes_is_said() -> None:
+    centers = torch.zeros(2, 6, dtype=torch.float64)
+    centers[:, 0] = torch.tensor([-0.05, 0.05])
+    known = 1e6 * torch.eye(6, dtype=torch.float64).expand(200, 6, 6)
+    with pytest.warns(UserWarning, match="has 2 modes, and what 1 of 1 candidates"):
+        linearised_information_gain(
+            drawn(200, 3, centers), ["view"], lambda c: (SPREADS, []), information=lambda *now: known, seed=0
+        )
 
 
 def touch(x: float, depth: float) -> Plan:
@@ -192,8 +249,12 @@ def test_of_touches_those_that_meet_the_part_tell_its_height() -> None:
     # Half of the hypotheses are not reached; those that are bound the others' height from below.
     assert 0.2 * gain[0] < gain[4] < 0.8 * gain[0]
     assert abs(gain[3] - gain[0]) < 1.0
-    again = linearised_information_gain(population, plans[:1], lambda plan: ([action_of(plan)],), seed=0)
-    assert again.best.information_gain == pytest.approx(gain[0], abs=1e-9)
+    # The noise is the same whatever else is asked.
+    again = linearised_information_gain(
+        population, [plans[3], plans[0], plans[0]], lambda plan: ([action_of(plan)],), seed=0
+    )
+    assert again.of(1).information_gain == pytest.approx(gain[0], abs=1e-9)
+    assert again.difference(again.of(1), again.of(2)) == (0.0, 0.0)
 
 
 def test_what_cannot_be_ranked_is_refused_in_a_sentence() -> None:

@@ -187,15 +187,23 @@ class ContactManifold(LazyDistribution):
     def samples(sites: Sequence[ContactManifold]) -> list[Tensor]:
         """A sample of each of several, their motions all in one batch where they can be run together.
 
+        All have the same noise, as far as they have as many stamps, so that they are compared by what differs
+        between them; torch's generator is left as one of them leaves it.
+
         Raises:
             InputError: one of them cannot be sampled.
         """
         kinds = {type(site.motion) for site in sites}
         together = getattr(next(iter(kinds)), "together", None) if len(kinds) == 1 else None
         if together is None:
-            return [site.sample() for site in sites]
-        moved = together([site.motion for site in sites], [site.pose for site in sites])
-        return [site._with_errors(rows) for site, rows in zip(sites, moved, strict=True)]
+            moved = [None] * len(sites)
+        else:
+            moved = together([site.motion for site in sites], [site.pose for site in sites])
+        state, drawn = torch.get_rng_state(), []
+        for site, rows in zip(sites, moved, strict=True):
+            torch.set_rng_state(state)
+            drawn.append(site.sample() if rows is None else site._with_errors(rows))
+        return drawn
 
     def _with_errors(self, rows: Tensor) -> Tensor:
         if tuple(rows.shape) != (*self.batch_shape, *self.event_shape):

@@ -74,7 +74,8 @@ def expected_information_gain(
         population: weighted particles.
         candidates: what may be done next; anything that `extend_args` understands.
         extend_args: the program's arguments once a candidate is done as well, those of all measurements so
-            far included; for a `Series`, those of its next step. `Batched` simulates several at once.
+            far included; for a `Series`, those of its next step. `Batched` simulates several at once. A
+            `Plan` is no action yet: `bcppl.recordings.plan.action_of(plan)` is.
         entropy: what is to fall: `weight_entropy()` (the default, the paper's), `mode_entropy(address)`,
             `neighbour_entropy(address)`, `value_entropy(address)`, or what answers alike.
         hypotheses: how many play the truth, drawn systematically by weight; None: every particle, once.
@@ -154,6 +155,7 @@ def _after_both(first: Prospect, then: Following) -> Prospect:
         entropy=first.entropy + first.information_gain - gain,
         cost=first.cost + paid,
         steps=2,
+        immediate=first.value,
         gains=gains,
         then=then.numbers,
     )

@@ -55,9 +55,11 @@ def mean_and_error(values: Tensor, weights: Tensor) -> tuple[float, float]:
 
     They are not: every particle comes once, or as often as its weight asks. So the error is a little too
     large, by the share that differs between particles rather than between draws of the noise. NaN values are
-    left out.
+    left out; of nothing the mean is NaN and the error infinite.
     """
     told = ~torch.isnan(values)
+    if not bool(told.any()):
+        return math.nan, math.inf
     values, weights = values[told], weights[told] / weights[told].sum()
     mean = weights @ values
     squares = weights.square()

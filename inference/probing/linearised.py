@@ -11,6 +11,7 @@ section 4.2.)
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -60,17 +61,20 @@ def linearised_information_gain(
     in it that explains it best; what is told of which mode is right counts as well.
 
     Only the hypotheses are simulated, the touches of all candidates in one batch. All candidates have the
-    same hypotheses and the same seed of the noise.
+    same hypotheses, and the same noise as far as they are felt at as many stamps. What `information` says
+    tells nothing of which mode is right: of several modes, such candidates are worth more than is counted
+    here, and a warning says so.
 
     With `depth=2` each candidate gains what it and the best candidate after it tell together, if that is
     worth its cost. The second is chosen before the first is felt, and tells what it would have told alone of
-    where within a mode the part is.
+    where within a mode the part is. Of two that tell as much in either order, the one that tells more by
+    itself comes first.
 
     Args:
         population: weighted particles.
         candidates: what may be done next; anything that `extend_args` understands.
         extend_args: the program's arguments once a candidate is done as well, those of all measurements so
-            far included.
+            far included; a `Plan` is no action yet, `bcppl.recordings.plan.action_of(plan)` is.
         address: of the pose; the first latent address unless given.
         hypotheses: how many play the truth, drawn systematically by weight; None: every particle, once.
         information: what a candidate tells at the hypotheses, (H, 6, 6) in the tangent space at their poses,
@@ -85,8 +89,9 @@ def linearised_information_gain(
 
     Raises:
         InputError: there are no candidates; the population has no weight, has collapsed to a point or does
-            not span the pose's axes; a candidate adds nothing to observe, or what cannot be linearised; a
-            cost, a rate or a setting is out of range.
+            not span the pose's axes; a candidate adds nothing to observe, or what cannot be linearised;
+            `information` gives no symmetric matrices, or some that are negative; a cost, a rate or a setting
+            is out of range.
         InferenceError: the simulation of a candidate failed for every hypothesis.
     """
     candidates = list(candidates)
@@ -102,6 +107,7 @@ def linearised_information_gain(
     trace = population.trace.chosen(truths.particles)
     mode = belief.label[truths.particles]
     whites: list[Tensor] = []
+    uncounted: list[int] = []
     prospects: list[Prospect] = []
     for k, told in enumerate(_all_told(trace, candidates, extend_args, information, seed)):
         white = belief.carried(told.information(), trace[address], mode)
@@ -111,6 +117,8 @@ def linearised_information_gain(
         warn_of_lost(k, torch.isnan(gains))
         if len(belief) > 1 and told.sites:
             gains = belief.entropy - _left(belief, told, trace, address, mode, gains)
+        elif len(belief) > 1:
+            uncounted.append(k)
         whites.append(white)
         gain, error = mean_and_error(gains, truths.weights)
         prospects.append(
@@ -125,6 +133,13 @@ def linearised_information_gain(
                 gains=gains,
                 weights=truths.weights,
             )
+        )
+    if uncounted:
+        warnings.warn(
+            f"the belief has {len(belief)} modes, and what {len(uncounted)} of {len(candidates)} candidates "
+            f"(the first is candidate {uncounted[0]}) tell of which is right is not counted: their "
+            "`information` says nothing of it.",
+            stacklevel=2,
         )
     if depth == 2:
         prospects = [_followed(one, whites, costs, truths) for one in prospects]
@@ -174,7 +189,7 @@ def _all_told(
         args = arguments(candidate)
         known = None if information is None else information(candidate, trace)
         if known is not None:
-            found.append(_Told(args, known))
+            found.append(_Told(args, _positive(k, known, trace.particles)))
             continue
         with seeded(seed), ContactManifold.drawn_later():
             longer, _ = extend(trace, args, {})
@@ -189,7 +204,8 @@ def _all_told(
             if not hasattr(site, "quadratic"):
                 raise InputError(
                     f"candidate {k} is observed at {one!r}, whose {type(site).__name__} has no `quadratic`; "
-                    "give `information` for it, or use expected_information_gain."
+                    "give `information` for it (for views bcppl.models.view_information.view_information), "
+                    "or use expected_information_gain."
                 )
         found.append(_Told(args, None, sites, {one: longer[one] for one in added}))
     drawn = [
@@ -204,6 +220,31 @@ def _all_told(
         for (told, a, _), value in zip(drawn, samples, strict=True):
             told.values[a] = value
     return found
+
+
+def _positive(number: int, information: object, count: int) -> Tensor:
+    """What a candidate is said to tell (H, 6, 6), once it was seen that it may be so."""
+    said = f"what candidate {number} is said to tell"
+    try:
+        known = torch.as_tensor(information, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"{said} is a {type(information).__name__}; give ({count}, 6, 6) numbers.") from None
+    if tuple(known.shape) != (count, 6, 6):
+        raise InputError(
+            f"{said} has shape {tuple(known.shape)}; give ({count}, 6, 6): a matrix for each hypothesis."
+        )
+    sound = known[torch.isfinite(known).all(dim=2).all(dim=1)]
+    if len(sound):
+        # Of less than one to the square metre or radian the sign is rounding.
+        scale = sound.diagonal(dim1=1, dim2=2).abs().clamp(min=1.0).sqrt()
+        unitless = sound / (scale[:, :, None] * scale[:, None, :])
+        even = bool((unitless - unitless.mT).abs().max() < 1e-3)
+        if not (even and float(torch.linalg.eigvalsh(unitless).min()) > -0.1):
+            raise InputError(
+                f"{said} is no information: its matrices are to be symmetric and not negative; check the "
+                "sign."
+            )
+    return known
 
 
 def _left(belief: Gaussians, told: _Told, trace: Trace, address: str, mode: Tensor, within: Tensor) -> Tensor:
@@ -257,14 +298,16 @@ def _followed(
     """A prospect that holds what the best second step, chosen now, tells as well."""
     alone = nats(whites[first.number])
     both = torch.stack([nats(whites[first.number] + white) for white in whites])
-    expected = [mean_and_error(first.gains + one - alone, truths.weights) for one in both]
-    worth = torch.tensor(
-        [gain - first.information_gain - price for (gain, _), price in zip(expected, costs, strict=True)]
-    )
+    # By what it adds, over the hypotheses that tell of both: those of which one is lost may be the poor ones.
+    added = [mean_and_error(one - alone, truths.weights)[0] for one in both]
+    worth = torch.tensor([more - price for more, price in zip(added, costs, strict=True)]).nan_to_num(-1.0)
     best = int(worth.argmax())
     if not float(worth[best]) > 0.0:
-        return replace(first, steps=2, then=torch.full((len(truths),), -1))
-    gain, error = expected[best]
+        return replace(
+            first, steps=2, then=torch.full((len(truths),), -1, dtype=torch.int64), immediate=first.value
+        )
+    gain = first.information_gain + added[best]
+    _, error = mean_and_error(first.gains + both[best] - alone, truths.weights)
     return replace(
         first,
         information_gain=gain,
@@ -274,4 +317,5 @@ def _followed(
         steps=2,
         gains=first.gains + both[best] - alone,
         then=torch.full((len(truths),), best),
+        immediate=first.value,
     )

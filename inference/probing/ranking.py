@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,6 +14,8 @@ from bcppl.errors import InputError
 from bcppl.inference.probing.hypotheses import mean_and_error
 
 Price = float | Mapping[str, float]
+
+_ALIKE = 6  # decimals of a nat, beyond which is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +33,8 @@ class Prospect:
         gains: (H,) the gain under every hypothesis, NaN where it could not be simulated. The k-th is the same
             truth with the same noise for every candidate.
         weights: (H,) of the hypotheses.
+        immediate: nats that it tells by itself less its own cost; of candidates that are worth the same it
+            comes first that has more of it. NaN where nothing was looked ahead: `value` says it.
         then: (H,) int64 the number of the best candidate after this one, under every hypothesis; -1 where
             none is worth its cost. None where nothing was looked ahead.
     """
@@ -44,6 +49,7 @@ class Prospect:
     gains: Tensor = field(repr=False)
     weights: Tensor = field(repr=False)
     then: Tensor | None = field(default=None, repr=False)
+    immediate: float = math.nan
 
     @property
     def value(self) -> float:
@@ -82,7 +88,7 @@ class Ranking(Sequence[Prospect]):
         """By how many nats the gain of one exceeds that of another, and the standard error of that.
 
         The hypotheses and the noise's seed are the same for both, so it is smaller than the two errors
-        together. It counts one step of look-ahead's error only.
+        together. It counts one step of look-ahead's error only. (nan, inf) where no hypothesis told of both.
         """
         return mean_and_error(first.gains - second.gains, first.weights)
 
@@ -96,8 +102,16 @@ class Ranking(Sequence[Prospect]):
 
 
 def ranked(prospects: Sequence[Prospect], entropy: float) -> Ranking:
-    """Prospects in order; equal ones stay as they were given."""
-    return Ranking(tuple(sorted(prospects, key=lambda p: (-p.steps, -p.value, p.number))), entropy)
+    """Prospects in order; of equal ones those first that tell more at once, then as they were given.
+
+    Two touches tell as much in either order, and the rest of a plan may never be carried out.
+    """
+
+    def place(one: Prospect) -> tuple[float, ...]:
+        at_once = one.value if math.isnan(one.immediate) else one.immediate
+        return -one.steps, -round(one.value, _ALIKE), -at_once, one.number
+
+    return Ranking(tuple(sorted(prospects, key=place)), entropy)
 
 
 def costs_in_nats(

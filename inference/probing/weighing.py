@@ -46,13 +46,15 @@ def _independent(trace: Trace, observed: Sequence[str], values: Mapping[str, Ten
     """The observed sites whose distributions do not hang on what others of them observe.
 
     The first never does. Another one shows it where particles are given one another's observations, all of
-    them in turn: its inputs are the same then. A site that does not say what it hangs on may hang on any.
+    them in turn, by two pairings: by one alone, each could be given what it drew itself. Its inputs are the
+    same then. A site that does not say what it hangs on may hang on any.
     """
     if len(observed) == 1:
         return list(observed)
     count, fixed = len(values[observed[0]]), list(observed)
-    for first in range(0, count, trace.particles):
-        index = (first + torch.arange(trace.particles)) % count
+    turns = [torch.arange(first, first + trace.particles) for first in range(0, count, trace.particles)]
+    for turn in (*turns, *(1 + turn for turn in turns[:1])):
+        index = turn % count
         moved = trace.at({a: values[a][index] for a in observed})
         fixed = [a for k, a in enumerate(fixed) if k == 0 or unchanged(trace, moved, a)]
     return fixed
