@@ -46,6 +46,7 @@ TRUTH = "#00A6D6"
 HEAVIEST = 10
 SMALLEST_ADD = 0.01  # mm: below it a logarithmic axis shows nothing of interest
 # How a peg moves along a planned way, or that a camera looks.
+OTHER = "#c7a6d8"  # candidates that were not chosen
 WAYS = {
     "free": "#56B4E9",
     "guarded": STRONG,
@@ -224,6 +225,8 @@ def action_in_3d(
 ) -> Figure:
     """What is to be done next: the part at a belief's mean, its particles, and the way of the peg's tip.
 
+    The way is the commanded one, as if nothing were met: guarded motions end where the surface is.
+
     Args:
         part: whose pose is sought.
         belief: (title, `world_from_part` (N, 7), log weights (N,)); weights in any scale.
@@ -235,7 +238,7 @@ def action_in_3d(
         InputError: as `belief_in_3d`.
     """
     title, poses, weights, mean = belief[0], *checked(*belief)
-    length = 0.45 * 1000.0 * part.diameter
+    length = 0.2 * 1000.0 * part.diameter
     body, edges = outline(part)
     figure = Figure(figsize=(7.0, 5.6))
     with rc_context({"grid.color": "0.88", "grid.linewidth": 0.6}):
@@ -250,7 +253,7 @@ def action_in_3d(
     )
     for other in others:
         way = _way(other, peg, mean)
-        axes.plot(*way.T, color="0.6", linewidth=0.7, alpha=0.6, zorder=4)
+        axes.plot(*way.T, color=OTHER, linewidth=0.7, alpha=0.8, zorder=4)
     way = _way(action, peg, mean)
     manners = action.manners if isinstance(action, Plan) else ("looking",)
     entries: dict[str, Line2D] = {}
@@ -259,12 +262,16 @@ def action_in_3d(
         wide, over = (1.4, 5) if manner == "free" else (2.6, 6)  # a way back must not hide the touch
         axes.plot(*way[k : k + 2].T, color=color, linewidth=wide, zorder=over)
         entries[manner] = Line2D([], [], color=color, linewidth=2.4)
-    entries["particles"] = Line2D([], [], color=PARTICLE, linewidth=1.0)
+    entries["particles (z axes)"] = Line2D([], [], color=PARTICLE, linewidth=1.0)
+    if len(others) > 1:
+        entries["other candidates"] = Line2D([], [], color=OTHER, linewidth=1.0)
     shown = np.concatenate([limits_of(part, length, poses, mean), way])
     frame(axes, shown.min(axis=0), shown.max(axis=0))
-    axes.set_title(f"{title}\n{in_words(poses, weights, mean, None)}", fontsize=10)
-    figure.legend(entries.values(), entries.keys(), loc="lower center", ncols=5, frameon=False, fontsize=9)
-    figure.subplots_adjust(left=0.02, right=0.95, top=0.9, bottom=0.1)
+    commanded = "the tip's way as commanded, as if nothing were met"
+    said = f"{title}\n{in_words(poses, weights, mean, None)}"
+    axes.set_title(f"{said}\n{commanded}" if isinstance(action, Plan) else said, fontsize=10)
+    figure.legend(entries.values(), entries.keys(), loc="lower center", ncols=4, frameon=False, fontsize=9)
+    figure.subplots_adjust(left=0.02, right=0.95, top=0.87, bottom=0.14)
     return figure
 
 

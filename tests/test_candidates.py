@@ -6,9 +6,11 @@ import dataclasses
 import functools
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -32,7 +34,7 @@ from bcppl.inference.probing.filters import (
     within_reach,
 )
 from bcppl.inference.probing.rules import surface_variance
-from bcppl.inference.probing.touching import Spot, face_of, middles_of_strokes, slide, touch
+from bcppl.inference.probing.touching import Spot, Touching, face_of, middles_of_strokes, slide, touch
 from bcppl.models.robots import load_robot
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.recordings.action_file import load_actions, save_actions
@@ -166,7 +168,7 @@ def test_filters_say_how_many_they_remove_and_why() -> None:
     assert pressing_force(plans[0]) == pytest.approx(4.0 + 2500.0 * 0.0015, rel=0.01)
     found = filtered([*plans, hard], [no_harder_than(10.0), from_within(down, 0.5, "come from aside")])
     assert found.removed == {"press with more than 10 N": 1, "come from aside": 3}
-    assert str(found) == "1 candidate; 1 press with more than 10 N; 3 come from aside"
+    assert str(found) == "1 candidate; left out those that press with more than 10 N (1), come from aside (3)"
 
 
 def test_what_an_arm_does_not_reach_is_left_out() -> None:
@@ -185,7 +187,7 @@ def test_what_an_arm_does_not_reach_is_left_out() -> None:
     limits = np.array([[joint.lower, joint.upper] for joint in arm.joints])
     assert (angles >= limits[:, 0] - 1e-9).all() and (angles <= limits[:, 1] + 1e-9).all()
     with pytest.raises(
-        InputError, match=r"none of 1 candidate is left .* 1 are out of panda's reach"
+        InputError, match=r"none of 1 candidate is left .* they are out of panda's reach \(1\)"
     ) as caught:
         filtered([far], [within_reach(Mounted(arm, "panda_hand_tcp", held, here))])
     assert_one_sentence(str(caught.value))
@@ -237,6 +239,23 @@ def test_what_leaves_no_choice_is_refused_in_a_sentence() -> None:
         with pytest.raises(InputError, match=says) as caught:
             call()
         assert_one_sentence(str(caught.value))
+    for says in (["no"] * len(planned(5)[2]), [math.nan] * len(planned(5)[2]), torch.tensor(True), [[True]]):
+        with pytest.raises(InputError, match="does not say of each"):
+            filtered(planned(5)[2], [Filter("are dull", lambda found, says=says: says)])  # type: ignore[misc]
+    with pytest.raises(InputError, match=r"a touch has press 1\.5"):
+        touch(belief, scene.part, scene.peg, Spot(np.zeros(3), UP), Touching(press=1.5))
+
+
+def test_a_motion_that_is_held_before_anything_was_met_is_looked_at_as_well() -> None:
+    scene, gap, _ = planned(5)
+    plan = touch(about(scene, 0.001), scene.part, scene.peg, Spot(np.array([-0.02, -0.02, 0.0]), UP))
+    through = plan.world_from_peg.copy()
+    through[3:5, 2] -= 0.05
+    manners = tuple("held" if manner == "guarded" else manner for manner in plan.manners)
+    held = dataclasses.replace(plan, world_from_peg=through, manners=manners)
+    assert pressing_force(held) > 100.0
+    for each in (no_harder_than(10.0), clear_of_part(gap, scene.truth)):
+        assert list(filtered([plan, held], [each])) == [plan]
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".json"])
@@ -245,7 +264,10 @@ def test_actions_come_back_from_a_file_bit_for_bit(suffix: str, tmp_path: Path) 
     device = dataclasses.replace(
         scene.cameras[0], device="wrist", distortion=(0.1, 0.0, 0.0, 0.0), wrist_from_camera=scene.truth
     )
-    actions = [*found, View(device)]
+    knots = np.repeat(poses.identity(5000).numpy()[:1], 5000, axis=0)
+    ones = np.ones(6)
+    long = Plan("long", np.linspace(0.0, 50.0, 5000), knots, ("held",) * 4999, 4.0, ones, ones)
+    actions = [*found, View(device), long]
     save_actions(actions, tmp_path / f"actions{suffix}")
     back = load_actions(tmp_path / f"actions{suffix}")
     for there, here in zip(actions, back, strict=True):
@@ -292,8 +314,55 @@ def test_files_of_actions_that_make_no_sense_are_refused_in_a_sentence(tmp_path:
         with pytest.raises(InputError, match=says) as caught:
             load_actions(tmp_path / "plan.json")
         assert_one_sentence(str(caught.value))
-    (tmp_path / "plan.json").write_text(json.dumps({"actions": [plan]}))
-    assert len(load_actions(tmp_path / "plan.json")) == 1
+    camera = {"kind": "view", "name": "b", "world_from_camera": plan["world_from_peg"][0]} | {  # type: ignore[index]
+        **{"width": 160, "height": 120, "fx": 100.0, "fy": 100.0, "cx": 80.0, "cy": 60.0},
+        **{"near": 0.1, "far": 2.0},
+    }
+    for field, value, says in (
+        ("width", "160", "'160' pixels wide"),
+        ("height", -1, "-1 pixels high"),
+        ("fx", "a", "focal length fx of 'a'"),
+        ("far", 0.05, "sees from 0.1 m to 0.05 m"),
+        ("wrist_from_camera", [1, 2], "wrist_from_camera"),
+        ("world_from_camera", [0.0] * 7, "world_from_camera"),
+    ):
+        (tmp_path / "view.json").write_text(json.dumps({"actions": [camera | {field: value}]}))
+        with pytest.raises(InputError, match=f"action 0 of .*view.json: .*{says}") as caught:
+            load_actions(tmp_path / "view.json")
+        assert_one_sentence(str(caught.value))
+    (tmp_path / "plan.json").write_text(json.dumps({"actions": [plan, camera]}))
+    assert len(load_actions(tmp_path / "plan.json")) == 2
+    (tmp_path / "plan.json").write_text('{"schema_version": "1", "actions": []}')
+    with pytest.raises(InputError, match="schema_version '1'"):
+        load_actions(tmp_path / "plan.json")
+    save_actions([], tmp_path / "empty.h5")
+    assert load_actions(tmp_path / "empty.h5") == []
+    with pytest.raises(InputError, match="cannot be written"):
+        save_actions([], tmp_path / f"{'a' * 300}.json")
+
+
+def test_a_damaged_file_of_actions_says_which_of_them_it_is(tmp_path: Path) -> None:
+    def refused(says: str, damage: Callable[[h5py.Group], None]) -> None:
+        save_actions(planned(5)[2][:2], tmp_path / "plans.h5")
+        with h5py.File(tmp_path / "plans.h5", "r+") as file:
+            damage(file["actions/000001"])
+        with pytest.raises(InputError, match=f"action 1 of .*plans.h5.* {says}") as caught:
+            load_actions(tmp_path / "plans.h5")
+        assert_one_sentence(str(caught.value))
+
+    def lacking(group: h5py.Group) -> None:
+        del group["times"]
+
+    def deep(group: h5py.Group) -> None:
+        del group["times"]
+        group.create_group("times")
+
+    refused("lacks 'times'", lacking)
+    refused("times in 'a group'", deep)
+    refused("neither of kind", lambda group: group.attrs.update(kind="vieuw"))
+    refused(
+        "world_from_peg in 'mm", lambda group: group["world_from_peg"].attrs.update(units="mm mm mm 1 1 1 1")
+    )
 
 
 def test_a_slide_goes_as_far_as_it_is_asked_to() -> None:

@@ -55,6 +55,7 @@ def here(tmp_path: Path) -> Path:
     recording, beliefs = saved()
     (tmp_path / "look.h5").write_bytes(recording)
     (tmp_path / "runs").mkdir()
+    (tmp_path / "folder.json").mkdir()
     for name, content in beliefs.items():
         (tmp_path / "runs" / name).write_bytes(content)
     noted = {"recording": str(tmp_path / "look.h5"), "model": "look_and_touch"}
@@ -98,7 +99,7 @@ def test_views_and_touches_are_ranked_together_and_other_models_by_reweighing(
     assert len(views) == 2 and 0.5 < max(views) < touched
     save(short(1), here / "push.h5")
     for kind, says in (
-        ("view", "model point_probe cannot foretell these"),
+        ("view", "model point_probe cannot foretell what"),
         ("touch", "holds no peg to carry out 'touch' with"),
     ):
         refused(bcppl("probe", "push.h5", "--candidates", f"{kind}:1", "--particles", 6), says)
@@ -112,8 +113,9 @@ def refused(ran: Ran, says: str) -> None:
     assert says in lines[0], lines[0]
 
 
+HAND = ["--robot", "panda", "--link", "panda_hand"]
 WRONG = {
-    "none": (["--candidates", ""], "--candidates names none"),
+    "none": (["--candidates", ""], "there are no candidates: --candidates is ''"),
     "kind": (["--candidates", "poke:3"], "'poke:3'; give kinds (touch"),
     "number": (["--candidates", "touch:x"], "'touch:x'"),
     "zero": (["--candidates", "touch:0"], "there are no candidates"),
@@ -127,11 +129,19 @@ WRONG = {
     "table": (["--table", "0.5"], "lead into the table"),
     "robot": (["--robot", "panda"], "without --link"),
     "robot's name": (["--robot", "hal", "--link", "x"], "no URDF file and no shipped robot"),
-    "held": (["--robot", "panda", "--link", "panda_hand", "--link-from-peg", "1 2"], "has 2 numbers"),
+    "held": ([*HAND, "--link-from-peg", "1 2"], "has 2 numbers"),
+    "held somehow": (HAND, "without --link-from-peg"),
     "reach": (
-        ["--robot", "panda", "--link", "panda_hand", "--world-from-base", "9 0 0 1 0 0 0"],
-        "are out of panda's reach",
+        [*HAND, "--link-from-peg", "0 0 0.1 0 1 0 0", "--world-from-base", "9 0 0 1 0 0 0"],
+        "out of panda's reach",
     ),
+    "link": (["--link", "panda_hand"], "give it with --robot"),
+    "itself": (["--output", "runs/belief_002.h5"], "would overwrite runs/belief_002.h5"),
+    "folder's name": (["--output", "folder.json"], "is a folder"),
+    "many": (["--candidates", "touch:" + "9" * 5000], "10000 at most"),
+    "hypotheses": (["--hypotheses", "1"], "--hypotheses is 1"),
+    "table's height": (["--table", "nan"], "--table is nan"),
+    "inference": (["--inference", "guided_smc"], "--inference says nothing"),
     "of": (["--of", "nothing"], "there is no recording 'nothing'"),
 }
 
@@ -158,7 +168,7 @@ def test_another_recording_and_a_plan_through_the_part_are_noticed(
     down[0, 2] += 0.2
     plan = Plan("down", np.array([0.0, 1.0]), down.numpy(), ("free",), 4.0, np.ones(6), np.ones(6))
     save_actions([plan], here / "down.json")
-    refused(bcppl("probe", "runs/belief_002.h5", "--candidates", "down.json"), "1 lead through the part")
+    refused(bcppl("probe", "runs/belief_002.h5", "--candidates", "down.json"), "lead through the part (1)")
 
 
 def test_beliefs_that_say_nothing_are_refused(bcppl: Callable[..., Ran], here: Path) -> None:
@@ -172,6 +182,15 @@ def test_beliefs_that_say_nothing_are_refused(bcppl: Callable[..., Ran], here: P
         )
         return f"runs/{name}"
 
+    save_belief(
+        belief,
+        "runs/mine.h5",
+        label="mine",
+        log_evidence=0.0,
+        random_state=torch.Generator().get_state(),
+        latent=latent,
+    )
+    refused(bcppl("probe", "runs/mine.h5", "--candidates", "touch:1"), "has the label 'mine'")
     none = torch.full((count,), -torch.inf, dtype=torch.float64)
     weightless = written("none.h5", Belief(belief.world_from_part, none), latent)
     same = {a: v[:1].expand_as(v).clone() for a, v in latent.items()}

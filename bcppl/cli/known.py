@@ -64,6 +64,10 @@ def known(
         InputError: something is not to be found, does not fit, or cannot be gone on from.
     """
     if Path(name).is_file() and is_belief(name):
+        if inference is not None:
+            raise InputError(
+                f"{name} is a belief, on which nothing is run, so --inference says nothing; leave it out."
+            )
         return _read(Path(name), of, model, check)
     if of is not None:
         raise InputError(
@@ -109,7 +113,7 @@ def _read(path: Path, of: str | None, model: str | None, check: Callable[[Record
         )
     whole = loading.recording(of)
     chosen = _chosen(model or noted.get("model") or whole.model)
-    taken = 0 if label == "prior" else int(label.rpartition(" ")[2])
+    taken = _taken(path, label)
     if taken > len(whole.measurements):
         raise InputError(
             f"{path} stands after {label}, but {of} has {len(whole.measurements)} measurements; "
@@ -138,6 +142,17 @@ def _read(path: Path, of: str | None, model: str | None, check: Callable[[Record
     check(whole)
     recording = Recording(**{**vars(whole), "measurements": measured})
     return Known(recording, chosen, Population(trace, belief.log_weights.to(torch.float64)), scene)
+
+
+def _taken(path: Path, label: str) -> int:
+    """How many measurements a belief has taken in, by the label of its step."""
+    count = "0" if label == "prior" else label.rpartition(" ")[2]
+    if not (count.isascii() and count.isdecimal() and len(count) < 10):
+        raise InputError(
+            f"{path} has the label {label!r}, which does not say how many measurements it has taken in; give "
+            'one that `bcppl run` wrote, or save it with the label of its step ("prior", "measurement 3").'
+        )
+    return int(count)
 
 
 def _noted(path: Path) -> dict[str, Any]:

@@ -33,6 +33,7 @@ from bcppl.inference.probing.filters import (
     lasting,
     name_of,
     no_harder_than,
+    pressing_force,
     refuse_none,
     within_reach,
 )
@@ -51,7 +52,9 @@ from bcppl.simulators.gap import PegGap
 DEFAULT = ",".join(f"{kind}:{count}" for kind, count in MIXED.items())
 WAYS = ("linearised", "reweighing")
 COUNT = 8  # of a kind that is named without a number
+MOST = 10_000  # of a kind: more fit no memory, and are ranked in hours
 NUMBERS = "x y z qw qx qy qz"
+STILL = "0 0 0 1 0 0 0"
 
 
 def probe(
@@ -100,8 +103,16 @@ def probe(
         typer.Option(help="An arm (panda, iiwa or a URDF file): what it does not reach is left out."),
     ] = None,
     link: Annotated[str | None, typer.Option(help="The arm's link that holds the peg.")] = None,
-    link_from_peg: Annotated[str, typer.Option(help=f"How it is held there: {NUMBERS}.")] = "0 0 0 1 0 0 0",
-    world_from_base: Annotated[str, typer.Option(help=f"Where the arm stands: {NUMBERS}.")] = "0 0 0 1 0 0 0",
+    link_from_peg: Annotated[
+        str | None,
+        typer.Option(
+            help=f"The peg's frame (its tip at the lowest z) in the link's: {NUMBERS}; panda_hand, whose z "
+            "leads along the fingers, holds it at about 0 0 0.1 0 1 0 0."
+        ),
+    ] = None,
+    world_from_base: Annotated[
+        str | None, typer.Option(help=f"Where the arm stands: {NUMBERS}; at the world's origin by default.")
+    ] = None,
 ) -> None:
     """Say where to touch or look next: candidates by the nats that each is expected to tell."""
     whole_number("--top is {}", top)
@@ -111,10 +122,11 @@ def probe(
     if by not in (None, *WAYS):
         raise InputError(f"--by is {by!r}; give one of {', '.join(WAYS)}.")
     output = Path(f"{Path(recording).stem}_next.json") if output is None else output
-    if output.suffix not in SUFFIXES:
-        raise InputError(f"--output is {output}; give a file that ends in {' or '.join(SUFFIXES)}.")
-    if not output.parent.is_dir():
-        raise InputError(f"there is no folder {output.parent} to write {output.name} into; make it first.")
+    picture = _picture(output, [recording, candidates, *filter(None, (of, model, inference))])
+    if hypotheses is not None:
+        whole_number("--hypotheses is {}", hypotheses, least=2)
+    if table is not None:
+        number_within("--table is {}", table)
     own = load_actions(candidates) if _is_file(candidates) else None
     kinds = _kinds(candidates) if own is None else {}
     filters = _filters(force, above, robot, link, link_from_peg, world_from_base, seed)
@@ -131,16 +143,34 @@ def probe(
             ranking = rank(before.population, found, scene)
         except (AttributeError, KeyError, TypeError) as error:
             raise InputError(
-                f"model {model or before.recording.model} cannot foretell these candidates ({error}); give "
-                "kinds that it explains, or a model of depth images and of a peg's touches: look_and_touch."
+                f"model {model or before.recording.model} cannot foretell what views and plans of a peg "
+                "would observe; run a model of depth images and of a peg's touches, such as look_and_touch; "
+                "pushes of a point finger are ranked from Python, with expected_information_gain."
             ) from error
     console.width = max(console.width, 100)  # no number is cut, also where the output is no terminal
     console.print(_shown(ranking, top))
     best = named_apart(ranking.best.candidate, before.recording)
     save_actions([best], output)
-    picture = output.with_suffix(".png")
     _draw(before, best, found).savefig(picture, dpi=150)
     console.print(f"the best is in {output}, its picture in {picture}", soft_wrap=True)
+
+
+def _picture(output: Path, given: Sequence[str]) -> Path:
+    """Where the picture goes; refuses what cannot be written, or would overwrite what is read."""
+    if output.suffix not in SUFFIXES:
+        raise InputError(f"--output is {output}; give a file that ends in {' or '.join(SUFFIXES)}.")
+    if not output.parent.is_dir():
+        raise InputError(f"there is no folder {output.parent} to write {output.name} into; make it first.")
+    picture = output.with_suffix(".png")
+    for file in (output, picture):
+        if file.is_dir():
+            raise InputError(f"{file} is a folder; give another name for the best action with --output.")
+        for name in given:
+            if file.exists() and Path(name).exists() and file.samefile(name):
+                raise InputError(
+                    f"--output would overwrite {name}, which is read; give another name for the best action."
+                )
+    return picture
 
 
 def _rank(by: str | None, before: Known, scene: Any, settings: dict[str, Any]) -> Rank:
@@ -161,8 +191,8 @@ def _pegless(own: Sequence[Plan | View] | None, kinds: dict[str, int]) -> Callab
     def check(recording: Recording) -> None:
         if asked and recording.peg is None:
             raise InputError(
-                f"the recording holds no peg to carry out {asked[0]!r} with; add the peg, or ask for views "
-                "(--candidates view:8)."
+                f"the recording holds no peg to carry out {asked[0]!r} with; add the peg, or where the model "
+                "explains depth images ask for views (--candidates view:8)."
             )
 
     return check
@@ -182,9 +212,14 @@ def _kinds(words: str) -> dict[str, int]:
                 f"--candidates has {word!r}; give kinds ({', '.join(KINDS)}), each with a number if you like "
                 "(touch:20,slide:12), or a file that ends in .h5 or .json."
             )
+        if len(count) > len(str(MOST)) or int(count or COUNT) > MOST:
+            raise InputError(f"--candidates asks for {count[:20]} of {kind}; give {MOST} at most.")
         found[kind] = found.get(kind, 0) + int(count or COUNT)
-    if not found:
-        raise InputError("--candidates names none; give kinds such as touch:20,slide:12, or a file of plans.")
+    if not any(found.values()):
+        raise InputError(
+            f"there are no candidates: --candidates is {words!r}; give kinds such as touch:20,slide:12, or a "
+            "file of plans."
+        )
     return found
 
 
@@ -193,8 +228,8 @@ def _filters(
     above: float | None,
     robot: str | None,
     link: str | None,
-    link_from_peg: str,
-    world_from_base: str,
+    link_from_peg: str | None,
+    world_from_base: str | None,
     seed: int,
 ) -> list[Filter]:
     found = [] if force is None else [no_harder_than(force)]
@@ -205,9 +240,19 @@ def _filters(
     if robot is not None:
         if link is None:
             raise InputError("--robot is given without --link; say which link of the arm holds the peg.")
+        if link_from_peg is None:
+            raise InputError(
+                "--robot is given without --link-from-peg; say how the link holds the peg (panda_hand, whose "
+                'z leads along the fingers, at about "0 0 0.1 0 1 0 0").'
+            )
         arm = load_robot(robot, tip=link)
-        held, stands = _pose("--link-from-peg", link_from_peg), _pose("--world-from-base", world_from_base)
+        held, stands = (
+            _pose("--link-from-peg", link_from_peg),
+            _pose("--world-from-base", world_from_base or STILL),
+        )
         found.append(within_reach(Mounted(arm, link, held, stands), seed=seed))
+    elif (link, link_from_peg, world_from_base) != (None, None, None):
+        raise InputError("--link, --link-from-peg and --world-from-base are of an arm; give it with --robot.")
     return found
 
 
@@ -269,14 +314,16 @@ def _shown(ranking: Ranking, top: int) -> Table:
     shown = Table(
         title=f"entropy now: {ranking.entropy:.2f} nats", title_justify="left", box=None, pad_edge=False
     )
-    for k, name in enumerate(("rank", "what", "gain (nats)", "error", "cost (nats)", "time (s)")):
+    columns = ("rank", "what", "gain (nats)", "error", "cost (nats)", "value", "time (s)", "press (N)")
+    for k, name in enumerate(columns):
         shown.add_column(name, justify="left" if k == 1 else "right", no_wrap=True)
     for k, each in enumerate(ranking[:top]):
-        cells = (each.information_gain, each.standard_error, each.cost)
+        what = each.candidate
+        cells = (each.information_gain, each.standard_error, each.cost, each.value, lasting(what))
         numbers = [f"{value:.2f}" for value in cells]
         numbers[1] = f"± {numbers[1]}"
-        name = escape(name_of(each.candidate))
-        shown.add_row(str(k + 1), name, *numbers, f"{lasting(each.candidate):.2f}")
+        press = f"{pressing_force(what):.1f}" if isinstance(what, Plan) else ""
+        shown.add_row(str(k + 1), escape(name_of(what)), *numbers, press)
     return shown
 
 

@@ -10,7 +10,8 @@ Both hold the same, a list of actions in SI units, frames in the names (schema v
     kind "view"   name; width, height, fx, fy, cx, cy, near, far, world_from_camera (7): a camera, as in a
                   recording; distortion, wrist_from_camera (7) and device where there is one
 
-Numbers come back bit for bit from either.
+The JSON also says its units, and in words (`about`) what the numbers are; neither is read again. Numbers
+come back bit for bit from either.
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
+from bcppl import poses
+from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.recordings.cameras import INTRINSICS, RANGE, read_camera, write_camera
 from bcppl.recordings.datasets import POSE_UNITS, array, number, put
@@ -34,6 +38,13 @@ from bcppl.simulators.camera import Camera
 FORMAT = "bcppl actions"
 SCHEMA_VERSION = 1
 SUFFIXES = (".h5", ".json")
+ABOUT = (
+    "Poses are x y z qw qx qy qz in the world; world_from_peg is the peg's frame, its tip at its lowest z. "
+    "manners[k] is how pose k is left for pose k + 1, from times[k] to times[k + 1]: free (as commanded), "
+    "guarded (until a force of `force` is felt; the way that was left then stays undone), held (pressed on, "
+    "as planned but for that way) or searching (held, until the peg has sunk by `sink`). stiffness, damping "
+    "are of the arm along, then about, the commanded peg's axes; rate is of what is measured."
+)
 
 _PLAN_UNITS = {
     "times": "s",
@@ -50,6 +61,15 @@ _VIEW_KEYS = (
     *("kind", "name", "world_from_camera", *INTRINSICS, *RANGE),
     *("distortion", "wrist_from_camera", "device"),
 )
+
+_CAMERA_KEYS = {"world_from_camera", *INTRINSICS, *RANGE}
+_UNITS = {
+    **_PLAN_UNITS,
+    **INTRINSICS,
+    **RANGE,
+    "world_from_camera": POSE_UNITS,
+    "wrist_from_camera": POSE_UNITS,
+}
 
 Action = Plan | View
 
@@ -70,19 +90,24 @@ def save_actions(actions: Sequence[Action], path: str | os.PathLike[str]) -> Non
             tree = {
                 "format": FORMAT,
                 "schema_version": SCHEMA_VERSION,
+                "about": ABOUT,
+                "units": _UNITS,
                 "actions": [_tree_of(action) for action in actions],
             }
             unfinished.write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
         else:
             with h5py.File(unfinished, "w") as file:
                 file.attrs.update(format=FORMAT, schema_version=SCHEMA_VERSION)
+                file.create_group("actions")
                 for k, action in enumerate(actions):
                     _write(file.create_group(f"actions/{k:06d}"), action)
         os.replace(unfinished, path)
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be written: {error}.") from error
     finally:
-        unfinished.unlink(missing_ok=True)
+        # What could not be made, such as a name that is too long, cannot be removed either.
+        with suppress(OSError, ValueError):
+            unfinished.unlink(missing_ok=True)
 
 
 def load_actions(path: str | os.PathLike[str]) -> list[Action]:
@@ -108,9 +133,9 @@ def _refuse_suffix(path: Path) -> None:
 def _refuse_header(path: Path, header: Mapping[str, Any]) -> None:
     if header.get("format", FORMAT) != FORMAT:
         raise InputError(f"{path} holds a {header['format']}, no actions; give a file of plans and views.")
-    version = header.get("schema_version", SCHEMA_VERSION)
-    if not isinstance(version, int | np.integer) or version > SCHEMA_VERSION:
-        raise InputError(f"{path} was written by a later bcppl; upgrade bcppl.")
+    version = whole_number(f"{path} has schema_version {{}}", header.get("schema_version", SCHEMA_VERSION))
+    if version > SCHEMA_VERSION:
+        raise InputError(f"{path} was written by a later bcppl (schema {version}); upgrade bcppl.")
 
 
 # ---- JSON
@@ -134,7 +159,7 @@ def _tree_of(action: Action) -> dict[str, Any]:
 def _from_json(path: Path) -> list[Action]:
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is no valid JSON ({error}); write it again.") from error
     if not isinstance(tree, dict) or not isinstance(tree.get("actions"), list):
         raise InputError(f'{path} holds no list of "actions"; see `bcppl.recordings.action_file` for one.')
@@ -158,7 +183,7 @@ def _action_of(entry: Any, what: str) -> Action:
             return _plan(str(entry["name"]), tuple(entry["manners"]), given)
         numbers = {n: entry[n] for n in (*INTRINSICS, *RANGE)}
         wrist = entry.get("wrist_from_camera")
-        return View(
+        return _view(
             Camera(
                 name=str(entry["name"]),
                 world_from_camera=np.array(entry["world_from_camera"], dtype=np.float64),
@@ -174,6 +199,13 @@ def _action_of(entry: Any, what: str) -> Action:
         raise InputError(f"{what} lacks {error.args[0]!r}; add it.") from error
     except (TypeError, ValueError) as error:
         raise InputError(f"{what} holds what is no number ({error}); write numbers in SI units.") from error
+
+
+def _view(camera: Camera) -> View:
+    camera.stated_pose()
+    if camera.wrist_from_camera is not None:
+        poses.as_pose(camera.wrist_from_camera, f"the wrist_from_camera of {camera.name!r}")
+    return View(camera)
 
 
 def _plan(name: str, manners: tuple[Any, ...], given: Mapping[str, Any]) -> Plan:
@@ -193,7 +225,8 @@ def _write(group: h5py.Group, action: Action) -> None:
         write_camera(group, action.camera)
         return
     group.attrs.update(kind="plan", name=action.name)
-    group.attrs["manners"] = list(action.manners)
+    # No attribute: those hold 64 KiB.
+    group.create_dataset("manners", data=list(action.manners), dtype=h5py.string_dtype())
     for name, units in _PLAN_UNITS.items():
         put(group, name, getattr(action, name), units)
 
@@ -205,22 +238,49 @@ def _from_hdf5(path: Path) -> list[Action]:
             if "format" not in header:
                 raise InputError(f"{path} is an HDF5 file but holds no actions; give one of plans and views.")
             _refuse_header(path, header)
-            return [_read(group) for _, group in sorted(file["actions"].items())]
+            entries = file["actions"]
+            if not isinstance(entries, h5py.Group):
+                raise InputError(f"{path} has actions that are no group; make it again.")
+            return [_read(entry, f"action {k} of {path}") for k, entry in enumerate(_sorted(entries))]
     except InputError:
         raise
     except KeyError as error:
-        raise InputError(f"{path} lacks {error.args[0]!r}; make it again.") from error
+        raise InputError(f"{path} lacks its group of actions; make it again.") from error
     except (OSError, TypeError, ValueError) as error:
         raise InputError(f"{path} is damaged or no HDF5 file ({error}); make it again.") from error
 
 
-def _read(group: h5py.Group) -> Action:
-    name = str(group.attrs["name"])
-    if str(group.attrs["kind"]) == "view":
-        return View(read_camera(name, group))
-    given = {
-        each: number(group, each) if group[each].ndim == 0 else array(group, each)
-        for each in _PLAN_UNITS
-        if each in group
-    }
-    return _plan(name, tuple(str(manner) for manner in group.attrs["manners"]), given)
+def _sorted(entries: h5py.Group) -> list[Any]:
+    return [entry for _, entry in sorted(entries.items())]
+
+
+def _read(entry: Any, what: str) -> Action:
+    attributes = dict(entry.attrs) if isinstance(entry, h5py.Group) else {}
+    if attributes.get("kind") not in ("plan", "view"):
+        raise InputError(f'{what} is neither of kind "plan" nor "view"; say which it is.')
+    is_plan = attributes["kind"] == "plan"
+    lacking = {"manners", *_PLAN_UNITS} - {*_MAY_LACK, *entry} if is_plan else _CAMERA_KEYS - set(entry)
+    if "manners" in attributes:
+        lacking = lacking - {"manners"}
+    if lacking or "name" not in attributes:
+        raise InputError(f"{what} lacks {', '.join(map(repr, sorted(lacking or {'name'})))}; add it.")
+    for name, value in entry.items():
+        said = value.attrs.get("units") if isinstance(value, h5py.Dataset) else "a group"
+        if said != (asked := _UNITS.get(name, said)):
+            raise InputError(f"{what} has {name} in {said!r}; give a dataset in {asked!r}.")
+    try:
+        name = str(attributes["name"])
+        if not is_plan:
+            return _view(read_camera(name, entry))
+        given = {
+            each: number(entry, each) if entry[each].ndim == 0 else array(entry, each)
+            for each in _PLAN_UNITS
+            if each in entry
+        }
+        # Files before version 0.7 have them as an attribute.
+        manners = attributes["manners"] if "manners" in attributes else entry["manners"].asstr()[()]
+        return _plan(name, tuple(str(manner) for manner in manners), given)
+    except InputError as error:
+        raise InputError(f"{what}: {error}") from None
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what} holds what is no number ({error}); write numbers in SI units.") from error

@@ -20,6 +20,10 @@ Array = npt.NDArray[np.float64]
 Manner = Literal["free", "guarded", "held", "searching"]
 MANNERS: tuple[Manner, ...] = ("free", "guarded", "held", "searching")
 
+QUICKEST = 1e5  # samples a second: beyond it a rate is no sensor's
+STIFFEST = (
+    1e7  # N/m, and in the units of the others: no arm is so stiff, and no step of a simulation so short
+)
 LONGEST = 600.0  # s: a plan that lasts longer is in milliseconds
 WIDEST = 5.0  # m between its knots, and
 FARTHEST = 100.0  # m from the world's origin: beyond either it is in millimetres
@@ -89,7 +93,13 @@ class Plan:
                 raise InputError(
                     f"plan {self.name!r} has a motion that is {manner!r}; give one of {', '.join(MANNERS)}."
                 )
-        number_within(f"plan {self.name!r} has a rate of {{}} a second", self.rate, above=0.0)
+        lasts = float(self.times[-1] - self.times[0])
+        number_within(
+            f"plan {self.name!r} lasts {lasts:.3g} s and has a rate of {{}} a second",
+            self.rate,
+            least=1.0 / lasts,
+            most=QUICKEST,
+        )
         lengths = np.linalg.norm(self.world_from_peg[:, 3:], axis=1)
         if not (np.abs(lengths - 1.0) < 1e-3).all():
             raise InputError(
@@ -98,9 +108,10 @@ class Plan:
             )
         self._refuse_units()
         for name, given in (("stiffness", self.stiffness), ("damping", self.damping)):
-            if given.shape != (6,) or not (np.isfinite(given).all() and (given >= 0.0).all()):
+            if given.shape != (6,) or not ((given >= 0.0) & (given <= STIFFEST)).all():
                 raise InputError(
-                    f"plan {self.name!r} has {name} {given.tolist()}; give six numbers, none negative."
+                    f"plan {self.name!r} has {name} {given.tolist()}; give six numbers from 0 to "
+                    f"{STIFFEST:g}, in N/m and N m/rad, or N s/m and N m s/rad."
                 )
         number_within(f"plan {self.name!r} stops at {{}} N", self.force, above=0.0)
         number_within(f"plan {self.name!r} has a sink of {{}} m", self.sink)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.arguments import whole_number
+from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.simulators.distortion import LARGEST, distorted, undistorted_rays, unfolded
 
@@ -75,7 +75,7 @@ class Camera:
 
         Raises:
             InputError: the pose is none or has no unit quaternion; there are no pixels; a focal length is not
-                positive or the principal point is not finite.
+                positive, the principal point is not finite, or near is not below far.
         """
         self._refuse_optics()
         pose = poses.as_pose(
@@ -89,19 +89,28 @@ class Camera:
         return pose
 
     def _refuse_optics(self) -> None:
-        if not (self.width >= 1 and self.height >= 1):
-            raise InputError(
-                f"camera {self.name!r} has {self.width}×{self.height} pixels; give at least one of each."
+        for size, value in (("wide", self.width), ("high", self.height)):
+            whole_number(f"camera {self.name!r} is {{}} pixels {size}", value)
+        for name in ("fx", "fy"):
+            number_within(
+                f"camera {self.name!r} has a focal length {name} of {{}} pixels (turn a mirrored image back "
+                "before)",
+                getattr(self, name),
+                above=0.0,
             )
-        if not (0.0 < self.fx < np.inf and 0.0 < self.fy < np.inf):
-            raise InputError(
-                f"camera {self.name!r} has focal lengths fx {self.fx} and fy {self.fy}; give positive "
-                "numbers, in pixels; turn a mirrored image back before."
+        for name in ("cx", "cy"):
+            number_within(
+                f"camera {self.name!r} has its principal point at {name} {{}} pixels", getattr(self, name)
             )
-        if not (abs(self.cx) < np.inf and abs(self.cy) < np.inf):
+        near = number_within(f"camera {self.name!r} sees from {{}} m on", self.near, least=0.0)
+        try:
+            beyond = float(self.far) > near
+        except (TypeError, ValueError):
+            beyond = False
+        if not beyond:
             raise InputError(
-                f"camera {self.name!r} has its principal point at cx {self.cx} and cy {self.cy}; give finite "
-                "numbers, in pixels."
+                f"camera {self.name!r} sees from {self.near} m to {self.far!r} m; give near below far, in "
+                "metres."
             )
 
     @property
@@ -114,7 +123,8 @@ class Camera:
 
         Raises:
             InputError: there are no pixels, a focal length is not positive, the principal point is not
-                finite, or the distortion folds the image over, so that a pixel sees along no ray or several.
+                finite, near is not below far, or the distortion folds the image over, so that a pixel sees
+                along no ray or several.
         """
         self._refuse_optics()
         if self.is_distorted:

@@ -65,8 +65,13 @@ class Candidates(Sequence[Candidate]):
         return self.kept[index]
 
     def __str__(self) -> str:
-        gone = "".join(f"; {count} {why}" for why, count in self.removed.items() if count)
-        return f"{len(self)} candidate{'s' * (len(self) != 1)}{gone}"
+        left = f"; left out those that {self.gone}" if self.gone else ""
+        return f"{len(self)} candidate{'s' * (len(self) != 1)}{left}"
+
+    @property
+    def gone(self) -> str:
+        """What was left out, in words: "come from below (9), lead through the part (1)"; else empty."""
+        return ", ".join(f"{why} ({count})" for why, count in self.removed.items() if count)
 
 
 class Mounted(NamedTuple):
@@ -75,7 +80,8 @@ class Mounted(NamedTuple):
     Attributes:
         robot: with a tip, so that no joint is left out or too many.
         link: what the peg is mounted on.
-        link_from_peg: (7,).
+        link_from_peg: (7,) the peg's frame, whose tip is at its lowest z, in the link's: where the link's z
+            leads along the fingers, turned about by pi.
         world_from_base: (7,) where the robot stands.
     """
 
@@ -119,13 +125,21 @@ def sifted(candidates: Iterable[Candidate], filters: Sequence[Filter]) -> Candid
 
 def _kept(each: Filter, candidates: Sequence[Candidate]) -> list[bool]:
     given: object = each.keeps(candidates)
-    says = list(given) if isinstance(given, Iterable) else []
-    if len(says) != len(candidates):
+    try:
+        says = list(given) if isinstance(given, Iterable) else []
+    except TypeError:  # an array without axes
+        says = []
+    flags = [bool(one) for one in says if isinstance(one, bool | np.bool_) or _is_flag(one)]
+    if not len(says) == len(flags) == len(candidates):
         raise InputError(
             f"the filter of candidates that {each.removes} does not say of each whether it is kept; let it "
             f"give {len(candidates)} booleans for {len(candidates)} candidates."
         )
-    return says
+    return flags
+
+
+def _is_flag(said: object) -> bool:
+    return isinstance(said, torch.Tensor) and said.dtype == torch.bool and said.ndim == 0
 
 
 def refuse_none(candidates: Candidates) -> None:
@@ -136,13 +150,12 @@ def refuse_none(candidates: Candidates) -> None:
     """
     if len(candidates):
         return
-    gone = [f"{count} {why}" for why, count in candidates.removed.items() if count]
-    if not gone:
+    if not candidates.gone:
         raise InputError("there are no candidates to choose from; give one plan or view, or a kind of them.")
     total = sum(candidates.removed.values())
     raise InputError(
-        f"none of {total} candidate{'s' * (total != 1)} is left to choose from: {', '.join(gone)}; give "
-        "other candidates, or filters that keep more."
+        f"none of {total} candidate{'s' * (total != 1)} is left to choose from: they {candidates.gone}; "
+        "give other candidates, or filters that keep more."
     )
 
 
@@ -150,7 +163,8 @@ def from_within(direction: Sequence[float], angle: float, removes: str = "") -> 
     """Keeps plans whose guarded motions are, and views that look, along a direction within an angle.
 
     Args:
-        direction: (3,) in the world, of any length; for touches from above [0, 0, -1].
+        direction: (3,) in the world, of any length, along which the peg moves or the camera looks; for
+            touches from above [0, 0, -1].
         angle: radians.
         removes: what is true of the others, in words.
 
@@ -190,7 +204,7 @@ def clear_of_part(gap: PegGap, world_from_part: Array | torch.Tensor) -> Filter:
         gap: of the part and the peg.
         world_from_part: (7,).
     """
-    there = torch.as_tensor(world_from_part)[None]
+    there = poses.as_pose(world_from_part, "where the part is thought to be")[None]
 
     def keeps(candidates: Sequence[Candidate]) -> list[bool]:
         ways = [free_ways(c) if isinstance(c, Plan) else np.empty((0, 7)) for c in candidates]
@@ -210,7 +224,7 @@ def meeting(gap: PegGap, world_from_part: Array | torch.Tensor) -> Filter:
         gap: of the part and the peg.
         world_from_part: (7,).
     """
-    there = torch.as_tensor(world_from_part)[None]
+    there = poses.as_pose(world_from_part, "where the part is thought to be")[None]
 
     def keeps(candidates: Sequence[Candidate]) -> list[bool]:
         met = [middles_of_strokes(c) if isinstance(c, Plan) else [] for c in candidates]
@@ -264,8 +278,8 @@ def no_harder_than(force: float) -> Filter:
 def pressing_force(plan: Plan) -> float:
     """With how many newtons a plan presses once it has met a surface.
 
-    It is what stops its guarded motions, and what its spring adds where it is led on beyond that. An impact
-    may be more.
+    It is what stops its guarded motions, and what its spring adds where it is led on beyond that. What is
+    held while nothing was met counts as if it met something where it begins. An impact may be more.
     """
     worst, onto = 0.0, np.zeros(3)
     for k, manner in enumerate(plan.manners):
@@ -273,11 +287,14 @@ def pressing_force(plan: Plan) -> float:
         if manner == "guarded":
             worst, onto = max(worst, plan.force), way / max(float(np.linalg.norm(way)), 1e-12)
             base = plan.world_from_peg[k + 1, :3]
-        elif manner in ("held", "searching") and onto.any():
-            beyond = float((plan.world_from_peg[k + 1, :3] - base) @ onto)
+        elif manner in ("held", "searching"):
+            met = bool(onto.any())
+            begins = base if met else plan.world_from_peg[k, :3]
+            along = onto if met else way / max(float(np.linalg.norm(way)), 1e-12)
+            beyond = float((plan.world_from_peg[k + 1, :3] - begins) @ along)
             held = poses.rotation_matrix(torch.from_numpy(plan.world_from_peg[k + 1])).numpy()
-            spring = float(np.square(held.T @ onto) @ np.asarray(plan.stiffness)[:3])
-            worst = max(worst, plan.force + spring * max(beyond, 0.0))
+            spring = float(np.square(held.T @ along) @ np.asarray(plan.stiffness)[:3])
+            worst = max(worst, (plan.force if met else 0.0) + spring * max(beyond, 0.0))
         elif manner == "free":
             onto = np.zeros(3)
     return worst
@@ -328,14 +345,20 @@ def _distinct(world_from_peg: Array) -> Array:
 
 
 def free_ways(plan: Plan) -> Array:
-    """Poses (M, 7) of the peg, at most 2 mm apart, on the free motions before and after it presses."""
-    found = [plan.world_from_peg[:1]] if plan.manners[0] == "free" else []
+    """Poses (M, 7) of the peg, at most 2 mm apart, on its motions before and after it presses.
+
+    Those are its free ones, and what is held while no guarded motion has met anything.
+    """
+    found, pressed = [plan.world_from_peg[:1]], False
     for k, manner in enumerate(plan.manners):
-        if manner == "free" and (k == 0 or plan.manners[k - 1] == "free"):
+        if manner == "guarded":
+            pressed = True
+        elif not pressed:
             found.append(np.stack(list(_between(plan.world_from_peg[k], plan.world_from_peg[k + 1]))))
         elif manner == "free":
             found.append(plan.world_from_peg[k + 1 : k + 2])
-    return np.concatenate(found) if found else np.empty((0, 7))
+            pressed = False
+    return np.concatenate(found)
 
 
 def _between(start: Array, stop: Array) -> Iterator[Array]:

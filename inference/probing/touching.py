@@ -66,6 +66,10 @@ class Spot(NamedTuple):
     normal: Array
 
 
+# More is in millimetres.
+_MOST = dict(safe=1.0, depth=0.5, free=5.0, guarded=1.0, sliding=1.0, press=0.05, length=1.0) | dict(
+    shortest=0.5, longest=0.5
+)
 _STILL = 0.15  # s before anything moves, in which the wrench is tared
 _QUICKEST = 0.05  # s that a motion takes at least
 _ALIKE = 2e-5  # m: vertices of a peg so near to its farthest one are as far
@@ -276,8 +280,9 @@ def middles_of_strokes(plan: Plan) -> list[tuple[Array, Array]]:
 
 def _checked(touching: Touching) -> Touching:
     for name, value in touching._asdict().items():
-        if not isinstance(value, tuple):
-            number_within(f"a touch has {name} {{}}", value, above=0.0)
+        if name not in ("stiffness", "damping"):  # the plan looks at these
+            most = _MOST.get(name, math.inf)
+            number_within(f"a touch has {name} {{}} (m, m/s, s, N)", value, above=0.0, most=most)
     return touching
 
 
