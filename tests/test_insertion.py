@@ -16,6 +16,7 @@ from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.inference.probing.chance import chance_of_success
 from bcppl.inference.probing.insertion import Attempt, insertion_plan
+from bcppl.inference.schemes import systematic
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, bench_part
 from bcppl.models.worlds.guarded_motion import command_of
@@ -131,15 +132,22 @@ def test_the_search_is_what_finds_it() -> None:
     assert result.peak_press < 30.0
 
 
-def test_the_chance_is_nothing_where_no_particle_has_the_hole_and_rises_with_the_clearance() -> None:
+def test_the_chance_is_the_arms_rises_with_the_clearance_and_is_nothing_without_the_hole() -> None:
     chances = []
     for clearance, shift in ((0.0001, 0.001), (0.001, 0.001), (0.001, 0.0002)):
         scene = bench_scene(3, part="square 8 mm", clearance=clearance)
         belief = believed(scene, 3, shift, np.radians(0.3))
         plan = insertion_plan(belief, scene.part, scene.peg, attempt=Attempt(longest=3.0))
         chances.append(chance_of_success(belief, plan, PegPhysics(scene.part, scene.peg), particles=12))
-    assert chances[0].success <= 0.25 and chances[2].success > 0.9
-    assert chances[0].success < chances[1].success <= chances[2].success
+        if len(chances) == 1:
+            # Pegs that find nothing are pushed as well, and some slip over the chamfer into the hole.
+            torch.manual_seed(0)
+            drawn = systematic(belief.log_weights, 12)
+            arms = [replace(scene, truth=t.numpy()) for t in belief.world_from_part[drawn]]
+            inserted = float(np.mean([arm.insert(plan).inserted for arm in arms]))
+            assert 0.3 < inserted < 0.8 and chances[0].success == pytest.approx(inserted, abs=0.26)
+    assert chances[0].success < chances[2].success > 0.9
+    assert chances[0].found < chances[1].found <= chances[2].found
     elsewhere = belief.world_from_part.clone()
     elsewhere[:, 0] += 0.015
     away = Belief(elsewhere, belief.log_weights)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -98,8 +100,12 @@ def test_the_loop_ends_by_gain_by_chance_and_by_number() -> None:
         )
 
     assert rounds(probes=1) == 1
-    assert rounds(probes=3, least_gain=0.1) == 0  # a random order foretells no gain
-    assert rounds(probes=3, chance=lambda belief: 1.0) == 0
+    with pytest.raises(InputError, match="foretells no gains"):
+        rounds(probes=3, least_gain=0.1)  # an order that is drawn
+    with pytest.warns(UserWarning, match="before its first probe: an insertion succeeds with a chance of 1"):
+        assert rounds(probes=3, chance=lambda belief: 1.0) == 0
+    with pytest.raises(InputError, match="from a chance of 2 on"):
+        rounds(enough=2)
     asked_of: list[Belief] = []
 
     def surer(belief: Belief) -> float:
@@ -108,7 +114,70 @@ def test_the_loop_ends_by_gain_by_chance_and_by_number() -> None:
 
     assert rounds(probes=3, chance=surer, enough=0.9) == 1
     assert asked_of[0] is last.belief and asked_of[1] is not last.belief
-    assert rounds(probes=3, seconds=0.5) == 0  # no touch is so short
+    with pytest.warns(UserWarning, match="all candidates last longer than 0.5 s"):
+        assert rounds(probes=3, seconds=0.5) == 0
+    with pytest.warns(UserWarning, match="is expected to tell .* nats, too few"):
+        loop = probing_loop(
+            model,
+            look,
+            BenchArm(scene),
+            asked,
+            by_information(model.pose, hypotheses=4, seed=0),
+            start=last,
+            least_gain=50.0,
+        )
+        assert not list(loop)
+
+
+def test_what_the_world_measured_is_to_be_what_was_asked_for_and_to_fit() -> None:
+    scene, look, last, _ = seen()
+    plan = asked(last.belief, 0)[0]
+
+    class Twisted:
+        """An arm whose windows (a list) are changed."""
+
+        def __init__(self, change: Callable[[list[Any]], list[Any]]) -> None:
+            self.change = change
+
+        def carry_out(self, candidate: Any) -> list[Any]:
+            return self.change(BenchArm(scene).carry_out(candidate))
+
+    def millimetres(windows: list[Any]) -> list[Any]:
+        scale = np.array([1e3, 1e3, 1e3, 1.0, 1.0, 1.0, 1.0])
+        touches = [w.observation for w in windows]
+        told = [dataclasses.replace(t, world_from_peg=t.world_from_peg * scale) for t in touches]
+        return [dataclasses.replace(w, observation=t) for w, t in zip(windows, told, strict=True)]
+
+    for says, change in (
+        ("asked for 'touch 1.*' and gave a measurement of 'camera_0'", lambda w: [look.measurements[0]]),
+        ("for 'touch 1.*' does not fit: .*millimetres", millimetres),
+        ("for 'touch 1.*' does not fit", lambda w: w[len(w) // 2 :]),
+        ("for 'touch 1.*' does not fit", lambda w: w[::-1]),
+    ):
+        loop = probing_loop(
+            model, look, Twisted(change), lambda *now: [plan], lambda p, found, s: in_order(found), start=last
+        )
+        with pytest.raises(InputError, match=says) as caught:
+            next(loop)
+        assert_one_sentence(str(caught.value))
+    for says, settings in (
+        ("candidates_from is a list", {"candidates_from": [plan]}),
+        ("rank is a str", {"rank": "information"}),
+        ("rank gives a list", {"rank": lambda *now: []}),
+        ("yields no step", {"infer": lambda *now, **more: iter([])}),
+    ):
+        given = {
+            "candidates_from": lambda *now: [plan],
+            "rank": lambda p, found, s: in_order(found),
+        } | settings
+        with pytest.raises(InputError, match=says) as caught:
+            next(probing_loop(model, look, BenchArm(scene), start=last, **given))  # type: ignore[arg-type]
+        assert_one_sentence(str(caught.value))
+    for what, names in ((scene, "a BenchScene"), (insertion_plan(last.belief, scene.part, scene.peg), "Ins")):
+        with pytest.raises(InputError, match=f"asked to carry out {'a ' if names == 'Ins' else ''}{names}"):
+            BenchArm(scene).carry_out(what)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="asked to insert by a Plan"):
+        BenchArm(scene).insert(plan)  # type: ignore[arg-type]
 
 
 def test_probes_together_last_no_longer_than_they_may() -> None:

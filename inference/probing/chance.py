@@ -55,8 +55,9 @@ def chance_of_success(
 ) -> Chance:
     """The probability under a belief that an insertion as planned succeeds.
 
-    The same command is carried out against the part where each particle has it. Those that find the hole are
-    then pushed, from where their peg stands. As for the arm, a push ends where its force is felt.
+    The same command is carried out against the part where each particle has it. Each peg is then pushed
+    from where it stands, also where the search found nothing, as by the arm. As there, a push ends where its
+    force is felt.
 
     Args:
         belief: over world_from_part.
@@ -70,6 +71,11 @@ def chance_of_success(
         InputError: the plan is of another kind, the part has no hole or several, the peg does not fit, or the
             number of particles is not positive.
     """
+    if not isinstance(physics, PegPhysics):
+        raise InputError(
+            f"the chance of an insertion is to be simulated by a {type(physics).__name__}; give "
+            "PegPhysics(part, peg)."
+        )
     if not isinstance(plan, InsertionPlan):
         raise InputError(
             f"the chance of an insertion is asked of a {type(plan).__name__}; give what `insertion_plan` "
@@ -80,10 +86,7 @@ def chance_of_success(
     world_from_part = _drawn(belief, particles, seed)
     count = len(world_from_part)
     found, stands = _search(plan, physics, hole, world_from_part)
-    success = np.zeros(count, dtype=bool)
-    if found.any():
-        depth = _push(plan, physics, hole, world_from_part[found], stands[found])
-        success[found] = depth >= plan.deep_enough
+    success = _push(plan, physics, hole, world_from_part, stands)
     smoothed = (success.sum() + 1.0) / (count + 2.0)
     error = math.sqrt(smoothed * (1.0 - smoothed) / count)
     return Chance(float(success.mean()), float(found.mean()), error)
@@ -139,13 +142,14 @@ def _search(
         if yields.all():
             break
         left, rollout = left[~yields], rollout[~yields]
+        stands[left] = rollout.world_from_peg[:, -1]
     return found, stands
 
 
 def _push(
     plan: InsertionPlan, physics: PegPhysics, hole: Hole, world_from_part: torch.Tensor, stands: Array
-) -> Array:
-    """How deep (N,) the pegs end, metres.
+) -> Mask:
+    """Whether (N,) the pegs end in the hole, deep enough.
 
     One command serves all: instead of the pegs the parts are moved, until the pegs stand in the same place.
     """
@@ -159,7 +163,9 @@ def _push(
     rollout = physics.start(moved, probe).advance(len(probe.stamps))
     ends = _stopped(rollout, push.force)
     there = torch.from_numpy(rollout.world_from_peg[np.arange(len(pegs)), ends])
-    return depth_reached(hole, physics.peg, poses.compose(poses.inverse(moved), there).numpy())
+    part_from_peg = poses.compose(poses.inverse(moved), there).numpy()
+    deep = depth_reached(hole, physics.peg, part_from_peg) >= plan.deep_enough
+    return np.asarray(deep & (aside_of(hole, physics.peg, part_from_peg) < _BESIDE))
 
 
 def _stopped(rollout: Rollout, force: float) -> npt.NDArray[np.int64]:

@@ -3,15 +3,18 @@
 In short, with any robot or world that carries out plans:
 
     arm = BenchArm(scene)
+    *_, last = guided_smc.infer(model, scene.look())
     asked = lambda belief, number: candidates(belief, scene.part, scene.peg, seed=number)
-    for each in probing_loop(model, scene.look(), arm, asked, probes=3):
+    for each in probing_loop(model, scene.look(), arm, asked, start=last, probes=3):
         print(each.chosen.name, each.ranking.best.information_gain)
-    print(arm.insert(insertion_plan(each.step.belief, scene.part, scene.peg)))
+        last = each.step
+    print(arm.insert(insertion_plan(last.belief, scene.part, scene.peg)))
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Protocol
@@ -35,6 +38,7 @@ from bcppl.inference.probing.filters import (
 from bcppl.inference.probing.ranking import Ranking
 from bcppl.inference.probing.rules import Rank, by_information
 from bcppl.inference.smc import Step
+from bcppl.recordings.check import problems
 from bcppl.recordings.measurements import DepthImage, Measurement, ProbeWindow, Recording, View
 from bcppl.recordings.plan import Plan
 from bcppl.traces import Model
@@ -101,7 +105,8 @@ def probing_loop(
 ) -> Iterator[Round]:
     """Choose, carry out, take in: yields after each probe.
 
-    What was taken in is not computed again: inference goes on from the last step.
+    What was taken in is not computed again: inference goes on from the last step. Where it is over before the
+    first probe a warning says why.
 
     Args:
         model: what explains the recording; its program's arguments are its scene and the actions.
@@ -118,16 +123,19 @@ def probing_loop(
             ranked, and where none is left it is over.
         least_gain: nats; where the best candidate is expected to tell less, less its cost, it is over.
         chance: of an insertion under a belief, such as `chance_of_success(...).success`; asked before the
-            first probe and after each.
+            first probe and after each. Of few particles it errs by more than `enough` leaves: take its
+            `error` off.
         enough: it is over once that chance reaches so much.
 
     Raises:
         InputError: there are no candidates, or what is given as one is none, or a plan needs a peg that the
             recording lacks; the belief has no weight or has collapsed to a point; a number is out of range;
-            the world cannot carry out anything, or measured nothing; a chance is no number from 0 to 1.
+            the world cannot carry out anything, or measured nothing, something else than was asked for or
+            what does not fit the recording; inference took nothing in; a chance is no number from 0 to 1;
+            `least_gain` is given with a rule that foretells no gains.
     """
     whole_number("the loop is to make {} probes at most", probes)
-    number_within("an insertion is tried from a chance of {} on", enough, least=0.0)
+    number_within("an insertion is tried from a chance of {} on", enough, least=0.0, most=1.0)
     left = math.inf if seconds is None else number_within("the loop is given {} s", seconds, least=0.0)
     if least_gain is not None:
         number_within("the loop ends below a gain of {}", least_gain)
@@ -137,9 +145,13 @@ def probing_loop(
             "`carry_out(candidate)`, such as bcppl.models.worlds.bench_arm.BenchArm."
         )
     rank = by_information(model.pose) if rank is None else rank
+    for what, given in (("candidates_from", candidates_from), ("rank", rank), ("infer", infer)):
+        if not callable(given):
+            raise InputError(f"the loop's {what} is a {type(given).__name__}; give a function.")
     scene = prepared(model, recording, None if start is None else start.population.trace.args[0])
     step = _last(infer(model, recording, particles=particles, seed=seed, scene=scene, start=start), start)
-    if chance is not None and _likely(chance, step.belief) >= enough:
+    if chance is not None and (likely := _likely(chance, step.belief)) >= enough:
+        _nothing_done(f"an insertion succeeds with a chance of {likely:.3g} as it is")
         return
     for number in range(probes):
         refuse_settled(step.belief)
@@ -147,18 +159,24 @@ def probing_loop(
         if math.isfinite(left):
             found = sifted(found, [no_longer_than(left)])
             if not found:
+                if number == 0:
+                    _nothing_done(f"all candidates last longer than {left:.3g} s")
                 return
         scene = prepared(model, with_views(recording, found), scene)
-        ranking = rank(step.population, found, scene)
-        if least_gain is not None and not ranking.best.value >= least_gain:
+        ranking = _ranked(rank(step.population, found, scene), least_gain is not None)
+        if least_gain is not None and ranking.best.value < least_gain:
+            if number == 0:
+                _nothing_done(
+                    f"the best candidate is expected to tell {ranking.best.value:.3g} nats, too few"
+                )
             return
         chosen = named_apart(ranking.best.candidate, recording)
         measured = _measured(world.carry_out(chosen), chosen)
         left = max(0.0, left - lasting(chosen))
-        recording = replace(recording, measurements=[*recording.measurements, *measured])
+        recording = _going_on(recording, measured, chosen)
         scene, before = prepared(model, recording, scene), step
         count = len(before.population)
-        step = _last(infer(model, recording, particles=count, seed=seed, scene=scene, start=before), before)
+        step = _last(infer(model, recording, particles=count, seed=seed, scene=scene, start=before), None)
         likely = math.nan if chance is None else _likely(chance, step.belief)
         yield Round(number, found, ranking, chosen, recording, before, step, likely)
         if likely >= enough:
@@ -169,8 +187,29 @@ def _last(steps: Iterator[Step], before: Step | None) -> Step:
     for each in steps:
         before = each
     if before is None:
-        raise InputError("the loop's inference yields no step; give one that yields the prior's first.")
+        raise InputError(
+            "the loop's inference yields no step, so that nothing was taken in; give one that yields a step "
+            "for each measurement."
+        )
     return before
+
+
+def _nothing_done(why: str) -> None:
+    warnings.warn(f"the loop is over before its first probe: {why}.", stacklevel=3)
+
+
+def _ranked(ranking: object, foretold: bool) -> Ranking:
+    if not isinstance(ranking, Ranking) or not len(ranking):
+        raise InputError(
+            f"the loop's rank gives a {type(ranking).__name__} that ranks nothing; give a function that "
+            "returns a Ranking of the candidates, such as by_information(pose)."
+        )
+    if foretold and math.isnan(ranking.best.value):
+        raise InputError(
+            "the loop is to end below a least_gain, and its rank foretells no gains; leave least_gain out, "
+            "or rank by information."
+        )
+    return ranking
 
 
 def _likely(chance: Callable[[Belief], float], belief: Belief) -> float:
@@ -204,7 +243,30 @@ def _measured(given: object, chosen: Candidate) -> list[Measurement]:
                 f"the world gave a {type(each).__name__} when it was asked for {name_of(chosen)!r}; give "
                 "measurements, each an action and what was observed."
             )
+        name = _asked(each.action)
+        if name != name_of(chosen):
+            raise InputError(
+                f"the world was asked for {name_of(chosen)!r} and gave a measurement of {name!r}; give the "
+                "windows of a probe with the plan's name, or an image of the view's camera."
+            )
     return measured
+
+
+def _asked(action: object) -> str:
+    """The name of the probe or camera that an action is of."""
+    if isinstance(action, View):
+        return action.camera.name
+    return action.probe.name if isinstance(action, ProbeWindow) else type(action).__name__
+
+
+def _going_on(recording: Recording, measured: Sequence[Measurement], chosen: Candidate) -> Recording:
+    """The recording with what was measured, which must leave it as sound as it was."""
+    longer = replace(recording, measurements=[*recording.measurements, *measured])
+    found = set(problems(recording))
+    for problem in problems(longer):
+        if problem not in found:
+            raise InputError(f"what the world measured for {name_of(chosen)!r} does not fit: {problem}")
+    return longer
 
 
 def named_apart(candidate: Candidate, recording: Recording) -> Candidate:

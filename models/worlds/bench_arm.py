@@ -9,6 +9,7 @@ import numpy.typing as npt
 import torch
 
 from bcppl import poses
+from bcppl.errors import InputError
 from bcppl.models.worlds.bench import BenchScene
 from bcppl.models.worlds.inserting import InsertionResult
 from bcppl.recordings.insertion_plan import InsertionPlan
@@ -47,16 +48,33 @@ class BenchArm:
             self._off[camera.instrument] = off.numpy(), float(bias)
 
     def carry_out(self, candidate: Plan | View) -> list[Measurement]:
-        """What is measured: the windows of a plan, on a clock that goes on, or an image."""
+        """What is measured: the windows of a plan, on a clock that goes on, or an image.
+
+        Raises:
+            InputError: it is asked for something else.
+        """
         if isinstance(candidate, View):
             return [Measurement(candidate, self._look(candidate.camera))]
+        if not isinstance(candidate, Plan):
+            raise InputError(
+                f"the arm is asked to carry out a {type(candidate).__name__}; give a Plan or a View, and "
+                "insertion plans to `insert`."
+            )
         began = candidate.times[0]
         plan = replace(candidate, times=candidate.times - began + self.clock)
         self.clock = float(plan.times[-1]) + _BETWEEN
         return self.scene.felt(plan, self._sensors)
 
     def insert(self, plan: InsertionPlan) -> InsertionResult:
-        """An insertion as it truly went."""
+        """An insertion as it truly went.
+
+        Raises:
+            InputError: what is given is no plan of one.
+        """
+        if not isinstance(plan, InsertionPlan):
+            raise InputError(
+                f"the arm is asked to insert by a {type(plan).__name__}; give what `insertion_plan` makes."
+            )
         return self.scene.insert(plan, self._sensors)
 
     def _look(self, camera: Camera) -> DepthImage:

@@ -26,7 +26,8 @@ class InsertionResult(NamedTuple):
     Attributes:
         inserted: whether the peg ended in the hole, at least 0.8 of its depth or 10 mm beyond its chamfer
             below the top of the part.
-        found: when (s) the search ended because the peg yielded; NaN where it did not.
+        found: when (s) the search ended because the peg yielded; NaN where it did not. It is pushed then as
+            well, and may slip in.
         depth: how deep the tip truly ended below the top, metres.
         peak_force: the largest force that was exerted on the peg at a sample, N.
         peak_press: the same but for single samples, over within which is an impact: of each two samples in a
@@ -86,7 +87,7 @@ def insert(
     force = np.linalg.norm(np.concatenate([search.wrench, push.wrench])[:, :3], axis=1)
     searched = [t for k, t in search.stops.items() if plan.search.manners[k] == "searching"]
     return InsertionResult(
-        inserted=depth >= plan.deep_enough and beside < _BESIDE,
+        inserted=bool(depth >= plan.deep_enough and beside < _BESIDE),
         found=searched[0] if searched else float("nan"),
         depth=depth,
         peak_force=float(force.max()),
