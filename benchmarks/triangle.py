@@ -4,6 +4,7 @@ The triangle lies within 20 mm and 3 degrees of the guess. A push is drawn from 
 in; what is left is a belief that is long along the edge that was touched. The next push is chosen among
 others of the log, by what each is expected to tell; what was truly felt in it is then taken in. Asked is on
 which edge the chosen push lay (by the true pose, which nobody is told), and what is left of the slide.
+Beside it what the others would have left, for in some draws none of them ends it.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ class Chosen(NamedTuple):
         another: whether the second push lay on another edge than the first.
         before, after: how far the part could slide along the edge first touched (`slide`), mm.
         by_chance: the same after the first candidate, for which nobody asked.
+        least: the same after whichever candidate left least, as it turned out.
         share: of the candidates that lay on another edge.
     """
 
@@ -60,12 +62,18 @@ class Chosen(NamedTuple):
     before: float
     after: float
     by_chance: float
+    least: float
     share: float
 
     @property
     def gone(self) -> bool:
         """Whether it can slide no more."""
         return self.after <= GONE * self.before
+
+    @property
+    def could_be(self) -> bool:
+        """Whether some candidate, had it been chosen, would have left it no slide."""
+        return self.least <= GONE * self.before
 
 
 def edge_of(recording: Recording, push: int, settings: Any) -> Tensor:
@@ -136,7 +144,7 @@ def chosen(seed: int) -> list[Chosen]:
         step = after(recording, [0, second], scene, seed, first)
         return slide(step.belief, recording, edges[0])
 
-    found = []
+    found, least = [], min(left(k) for k in others)
     rankings = [
         *(
             expected_information_gain(
@@ -150,7 +158,7 @@ def chosen(seed: int) -> list[Chosen]:
     ]
     for ranking in rankings:
         best = others[ranking.best.number]
-        found.append(Chosen(another[best], before, left(best), left(1), float(np.mean(another[1:]))))
+        found.append(Chosen(another[best], before, left(best), left(1), least, float(np.mean(another[1:]))))
     return found
 
 
@@ -167,13 +175,15 @@ def main() -> None:
     for k, name in enumerate(WAYS):
         own = [one[k] for one in results]
         counts = sum(one.another for one in own), sum(one.gone for one in own)
-        numbers = [float(np.median([getattr(one, field) for one in own])) for field in Chosen._fields[1:4]]
+        numbers = [float(np.median([getattr(one, field) for one in own])) for field in Chosen._fields[1:5]]
         share = float(np.mean([one.share for one in own]))
-        lines.append([name, *counts, *numbers, share])
+        possible = sum(one.could_be for one in own)
+        lines.append([name, *counts, possible, *numbers, share])
         goal = 0.9 * draws if k == 0 else None
         rows += [
             Row(f"{name}: next push on another edge", counts[0], f"of {draws}", goal, "min"),
             Row(f"{name}: slide gone after it", counts[1], f"of {draws}", goal, "min"),
+            Row(f"{name}: draws in which some push ends it", possible, f"of {draws}", direction="min"),
             Row(f"{name}: slide before, median", numbers[0], "mm"),
             Row(f"{name}: slide after, median", numbers[1], "mm"),
             Row(f"{name}: slide after a push by chance, median", numbers[2], "mm"),
@@ -183,9 +193,11 @@ def main() -> None:
         "entropy",
         "another edge",
         "gone",
+        "could be",
         "slide mm",
         "after mm",
         "by chance mm",
+        "at least mm",
         "candidates on another",
     ]
     show(

@@ -136,6 +136,8 @@ WRONG = {
         "out of panda's reach",
     ),
     "link": (["--link", "panda_hand"], "give it with --robot"),
+    "depth": (["--depth", "3"], "--depth is 3"),
+    "seconds": (["--seconds", "0.5"], "last longer than 0.5 s"),
     "itself": (["--output", "runs/belief_002.h5"], "would overwrite runs/belief_002.h5"),
     "folder's name": (["--output", "folder.json"], "is a folder"),
     "many": (["--candidates", "touch:" + "9" * 5000], "10000 at most"),

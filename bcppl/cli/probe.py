@@ -33,6 +33,7 @@ from bcppl.inference.probing.filters import (
     lasting,
     name_of,
     no_harder_than,
+    no_longer_than,
     pressing_force,
     refuse_none,
     within_reach,
@@ -66,7 +67,12 @@ def probe(
     ],
     candidates: Annotated[
         str,
-        typer.Option(help=f"Kinds and how many of each ({', '.join(KINDS)}), or a file of plans and views."),
+        typer.Option(
+            help="A file of plans and views, or kinds and how many of each: touch (one place of the "
+            "surface), slide (a touch led on along it), pair (two faces in turn), search (a spiral over the "
+            "hole), attempt (straight into it), view (a depth image). Faces are named by where they look to "
+            "in the part's frame."
+        ),
     ] = DEFAULT,
     top: Annotated[int, typer.Option(help="How many of the best are shown.")] = 5,
     output: Annotated[
@@ -90,7 +96,9 @@ def probe(
         ),
     ] = None,
     rate: Annotated[float, typer.Option(help="Nats that a second of the arm's time costs.")] = 0.0,
+    depth: Annotated[int, typer.Option(help="1, or 2: the best probe after it counts as well.")] = 1,
     force: Annotated[float | None, typer.Option(help="N; plans that press harder are left out.")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Plans that last longer are left out.")] = None,
     table: Annotated[
         float | None, typer.Option(help="Height (m) of a table that no plan may lead into.")
     ] = None,
@@ -119,6 +127,7 @@ def probe(
     whole_number("--particles is {}", particles, least=2)
     loading.refuse_seed(seed)
     number_within("--rate is {}", rate, least=0.0)
+    whole_number("--depth is {}", depth, most=2)
     if by not in (None, *WAYS):
         raise InputError(f"--by is {by!r}; give one of {', '.join(WAYS)}.")
     output = Path(f"{Path(recording).stem}_next.json") if output is None else output
@@ -129,7 +138,8 @@ def probe(
         number_within("--table is {}", table)
     own = load_actions(candidates) if _is_file(candidates) else None
     kinds = _kinds(candidates) if own is None else {}
-    filters = _filters(force, above, robot, link, link_from_peg, world_from_base, seed)
+    filters = [] if seconds is None else [no_longer_than(seconds)]
+    filters += _filters(force, above, robot, link, link_from_peg, world_from_base, seed)
     console = Console(highlight=False)
     pegless = _pegless(own, kinds)
     before = known(recording, of, model, inference, particles, seed, console, pegless)
@@ -137,7 +147,7 @@ def probe(
     console.print(escape(str(found)), soft_wrap=True)
     scene = prepared(before.model, with_views(before.recording, found), before.scene)
     with console.status("ranking"):
-        settings = {"hypotheses": hypotheses, "cost": lasting, "rate": rate, "seed": seed}
+        settings = {"hypotheses": hypotheses, "cost": lasting, "rate": rate, "depth": depth, "seed": seed}
         rank = _rank(by, before, scene, settings)
         try:
             ranking = rank(before.population, found, scene)
@@ -240,12 +250,12 @@ def _filters(
     if robot is not None:
         if link is None:
             raise InputError("--robot is given without --link; say which link of the arm holds the peg.")
+        arm = load_robot(robot, tip=link)
         if link_from_peg is None:
             raise InputError(
                 "--robot is given without --link-from-peg; say how the link holds the peg (panda_hand, whose "
                 'z leads along the fingers, at about "0 0 0.1 0 1 0 0").'
             )
-        arm = load_robot(robot, tip=link)
         held, stands = (
             _pose("--link-from-peg", link_from_peg),
             _pose("--world-from-base", world_from_base or STILL),

@@ -96,9 +96,15 @@ class Ranking(Sequence[Prospect]):
         rows = [f"entropy now {self.entropy:.3f} nats", "number   gain (nats)    error     cost    value"]
         rows += [
             f"{p.number:6d} {p.information_gain:13.3f} {p.standard_error:8.3f} {p.cost:8.3f} {p.value:8.3f}"
+            f"  {_named(p.candidate)}".rstrip()
             for p in self.prospects
         ]
         return "\n".join(rows)
+
+
+def _named(candidate: Any) -> str:
+    """A candidate's name, or its camera's; empty where it has none."""
+    return str(getattr(getattr(candidate, "camera", candidate), "name", ""))
 
 
 def ranked(prospects: Sequence[Prospect], entropy: float) -> Ranking:
@@ -128,8 +134,18 @@ def costs_in_nats(
         rate: nats for one unit of it; by name where costs are.
 
     Raises:
-        InputError: a candidate has no cost, a cost has no rate, or one of them is no finite number.
+        InputError: a candidate has no cost, a cost has no rate or a rate no cost, or one of them is no finite
+            number.
     """
+    if cost is None and rate != 1.0:
+        raise InputError(
+            f"a rate of {rate} is given without a cost; give cost=..., a function of a candidate."
+        )
+    if not (cost is None or callable(cost) or isinstance(cost, Mapping)):
+        raise InputError(
+            f"the cost is a {type(cost).__name__}; give a function of a candidate, or what maps candidates "
+            "to costs."
+        )
     return [0.0 if cost is None else _cost(k, one, cost, rate) for k, one in enumerate(candidates)]
 
 
