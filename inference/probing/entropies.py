@@ -21,7 +21,7 @@ from scipy.special import digamma
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.arguments import whole_number
+from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import Belief
 from bcppl.beliefs.merged import distinct_poses
 from bcppl.beliefs.modes import cluster, gathered, links, nearest
@@ -139,6 +139,8 @@ def parted(
     distinct: Tensor, translation: float, rotation: float, symmetries: Tensor | None = None
 ) -> tuple[Tensor, tuple[float, float]]:
     """Which mode each of distinct poses (K, 7) is in, (K,) int64, and the gap between modes that was used."""
+    number_within("modes are to be parted by {} m", translation, above=0.0)
+    number_within("modes are to be parted by {} rad", rotation, above=0.0)
     # The few particles of a wide belief are farther apart than modes are, and no modes for that.
     sparse = SPARSE * float(nearest(distinct, translation, rotation, symmetries).median())
     gap = (max(1.0, sparse) * translation, max(1.0, sparse) * rotation)

@@ -191,8 +191,14 @@ def _all_told(
         if known is not None:
             found.append(_Told(args, _positive(k, known, trace.particles)))
             continue
-        with seeded(seed), ContactManifold.drawn_later():
-            longer, _ = extend(trace, args, {})
+        try:
+            with seeded(seed), ContactManifold.drawn_later():
+                longer, _ = extend(trace, args, {})
+        except KeyError as error:
+            raise InputError(
+                f"candidate {k} cannot be simulated, for the scene does not know {error}; prepare the scene "
+                "with it, or give `information` (for views bcppl.models.view_information.view_information)."
+            ) from error
         added = [a for a in longer.since(trace) if a in longer.choices]
         if not added:
             raise InputError(

@@ -70,6 +70,7 @@ class Spot(NamedTuple):
 _MOST = dict(safe=1.0, depth=0.5, free=5.0, guarded=1.0, sliding=1.0, press=0.05, length=1.0) | dict(
     shortest=0.5, longest=0.5
 )
+_PLACES = 1_000_000
 _STILL = 0.15  # s before anything moves, in which the wrench is tared
 _QUICKEST = 0.05  # s that a motion takes at least
 _ALIKE = 2e-5  # m: vertices of a peg so near to its farthest one are as far
@@ -83,9 +84,10 @@ def spots_of(part: Part, count: int, seed: int = 0) -> list[Spot]:
     """Places drawn evenly by area over a part's surface, inner walls and bottom included.
 
     Raises:
-        InputError: the count is no positive whole number, or the part has an empty mesh.
+        InputError: the count is no whole number from 1 to a million, or the part has an empty mesh.
     """
-    count, seed = whole_number("{} places of a surface were asked for", count), seed_number(seed)
+    count = whole_number("{} places of a surface were asked for", count, most=_PLACES)
+    seed = seed_number(seed)
     part.check(closed=False)
     places, faces = trimesh.sample.sample_surface(part.mesh, count, seed=np.random.default_rng(seed))
     normals = part.mesh.face_normals[faces]
