@@ -184,7 +184,7 @@ def test_who_looks_through_a_bad_camera_is_told(make: Callable[[Part], Any]) -> 
         ({"fx": -45.0}, "fx -45.0"),
         ({"fy": np.nan}, "fy nan"),
         ({"cx": np.inf}, "cx inf"),
-        ({"width": 0}, "0×30 pixels"),
+        ({"width": 0}, "0 pixels wide"),
     ]:
         with pytest.raises(InputError, match=said):
             renderer.images(replace(CAMERA, **wrong), pose)

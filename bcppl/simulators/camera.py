@@ -93,7 +93,7 @@ class Camera:
             whole_number(f"camera {self.name!r} is {{}} pixels {size}", value)
         for name in ("fx", "fy"):
             number_within(
-                f"camera {self.name!r} has a focal length {name} of {{}} pixels (turn a mirrored image back "
+                f"camera {self.name!r} has a focal length {name} {{}} pixels (turn a mirrored image back "
                 "before)",
                 getattr(self, name),
                 above=0.0,
