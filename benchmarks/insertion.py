@@ -7,19 +7,18 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jobs import each
 from report import Row, cores, finish, options, show
-from scenes import PARTICLES, gone_on, taken_in
+from rich.console import Console
+from scenes import PARTICLES, every, gone_on, one_line, taken_in
 from scipy.stats import binomtest
 
 from bcppl import poses
 from bcppl.beliefs import Belief
-from bcppl.errors import InferenceError, InputError
 from bcppl.inference.probing.candidates import MIXED, candidates
 from bcppl.inference.probing.chance import chance_of_success
 from bcppl.inference.probing.filters import Candidate
@@ -101,8 +100,8 @@ def attempts(task: Task) -> list[Outcome]:
                 else:
                     last = seen if known == VISION else _probed(scene, arm, seen)
                 outcomes.append(_attempt(scene, arm, last.belief, known, task.foretell))
-            except (InputError, InferenceError) as error:
-                outcomes.append(Outcome(task.seed, task.clearance, scene.name, known, failed=str(error)))
+            except Exception as error:  # one scene must not take the others with it
+                outcomes.append(Outcome(task.seed, task.clearance, scene.name, known, failed=one_line(error)))
     return outcomes
 
 
@@ -147,6 +146,24 @@ def _attempt(scene: BenchScene, arm: BenchArm, belief: Belief, known: str, foret
         time=result.time,
         chance=chance,
     )
+
+
+def lost(task: Task, why: str) -> list[Outcome]:
+    """A scene whose process died."""
+    return [Outcome(task.seed, task.clearance, "-", known, failed=why) for known in task.known]
+
+
+def as_they_come(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
+    """Every attempt, told of; an interrupted run keeps what is there."""
+    console = Console(stderr=True, highlight=False)
+    try:
+        for k, made in enumerate(every(attempts, tasks, jobs, lost)):
+            said = "; ".join(f"{o.known} {'in' if o.inserted else o.failed or 'not in'}" for o in made)
+            scene = f"{made[0].seed}, {1e3 * made[0].clearance:g} mm"
+            console.print(f"{k + 1} of {len(tasks)}, scene {scene}: {said}", soft_wrap=True, markup=False)
+            yield from made
+    except KeyboardInterrupt:
+        console.print("stopped: what follows is of the scenes so far.")
 
 
 def rate(outcomes: Sequence[Outcome]) -> tuple[float, float, float]:
@@ -210,13 +227,16 @@ def main() -> None:
     count = 2 if arguments.quick else arguments.scenes
     seeds = range(arguments.seed, arguments.seed + count)
     known = tuple(arguments.known)
-    tasks = [Task(seed, clearance, known, arguments.foretell) for clearance in CLEARANCES for seed in seeds]
-    outcomes = [outcome for made in each(attempts, tasks, arguments.jobs) for outcome in made]
+    # Clearances in turn: a run that is stopped has as many scenes of each.
+    tasks = [Task(seed, clearance, known, arguments.foretell) for seed in seeds for clearance in CLEARANCES]
+    outcomes = sorted(as_they_come(tasks, arguments.jobs), key=lambda o: (o.clearance, o.seed))
     lines, rows = [], []
     for what in known:
         mine = [o for o in outcomes if o.known == what]
         for clearance in (*CLEARANCES, None):
             some = [o for o in mine if clearance in (None, o.clearance)]
+            if not some:
+                continue
             where = "all" if clearance is None else f"{1e3 * clearance:g} mm"
             lines.append(_line(f"{what}, {where}", some))
             share, low, high = rate(some)

@@ -52,6 +52,7 @@ REGIONS = ("translation", "rotation", "pose", "ADD-radius")
 
 Array = npt.NDArray[np.float64]
 Value = TypeVar("Value")
+Task = TypeVar("Task")
 
 
 class Moment(NamedTuple):
@@ -285,36 +286,36 @@ def one_line(error: BaseException) -> str:
 
 
 def every(
-    function: Callable[[int], Value], seeds: Sequence[int], jobs: int, lost: Callable[[int, str], Value]
+    function: Callable[[Task], Value], tasks: Sequence[Task], jobs: int, lost: Callable[[Task, str], Value]
 ) -> Iterator[Value]:
     """The results as they come; a process that dies takes no other scene with it.
 
     Args:
-        function: of a seed.
-        seeds: all of them.
+        function: of a task, such as a scene's seed.
+        tasks: all of them.
         jobs: how many at a time; with one everything stays in this process, with all its threads.
-        lost: the result of a seed whose process died, and why.
+        lost: the result of a task whose process died, and why.
     """
     if jobs == 1:
-        yield from map(function, seeds)
+        yield from map(function, tasks)
         return
     os.environ.update(dict.fromkeys(THREADS, "1"))
-    left = list(seeds)
+    left = list(tasks)
     try:
         with _pool(jobs) as pool:
-            asked = {pool.submit(function, seed): seed for seed in seeds}
+            asked = {pool.submit(function, task): task for task in tasks}
             for future in as_completed(asked):
                 result = future.result()
                 left.remove(asked[future])
                 yield result
     except BrokenProcessPool:
         # Which of those under way killed its process is not said: each that is left has one of its own.
-        for seed in left:
+        for task in left:
             try:
                 with _pool(1) as pool:
-                    yield pool.submit(function, seed).result()
+                    yield pool.submit(function, task).result()
             except BrokenProcessPool as error:
-                yield lost(seed, one_line(error))
+                yield lost(task, one_line(error))
 
 
 def apart(function: Callable[..., Value], *arguments: Any) -> Value:
