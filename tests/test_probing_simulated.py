@@ -207,6 +207,37 @@ def test_sites_that_broadcast_weigh_several_observations_as_one_by_one() -> None
         torch.testing.assert_close(site.log_prob(values[:, None]), expected)
 
 
+class Off(LazyDistribution):
+    """A reading that is off by what was read before."""
+
+    def __init__(self, x: Tensor, before: Tensor) -> None:
+        super().__init__(len(x), (), (x, before))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        x, before = self.inputs
+        return dist.Normal(x - before, 0.2).log_prob(value)
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        x, before = self.inputs
+        return dist.Normal(x - before, 0.2).sample()
+
+
+def test_a_site_that_hangs_on_another_is_weighed_so_also_by_what_each_particle_drew_itself() -> None:
+    def twice() -> None:
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        first = pyro.sample("first", dist.Normal(x, 0.5))
+        pyro.sample("second", Off(x, first))
+
+    torch.manual_seed(2)
+    trace = simulate(twice, (), 6)
+    drawn = {address: trace[address] for address in ("first", "second")}
+    found = weighed(trace, ("first", "second"), drawn)
+    first, second = drawn["first"][:, None], drawn["second"][:, None]
+    exact = dist.Normal(trace["x"], 0.5).log_prob(first)
+    exact = exact + dist.Normal(trace["x"] - first, 0.2).log_prob(second)
+    torch.testing.assert_close(found, exact)
+
+
 class Unforeseen(LazyDistribution):
     """A likelihood of what was measured that cannot say what will be."""
 

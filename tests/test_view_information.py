@@ -45,6 +45,15 @@ def test_of_a_plane_that_fills_the_image_it_is_the_closed_form() -> None:
     torch.testing.assert_close(found[0], found[1])
 
 
+def test_what_is_out_of_the_sensors_range_tells_nothing() -> None:
+    renderer = DepthRenderer(block((0.3, 0.3, 0.02)))
+    seen = pixel_information(renderer, from_above(0.3), poses.identity(1))
+    assert float(seen[0, 2, 2]) > 1000.0
+    for near, far in ((0.05, 0.2), (0.4, 2.0)):
+        blind = replace(from_above(0.3), near=near, far=far)
+        assert not pixel_information(renderer, blind, poses.identity(1)).any()
+
+
 def test_the_cameras_error_bounds_what_it_tells_and_a_second_image_tells_less() -> None:
     recording = bench_scene(2, part="square 8 mm").look()
     scene = model.prepare(recording)

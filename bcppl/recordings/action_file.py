@@ -260,8 +260,6 @@ def _read(entry: Any, what: str) -> Action:
         raise InputError(f'{what} is neither of kind "plan" nor "view"; say which it is.')
     is_plan = attributes["kind"] == "plan"
     lacking = {"manners", *_PLAN_UNITS} - {*_MAY_LACK, *entry} if is_plan else _CAMERA_KEYS - set(entry)
-    if "manners" in attributes:
-        lacking = lacking - {"manners"}
     if lacking or "name" not in attributes:
         raise InputError(f"{what} lacks {', '.join(map(repr, sorted(lacking or {'name'})))}; add it.")
     for name, value in entry.items():
@@ -277,8 +275,7 @@ def _read(entry: Any, what: str) -> Action:
             for each in _PLAN_UNITS
             if each in entry
         }
-        # Files before version 0.7 have them as an attribute.
-        manners = attributes["manners"] if "manners" in attributes else entry["manners"].asstr()[()]
+        manners = entry["manners"].asstr()[()]
         return _plan(name, tuple(str(manner) for manner in manners), given)
     except InputError as error:
         raise InputError(f"{what}: {error}") from None

@@ -66,10 +66,14 @@ class Spot(NamedTuple):
     normal: Array
 
 
-# More is in millimetres.
-_MOST = dict(safe=1.0, depth=0.5, free=5.0, guarded=1.0, sliding=1.0, press=0.05, length=1.0) | dict(
-    shortest=0.5, longest=0.5
-)
+# By unit, what numbers of it say and how large they may be: beyond it they are in millimetres.
+_BOUNDS = {
+    "m": {"safe": 1.0, "depth": 0.5, "press": 0.05, "length": 1.0, "shortest": 0.5, "longest": 0.5},
+    "m/s": {"free": 5.0, "guarded": 1.0, "sliding": 1.0},
+    "N": {"force": math.inf},
+    "s": {"dwell": math.inf},
+    "standard deviations": {"sure": math.inf},
+}
 _PLACES = 1_000_000
 _STILL = 0.15  # s before anything moves, in which the wrench is tared
 _QUICKEST = 0.05  # s that a motion takes at least
@@ -281,10 +285,9 @@ def middles_of_strokes(plan: Plan) -> list[tuple[Array, Array]]:
 
 
 def _checked(touching: Touching) -> Touching:
-    for name, value in touching._asdict().items():
-        if name not in ("stiffness", "damping"):  # the plan looks at these
-            most = _MOST.get(name, math.inf)
-            number_within(f"a touch has {name} {{}} (m, m/s, s, N)", value, above=0.0, most=most)
+    for unit, bounds in _BOUNDS.items():
+        for name, most in bounds.items():
+            number_within(f"a touch has {name} {{}} {unit}", getattr(touching, name), above=0.0, most=most)
     return touching
 
 
