@@ -6,6 +6,7 @@ that they and the images make likeliest. No answer hangs on either.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -19,7 +20,17 @@ from bcppl import poses
 from bcppl.distributions.fitted import FittedNormal, fitted_normal
 from bcppl.distributions.manifold_fit import Normal, Told, Window, told_by
 from bcppl.distributions.mixture import MixturePose
-from bcppl.distributions.pose_normals import allowed, normal_like, product, transport, widened, within
+from bcppl.distributions.pose_normals import (
+    Modes,
+    allowed,
+    matched,
+    normal_like,
+    product,
+    transport,
+    widened,
+    widened_modes,
+    within,
+)
 from bcppl.distributions.poses import NormalPose
 from bcppl.models import camera_error
 from bcppl.models.camera_error import farther
@@ -35,6 +46,9 @@ SHARPEST = torch.tensor([5e-5] * 3 + [1e-3] * 3 + [1e-4], dtype=torch.float64)
 MOVED, ARRIVING, WALKING = 0.9, 0.98, 0.9
 WALK = torch.tensor([0.1, 1.5], dtype=torch.float64).log()  # of the scale of a walk
 NEAR = 0.02  # m: a window in which the peg stays farther off says nothing
+UNSURE = 0.0005  # m: a part that is known less well may be touched in other places than it seems
+NEARBY = 25.0  # squared deviations: modes that are nearer are the same before and after a measurement
+STAYING = 0.8  # of the particles go to such, the others to any
 
 
 def looks_at(
@@ -66,12 +80,10 @@ def part_given(
     if seen is None:
         expected = normal_like(scene.prior)
         center, precision = expected.center.expand(trace.particles, 7), torch.linalg.inv(expected.covariance)
+        precision = precision.expand(trace.particles, 6, 6)
     else:
         center, precision = seen.center, torch.linalg.inv(seen.covariance)
-    covariance = torch.linalg.inv(precision + told.information)
-    pull = (precision @ poses.local(told.around, center)[..., None])[..., 0] - told.slope
-    pose = poses.retract(told.around, (covariance @ pull[..., None])[..., 0])
-    return widened(pose, 0.5 * (covariance + covariance.transpose(-1, -2)))
+    return widened_modes(told.given(center, precision))
 
 
 def told_by_touches(
@@ -91,9 +103,21 @@ def told_by_touches(
             if scene.near[f"touch_{k}"]:
                 windows.append(Window(value, partial(touch_of, scene, action)))
     latest = max(scene.told, default=None)
-    before = None if latest is None else scene.told[latest].around[None]
-    scene.told[len(actions)] = told_by(scene.gap, windows, known, before)
+    before = None if latest is None else scene.told[latest]
+    everywhere = bool((windows[-1].value[:, 7] == 1.0).any()) and unsure(known, before) if windows else False
+    around = None if before is None else before.around
+    scene.told[len(actions)] = told_by(scene.gap, windows, known, around, everywhere)
     return scene.told[len(actions)]
+
+
+def unsure(known: Normal, told: Told | None) -> bool:
+    """Whether what is known so far leaves several places open, or one that is wide."""
+    if told is None:
+        covariances = torch.linalg.inv(known.precision)
+    else:
+        covariances = told.given(known.center[0], known.precision[0]).covariances
+    wide = torch.linalg.eigvalsh(covariances[:, :3, :3])[:, -1].sqrt()
+    return len(wide) > 1 or bool((wide > UNSURE).any())
 
 
 def placed_by_images(scene: Scene, actions: Sequence[View | ProbeWindow]) -> Normal:
@@ -155,26 +179,48 @@ def moved_on(
     Normals resemble both beliefs. What carries the one to the other by the shortest ways carries the
     particles, and some noise is added: a measurement that tells little moves them little.
     """
-    start, spread = placed_by_all(trace, before)
-    end, goal = placed_by_all(trace, after)
-    away = poses.local(start.expand(trace.particles, 7), trace["part"]) @ transport(spread, goal)
-    center = poses.retract(end, MOVED * away)
-    return widened(center, ((1.0 - MOVED**2) * goal).expand(trace.particles, 6, 6))
+    start, goal = placed_by_all(trace, before), placed_by_all(trace, after)
+    own, passes = start.own(trace["part"]), passing(start, goal)
+    away = poses.local(start.centers[own], trace["part"])
+    ways = torch.stack(
+        [torch.stack([transport(one, other) for other in goal.covariances]) for one in start.covariances]
+    )
+    moved = (away[:, None, None] @ ways[own])[:, :, 0]
+    return widened_modes(
+        Modes(
+            poses.retract(goal.centers, MOVED * moved),
+            ((1.0 - MOVED**2) * goal.covariances).expand(trace.particles, -1, 6, 6),
+            passes[own],
+        )
+    )
 
 
-def placed_by_all(trace: Trace, actions: Sequence[View | ProbeWindow]) -> tuple[Tensor, Tensor]:
-    """Where images' fits and touches place the part, whatever the particles hold: centre (7,), covariance."""
+def passing(start: Modes, goal: Modes) -> Tensor:
+    """Log-chances (M, K) by which particles of each of M modes come to each of K others.
+
+    Mostly they go to where they may be already: to their own mode, as more measurements know it.
+    """
+    away = poses.local(start.centers[:, None], goal.centers)
+    both = start.covariances[:, None] + goal.covariances
+    squared = (away * torch.linalg.solve(both, away[..., None])[..., 0]).sum(dim=-1)
+    any_mode = goal.log_weights.log_softmax(dim=0).expand(len(start.centers), -1)
+    near = torch.where(squared < NEARBY, any_mode, -torch.inf)
+    near = torch.where((near > -torch.inf).any(dim=1, keepdim=True), near, any_mode).log_softmax(dim=1)
+    return torch.logaddexp(near + math.log(STAYING), any_mode + math.log1p(-STAYING))
+
+
+def placed_by_all(trace: Trace, actions: Sequence[View | ProbeWindow]) -> Modes:
+    """Where images' fits and touches place the part, whatever the particles hold."""
     scene = trace.args[0]
     if len(actions) not in scene.placed:
         known = placed_by_images(scene, actions)
         center, precision = known.center[0], known.precision[0]
         if any(isinstance(action, ProbeWindow) for action in actions):
             told = told_by_touches(scene, actions, trace.observations)
-            pull = precision @ poses.local(told.around, center) - told.slope
-            precision = precision + told.information
-            center = poses.retract(told.around, torch.linalg.solve(precision, pull))
-        covariance = torch.linalg.inv(precision)
-        scene.placed[len(actions)] = center, 0.5 * (covariance + covariance.T)
+            scene.placed[len(actions)] = told.given(center, precision)
+        else:
+            alone = torch.zeros(1, dtype=torch.float64)
+            scene.placed[len(actions)] = Modes(center[None], torch.linalg.inv(precision)[None], alone)
     return scene.placed[len(actions)]
 
 
@@ -230,12 +276,9 @@ def seen_before(trace: Trace, view: Camera, bias: Tensor) -> NormalPose | None:
     if before is scene.prior:
         return None
     if isinstance(before, MixturePose):
-        parts = before.components  # the first of them is the normal itself
-        center, covariance = parts.center[..., 0, :], parts.covariance[..., 0, :, :]
-    else:
-        center, covariance = before.center, before.covariance
-    seen = seen_from(scene, scene.looks[view.name].camera, center, bias)
-    return NormalPose(seen.center, covariance + seen.covariance)
+        before = matched(before)
+    seen = seen_from(scene, scene.looks[view.name].camera, before.center, bias)
+    return NormalPose(seen.center, before.covariance + seen.covariance)
 
 
 def seen_in(scene: Scene, view: Camera, address: str, image: Tensor) -> FittedNormal:
@@ -265,6 +308,7 @@ def all_along(trace: Trace) -> None:
     """A proposal: the part walks as far as all is unsure of it, and where cameras see it comes along."""
     actions = trace.args[1]
     size = torch.exp(pyro.sample("walk", dist.Uniform(*WALK)))
-    _, covariance = placed_by_all(trace, actions)
+    placed = placed_by_all(trace, actions)
+    covariance = placed.covariances[placed.own(trace["part"])]
     step = (2.38 * size) ** 2 / 6.0
     carried_along(trace, actions, NormalPose(trace["part"], step[:, None, None] * covariance), WALKING)

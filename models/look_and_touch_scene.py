@@ -14,6 +14,7 @@ from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import FittedNormal
 from bcppl.distributions.manifold import ContactManifold, MeasuresGap
 from bcppl.distributions.manifold_fit import Told
+from bcppl.distributions.pose_normals import Modes
 from bcppl.models.camera_error import Cameras, Look
 from bcppl.recordings.measurements import ProbeWindow
 from bcppl.simulators.camera import Camera
@@ -65,7 +66,7 @@ class Scene:
             the guess, and of the camera's bias.
         near: by address, whether a window's peg came near where images place the part.
         told: by the number of actions, what all of their touches say to second order.
-        placed: by the number of actions, the normal that resembles what all of them say of the part.
+        placed: by the number of actions, the normals that resemble what all of them say of the part.
     """
 
     prior: Any
@@ -77,7 +78,7 @@ class Scene:
     settings: Settings
     fits: dict[str, FittedNormal] = field(default_factory=dict)
     told: dict[int, Told] = field(default_factory=dict)
-    placed: dict[int, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    placed: dict[int, Modes] = field(default_factory=dict)
     near: dict[str, bool] = field(default_factory=dict)
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,11 +17,50 @@ WIDTHS = torch.tensor([1.1, 3.0], dtype=torch.float64)
 SHARES = torch.tensor([0.85, 0.15], dtype=torch.float64)
 
 
+class Modes(NamedTuple):
+    """A mixture of M normals: centres (..., M, 7), covariances (..., M, 6, 6), log-weights (..., M)."""
+
+    centers: Tensor
+    covariances: Tensor
+    log_weights: Tensor
+
+    def own(self, pose: Tensor) -> Tensor:
+        """Of which of M normals poses (N, 7) most likely are: (N,) int64."""
+        if len(self.centers) == 1:
+            return torch.zeros(len(pose), dtype=torch.int64)
+        said = NormalPose(self.centers, self.covariances).log_prob(pose[:, None])
+        return (self.log_weights + said).argmax(dim=1)
+
+
 def widened(center: Tensor, covariance: Tensor) -> MixturePose:
     """A normal with centres (N, 7) and covariances (N, 6, 6), and a share of it wider."""
-    covariances = WIDTHS[:, None, None] ** 2 * covariance[..., None, :, :]
+    alone = torch.zeros(1, dtype=torch.float64)
+    return widened_modes(Modes(center[..., None, :], covariance[..., None, :, :], alone))
+
+
+def widened_modes(modes: Modes) -> MixturePose:
+    """A mixture of M normals for each of N, (N, M, 7) and so on, and a share of each wider."""
+    centers, wide = modes.centers, WIDTHS[:, None, None] ** 2 * modes.covariances[..., None, :, :]
+    log_weights = modes.log_weights.log_softmax(dim=-1)[..., None] + SHARES.log()
     return MixturePose(
-        SHARES.log(), center[..., None, :].expand(*center.shape[:-1], len(WIDTHS), 7), covariances
+        log_weights.flatten(-2),
+        centers[..., None, :].expand(*centers.shape[:-1], len(WIDTHS), 7).flatten(-3, -2),
+        wide.flatten(-4, -3),
+    )
+
+
+def matched(modes: MixturePose) -> NormalPose:
+    """The normal with the mean and the covariance of what `widened_modes` gives, but for the wider shares."""
+    every = len(WIDTHS)
+    chances = modes.log_weights[..., ::every].softmax(dim=-1)
+    centers = modes.components.center[..., ::every, :]
+    covariances = modes.components.covariance[..., ::every, :, :]
+    away = poses.local(centers[..., :1, :], centers)
+    mean = (chances[..., None] * away).sum(dim=-2)
+    off = away - mean[..., None, :]
+    covariance = covariances + off[..., :, None] * off[..., None, :]
+    return NormalPose(
+        poses.retract(centers[..., 0, :], mean), (chances[..., None, None] * covariance).sum(dim=-3)
     )
 
 

@@ -1,0 +1,181 @@
+"""A touch that either of two ridges explains: both are found, and believed in as they are likely."""
+
+from __future__ import annotations
+
+import functools
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from bcppl import poses
+from bcppl.distributions.manifold_fit import Normal, Told, Window, told_by
+from bcppl.distributions.pose_normals import Modes, matched, widened, widened_modes
+from bcppl.inference.guided_smc import guided, infer, kernel
+from bcppl.inference.smc import smc
+from bcppl.inference.smcp3 import Pair
+from bcppl.models import look_and_touch
+from bcppl.models.look_and_touch_proposals import passing
+from bcppl.models.look_and_touch_scene import Scene, touch_of
+from bcppl.parts import Part
+from bcppl.recordings import problems
+from bcppl.recordings.measurements import Guess, Measurement, Probe, ProbeWindow, Recording, Touch
+from bcppl.simulators.shapes import box_peg
+
+APART, THICK, HIGH, WIDE = 0.012, 0.004, 0.01, 0.004  # m: of the ridges, and of the peg
+LENGTH, DEEP = 0.05, 0.006  # m: the peg, and how far below the ridges' tops its tip is
+TOUCHED, SPEED = 0.3, 0.007  # s from which the peg, moving along x at so many m/s, is held up
+# Where the middle of the part is if the inner side of one ridge was touched, or the outer side of the other.
+INNER, OUTER = -0.5 * (APART - THICK - WIDE), 0.5 * (APART + THICK + WIDE)
+
+
+def ridges() -> Part:
+    walls = [
+        trimesh.creation.box((THICK, 0.06, HIGH), trimesh.transformations.translation_matrix([x, 0.0, 0.0]))
+        for x in (-0.5 * APART, 0.5 * APART)
+    ]
+    mesh = trimesh.util.concatenate(walls)
+    return Part("two ridges", np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces))
+
+
+@functools.cache
+def touched() -> Recording:
+    """The peg moves by 2 mm along x, to where its middle is at x = 0, and is held up there."""
+    stamps = np.arange(0.0, 0.7, 0.01)
+    x = np.minimum(0.0, SPEED * (stamps - TOUCHED))
+    command = np.zeros((len(stamps), 7))
+    command[:, 0], command[:, 2], command[:, 3] = SPEED * (stamps - TOUCHED), LENGTH - DEEP + 0.5 * HIGH, 1.0
+    stood = command.copy()
+    stood[:, 0] = x
+    wrench = np.zeros((len(stamps), 6))
+    wrench[stamps > TOUCHED, 0] = -4.0
+    probe = Probe("across", stamps, command, np.full(6, 2000.0), np.full(6, 50.0), stamps)
+    action = ProbeWindow(probe, 0, len(stamps))
+    guess = Guess(
+        np.array([0.5 * (INNER + OUTER), 0, 0, 1, 0, 0, 0]), np.array([0.011, 0.003, 1e-4]), 0.002, 0.01
+    )
+    seen = Measurement(action, Touch(stamps, wrench, stood))
+    return Recording(ridges(), guess, [seen], peg=box_peg(WIDE, LENGTH))
+
+
+def shares(world_from_part: Tensor, weights: Tensor) -> tuple[float, float]:
+    """Of the two explanations; what is left is neither."""
+    x = world_from_part[:, 0]
+    near = [(x - middle).abs() < 0.0005 for middle in (INNER, OUTER)]
+    return float(weights[near[0]].sum()), float(weights[near[1]].sum())
+
+
+def explained(everywhere: bool, before: Tensor | None = None) -> tuple[Scene, Normal, Told]:
+    recording = touched()
+    scene = look_and_touch.prepare(recording)
+    value = look_and_touch.observe(scene, recording.measurements)["touch_0"]
+    spread = torch.tensor([0.006, 0.002, 1e-4, 0.001, 0.001, 0.005], dtype=torch.float64)
+    center = torch.from_numpy(recording.guess.world_from_part)[None]
+    known = Normal(center, torch.diag(spread**-2)[None])
+    window = Window(value, partial(touch_of, scene, recording.measurements[0].action))
+    assert scene.gap is not None
+    return scene, known, told_by(scene.gap, [window], known, before, everywhere)
+
+
+def test_the_world_is_sound_and_both_places_explain_the_touch_alike() -> None:
+    recording = touched()
+    assert not [p for p in problems(recording) if "tared" not in p]
+    scene = look_and_touch.prepare(recording)
+    value = look_and_touch.observe(scene, recording.measurements)["touch_0"]
+    assert set(value[:, 7][~torch.isnan(value[:, 7])].tolist()) == {0.0, 1.0}
+    there = poses.identity(4)
+    there[:, 0] = torch.tensor([INNER, OUTER, 0.5 * (INNER + OUTER), OUTER + 0.002])
+    said = touch_of(scene, recording.measurements[0].action, there).log_prob(value)
+    assert float(said[0]) == pytest.approx(float(said[1]), abs=1e-4)
+    assert float(said[:2].min() - said[2:].max()) > 20.0
+
+
+def test_everywhere_finds_both_with_the_same_weight_and_what_was_found_is_kept() -> None:
+    _, known, one = explained(False)
+    assert len(one.around) == 1, "errors of millimetres lead all starts to one of them"
+    _, _, both = explained(True)
+    modes = both.given(known.center[0], known.precision[0])
+    assert sorted(round(1e3 * float(x), 1) for x in modes.centers[:, 0]) == [1e3 * INNER, 1e3 * OUTER]
+    assert float((modes.log_weights[0] - modes.log_weights[1]).abs()) < 0.1
+    *_, again = explained(False, both.around)
+    assert len(again.around) == 2
+
+
+def test_a_mode_weighs_what_a_normal_observation_is_worth() -> None:
+    torch.manual_seed(0)
+    rows, noise = torch.randn(9, 6, dtype=torch.float64), 0.3
+    spread = torch.rand(6, dtype=torch.float64) + 0.5
+    off = torch.cat([0.2 * torch.randn(3), torch.zeros(3)]).double()
+    seen = torch.randn(9, dtype=torch.float64)
+    information, zero = rows.T @ rows / noise**2, torch.zeros(9, dtype=torch.float64)
+    said = MultivariateNormal(zero, noise**2 * torch.eye(9).double()).log_prob(seen)
+    told = Told(poses.identity(1), -(rows.T @ seen / noise**2)[None], information[None], said[None])
+    found = told.given(poses.retract(poses.identity(1), off)[0], torch.diag(spread**-2))
+    whole = noise**2 * torch.eye(9).double() + rows @ torch.diag(spread**2) @ rows.T
+    assert float(found.log_weights) == pytest.approx(
+        float(MultivariateNormal(rows @ off, whole).log_prob(seen)), rel=1e-6
+    )
+    precision = torch.diag(spread**-2) + information
+    expected = torch.linalg.solve(precision, off / spread**2 + rows.T @ seen / noise**2)
+    torch.testing.assert_close(poses.local(poses.identity(1), found.centers)[0], expected)
+    torch.testing.assert_close(found.covariances[0], torch.linalg.inv(precision))
+
+
+def test_modes_widen_as_one_does_and_match_their_mean_and_covariance() -> None:
+    torch.manual_seed(1)
+    center = poses.retract(poses.identity(3), 0.1 * torch.randn(3, 6, dtype=torch.float64))
+    root = torch.randn(6, 6, dtype=torch.float64)
+    covariance = 1e-4 * (root @ root.T + torch.eye(6)).expand(3, 6, 6)
+    twice = Modes(
+        torch.stack([center, center], 1), torch.stack([covariance] * 2, 1), torch.tensor([1.0, -2.0]).double()
+    )
+    at = poses.retract(center, 0.01 * torch.randn(3, 6, dtype=torch.float64))
+    one, other = widened(center, covariance), widened_modes(twice)
+    torch.testing.assert_close(one.log_prob(at), other.log_prob(at))
+    torch.testing.assert_close(matched(one).covariance, matched(other).covariance)
+    away = torch.tensor([0.01, 0, 0, 0, 0, 0], dtype=torch.float64)
+    apart = Modes(
+        torch.stack([center, poses.retract(center, away)], 1),
+        twice.covariances,
+        torch.tensor([0.0, 0.0]).double(),
+    )
+    middle = matched(widened_modes(apart))
+    torch.testing.assert_close(poses.local(center, middle.center), (0.5 * away).expand(3, 6))
+    spread = middle.covariance - matched(one).covariance
+    torch.testing.assert_close(spread, 0.25 * torch.outer(away, away).expand(3, 6, 6))
+
+
+def test_particles_mostly_stay_in_their_mode_and_may_go_to_any() -> None:
+    centers = poses.identity(2)
+    centers[1, 0] = 0.01
+    spread = 1e-7 * torch.eye(6, dtype=torch.float64).expand(2, 6, 6)
+    modes = Modes(centers, spread, torch.tensor([0.9, 0.1]).double().log())
+    stay = passing(modes, modes).exp()
+    torch.testing.assert_close(stay, torch.tensor([[0.98, 0.02], [0.18, 0.82]]).double())
+    wide = Modes(centers[:1], 1e-4 * torch.eye(6).double()[None], torch.zeros(1).double())
+    torch.testing.assert_close(passing(wide, modes).exp(), torch.tensor([[0.9, 0.1]]).double())
+    torch.testing.assert_close(passing(modes, wide).exp(), torch.ones(2, 1).double())
+    assert modes.own(centers).tolist() == [0, 1]
+
+
+def test_the_belief_holds_both_alike() -> None:
+    held = []
+    for seed in range(6):
+        *_, last = infer(look_and_touch.model, touched(), particles=75, seed=seed)
+        held.append(shares(last.belief.world_from_part, last.belief.weights))
+    inner, outer = np.array(held).T
+    assert float(np.min(inner + outer)) > 0.9, held
+    assert float(inner.min()) > 0.1 and float(inner.max()) < 0.9, held
+    assert 0.35 < float(np.mean(inner / (inner + outer))) < 0.65, held
+
+
+def test_the_pair_leads_back_from_both() -> None:
+    assert look_and_touch.model.arrival is not None
+    pair = Pair(*look_and_touch.model.arrival, check=True)
+    step = guided(pair, kernel("part", look_and_touch.model.proposals))
+    *_, last = smc(look_and_touch.model, touched(), step=step, particles=20, seed=0)
+    assert np.isfinite(last.info.log_evidence)
