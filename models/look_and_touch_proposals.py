@@ -104,10 +104,18 @@ def told_by_touches(
                 windows.append(Window(value, partial(touch_of, scene, action)))
     latest = max(scene.told, default=None)
     before = None if latest is None else scene.told[latest]
-    everywhere = bool((windows[-1].value[:, 7] == 1.0).any()) and unsure(known, before) if windows else False
+    everywhere = met_anew(windows) and unsure(known, before)
     around = None if before is None else before.around
     scene.told[len(actions)] = told_by(scene.gap, windows, known, around, everywhere)
     return scene.told[len(actions)]
+
+
+def met_anew(windows: Sequence[Window]) -> bool:
+    """Whether in the last window the peg met the part, and did not only stay on it."""
+    if not windows:
+        return False
+    felt = torch.cat([torch.zeros(1), *(window.value[:, 7] == 1.0 for window in windows[-2:])]).bool()
+    return bool((felt[1:] & ~felt[:-1])[-len(windows[-1].value) :].any())
 
 
 def unsure(known: Normal, told: Told | None) -> bool:

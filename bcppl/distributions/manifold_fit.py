@@ -24,6 +24,7 @@ _MOVED = 0.001  # m: less is no direction
 # Explanations that are kept: so many at most, with a weight of the best one's by so many nats less, and so
 # many squared deviations apart.
 _MODES, _FAINT, _SAME = 4, 6.0, 12.0
+_LEFT = 12  # starts of those from everywhere that are followed to the end
 
 
 class Normal(NamedTuple):
@@ -121,7 +122,7 @@ def told_by(
     if everywhere:
         others.append(poses.retract(center, _PLACES @ scale.T))
     if sum(len(each) for each in others):
-        each, _ = fitted(gap, windows, torch.cat(others), known, FINE, halve=False)
+        each, _ = fitted(gap, windows, torch.cat(others), known, FINE, _LEFT)
         best = torch.cat([best, each])
     return _apart(_told(gap, windows, best), known)
 
@@ -162,7 +163,7 @@ def fitted(
     starts: Tensor,
     known: Normal,
     blurs: Sequence[float],
-    halve: bool = True,
+    least: int = 1,
 ) -> tuple[Tensor, Tensor]:
     """The likeliest poses (M, 7) to which Gauss-Newton leads, and their log-probabilities (M,).
 
@@ -172,7 +173,7 @@ def fitted(
         known: beside them.
         starts: (S, 7).
         blurs: metres that are added to errors at each step, 0 in the end.
-        halve: whether half of the starts are left at each step, one in the end; else all are.
+        least: half of the starts are left at each step, but so many in the end.
     """
     center, precision = known
     pose, said = starts, torch.zeros(len(starts))
@@ -187,9 +188,9 @@ def fitted(
         for site, value in _sites(gap, windows, tried.reshape(-1, 7), blur):
             total = total + site.log_prob(value)
         said, farthest = total.reshape(tried.shape[:2]).max(dim=1)
-        kept = said.topk(max(1, len(pose) // 2) if halve else len(pose)).indices
+        kept = said.topk(max(least, len(pose) // 2) if len(pose) > least else len(pose)).indices
         pose, said = tried[kept, farthest[kept]], said[kept]
-    return (pose[:1], said[:1]) if halve else (pose, said)
+    return pose[:least], said[:least]
 
 
 def _onward(windows: Sequence[Window]) -> Tensor | None:
