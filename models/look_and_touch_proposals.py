@@ -1,7 +1,7 @@
 """What is known beforehand of where a part that is seen and touched will be: proposals of `look_and_touch`.
 
-An image is resembled by a normal over where its camera sees the part, touches by a quadratic around the pose
-that they and the images make likeliest. No answer hangs on either.
+An image is resembled by a normal over where its camera sees the part, touches by quadratics around the poses
+that explain them. No answer hangs on either.
 """
 
 from __future__ import annotations
@@ -104,18 +104,17 @@ def told_by_touches(
                 windows.append(Window(value, partial(touch_of, scene, action)))
     latest = max(scene.told, default=None)
     before = None if latest is None else scene.told[latest]
-    everywhere = met_anew(windows) and unsure(known, before)
+    everywhere = met_anew(windows, newest=before is not None) and unsure(known, before)
     around = None if before is None else before.around
     scene.told[len(actions)] = told_by(scene.gap, windows, known, around, everywhere)
     return scene.told[len(actions)]
 
 
-def met_anew(windows: Sequence[Window]) -> bool:
-    """Whether in the last window the peg met the part, and did not only stay on it."""
-    if not windows:
-        return False
-    felt = torch.cat([torch.zeros(1), *(window.value[:, 7] == 1.0 for window in windows[-2:])]).bool()
-    return bool((felt[1:] & ~felt[:-1])[-len(windows[-1].value) :].any())
+def met_anew(windows: Sequence[Window], newest: bool) -> bool:
+    """Whether in one of the windows, or in the newest, the peg met the part, and did not only stay on it."""
+    felt = torch.cat([torch.zeros(1, dtype=torch.bool), *(window.value[:, 7] == 1.0 for window in windows)])
+    onsets = felt[1:] & ~felt[:-1]
+    return bool((onsets[-len(windows[-1].value) :] if newest and windows else onsets).any())
 
 
 def unsure(known: Normal, told: Told | None) -> bool:

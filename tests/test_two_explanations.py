@@ -19,7 +19,7 @@ from bcppl.inference.guided_smc import guided, infer, kernel
 from bcppl.inference.smc import smc
 from bcppl.inference.smcp3 import Pair
 from bcppl.models import look_and_touch
-from bcppl.models.look_and_touch_proposals import passing
+from bcppl.models.look_and_touch_proposals import met_anew, passing, unsure
 from bcppl.models.look_and_touch_scene import Scene, touch_of
 from bcppl.parts import Part
 from bcppl.recordings import problems
@@ -160,6 +160,27 @@ def test_particles_mostly_stay_in_their_mode_and_may_go_to_any() -> None:
     torch.testing.assert_close(passing(wide, modes).exp(), torch.tensor([[0.9, 0.1]]).double())
     torch.testing.assert_close(passing(modes, wide).exp(), torch.ones(2, 1).double())
     assert modes.own(centers).tolist() == [0, 1]
+
+
+def test_the_peg_meets_the_part_where_it_did_not_touch_before() -> None:
+    def window(flags: str) -> Window:
+        value = torch.zeros(len(flags), 8, dtype=torch.float64)
+        value[:, 7] = torch.tensor([{"#": 1.0, ".": 0.0, "?": torch.nan}[each] for each in flags])
+        return Window(value, partial(pytest.fail, "not asked"))
+
+    for newest, windows, met in (
+        (True, ["..?##"], True),
+        (True, ["..###", "#####"], False),
+        (False, ["..###", "#####"], True),
+        (True, ["..###", "#?..#"], True),
+        (True, ["...??", "##"], True),
+        (False, ["....", "??"], False),
+        (True, [], False),
+    ):
+        assert met_anew([window(each) for each in windows], newest) is met, (newest, windows)
+    known = Normal(poses.identity(1), torch.diag(torch.tensor([0.0004] * 3 + [0.1] * 3) ** -2).double()[None])
+    assert not unsure(known, None)
+    assert unsure(Normal(known.center, known.precision / 4.0), None)
 
 
 def test_the_belief_holds_both_alike() -> None:
