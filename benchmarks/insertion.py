@@ -222,18 +222,21 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=100, help="at each clearance")
     parser.add_argument("--jobs", type=int, default=cores(), help="scenes at a time")
     parser.add_argument("--known", nargs="+", choices=KNOWN, default=list(KNOWN))
+    all_mm = [round(1e3 * clearance, 3) for clearance in CLEARANCES]
+    parser.add_argument("--clearances", nargs="+", type=float, choices=all_mm, default=all_mm, help="in mm")
     parser.add_argument("--foretell", action="store_true", help="compute the chance of each attempt as well")
     arguments = parser.parse_args()
     count = 2 if arguments.quick else arguments.scenes
     seeds = range(arguments.seed, arguments.seed + count)
     known = tuple(arguments.known)
+    clearances = [m for m, mm in zip(CLEARANCES, all_mm, strict=True) if mm in arguments.clearances]
     # Clearances in turn: a run that is stopped has as many scenes of each.
-    tasks = [Task(seed, clearance, known, arguments.foretell) for seed in seeds for clearance in CLEARANCES]
+    tasks = [Task(seed, clearance, known, arguments.foretell) for seed in seeds for clearance in clearances]
     outcomes = sorted(as_they_come(tasks, arguments.jobs), key=lambda o: (o.clearance, o.seed))
     lines, rows = [], []
     for what in known:
         mine = [o for o in outcomes if o.known == what]
-        for clearance in (*CLEARANCES, None):
+        for clearance in (*clearances, None):
             some = [o for o in mine if clearance in (None, o.clearance)]
             if not some:
                 continue
@@ -242,7 +245,9 @@ def main() -> None:
             share, low, high = rate(some)
             goal = None
             if what != VISION:
-                goal = OVERALL if clearance is None else TIGHTEST if clearance == min(CLEARANCES) else None
+                goal = TIGHTEST if clearance == min(CLEARANCES) else None
+                if clearance is None and len(clearances) == len(CLEARANCES):
+                    goal = OVERALL
             rows += [
                 Row(f"inserted, {what}, {where}", share, "share", goal, "min"),
                 Row(f"inserted, {what}, {where}, lower end", low, "share", None, "min"),
