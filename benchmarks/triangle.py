@@ -4,13 +4,14 @@ The triangle lies within 20 mm and 3 degrees of the guess. A push is drawn from 
 in; what is left is a belief that is long along the edge that was touched. The next push is chosen among
 others of the log, by what each is expected to tell; what was truly felt in it is then taken in. Asked is on
 which edge the chosen push lay (by the true pose, which nobody is told), and what is left of the slide.
-Beside it what the others would have left, for in some draws none of them ends it.
+With `--every` also what the others would have left, for in some draws few or none of them end it.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import cache, partial
@@ -42,7 +43,7 @@ from bcppl.traces import Trace, extend
 
 LOG = "10_90"
 YAW = 3.0  # degrees; with more, another contact on the same edge is worth as much as one on another
-PARTICLES, CANDIDATES, HYPOTHESES = 75, 12, 16
+PARTICLES, CANDIDATES, HYPOTHESES = 75, 32, 16
 GONE = 1.0 / 3.0  # of how far it could slide
 WAYS = ("entropy of weights", "entropy of the pose", "information added up")
 
@@ -54,7 +55,7 @@ class Chosen(NamedTuple):
         another: whether the second push lay on another edge than the first.
         before, after: how far the part could slide along the edge first touched (`slide`), mm.
         by_chance: the same after the first candidate, for which nobody asked.
-        least: the same after whichever candidate left least, as it turned out.
+        least: the same after whichever candidate left least, as it turned out; NaN where nobody looked.
         share: of the candidates that lay on another edge.
     """
 
@@ -121,16 +122,18 @@ def told(arguments: Callable[[Any], tuple[Any, ...]], push: Push, trace: Trace) 
     return slope.transpose(-1, -2) @ slope
 
 
-def chosen(seed: int) -> list[Chosen]:
-    """One draw, each way."""
+def chosen(
+    seed: int, candidates: int = CANDIDATES, hypotheses: int = HYPOTHESES, every: bool = False
+) -> list[Chosen]:
+    """One draw, each way, from so many pushes; `every` one of them is tried as well."""
     logs = sorted(LOGS.glob(f"{LOG}_10_10*"))
-    recording = command(logs, pushes=1 + CANDIDATES, seed=seed, yaw=YAW)
+    recording = command(logs, pushes=1 + candidates, seed=seed, yaw=YAW)
     settings = learnt(OTHER[LOG])
     scene = model.prepare(recording, **asdict(settings))
     first = after(recording, [0], scene, seed)
-    edges = torch.stack([edge_of(recording, k, settings) for k in range(1 + CANDIDATES)])
+    edges = torch.stack([edge_of(recording, k, settings) for k in range(1 + candidates)])
     another = (edges @ edges[0] < math.cos(math.radians(45.0))).tolist()
-    others = range(1, 1 + CANDIDATES)
+    others = range(1, 1 + candidates)
     actions = [recording.measurements[k].action for k in others]
     done = [recording.measurements[0].action]
 
@@ -144,11 +147,11 @@ def chosen(seed: int) -> list[Chosen]:
         step = after(recording, [0, second], scene, seed, first)
         return slide(step.belief, recording, edges[0])
 
-    found, least = [], min(left(k) for k in others)
+    found, least = [], min(left(k) for k in others) if every else math.nan
     rankings = [
         *(
             expected_information_gain(
-                first.population, actions, arguments, entropy, hypotheses=HYPOTHESES, seed=seed
+                first.population, actions, arguments, entropy, hypotheses=hypotheses, seed=seed
             )
             for entropy in (weight_entropy(), mode_entropy("part"))
         ),
@@ -159,36 +162,51 @@ def chosen(seed: int) -> list[Chosen]:
     for ranking in rankings:
         best = others[ranking.best.number]
         found.append(Chosen(another[best], before, left(best), left(1), least, float(np.mean(another[1:]))))
+    one = found[0]
+    edge = "another" if one.another else "the same"
+    print(f"draw {seed}: {edge} edge, slide {before:.2f} to {one.after:.2f} mm", file=sys.stderr, flush=True)
     return found
 
 
 def main() -> None:
     parser: argparse.ArgumentParser = options(__doc__ or "")
     parser.add_argument("--jobs", type=int, default=cores(), help="processes, of one thread each if several")
+    parser.add_argument("--candidates", type=int, default=CANDIDATES, help="pushes to choose from")
+    parser.add_argument("--hypotheses", type=int, default=HYPOTHESES, help="particles that play the truth")
+    parser.add_argument("--every", action="store_true", help="say what every candidate would have left")
     arguments = parser.parse_args()
+    if arguments.candidates < 1:
+        parser.error(f"--candidates is {arguments.candidates}; give one or more.")
     if not LOGS.is_dir():
         print(f"skipped: the push logs are not at {LOGS}.")
         return
     draws = 3 if arguments.quick else 20
-    results = each(chosen, range(arguments.seed, arguments.seed + draws), arguments.jobs)
+    choose = partial(
+        chosen,
+        candidates=arguments.candidates,
+        hypotheses=arguments.hypotheses,
+        every=arguments.every,
+    )
+    results = each(choose, range(arguments.seed, arguments.seed + draws), arguments.jobs)
     rows, lines = [], []
     for k, name in enumerate(WAYS):
         own = [one[k] for one in results]
         counts = sum(one.another for one in own), sum(one.gone for one in own)
         numbers = [float(np.median([getattr(one, field) for one in own])) for field in Chosen._fields[1:5]]
         share = float(np.mean([one.share for one in own]))
-        possible = sum(one.could_be for one in own)
+        possible = sum(one.could_be for one in own) if arguments.every else math.nan
         lines.append([name, *counts, possible, *numbers, share])
         goal = 0.9 * draws if k == 0 else None
         rows += [
             Row(f"{name}: next push on another edge", counts[0], f"of {draws}", goal, "min"),
             Row(f"{name}: slide gone after it", counts[1], f"of {draws}", goal, "min"),
-            Row(f"{name}: draws in which some push ends it", possible, f"of {draws}", direction="min"),
             Row(f"{name}: slide before, median", numbers[0], "mm"),
             Row(f"{name}: slide after, median", numbers[1], "mm"),
             Row(f"{name}: slide after a push by chance, median", numbers[2], "mm"),
             Row(f"{name}: candidates on another edge", share, "", direction="min"),
         ]
+        if arguments.every:
+            rows.append(Row(f"{name}: some push ends it", possible, f"of {draws}", direction="min"))
     columns = [
         "entropy",
         "another edge",
@@ -201,7 +219,9 @@ def main() -> None:
         "candidates on another",
     ]
     show(
-        f"one real push, then the best of {CANDIDATES}: {draws} draws, {PARTICLES} particles", columns, lines
+        f"one real push, then the best of {arguments.candidates}: {draws} draws, {PARTICLES} particles",
+        columns,
+        lines,
     )
     finish(rows, arguments.json)
 
