@@ -211,8 +211,9 @@ def passing(start: Modes, goal: Modes) -> Tensor:
     both = start.covariances[:, None] + goal.covariances
     squared = (away * torch.linalg.solve(both, away[..., None])[..., 0]).sum(dim=-1)
     any_mode = goal.log_weights.log_softmax(dim=0).expand(len(start.centers), -1)
-    near = torch.where(squared < NEARBY, any_mode, -torch.inf)
-    near = torch.where((near > -torch.inf).any(dim=1, keepdim=True), near, any_mode).log_softmax(dim=1)
+    mine = squared < NEARBY
+    mine = mine | ~mine.any(dim=1, keepdim=True)
+    near = torch.where(mine, any_mode, -torch.inf).log_softmax(dim=1)
     return torch.logaddexp(near + math.log(STAYING), any_mode + math.log1p(-STAYING))
 
 

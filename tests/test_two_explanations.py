@@ -20,7 +20,7 @@ from bcppl.inference.smc import smc
 from bcppl.inference.smcp3 import Pair
 from bcppl.models import look_and_touch
 from bcppl.models.look_and_touch_proposals import met_anew, passing, unsure
-from bcppl.models.look_and_touch_scene import Scene, touch_of
+from bcppl.models.look_and_touch_scene import touch_of
 from bcppl.parts import Part
 from bcppl.recordings import problems
 from bcppl.recordings.measurements import Guess, Measurement, Probe, ProbeWindow, Recording, Touch
@@ -69,7 +69,7 @@ def shares(world_from_part: Tensor, weights: Tensor) -> tuple[float, float]:
     return float(weights[near[0]].sum()), float(weights[near[1]].sum())
 
 
-def explained(everywhere: bool, before: Tensor | None = None) -> tuple[Scene, Normal, Told]:
+def explained(everywhere: bool, before: Tensor | None = None) -> tuple[Normal, Told]:
     recording = touched()
     scene = look_and_touch.prepare(recording)
     value = look_and_touch.observe(scene, recording.measurements)["touch_0"]
@@ -78,7 +78,7 @@ def explained(everywhere: bool, before: Tensor | None = None) -> tuple[Scene, No
     known = Normal(center, torch.diag(spread**-2)[None])
     window = Window(value, partial(touch_of, scene, recording.measurements[0].action))
     assert scene.gap is not None
-    return scene, known, told_by(scene.gap, [window], known, before, everywhere)
+    return known, told_by(scene.gap, [window], known, before, everywhere)
 
 
 def test_the_world_is_sound_and_both_places_explain_the_touch_alike() -> None:
@@ -95,13 +95,13 @@ def test_the_world_is_sound_and_both_places_explain_the_touch_alike() -> None:
 
 
 def test_everywhere_finds_both_with_the_same_weight_and_what_was_found_is_kept() -> None:
-    _, known, one = explained(False)
+    known, one = explained(False)
     assert len(one.around) == 1, "errors of millimetres lead all starts to one of them"
-    _, _, both = explained(True)
+    _, both = explained(True)
     modes = both.given(known.center[0], known.precision[0])
     assert sorted(round(1e3 * float(x), 1) for x in modes.centers[:, 0]) == [1e3 * INNER, 1e3 * OUTER]
     assert float((modes.log_weights[0] - modes.log_weights[1]).abs()) < 0.1
-    *_, again = explained(False, both.around)
+    _, again = explained(False, both.around)
     assert len(again.around) == 2
 
 

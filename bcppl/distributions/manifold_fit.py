@@ -35,7 +35,7 @@ class Normal(NamedTuple):
 
 
 class Told(NamedTuple):
-    """What touches say to second order around each of M poses (M, 7) that explain them, the likeliest first.
+    """What touches say to second order around each of M poses (M, 7) that explain them, the weightiest first.
 
     Of minus the log-likelihood (M, 6) and (M, 6, 6); and the log-likelihood (M,) there.
     """
@@ -121,16 +121,17 @@ def told_by(
     others = [] if before is None or len(before) == 1 else [before]
     if everywhere:
         others.append(poses.retract(center, _PLACES @ scale.T))
-    if sum(len(each) for each in others):
+    if others:
         each, _ = fitted(gap, windows, torch.cat(others), known, FINE, _LEFT)
         best = torch.cat([best, each])
     return _apart(_told(gap, windows, best), known)
 
 
-def _told(gap: MeasuresGap, windows: Sequence[Window], pose: Tensor) -> Told:
+def _told(gap: MeasuresGap, windows: Sequence[Window], pose: Tensor, blur: float = 0.0) -> Told:
+    """What all windows say around poses (S, 7), or would with errors `blur` metres wider."""
     slope, information = pose.new_zeros(len(pose), 6), pose.new_zeros(len(pose), 6, 6)
     said = pose.new_zeros(len(pose))
-    for site, value in _sites(gap, windows, pose, 0.0):
+    for site, value in _sites(gap, windows, pose, blur):
         quadratic = site.quadratic(value)
         slope, information = slope + quadratic.slope, information + quadratic.information
         said = said + site.log_prob(value)
@@ -178,9 +179,9 @@ def fitted(
     center, precision = known
     pose, said = starts, torch.zeros(len(starts))
     for blur in blurs:
-        slope, information = _pull(gap, windows, pose, blur)
-        pull = (precision @ poses.local(pose, center)[..., None])[..., 0] - slope
-        step = torch.linalg.solve(precision + information, pull[..., None])
+        told = _told(gap, windows, pose, blur)
+        pull = (precision @ poses.local(pose, center)[..., None])[..., 0] - told.slope
+        step = torch.linalg.solve(precision + told.information, pull[..., None])
         # Which corner touches changes on the way: so far and no farther than it gains.
         tried = poses.retract(pose[:, None], _SHARES_OF_STEP[:, None] * step[:, None, :, 0])
         away = poses.local(center, tried.reshape(-1, 7))
@@ -188,7 +189,7 @@ def fitted(
         for site, value in _sites(gap, windows, tried.reshape(-1, 7), blur):
             total = total + site.log_prob(value)
         said, farthest = total.reshape(tried.shape[:2]).max(dim=1)
-        kept = said.topk(max(least, len(pose) // 2) if len(pose) > least else len(pose)).indices
+        kept = said.topk(min(len(pose), max(least, len(pose) // 2))).indices
         pose, said = tried[kept, farthest[kept]], said[kept]
     return pose[:least], said[:least]
 
@@ -205,15 +206,6 @@ def _onward(windows: Sequence[Window]) -> Tensor | None:
     last = int(onsets[-1])
     way = rows[last + 1, :3] - rows[max(0, last - 2), :3]
     return way / way.norm() if float(way.norm()) > _MOVED else None
-
-
-def _pull(gap: MeasuresGap, windows: Sequence[Window], pose: Tensor, blur: float) -> tuple[Tensor, Tensor]:
-    """Slope (S, 6) and curvature (S, 6, 6) of minus the log-likelihood of all windows at poses (S, 7)."""
-    slope, information = pose.new_zeros(len(pose), 6), pose.new_zeros(len(pose), 6, 6)
-    for site, value in _sites(gap, windows, pose, blur):
-        said = site.quadratic(value)
-        slope, information = slope + said.slope, information + said.information
-    return slope, information
 
 
 def _sites(

@@ -67,6 +67,7 @@ class Spot(NamedTuple):
 
 
 # By unit, what numbers of it say and how large they may be: beyond it they are in millimetres.
+# At stiffness and damping the plan looks.
 _BOUNDS = {
     "m": {"safe": 1.0, "depth": 0.5, "press": 0.05, "length": 1.0, "shortest": 0.5, "longest": 0.5},
     "m/s": {"free": 5.0, "guarded": 1.0, "sliding": 1.0},
