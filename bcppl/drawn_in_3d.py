@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
-from bcppl.parts import Part
+from bcppl.geometry.parts import Part
 
 Array = npt.NDArray[np.float64]
 

@@ -34,9 +34,9 @@ from bcppl.drawn_in_3d import (
     rotation,
 )
 from bcppl.errors import InputError
-from bcppl.parts import Part
-from bcppl.recordings.measurements import View
-from bcppl.recordings.plan import Plan
+from bcppl.geometry.parts import Part
+from bcppl.robot.plan import Plan
+from bcppl.sensors.measurements import View
 
 Array = npt.NDArray[np.float64]
 

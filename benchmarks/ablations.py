@@ -25,18 +25,18 @@ from scenes import (
 )
 from scipy.stats import bootstrap
 
-from bcppl.inference import tempered_smc
+from bcppl.inference.filters import tempered_smc
+from bcppl.inference.filters.smc import Step, smc
+from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence
 from bcppl.inference.kernels.kernel import Move
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.proposals.together import continuous, drift_together
 from bcppl.inference.resampling import adaptive, systematic
-from bcppl.inference.smc import Step, smc
-from bcppl.inference.tempering import tempered
 from bcppl.models import look_and_touch, peg_in_hole
 from bcppl.models.worlds.bench import bench_scene
-from bcppl.recordings.measurements import Recording, View
+from bcppl.sensors.measurements import Recording, View
 
 DEFAULT, SEEN, FREE_SPACE = "default", "vision only", "no free-space evidence"
 MANY, FEW = 1000, 10  # particles that only so many scenes are run with

@@ -17,7 +17,7 @@ from report import Row, finish, options, show
 from scipy.stats import chi2
 
 from bcppl import poses
-from bcppl.inference.tempered_smc import infer
+from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models import camera_error, part_in_view
 
 MODELS = {"latent errors": camera_error.model, "none": part_in_view.model}

@@ -4,7 +4,8 @@ The guess is the truth moved by a draw from the prior, 40 mm to either side and 
 counts as found where the posterior mean is closer to the truth than a tenth of its diameter, by ADD over the
 mesh's vertices, or by ADD-S where it looks the same from several sides (Hinterstoisser et al., ACCV 2012).
 
-The model asks for climbs before tempering (`bcppl.inference.climbing`); `--set climbs=0` leaves them out.
+The model asks for climbs before tempering (`bcppl.inference.proposals.climbing`);
+`--set climbs=0` leaves them out.
 Beliefs are over-sure: a truth gap of minus hundreds of nats is the model's fault, not the search's.
 """
 
@@ -22,7 +23,7 @@ from jobs import each
 from report import DATA, Row, finish, options, show
 
 from bcppl.beliefs import average_distance, average_nearest_distance
-from bcppl.inference.tempered_smc import infer
+from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.part_in_view import model
 from bcppl.recordings.importers.bop import command
 

@@ -19,18 +19,18 @@ from report import Row, cores, finish, options, show
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.contact.model_copies import ModelCopies
+from bcppl.contact.peg_model import build_model, controls, hold
+from bcppl.contact.physics import PegPhysics
+from bcppl.contact.stepping import WRENCH
+from bcppl.contact.unknowns import Unknowns
+from bcppl.contact.wrench import Sensing
 from bcppl.distributions.poses import prior_from_guess
-from bcppl.inference.tempered_smc import infer
+from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.peg_in_hole import CONTACT, model
 from bcppl.models.worlds.peg_in_hole import record
 from bcppl.recordings import Recording
-from bcppl.recordings.measurements import Probe, ProbeWindow
-from bcppl.simulators.model_copies import ModelCopies
-from bcppl.simulators.peg_model import build_model, controls, hold
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.stepping import WRENCH
-from bcppl.simulators.unknowns import Unknowns
-from bcppl.simulators.wrench import Sensing
+from bcppl.sensors.measurements import Probe, ProbeWindow
 
 PARTICLES = 75
 TOUCHING = 0.1  # N more or less than in free motion: what a wrist sensor's noise is

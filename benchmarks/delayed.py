@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from report import Row, finish, options, show
 
 from bcppl import poses
+from bcppl.inference.filters.tempered_smc import infer
 from bcppl.inference.kernels import (
     Kernel,
     Move,
@@ -33,7 +34,6 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals import differential_evolution, drift, independent
 from bcppl.inference.resampling import always
 from bcppl.inference.targets import POSTERIOR, Target
-from bcppl.inference.tempered_smc import infer
 from bcppl.models.peg_in_hole import model
 from bcppl.models.worlds.peg_in_hole import record
 from bcppl.traces import Trace

@@ -22,9 +22,9 @@ from pyro.infer import SMCFilter
 from report import Row, cores, finish, options, show
 from torch import Tensor
 
+from bcppl.inference.filters.smc import FEW_PARTICLES
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import adaptive
-from bcppl.inference.smc import FEW_PARTICLES
 from bcppl.traces import Series, extend, generate
 
 _spec = importlib.util.spec_from_file_location("problems", peer.SCRIPTS / "problems.py")
@@ -202,7 +202,7 @@ def main() -> None:
     threads = torch.get_num_threads()
     for count in COUNTS[:2] if arguments.quick else COUNTS:
         repeats = 3 if arguments.quick else REPEATS[count]
-        # As `bcppl.inference.smc` does it, for all engines alike.
+        # As `bcppl.inference.filters.smc` does it, for all engines alike.
         torch.set_num_threads(1 if count < FEW_PARTICLES else threads)
         timed = together(engines, count, observed, repeats, arguments.seed)
         torch.set_num_threads(threads)

@@ -21,11 +21,11 @@ from torch import Tensor
 
 from bcppl.beliefs import normalised
 from bcppl.distributions.lazy import LazyDistribution
+from bcppl.inference.filters.step import Observed
+from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.kernels import Kernel, distinct
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import adaptive, systematic
-from bcppl.inference.step import Observed
-from bcppl.inference.tempering import tempered
 from bcppl.traces import generate
 
 sys.path.insert(0, str(Path(__file__).parent / "peers"))

@@ -19,19 +19,19 @@ from scipy.stats import binomtest
 
 from bcppl import poses
 from bcppl.beliefs import Belief
-from bcppl.inference.probing.candidates import MIXED, candidates
-from bcppl.inference.probing.chance import chance_of_success
-from bcppl.inference.probing.filters import Candidate
-from bcppl.inference.probing.insertion import insertion_plan
-from bcppl.inference.probing.loop import probing_loop
-from bcppl.inference.probing.metrology import three_two_one
-from bcppl.inference.probing.rules import by_information
-from bcppl.inference.smc import Step
+from bcppl.contact.physics import PegPhysics
+from bcppl.geometry.gap import PegGap
+from bcppl.inference.design.loop import probing_loop
+from bcppl.inference.design.rules import by_information
+from bcppl.inference.filters.smc import Step
+from bcppl.inference.planning.candidates import MIXED, candidates
+from bcppl.inference.planning.chance import chance_of_success
+from bcppl.inference.planning.filters import Candidate
+from bcppl.inference.planning.insertion import insertion_plan
+from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
-from bcppl.simulators.gap import PegGap
-from bcppl.simulators.physics import PegPhysics
 
 CLEARANCES = Bench().clearances
 VISION, FIXED, CHOSEN = "vision", "3-2-1 probe", "chosen probes"

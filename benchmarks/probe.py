@@ -10,7 +10,7 @@ import numpy as np
 from jobs import each
 from report import Row, finish, options, show
 
-from bcppl.inference.tempered_smc import infer
+from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.peg_in_hole import model
 from bcppl.models.worlds.peg_in_hole import record
 

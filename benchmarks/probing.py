@@ -22,19 +22,19 @@ from rich.console import Console
 from scenes import PARTICLES, every, one_line, quantile, taken_in
 
 from bcppl.beliefs import Belief
-from bcppl.inference.probing import mode_entropy
-from bcppl.inference.probing.candidates import MIXED, candidates
-from bcppl.inference.probing.filters import Candidate, name_of
-from bcppl.inference.probing.loop import Round, probing_loop
-from bcppl.inference.probing.rules import Rank, at_random, by_information, by_largest_variance, in_order
-from bcppl.inference.probing.touching import Spot, touch
-from bcppl.inference.smc import Step
+from bcppl.geometry.gap import PegGap
+from bcppl.inference.design import mode_entropy
+from bcppl.inference.design.loop import Round, probing_loop
+from bcppl.inference.design.rules import Rank, at_random, by_information, by_largest_variance, in_order
+from bcppl.inference.filters.smc import Step
+from bcppl.inference.planning.candidates import MIXED, candidates
+from bcppl.inference.planning.faces import sides, spots_on_top
+from bcppl.inference.planning.filters import Candidate, name_of
+from bcppl.inference.planning.touching import Spot, touch
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
-from bcppl.recordings.measurements import Touch
-from bcppl.simulators.faces import sides, spots_on_top
-from bcppl.simulators.gap import PegGap
+from bcppl.sensors.measurements import Touch
 
 SCENES, PROBES = 50, 3
 WAYS = ("chosen", "random", "script", "variance")

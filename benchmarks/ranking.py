@@ -21,17 +21,17 @@ from scipy.stats import spearmanr
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.inference.guided_smc import infer
+from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.physics import PegPhysics
+from bcppl.inference.design import Ranking, expected_information_gain, linearised_information_gain
+from bcppl.inference.filters.guided_smc import infer
+from bcppl.inference.planning.candidates import candidates
 from bcppl.inference.population import Population
-from bcppl.inference.probing import Ranking, expected_information_gain, linearised_information_gain
-from bcppl.inference.probing.candidates import candidates
 from bcppl.inference.schemes import systematic
 from bcppl.models.look_and_touch import model
 from bcppl.models.look_and_touch_scene import Scene, touch_of
 from bcppl.models.worlds.bench import bench_scene
-from bcppl.recordings.plan import Plan, action_of, probe_of
-from bcppl.simulators.peg_model import ContactParameters
-from bcppl.simulators.physics import PegPhysics
+from bcppl.robot.plan import Plan, action_of, probe_of
 from bcppl.traces import Trace
 
 PARTICLES, CANDIDATES = 75, 32

@@ -28,11 +28,11 @@ from embreex.rtcore_scene import EmbreeScene
 from report import DATA, Row, cores, finish, options, show
 from scipy.spatial.transform import Rotation
 
-from bcppl.parts import Part
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.rasteriser import DepthRasteriser
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.rendering import renderer_for
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part
+from bcppl.rendering.choice import renderer_for
+from bcppl.rendering.rasteriser import DepthRasteriser
+from bcppl.rendering.renderer import DepthRenderer
 
 Array = npt.NDArray[np.float64]
 

@@ -36,12 +36,12 @@ from bcppl.beliefs.regions import (
     translation_deviation,
 )
 from bcppl.cli.surprises import MARK, Watch
-from bcppl.inference.guided_smc import infer
-from bcppl.inference.probing.metrology import three_two_one
-from bcppl.inference.smc import Step
+from bcppl.inference.filters.guided_smc import infer
+from bcppl.inference.filters.smc import Step
+from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
-from bcppl.recordings.measurements import Recording
+from bcppl.sensors.measurements import Recording
 
 PARTICLES = 75
 TIMES = {"3 s": 3.0, "4 s": 4.0, "5 s": 5.0, "6 s": 6.0}

@@ -12,12 +12,12 @@ import trimesh
 from report import Row, finish, options, show
 from scipy.stats import chi2
 
-from bcppl.parts import Part
-from bcppl.simulators.sensing.candidates import CORNER, EDGE, FACE
-from bcppl.simulators.sensing.intrinsic import IntrinsicSensing
-from bcppl.simulators.sensing.noise import WrenchNoise, filtered_share
-from bcppl.simulators.shapes import box_peg, round_peg
-from bcppl.simulators.wrench import Sensing
+from bcppl.contact.sensing.candidates import CORNER, EDGE, FACE
+from bcppl.contact.sensing.intrinsic import IntrinsicSensing
+from bcppl.contact.sensing.noise import WrenchNoise, filtered_share
+from bcppl.contact.wrench import Sensing
+from bcppl.geometry.parts import Part
+from bcppl.geometry.shapes import box_peg, round_peg
 
 Array = npt.NDArray[np.float64]
 

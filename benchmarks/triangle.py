@@ -26,19 +26,19 @@ from touches import LOGS, OTHER, learnt
 
 from bcppl import poses
 from bcppl.beliefs import Belief
-from bcppl.inference.probing import (
+from bcppl.geometry.distance import SignedDistance
+from bcppl.geometry.gap import Gap
+from bcppl.inference.design import (
     expected_information_gain,
     linearised_information_gain,
     mode_entropy,
     weight_entropy,
 )
-from bcppl.inference.smc import Step
-from bcppl.inference.tempered_smc import infer
+from bcppl.inference.filters.smc import Step
+from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.point_probe import felt, model
 from bcppl.recordings.importers.point_probe import command
-from bcppl.recordings.measurements import Push, Recording, Touch
-from bcppl.simulators.distance import SignedDistance
-from bcppl.simulators.gap import Gap
+from bcppl.sensors.measurements import Push, Recording, Touch
 from bcppl.traces import Trace, extend
 
 LOG = "10_90"

@@ -16,15 +16,15 @@ from report import Row, finish, options, show
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.track import ContactTrack
 from bcppl.distributions.contact import ChamferContacts, PegPose
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.wrench import Wrench
-from bcppl.inference.tempered_smc import infer
+from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models import peg_in_hole
 from bcppl.models.worlds.peg_in_hole import record
-from bcppl.recordings.measurements import Measurement, ProbeWindow, Touch, View
-from bcppl.simulators.peg_model import ContactParameters
-from bcppl.simulators.track import ContactTrack
+from bcppl.sensors.measurements import Measurement, ProbeWindow, Touch, View
 from bcppl.traces import Model, carried
 
 PARTICLES = 75

@@ -69,7 +69,7 @@ def collect(steps: Iterable[S], **functions: Callable[[S], Any]) -> Collected[S]
     """Watch a run: `name=function(step)` for each column.
 
     Args:
-        steps: an iterator such as `smc(...)` or `bcppl.inference.step.steps(...)`; it is not run ahead.
+        steps: an iterator such as `smc(...)` or `steps(...)`; it is not run ahead.
         functions: what is read of each step; see the ones below.
 
     Returns:

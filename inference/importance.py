@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
+from bcppl.inference.filters.step import Stepped
+from bcppl.inference.filters.tempering import Tempered
 from bcppl.inference.population import Population
-from bcppl.inference.step import Stepped
-from bcppl.inference.tempering import Tempered
 from bcppl.traces import Series, generate, propose
 
 Program = Callable[..., Any]
@@ -62,7 +62,7 @@ def tempered_importance_sampling(
     """From the prior to the posterior, all observations let in together, bit by bit.
 
     The SMC sampler of Del Moral, Doucet and Jasra, JRSS B 68, 2006, section 3.3.2. Where data come one after
-    another, start with `importance_sampling` and go on with `bcppl.inference.step.steps`.
+    another, start with `importance_sampling` and go on with `bcppl.inference.filters.step.steps`.
 
     Args:
         program: a Pyro program.

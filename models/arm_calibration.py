@@ -28,7 +28,7 @@ from scipy.linalg import helmert
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.simulators.robot import Robot
+from bcppl.robot.kinematics import Robot
 from bcppl.traces import Trace
 
 

@@ -28,12 +28,12 @@ from bcppl.distributions.fitted import fitted_normal
 from bcppl.distributions.pose_normals import normal_like, within
 from bcppl.distributions.poses import NormalPose
 from bcppl.distributions.silhouette import Silhouette, binned_mask
+from bcppl.effort import Effort
 from bcppl.errors import InputError
-from bcppl.parts import Part
-from bcppl.simulators.camera import Camera, bin_depth
-from bcppl.simulators.effort import Effort
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.robot import Robot
+from bcppl.geometry.camera import Camera, bin_depth
+from bcppl.geometry.parts import Part
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.robot.kinematics import Robot
 from bcppl.traces import Trace
 
 Array = npt.NDArray[np.float64]

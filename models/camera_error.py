@@ -25,13 +25,13 @@ from bcppl import poses
 from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import NormalPose, prior_from_guess
+from bcppl.effort import Effort
 from bcppl.errors import InputError
-from bcppl.recordings.measurements import DepthImage, Measurement, Recording, View
-from bcppl.simulators.camera import Camera, bin_depth
-from bcppl.simulators.effort import Effort
-from bcppl.simulators.region import region_of
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.stated_cameras import apparent_covariance, line_of_sight, seen_elsewhere
+from bcppl.geometry.camera import Camera, bin_depth
+from bcppl.rendering.region import region_of
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.stated_cameras import apparent_covariance, line_of_sight, seen_elsewhere
+from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
 from bcppl.traces import Model, Trace
 
 # Logarithms of how far what a camera sees is moved, in spreads of the particles.

@@ -22,14 +22,14 @@ import torch
 
 from bcppl import poses
 from bcppl.arguments import number_within
+from bcppl.contact.track import ContactTrack
+from bcppl.contact.unknowns import Unknowns
 from bcppl.distributions.contact import ChamferContacts, PegPose
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.models import peg_in_hole
-from bcppl.recordings.measurements import ProbeWindow, Recording, View
-from bcppl.simulators.track import ContactTrack
-from bcppl.simulators.unknowns import Unknowns
+from bcppl.sensors.measurements import ProbeWindow, Recording, View
 from bcppl.traces import Model, carried
 
 

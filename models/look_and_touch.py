@@ -16,20 +16,20 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
+from bcppl.contact.god_object import GodObject
+from bcppl.contact.sensing.felt import accelerations
+from bcppl.contact.wrench import Sensing
 from bcppl.distributions.poses import NormalPose, prior_from_guess
 from bcppl.errors import InputError
+from bcppl.geometry.camera import Camera, bin_depth
+from bcppl.geometry.gap import PegGap
 from bcppl.models.camera_error import Look, farther
 from bcppl.models.look_and_touch_proposals import all_along, left_out, part_anew, taken_in
 from bcppl.models.look_and_touch_scene import Scene, Settings, image_of, touch_of
-from bcppl.recordings.measurements import DepthImage, Measurement, ProbeWindow, Recording, Touch, View
-from bcppl.simulators.camera import Camera, bin_depth
-from bcppl.simulators.gap import PegGap
-from bcppl.simulators.god_object import GodObject
-from bcppl.simulators.region import region_of
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.sensing.felt import accelerations
-from bcppl.simulators.stated_cameras import apparent_covariance, seen_elsewhere
-from bcppl.simulators.wrench import Sensing
+from bcppl.rendering.region import region_of
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.stated_cameras import apparent_covariance, seen_elsewhere
+from bcppl.sensors.measurements import DepthImage, Measurement, ProbeWindow, Recording, Touch, View
 from bcppl.traces import Model
 
 

@@ -32,12 +32,12 @@ from bcppl.distributions.pose_normals import (
     within,
 )
 from bcppl.distributions.poses import NormalPose
+from bcppl.geometry.camera import Camera
 from bcppl.models import camera_error
 from bcppl.models.camera_error import farther
 from bcppl.models.look_and_touch_scene import Scene, image_of, touch_of
-from bcppl.recordings.measurements import ProbeWindow, View
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.stated_cameras import apparent_covariance
+from bcppl.rendering.stated_cameras import apparent_covariance
+from bcppl.sensors.measurements import ProbeWindow, View
 from bcppl.traces import Trace
 
 # What an image says is taken for no surer than this: metres, radians, metres of bias.

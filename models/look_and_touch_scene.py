@@ -10,20 +10,20 @@ from typing import Any
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
+from bcppl.contact.god_object import GodObject, WindowMotion
+from bcppl.contact.sensing.felt import Felt
+from bcppl.contact.wrench import Sensing
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import FittedNormal
 from bcppl.distributions.manifold import ContactManifold, MeasuresGap
 from bcppl.distributions.manifold_fit import Told
 from bcppl.distributions.pose_normals import Modes
+from bcppl.effort import Effort
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.gap import PegGap
 from bcppl.models.camera_error import Cameras, Look
-from bcppl.recordings.measurements import ProbeWindow
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.effort import Effort
-from bcppl.simulators.gap import PegGap
-from bcppl.simulators.god_object import GodObject, WindowMotion
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.sensing.felt import Felt
-from bcppl.simulators.wrench import Sensing
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.sensors.measurements import ProbeWindow
 
 
 @dataclass(frozen=True)

@@ -20,13 +20,13 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.depth import ClutteredDepth, RobustDepth
 from bcppl.distributions.poses import prior_from_guess
+from bcppl.effort import Effort
 from bcppl.errors import InputError
-from bcppl.parts import Part
-from bcppl.recordings.measurements import DepthImage, Measurement, Recording, View
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.effort import Effort
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.scene import RendersPart
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.scene import RendersPart
+from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
 from bcppl.traces import Model
 
 
@@ -126,7 +126,7 @@ def prepare(
 
     Args:
         recording: what was measured.
-        renderer: makes the renderer of the part, such as `bcppl.simulators.rendering.renderer_for`.
+        renderer: makes the renderer of the part, such as `bcppl.rendering.choice.renderer_for`.
         settings: fields of `Settings`.
 
     Raises:

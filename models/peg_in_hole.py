@@ -20,19 +20,19 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
+from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.physics import PegPhysics
+from bcppl.contact.track import ContactTrack
+from bcppl.contact.wrench import Sensing
 from bcppl.distributions.contact import ChamferContacts, PegPose
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import prior_from_guess
+from bcppl.effort import Effort
 from bcppl.errors import InputError
-from bcppl.parts import Part
-from bcppl.recordings.measurements import DepthImage, Measurement, ProbeWindow, Recording, Touch, View
-from bcppl.simulators.effort import Effort
-from bcppl.simulators.peg_model import ContactParameters
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.scene import RendersPart
-from bcppl.simulators.track import ContactTrack
-from bcppl.simulators.wrench import Sensing
+from bcppl.geometry.parts import Part
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.scene import RendersPart
+from bcppl.sensors.measurements import DepthImage, Measurement, ProbeWindow, Recording, Touch, View
 from bcppl.traces import Model, carried
 
 # What inference believes of the contact. The worlds that make recordings have parameters of their own.
@@ -128,7 +128,7 @@ def prepare(
 
     Args:
         recording: what was measured.
-        renderer: makes the renderer of the part, such as `bcppl.simulators.rendering.renderer_for`.
+        renderer: makes the renderer of the part, such as `bcppl.rendering.choice.renderer_for`.
         settings: fields of `Settings`.
 
     Raises:

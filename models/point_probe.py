@@ -23,10 +23,10 @@ from bcppl.distributions.poses import prior_from_guess
 from bcppl.distributions.shared_error import SharedError, SharedOnset
 from bcppl.distributions.touch import ForceDirection, FreePath, Placed
 from bcppl.errors import InputError
-from bcppl.parts import Part
+from bcppl.geometry.distance import SignedDistance
+from bcppl.geometry.parts import Part
 from bcppl.poses import compose, inverse, rotation_matrix, transform
-from bcppl.recordings.measurements import Measurement, Push, Recording, Touch
-from bcppl.simulators.distance import SignedDistance
+from bcppl.sensors.measurements import Measurement, Push, Recording, Touch
 from bcppl.traces.model import Model
 
 

@@ -16,11 +16,11 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.recordings.measurements import View
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.region import region_of
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.stated_cameras import apparent_covariance
+from bcppl.geometry.camera import Camera
+from bcppl.rendering.region import region_of
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.stated_cameras import apparent_covariance
+from bcppl.sensors.measurements import View
 from bcppl.traces import Trace
 
 Array = npt.NDArray[np.float64]
@@ -35,7 +35,7 @@ def view_information(candidate: Any, trace: Trace) -> Tensor | None:
     """What a view would tell of the part beside what the trace's views told: (N, 6, 6) at its particles.
 
     It says what is told about one place of the part, nothing of which of several is right. For `information`
-    of `bcppl.inference.probing.linearised_information_gain`, and populations of
+    of `bcppl.inference.design.linearised_information_gain`, and populations of
     `bcppl.models.look_and_touch`. Images of one instrument are taken to share its error as it appears at the
     part, wherever it looks from.
 

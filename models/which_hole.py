@@ -24,12 +24,12 @@ from pyro.distributions import Categorical
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.contact.track import ContactTrack
 from bcppl.distributions.contact import ChamferContacts, PegPose
 from bcppl.distributions.depth import RobustDepth
 from bcppl.errors import InputError
 from bcppl.models import peg_in_hole
-from bcppl.recordings.measurements import ProbeWindow, Recording, View
-from bcppl.simulators.track import ContactTrack
+from bcppl.sensors.measurements import ProbeWindow, Recording, View
 from bcppl.traces import Model, carried
 
 # Where the holes are in the frame of the first, metres: those of the plate that `invent` makes.

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from bcppl.parts import Part, Piece
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part, Piece
 from bcppl.recordings import (
     DepthImage,
     Guess,
@@ -20,7 +21,6 @@ from bcppl.recordings import (
     Touch,
     View,
 )
-from bcppl.simulators.camera import Camera
 
 HALF = math.sqrt(0.5)
 

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from bcppl import poses
 from bcppl.errors import InputError
-from bcppl.inference.guided_smc import infer
-from bcppl.inference.probing.metrology import three_two_one
+from bcppl.inference.filters.guided_smc import infer
+from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import bench_scene
 

@@ -19,15 +19,15 @@ from bcppl.distributions.path import Path
 from bcppl.distributions.poses import NormalPose, UniformPose
 from bcppl.distributions.touch import OnsetLocation
 from bcppl.errors import InputError
+from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.distance import SignedDistance
+from bcppl.geometry.parts import Part
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.proposals import contact_alignment, depth_alignment, program_of
 from bcppl.inference.proposals.proposal import Proposal
 from bcppl.inference.targets import POSTERIOR
-from bcppl.parts import Part
 from bcppl.poses import Freedom
-from bcppl.simulators.camera import Camera, looking_at
-from bcppl.simulators.distance import SignedDistance
-from bcppl.simulators.renderer import DepthRenderer
+from bcppl.rendering.renderer import DepthRenderer
 from bcppl.traces import Proposed, Trace, assess, propose, simulate
 from tests.invariance import equal_weights, largest_z
 

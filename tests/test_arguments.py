@@ -18,6 +18,9 @@ from bcppl.arguments import number_within, seed_number, whole_number
 from bcppl.distributions.poses import NormalPose, UniformPose
 from bcppl.errors import InputError
 from bcppl.inference.chains import markov_chains
+from bcppl.inference.filters.smcp3 import Pair, moved, smcp3
+from bcppl.inference.filters.tempering import tempered
+from bcppl.inference.filters.waste_free import waste_free_moves
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import (
     delayed_acceptance,
@@ -40,11 +43,8 @@ from bcppl.inference.proposals import (
 )
 from bcppl.inference.repeated import repeated
 from bcppl.inference.resampling import adaptive, always, systematic
-from bcppl.inference.smcp3 import Pair, moved, smcp3
 from bcppl.inference.strata import generate_stratified
 from bcppl.inference.targets import POSTERIOR, Target
-from bcppl.inference.tempering import tempered
-from bcppl.inference.waste_free import waste_free_moves
 from bcppl.traces import Series, Trace, extend, generate, simulate
 
 

@@ -21,7 +21,7 @@ from bcppl.models.arm_calibration import (
     sockets,
 )
 from bcppl.models.robots import load_robot
-from bcppl.simulators.robot import Robot
+from bcppl.robot.kinematics import Robot
 from bcppl.traces import generate
 
 DATA = Path(__file__).parents[2] / "shared/data/ball_in_socket"

@@ -15,10 +15,12 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.errors import InputError
+from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.parts import Part
+from bcppl.inference.filters.tempered_smc import kernel
+from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.importance import importance_sampling, tempered_importance_sampling
 from bcppl.inference.kernels import metropolis_hastings, mixture
-from bcppl.inference.tempered_smc import kernel
-from bcppl.inference.tempering import tempered
 from bcppl.models.arm_in_view import (
     Scene,
     along_the_view,
@@ -30,11 +32,9 @@ from bcppl.models.arm_in_view import (
     widened,
 )
 from bcppl.models.robots import load_robot
-from bcppl.parts import Part
-from bcppl.recordings.measurements import Guess
-from bcppl.simulators.camera import Camera, looking_at
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.robot import Robot
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.robot.kinematics import Robot
+from bcppl.sensors.measurements import Guess
 from bcppl.traces import generate
 
 XARM = Path(__file__).parents[2] / "shared/data/xarm7_realsense"

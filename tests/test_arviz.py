@@ -21,11 +21,11 @@ from bcppl.errors import InputError
 from bcppl.inference import arviz as export
 from bcppl.inference.arviz import to_arviz
 from bcppl.inference.chains import markov_chains
+from bcppl.inference.filters.step import StepInfo, Stepped
 from bcppl.inference.kernels import cycle, metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.repeated import Repeated
-from bcppl.inference.step import StepInfo, Stepped
 from bcppl.traces import generate
 
 arviz = export.import_arviz()

@@ -11,17 +11,17 @@ import shapely
 import torch
 
 from bcppl import poses
+from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.physics import PegPhysics
 from bcppl.errors import InputError
+from bcppl.geometry.outlines import check_fit
 from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
 from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, bench_part
 from bcppl.models.worlds.guarded_motion import CarriedOut, command_of
 from bcppl.recordings import Recording
-from bcppl.recordings.measurements import Probe
-from bcppl.recordings.plan import Plan
-from bcppl.simulators.outlines import check_fit
-from bcppl.simulators.peg_model import ContactParameters
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.renderer import DepthRenderer
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.robot.plan import Plan
+from bcppl.sensors.measurements import Probe
 
 STIFFNESS = np.array([2500.0] * 3 + [150.0] * 3)
 DAMPING = np.array([120.0] * 3 + [2.5] * 3)

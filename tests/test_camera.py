@@ -12,7 +12,7 @@ import torch
 
 from bcppl import poses
 from bcppl.errors import InputError
-from bcppl.simulators.camera import Camera, bin_depth, looking_at
+from bcppl.geometry.camera import Camera, bin_depth, looking_at
 
 Array = npt.NDArray[np.float64]
 

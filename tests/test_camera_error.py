@@ -14,14 +14,14 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.depth import RobustDepth
 from bcppl.errors import InputError
+from bcppl.inference.filters.tempered_smc import infer
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.kernels.kernel import takes
 from bcppl.inference.proposals import spread_of
 from bcppl.inference.targets import Target
-from bcppl.inference.tempered_smc import infer
 from bcppl.models import camera_error
 from bcppl.models.worlds.two_cameras import World, record
-from bcppl.recordings.measurements import Recording
+from bcppl.sensors.measurements import Recording
 from bcppl.traces import Trace, generate
 from tests.invariance import equal_weights, largest_z
 

@@ -18,8 +18,10 @@ import torch
 from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
-from bcppl.inference.probing.candidates import candidates
-from bcppl.inference.probing.filters import (
+from bcppl.geometry.gap import PegGap
+from bcppl.inference.design.rules import surface_variance
+from bcppl.inference.planning.candidates import candidates
+from bcppl.inference.planning.filters import (
     Candidates,
     Filter,
     Mounted,
@@ -33,15 +35,13 @@ from bcppl.inference.probing.filters import (
     pressing_force,
     within_reach,
 )
-from bcppl.inference.probing.rules import surface_variance
-from bcppl.inference.probing.touching import Spot, Touching, face_of, middles_of_strokes, slide, touch
+from bcppl.inference.planning.touching import Spot, Touching, face_of, middles_of_strokes, slide, touch
 from bcppl.models.robots import load_robot
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.recordings.action_file import load_actions, save_actions
-from bcppl.recordings.measurements import View
-from bcppl.recordings.plan import Plan
-from bcppl.simulators.gap import PegGap
-from bcppl.simulators.reach import joint_paths
+from bcppl.robot.plan import Plan
+from bcppl.robot.reach import joint_paths
+from bcppl.sensors.measurements import View
 from tests.made_recordings import assert_one_sentence
 
 KINDS = {"touch": 5, "slide": 3, "pair": 3, "search": 1, "attempt": 1, "view": 2}

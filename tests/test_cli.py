@@ -14,8 +14,8 @@ import h5py
 import numpy as np
 import pytest
 
+from bcppl.geometry.camera import Camera
 from bcppl.recordings import DepthImage, Measurement, Recording, View, problems, save
-from bcppl.simulators.camera import Camera
 from tests.command_line import SHIPPED, Ran, short
 
 DATA = Path(__file__).parents[2] / "shared/data"

@@ -14,14 +14,14 @@ import pytest
 import torch
 
 from bcppl.beliefs import Belief
-from bcppl.inference.guided_smc import infer
+from bcppl.inference.filters.guided_smc import infer
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.recordings import save
 from bcppl.recordings.action_file import load_actions, save_actions
 from bcppl.recordings.beliefs import load_belief, load_latent, save_belief
 from bcppl.recordings.fingerprint import fingerprint
-from bcppl.recordings.plan import Plan
+from bcppl.robot.plan import Plan
 from tests.command_line import SHIPPED, Ran, short
 
 KINDS = "touch:2,pair:1"

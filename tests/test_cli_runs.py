@@ -26,7 +26,7 @@ def test_a_users_own_files_are_taken_as_readily_as_names(bcppl: Callable[..., Ra
     )
     (tmp_path / "my_probe.py").write_text(mine.replace("program=point_probe", "program=my_probe"))
     (tmp_path / "my_smc.py").write_text(
-        "from bcppl.inference.smc import smc, tempered\n"
+        "from bcppl.inference.filters.smc import smc, tempered\n"
         "def infer(model, recording, *, particles, seed, scene):\n"
         "    options = {'particles': particles, 'seed': seed, 'scene': scene}\n"
         "    yield from smc(model, recording, step=tempered(), **options)\n"
@@ -68,7 +68,7 @@ def test_what_was_computed_before_a_stop_is_kept(
 ) -> None:
     (tmp_path / "stops.py").write_text(
         "from bcppl.errors import InferenceError, InputError\n"
-        "from bcppl.inference.tempered_smc import infer as whole\n"
+        "from bcppl.inference.filters.tempered_smc import infer as whole\n"
         "def infer(*args, **options):\n"
         "    for count, step in enumerate(whole(*args, **options)):\n"
         "        if count == 3:\n"

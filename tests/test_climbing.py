@@ -16,13 +16,13 @@ from bcppl.beliefs import average_distance
 from bcppl.distributions.depth import ClutteredDepth
 from bcppl.distributions.poses import UniformPose
 from bcppl.errors import InputError
-from bcppl.inference.climbing import Modes, jumps, modes
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import metropolis_hastings, rejuvenate
+from bcppl.inference.proposals.climbing import Modes, jumps, modes
 from bcppl.inference.targets import POSTERIOR
-from bcppl.parts import Part
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.renderer import DepthRenderer
+from bcppl.rendering.renderer import DepthRenderer
 from bcppl.traces import generate
 
 BOX = trimesh.creation.box((0.06, 0.04, 0.03))

@@ -15,11 +15,11 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.depth import ClutteredDepth, RobustDepth
 from bcppl.errors import InputError
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part
 from bcppl.models import part_in_view
-from bcppl.parts import Part
 from bcppl.recordings.importers import bop
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.renderer import DepthRenderer
+from bcppl.rendering.renderer import DepthRenderer
 
 CLUTTER = Path(__file__).parents[2] / "shared/data/lmo_scene2_frame3"
 

@@ -16,16 +16,17 @@ from rich.console import Console
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.inference import progress, tempered_smc
+from bcppl.inference import progress
 from bcppl.inference.collect import acceptance, collect, distinct, effective_sample_size, log_evidence, mean
+from bcppl.inference.filters import tempered_smc
+from bcppl.inference.filters.smc import Step, smc
+from bcppl.inference.filters.step import Observed, Stepped, steps
+from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.proposals import drift
 from bcppl.inference.repeated import repeated
 from bcppl.inference.resampling import always
-from bcppl.inference.smc import Step, smc
-from bcppl.inference.step import Observed, Stepped, steps
-from bcppl.inference.tempering import tempered
 from bcppl.models.point_probe import model
 from bcppl.recordings import Recording, load
 

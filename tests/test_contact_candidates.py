@@ -11,17 +11,17 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bcppl import poses
+from bcppl.contact.physics import PegPhysics
+from bcppl.contact.sensing.candidates import CORNER, EDGE, FACE
+from bcppl.contact.sensing.intrinsic import IntrinsicSensing
+from bcppl.contact.sensing.load import in_frame
+from bcppl.contact.sensing.noise import WrenchNoise, filtered_share, noise_at_rest
+from bcppl.contact.track import ContactTrack
+from bcppl.contact.wrench import Sensing
 from bcppl.errors import InputError
-from bcppl.parts import Part, Piece
-from bcppl.recordings.measurements import Probe
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.sensing.candidates import CORNER, EDGE, FACE
-from bcppl.simulators.sensing.intrinsic import IntrinsicSensing
-from bcppl.simulators.sensing.load import in_frame
-from bcppl.simulators.sensing.noise import WrenchNoise, filtered_share, noise_at_rest
-from bcppl.simulators.shapes import block, round_peg
-from bcppl.simulators.track import ContactTrack
-from bcppl.simulators.wrench import Sensing
+from bcppl.geometry.parts import Part, Piece
+from bcppl.geometry.shapes import block, round_peg
+from bcppl.sensors.measurements import Probe
 from tests.pressed_pegs import COVARIANCE, PEG, fork, noisy, pressed, wrench
 
 

@@ -14,15 +14,15 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.physics import PegPhysics, Rollout
+from bcppl.contact.wrench import Sensing
+from bcppl.geometry.layers import hole_outline
+from bcppl.geometry.outlines import block_with_hole, cylinder_peg, named_outline, peg_for
+from bcppl.geometry.parts import Part, Piece
+from bcppl.geometry.shapes import block, box_peg
 from bcppl.models.parts import insert_peg, insert_tray
-from bcppl.parts import Part, Piece
-from bcppl.recordings.measurements import Probe
-from bcppl.simulators.layers import hole_outline
-from bcppl.simulators.outlines import block_with_hole, cylinder_peg, named_outline, peg_for
-from bcppl.simulators.peg_model import ContactParameters
-from bcppl.simulators.physics import PegPhysics, Rollout
-from bcppl.simulators.shapes import block, box_peg
-from bcppl.simulators.wrench import Sensing
+from bcppl.sensors.measurements import Probe
 
 Array = npt.NDArray[np.float64]
 

@@ -15,16 +15,16 @@ from torch import Tensor
 
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
+from bcppl.inference.filters.step import Observed
+from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import Move, metropolis_hastings, rejuvenate
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import never
 from bcppl.inference.sizing import merged
-from bcppl.inference.step import Observed
 from bcppl.inference.strata import generate_stratified
 from bcppl.inference.targets import POSTERIOR, Target
-from bcppl.inference.tempering import tempered
 from bcppl.traces import Series, Trace, assess, generate, propose, update
 
 

@@ -14,11 +14,11 @@ import shapely
 import trimesh
 
 from bcppl.errors import InputError
-from bcppl.parts import Part, Piece
-from bcppl.simulators import decomposition
-from bcppl.simulators.decomposition import decomposed
-from bcppl.simulators.fidelity import geometric_error
-from bcppl.simulators.shapes import block
+from bcppl.geometry import decomposition
+from bcppl.geometry.decomposition import decomposed
+from bcppl.geometry.fidelity import geometric_error
+from bcppl.geometry.parts import Part, Piece
+from bcppl.geometry.shapes import block
 
 
 def angle(tall: float = 0.01) -> Part:

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from bcppl.distributions.depth import LaplaceDepth, RobustDepth
 from bcppl.errors import InputError
-from bcppl.parts import Part
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.renderer import DepthRenderer
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part
+from bcppl.rendering.renderer import DepthRenderer
 
 Array = npt.NDArray[np.float64]
 

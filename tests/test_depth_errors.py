@@ -16,10 +16,10 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.depth import DepthDistribution, LaplaceDepth, OccludedDepth, RobustDepth
 from bcppl.errors import InputError
-from bcppl.parts import Part
-from bcppl.simulators.camera import Camera, looking_at
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.scene import SceneRenderer, placed
+from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.parts import Part
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.scene import SceneRenderer, placed
 
 Array = npt.NDArray[np.float64]
 Kind = type[DepthDistribution]

@@ -10,8 +10,8 @@ import numpy.typing as npt
 import pytest
 
 from bcppl.errors import InputError
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.depth_noise import KINECT, REALSENSE_D435, DepthNoise
+from bcppl.geometry.camera import Camera
+from bcppl.rendering.depth_noise import KINECT, REALSENSE_D435, DepthNoise
 
 Array = npt.NDArray[np.float64]
 

@@ -22,15 +22,15 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.poses import UniformPose
+from bcppl.inference.filters.step import Observed, StepFunction, steps
+from bcppl.inference.filters.tempering import tempered
+from bcppl.inference.filters.waste_free import waste_free_moves
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import cycle, metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import adaptive, always, never
 from bcppl.inference.schemes import systematic
-from bcppl.inference.step import Observed, StepFunction, steps
-from bcppl.inference.tempering import tempered
-from bcppl.inference.waste_free import waste_free_moves
 from tests.agreement import RUNS, agrees, posterior_agrees
 from tests.invariance import number
 

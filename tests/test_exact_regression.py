@@ -18,13 +18,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from bcppl.inference.filters.step import Observed, steps
+from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import cycle, involutive, metropolis_hastings
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import adaptive
 from bcppl.inference.schemes import systematic
-from bcppl.inference.step import Observed, steps
-from bcppl.inference.tempering import tempered
 from bcppl.traces import Trace
 from tests.agreement import RUNS, agrees, posterior_agrees
 from tests.invariance import number

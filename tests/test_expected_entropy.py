@@ -13,8 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bcppl.inference.population import Population
-from bcppl.inference.probing import (
+from bcppl.inference.design import (
     Ranking,
     expected_entropy,
     expected_information_gain,
@@ -23,6 +22,7 @@ from bcppl.inference.probing import (
     value_entropy,
     weight_entropy,
 )
+from bcppl.inference.population import Population
 from bcppl.traces import generate, simulate
 from tests.invariance import equal_weights, matrix
 

@@ -13,7 +13,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from bcppl.drawn_in_3d import MANY_FACES
 from bcppl.errors import InputError
 from bcppl.figures import add_over_time, belief_in_3d
-from bcppl.parts import Part
+from bcppl.geometry.parts import Part
 
 HALF = np.sqrt(0.5)
 

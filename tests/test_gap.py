@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.contact.peg_model import ContactParameters, build_model
 from bcppl.errors import InputError
+from bcppl.geometry.gap import PegGap
+from bcppl.geometry.outlines import block_with_hole, peg_for, round_outline
+from bcppl.geometry.parts import Part
+from bcppl.geometry.shapes import block, box_peg
 from bcppl.models.worlds.bench_parts import bench_part
-from bcppl.parts import Part
-from bcppl.simulators.gap import PegGap
-from bcppl.simulators.outlines import block_with_hole, peg_for, round_outline
-from bcppl.simulators.peg_model import ContactParameters, build_model
-from bcppl.simulators.shapes import block, box_peg
 
 SIZE = np.array([0.06, 0.06, 0.025])  # of the block, m; its top is z = 0
 BASE = np.array([-0.5 * SIZE[0], -0.5 * SIZE[1], -SIZE[2]])

@@ -12,17 +12,17 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.contact.god_object import GodObject, WindowMotion
+from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.physics import PegPhysics
 from bcppl.distributions.manifold import ContactManifold
 from bcppl.errors import InputError
+from bcppl.geometry.gap import PegGap
+from bcppl.geometry.outlines import block_with_hole, peg_for, round_outline
+from bcppl.geometry.shapes import block, box_peg
 from bcppl.models.worlds.bench import BenchScene, bench_scene
-from bcppl.recordings.measurements import Probe, ProbeWindow, View
-from bcppl.recordings.plan import Plan, action_of, probe_of
-from bcppl.simulators.gap import PegGap
-from bcppl.simulators.god_object import GodObject, WindowMotion
-from bcppl.simulators.outlines import block_with_hole, peg_for, round_outline
-from bcppl.simulators.peg_model import ContactParameters
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.shapes import block, box_peg
+from bcppl.robot.plan import Plan, action_of, probe_of
+from bcppl.sensors.measurements import Probe, ProbeWindow, View
 
 LENGTH = 0.05
 STIFF, DAMP = np.array([2500.0] * 3 + [150.0] * 3), np.array([120.0] * 3 + [2.5] * 3)

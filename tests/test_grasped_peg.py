@@ -16,9 +16,9 @@ from bcppl.errors import InputError
 from bcppl.models import grasped_peg, part_in_view, peg_in_hole
 from bcppl.models.worlds import grasped_peg as world
 from bcppl.recordings import Recording, View
-from bcppl.simulators.rasteriser import DepthRasteriser
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.rendering import renderer_for
+from bcppl.rendering.choice import renderer_for
+from bcppl.rendering.rasteriser import DepthRasteriser
+from bcppl.rendering.renderer import DepthRenderer
 from bcppl.traces import Trace, extend, generate, simulate, update
 
 

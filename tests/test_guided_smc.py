@@ -21,18 +21,18 @@ from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
-from bcppl.inference import tempered_smc
-from bcppl.inference.guided_smc import guided, infer, kernel
+from bcppl.inference.filters import tempered_smc
+from bcppl.inference.filters.guided_smc import guided, infer, kernel
+from bcppl.inference.filters.smc import smc
+from bcppl.inference.filters.smcp3 import Pair, smcp3
+from bcppl.inference.planning.metrology import three_two_one
 from bcppl.inference.population import Population
-from bcppl.inference.probing.metrology import three_two_one
 from bcppl.inference.resampling import never
-from bcppl.inference.smc import smc
-from bcppl.inference.smcp3 import Pair, smcp3
 from bcppl.inference.targets import POSTERIOR
 from bcppl.models import look_and_touch
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.poses import Freedom
-from bcppl.recordings.measurements import Guess, Recording
+from bcppl.sensors.measurements import Guess, Recording
 from bcppl.traces import Model, Trace, generate
 from tests.made_recordings import assert_one_sentence
 

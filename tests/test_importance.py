@@ -13,14 +13,14 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.inference.chains import markov_chains
+from bcppl.inference.filters.step import Observed
+from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.importance import importance_sampling, tempered_importance_sampling
 from bcppl.inference.kernels import Move, metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import never
-from bcppl.inference.step import Observed
 from bcppl.inference.targets import Target
-from bcppl.inference.tempering import tempered
 from bcppl.traces import Trace, generate, simulate
 
 SEEN = torch.tensor(1.7, dtype=torch.float64)

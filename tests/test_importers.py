@@ -12,7 +12,7 @@ import typer
 from typer.testing import CliRunner
 
 from bcppl.errors import InputError
-from bcppl.parts import Part
+from bcppl.geometry.parts import Part
 from bcppl.poses import inverse, local, rotation_matrix, transform
 from bcppl.recordings import DepthImage, Push, Recording, Touch, View, load, notes, problems, save
 from bcppl.recordings.importers import bop, importers, point_probe

@@ -13,20 +13,20 @@ import torch
 
 from bcppl import poses
 from bcppl.beliefs import Belief
+from bcppl.contact.physics import PegPhysics
 from bcppl.errors import InputError
-from bcppl.inference.probing.chance import chance_of_success
-from bcppl.inference.probing.insertion import Attempt, insertion_plan
+from bcppl.geometry.extrusion import extruded
+from bcppl.geometry.holes import Hole, clearance_in, hole_from_peg, hole_of
+from bcppl.geometry.outlines import rectangular_outline
+from bcppl.geometry.parts import Part
+from bcppl.geometry.shapes import block
+from bcppl.inference.planning.chance import chance_of_success
+from bcppl.inference.planning.insertion import Attempt, insertion_plan
 from bcppl.inference.schemes import systematic
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, bench_part
 from bcppl.models.worlds.guarded_motion import command_of
-from bcppl.parts import Part
-from bcppl.recordings.insertion_plan import InsertionPlan
-from bcppl.simulators.extrusion import extruded
-from bcppl.simulators.holes import Hole, clearance_in, hole_from_peg, hole_of
-from bcppl.simulators.outlines import rectangular_outline
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.shapes import block
+from bcppl.robot.insertion_plan import InsertionPlan
 
 
 def believed(

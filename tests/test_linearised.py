@@ -12,18 +12,18 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.contact.god_object import GodObject, WindowMotion
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.manifold import ContactManifold, Quadratic
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
+from bcppl.geometry.gap import PegGap
+from bcppl.geometry.shapes import block, box_peg
+from bcppl.inference.design import linearised_information_gain, mode_entropy
+from bcppl.inference.design.gaussians import Gaussians, right_jacobian
 from bcppl.inference.population import Population
-from bcppl.inference.probing import linearised_information_gain, mode_entropy
-from bcppl.inference.probing.gaussians import Gaussians, right_jacobian
-from bcppl.recordings.measurements import ProbeWindow
-from bcppl.recordings.plan import Plan, action_of
-from bcppl.simulators.gap import PegGap
-from bcppl.simulators.god_object import GodObject, WindowMotion
-from bcppl.simulators.shapes import block, box_peg
+from bcppl.robot.plan import Plan, action_of
+from bcppl.sensors.measurements import ProbeWindow
 from bcppl.traces import Trace, generate
 from tests.probing_programs import CENTER, SPREAD, at, doubled, particles
 

@@ -8,12 +8,12 @@ import torch
 from bcppl import poses
 from bcppl.distributions.fitted import FittedNormal
 from bcppl.distributions.pose_normals import transport
-from bcppl.inference.guided_smc import infer
-from bcppl.inference.probing.metrology import three_two_one
+from bcppl.inference.filters.guided_smc import infer
+from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models.look_and_touch import model
 from bcppl.models.look_and_touch_proposals import placed_by_images
 from bcppl.models.worlds.bench import bench_scene
-from bcppl.recordings.measurements import View
+from bcppl.sensors.measurements import View
 
 
 def covariance(seed: int) -> torch.Tensor:

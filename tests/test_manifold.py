@@ -15,8 +15,8 @@ from torch.special import log_ndtr
 from bcppl import poses
 from bcppl.distributions.manifold import FARTHEST, ContactManifold
 from bcppl.errors import InputError
-from bcppl.simulators.gap import Gap, PegGap
-from bcppl.simulators.shapes import block, box_peg
+from bcppl.geometry.gap import Gap, PegGap
+from bcppl.geometry.shapes import block, box_peg
 
 NOISE, SHARED, SINK, OUTLIER = 8e-5, 3e-5, 2e-5, 1e-3
 LENGTH = 0.05

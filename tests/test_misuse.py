@@ -15,6 +15,10 @@ from bcppl.errors import InputError
 from bcppl.inference import collect
 from bcppl.inference.arviz import to_arviz
 from bcppl.inference.chains import markov_chains
+from bcppl.inference.filters.smcp3 import moved, smcp3
+from bcppl.inference.filters.step import Observed, steps
+from bcppl.inference.filters.tempering import tempered
+from bcppl.inference.filters.waste_free import waste_free_moves
 from bcppl.inference.importance import importance_sampling, tempered_importance_sampling
 from bcppl.inference.kernels import (
     cycle,
@@ -29,12 +33,8 @@ from bcppl.inference.kernels import (
 )
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
-from bcppl.inference.smcp3 import moved, smcp3
-from bcppl.inference.step import Observed, steps
 from bcppl.inference.summaries import mean
 from bcppl.inference.targets import POSTERIOR
-from bcppl.inference.tempering import tempered
-from bcppl.inference.waste_free import waste_free_moves
 from bcppl.traces import Trace, generate
 
 

@@ -15,16 +15,16 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 from shapely.affinity import translate
 
+from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.physics import PegPhysics
+from bcppl.contact.unknowns import Unknowns
 from bcppl.errors import InputError
-from bcppl.models.parts import SHAPES, insert_peg, insert_tray
-from bcppl.parts import Part
-from bcppl.recordings.measurements import Probe
-from bcppl.simulators import extrusion
-from bcppl.simulators.extrusion import extruded
-from bcppl.simulators.fidelity import geometric_error, solid_of
-from bcppl.simulators.layers import hole_outline, prismatic
-from bcppl.simulators.meshes import load_mesh
-from bcppl.simulators.outlines import (
+from bcppl.geometry import extrusion
+from bcppl.geometry.extrusion import extruded
+from bcppl.geometry.fidelity import geometric_error, solid_of
+from bcppl.geometry.layers import hole_outline, prismatic
+from bcppl.geometry.meshes import load_mesh
+from bcppl.geometry.outlines import (
     NAMED,
     block_with_hole,
     check_fit,
@@ -34,10 +34,10 @@ from bcppl.simulators.outlines import (
     round_outline,
     roundness_error,
 )
-from bcppl.simulators.peg_model import ContactParameters
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.shapes import block, box_peg
-from bcppl.simulators.unknowns import Unknowns
+from bcppl.geometry.parts import Part
+from bcppl.geometry.shapes import block, box_peg
+from bcppl.models.parts import SHAPES, insert_peg, insert_tray
+from bcppl.sensors.measurements import Probe
 
 NIST = Path(__file__).parents[2] / "shared/data/nist_insertion"
 BORDER = [(0, -0.05), (0.06, -0.05), (0.06, 0.05), (0, 0.05)]

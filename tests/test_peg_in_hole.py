@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bcppl.cli import loading
-from bcppl.inference import bayes_contact, tempered_smc
+from bcppl.inference.filters import bayes_contact, tempered_smc
 from bcppl.models import peg_in_hole
 from bcppl.models.worlds import peg_in_hole as world
 from bcppl.recordings import ProbeWindow, Recording

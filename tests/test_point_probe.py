@@ -11,11 +11,11 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.errors import InputError
+from bcppl.geometry.distance import SignedDistance
 from bcppl.models.point_probe import Settings, felt, learn, model, prepare
 from bcppl.models.worlds.point_probe import noise_seed
 from bcppl.recordings.importers.point_probe import command
-from bcppl.recordings.measurements import Measurement, Push, Recording, Touch
-from bcppl.simulators.distance import SignedDistance
+from bcppl.sensors.measurements import Measurement, Push, Recording, Touch
 from bcppl.traces import assess, generate
 
 LOGS = File(__file__).parents[2] / "shared/data/point_probe_pushes"

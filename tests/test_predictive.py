@@ -23,7 +23,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.predictive import THRESHOLD, Surprise, surprise
 from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
 from bcppl.recordings import DepthImage
-from bcppl.simulators.renderer import DepthRenderer
+from bcppl.rendering.renderer import DepthRenderer
 from bcppl.traces import Series, generate, simulate
 from tests.test_manifold import ledge, window
 

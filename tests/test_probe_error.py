@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bcppl.inference.tempered_smc import infer
+from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.peg_in_hole import model
 
 

@@ -14,8 +14,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.beliefs import Belief, entropy_of_modes
 from bcppl.errors import InputError
-from bcppl.inference.population import Population
-from bcppl.inference.probing import (
+from bcppl.inference.design import (
     EntropyOf,
     Ranking,
     expected_information_gain,
@@ -24,6 +23,7 @@ from bcppl.inference.probing import (
     value_entropy,
     weight_entropy,
 )
+from bcppl.inference.population import Population
 from bcppl.poses import FREE, Freedom
 from bcppl.traces import generate, simulate
 from tests.invariance import equal_weights, matrix

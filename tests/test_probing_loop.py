@@ -14,19 +14,19 @@ import torch
 
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
-from bcppl.inference.guided_smc import infer
-from bcppl.inference.probing.candidates import candidates
-from bcppl.inference.probing.filters import Candidate, lasting, name_of
-from bcppl.inference.probing.insertion import insertion_plan
-from bcppl.inference.probing.loop import Round, named_apart, probing_loop
-from bcppl.inference.probing.rules import at_random, by_information, in_order
-from bcppl.inference.smc import Step
+from bcppl.geometry.gap import PegGap
+from bcppl.inference.design.loop import Round, named_apart, probing_loop
+from bcppl.inference.design.rules import at_random, by_information, in_order
+from bcppl.inference.filters.guided_smc import infer
+from bcppl.inference.filters.smc import Step
+from bcppl.inference.planning.candidates import candidates
+from bcppl.inference.planning.filters import Candidate, lasting, name_of
+from bcppl.inference.planning.insertion import insertion_plan
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
 from bcppl.recordings import Recording, View, problems
-from bcppl.recordings.measurements import ProbeWindow
-from bcppl.simulators.gap import PegGap
+from bcppl.sensors.measurements import ProbeWindow
 from tests.made_recordings import assert_one_sentence
 
 PARTICLES = 30

@@ -20,18 +20,18 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.poses import NormalPose
 from bcppl.distributions.wrench import Wrench
 from bcppl.errors import InferenceError, InputError
-from bcppl.inference.population import Population
-from bcppl.inference.probing import (
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part
+from bcppl.inference.design import (
     Batched,
     Ranking,
     expected_information_gain,
     mode_entropy,
 )
-from bcppl.inference.probing.observations import simulated
-from bcppl.inference.probing.weighing import weighed
-from bcppl.parts import Part
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.renderer import DepthRenderer
+from bcppl.inference.design.observations import simulated
+from bcppl.inference.design.weighing import weighed
+from bcppl.inference.population import Population
+from bcppl.rendering.renderer import DepthRenderer
 from bcppl.traces import Series, Trace, carried, extend, generate, simulate
 from tests.invariance import equal_weights, matrix, number
 

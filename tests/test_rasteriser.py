@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from bcppl import poses
 from bcppl.errors import InputError
-from bcppl.parts import Part
-from bcppl.simulators.camera import Camera, looking_at
-from bcppl.simulators.rasteriser import DepthRasteriser
-from bcppl.simulators.renderer import DepthRenderer, Hits
-from bcppl.simulators.rendering import MOST_FACES, renderer_for
+from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.parts import Part
+from bcppl.rendering.choice import MOST_FACES, renderer_for
+from bcppl.rendering.rasteriser import DepthRasteriser
+from bcppl.rendering.renderer import DepthRenderer, Hits
 
 Array = npt.NDArray[np.float64]
 
@@ -221,8 +221,8 @@ def test_portions_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.array_equal(shuffled, image[order.numpy()])
     assert np.array_equal(DepthRasteriser(part).images(view, pose[17:18])[0], image[17])
     assert equal(DepthRasteriser(part, threads=4).hits(view, pose, faces=True), whole)
-    monkeypatch.setattr("bcppl.simulators.rasteriser.BUFFER", 700)
-    monkeypatch.setattr("bcppl.simulators.rasteriser.FEW", 10)
+    monkeypatch.setattr("bcppl.rendering.rasteriser.BUFFER", 700)
+    monkeypatch.setattr("bcppl.rendering.rasteriser.FEW", 10)
     assert equal(DepthRasteriser(part, threads=2).hits(view, pose, faces=True), whole)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bcppl.errors import InputError
-from bcppl.parts import Part
+from bcppl.geometry.parts import Part
 from bcppl.recordings import (
     Measurement,
     ProbeWindow,

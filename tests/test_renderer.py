@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from bcppl import poses
 from bcppl.errors import InputError
-from bcppl.parts import Part
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.renderer import DepthRenderer
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part
+from bcppl.rendering.renderer import DepthRenderer
 
 Array = npt.NDArray[np.float64]
 
@@ -203,7 +203,7 @@ def test_many_batches_equal_one(monkeypatch: pytest.MonkeyPatch) -> None:
     camera, pose = tilted_camera(), random_poses(40, 9, 0.02)
     renderer = DepthRenderer(part_of(RING))
     whole = renderer.hits(camera, pose)
-    monkeypatch.setattr("bcppl.simulators.renderer.BATCH", 50)
+    monkeypatch.setattr("bcppl.rendering.renderer.BATCH", 50)
     cut = renderer.hits(camera, pose)
     for name in ("particle", "pixel", "depth"):
         np.testing.assert_array_equal(getattr(cut, name), getattr(whole, name))

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.errors import InputError
+from bcppl.geometry.camera import Camera, looking_at
 from bcppl.models.robots import SHIPPED, load_robot
-from bcppl.simulators.camera import Camera, looking_at
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.robot import Robot
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.robot.kinematics import Robot
 
 FOLDER = Path(__file__).parents[1] / "models/robots"
 FLANGE = {"panda": "panda_hand", "iiwa": "lbr_iiwa_flange"}

@@ -14,13 +14,13 @@ import trimesh
 
 from bcppl import poses
 from bcppl.errors import InputError
-from bcppl.parts import Part
-from bcppl.simulators import scene as module
-from bcppl.simulators.camera import Camera, looking_at
-from bcppl.simulators.rasteriser import DepthRasteriser
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.rendering import renderer_for
-from bcppl.simulators.scene import SceneRenderer, background_part, placed
+from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.parts import Part
+from bcppl.rendering import scene as module
+from bcppl.rendering.choice import renderer_for
+from bcppl.rendering.rasteriser import DepthRasteriser
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.scene import SceneRenderer, background_part, placed
 
 Array = npt.NDArray[np.float64]
 

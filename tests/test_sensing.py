@@ -11,18 +11,18 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-import bcppl.simulators.sensing
+import bcppl.contact.sensing
 from bcppl import poses
+from bcppl.contact.physics import PegPhysics
+from bcppl.contact.sensing.load import identify_load, in_frame
+from bcppl.contact.sensing.onset import OnsetDetector
+from bcppl.contact.track import ContactTrack
+from bcppl.contact.wrench import Sensing
 from bcppl.errors import InputError
+from bcppl.geometry.distance import SignedDistance
+from bcppl.geometry.shapes import block
 from bcppl.recordings.importers.point_probe import LoggedPush, force_on_object, prism, read_log
-from bcppl.recordings.measurements import Probe, Touch
-from bcppl.simulators.distance import SignedDistance
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.sensing.load import identify_load, in_frame
-from bcppl.simulators.sensing.onset import OnsetDetector
-from bcppl.simulators.shapes import block
-from bcppl.simulators.track import ContactTrack
-from bcppl.simulators.wrench import Sensing
+from bcppl.sensors.measurements import Probe, Touch
 from tests.pressed_pegs import LOAD, LOGS, PEG, noisy, orientations
 
 # ---------------------------------------------------------------- weight
@@ -107,7 +107,7 @@ def test_weights_in_no_orientation_are_refused() -> None:
 
 
 def test_the_packages_example_does_what_it_says() -> None:
-    failed, tried = doctest.testmod(bcppl.simulators.sensing)
+    failed, tried = doctest.testmod(bcppl.contact.sensing)
     assert failed == 0 and tried > 20
 
 

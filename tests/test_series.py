@@ -15,10 +15,10 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
+from bcppl.inference.filters.smc import smc
+from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.proposals import drift
-from bcppl.inference.smc import smc
-from bcppl.inference.tempering import tempered
 from bcppl.traces import Model, Series, Trace, assess, extend, generate, regenerate, simulate, update
 from bcppl.traces.carried import carried
 from tests.invariance import number

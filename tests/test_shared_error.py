@@ -12,8 +12,8 @@ from bcppl import poses
 from bcppl.distributions.path import Path
 from bcppl.distributions.shared_error import SharedError, SharedOnset
 from bcppl.distributions.touch import Placed
-from bcppl.parts import Part
-from bcppl.simulators.distance import SignedDistance
+from bcppl.geometry.distance import SignedDistance
+from bcppl.geometry.parts import Part
 
 SHIFT, TURN, OFFSET, SPREAD = 0.0004, 0.005, 0.0002, 0.0003
 NEVER = torch.full((3,), math.nan, dtype=torch.float64)

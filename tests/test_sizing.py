@@ -18,14 +18,14 @@ from bcppl import poses
 from bcppl.distributions.poses import UniformPose
 from bcppl.errors import InputError
 from bcppl.inference import strata
+from bcppl.inference.filters.step import Observed, steps
+from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import always
 from bcppl.inference.schemes import multinomial, ssp
 from bcppl.inference.sizing import merged, replicated, resized
-from bcppl.inference.step import Observed, steps
 from bcppl.inference.strata import generate_stratified
-from bcppl.inference.tempering import tempered
 
 CHANCES = torch.tensor([0.2, 0.75, 0.05], dtype=torch.float64)
 SEEN = torch.tensor([2.1, 1.9], dtype=torch.float64)

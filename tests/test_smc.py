@@ -16,15 +16,15 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InferenceError
-from bcppl.inference import bayes_contact, smcp3, tempered_smc
-from bcppl.inference.bayes_contact import drift_and_weigh
+from bcppl.inference.filters import bayes_contact, smcp3, tempered_smc
+from bcppl.inference.filters.bayes_contact import drift_and_weigh
+from bcppl.inference.filters.smc import Step, smc
+from bcppl.inference.filters.step import Observed, StepFunction, StepInfo
+from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import adaptive, always, never, systematic
-from bcppl.inference.smc import Step, smc
-from bcppl.inference.step import Observed, StepFunction, StepInfo
-from bcppl.inference.tempering import tempered
 from bcppl.models.point_probe import model
 from bcppl.recordings import Recording, load
 from bcppl.traces import Trace, generate

@@ -15,10 +15,10 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
-from bcppl.inference import smcp3
+from bcppl.inference.filters import smcp3
+from bcppl.inference.filters.smcp3 import Pair, moved
 from bcppl.inference.kernels.jacobian import Charted, Real, Tangent
 from bcppl.inference.proposals import drift
-from bcppl.inference.smcp3 import Pair, moved
 from bcppl.poses import Freedom
 from bcppl.traces import Trace, simulate
 from tests.invariance import equal_weights, largest_z, number

@@ -13,12 +13,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from bcppl.inference import smcp3
+from bcppl.inference.filters import smcp3
+from bcppl.inference.filters.smcp3 import Pair
+from bcppl.inference.filters.step import Observed
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Fitted
 from bcppl.inference.resampling import adaptive, always, never, systematic
-from bcppl.inference.smcp3 import Pair
-from bcppl.inference.step import Observed
 from bcppl.traces import Series, Trace, generate
 from tests.invariance import number
 from tests.smcp3_programs import flat, nothing, silent

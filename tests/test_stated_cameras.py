@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from bcppl import poses
 from bcppl.errors import InputError
-from bcppl.simulators.camera import Camera, looking_at
-from bcppl.simulators.region import region_of
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.shapes import block_with_square_hole
-from bcppl.simulators.stated_cameras import apparent_covariance, line_of_sight, seen_elsewhere
+from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.shapes import block_with_square_hole
+from bcppl.rendering.region import region_of
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.stated_cameras import apparent_covariance, line_of_sight, seen_elsewhere
 
 PART = poses.as_pose([0.03, -0.02, 0.04, 0.5, 0.5, -0.5, 0.5])
 SHIFT, TURN = 0.002, 0.009

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InferenceError, InputError
+from bcppl.inference.filters.step import Observed
+from bcppl.inference.filters.tempering import conditional_effective_sample_size, next_exponent, tempered
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import Resample, adaptive, always, never
-from bcppl.inference.step import Observed
-from bcppl.inference.tempering import conditional_effective_sample_size, next_exponent, tempered
 from bcppl.traces import generate
 
 

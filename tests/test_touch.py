@@ -12,8 +12,8 @@ from bcppl import poses
 from bcppl.distributions.path import Path
 from bcppl.distributions.touch import ForceDirection, FreePath, OnsetLocation
 from bcppl.errors import InputError
-from bcppl.parts import Part
-from bcppl.simulators.distance import SignedDistance
+from bcppl.geometry.distance import SignedDistance
+from bcppl.geometry.parts import Part
 
 
 def t(*values: float) -> Tensor:

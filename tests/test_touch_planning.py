@@ -13,16 +13,16 @@ import torch
 
 from bcppl import poses
 from bcppl.beliefs import Belief
+from bcppl.contact.sensing.felt import Felt
 from bcppl.errors import InputError
-from bcppl.inference.probing.metrology import Pace, three_two_one
+from bcppl.geometry.gap import PegGap
+from bcppl.geometry.shapes import block, block_with_square_hole, box_peg, round_peg
+from bcppl.inference.planning.faces import section, sides, spots_on_top
+from bcppl.inference.planning.metrology import Pace, three_two_one
 from bcppl.models.parts import insert_peg, insert_tray
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.guarded_motion import CarriedOut
-from bcppl.recordings.plan import Plan
-from bcppl.simulators.faces import section, sides, spots_on_top
-from bcppl.simulators.gap import PegGap
-from bcppl.simulators.sensing.felt import Felt
-from bcppl.simulators.shapes import block, block_with_square_hole, box_peg, round_peg
+from bcppl.robot.plan import Plan
 from tests.made_recordings import assert_one_sentence
 
 NAN = float("nan")

@@ -12,15 +12,15 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.contact.physics import PegPhysics, Rollout
+from bcppl.contact.track import ContactTrack
+from bcppl.contact.unknowns import Unknowns
+from bcppl.contact.wrench import Sensing
 from bcppl.distributions.contact import ChamferContacts
 from bcppl.errors import InputError
-from bcppl.parts import Part, Piece
-from bcppl.recordings.measurements import Probe
-from bcppl.simulators.physics import PegPhysics, Rollout
-from bcppl.simulators.shapes import block, block_with_square_hole, box_peg
-from bcppl.simulators.track import ContactTrack
-from bcppl.simulators.unknowns import Unknowns
-from bcppl.simulators.wrench import Sensing
+from bcppl.geometry.parts import Part, Piece
+from bcppl.geometry.shapes import block, block_with_square_hole, box_peg
+from bcppl.sensors.measurements import Probe
 
 STIFFNESS = np.array([1500.0, 1000.0, 2000.0, 60.0, 50.0, 40.0])
 DAMPING = np.array([80.0, 80.0, 80.0, 2.0, 2.0, 2.0])

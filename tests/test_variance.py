@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from bcppl.inference import population as population_module
+from bcppl.inference.filters.step import Observed, steps
+from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Resample, adaptive, always, never
 from bcppl.inference.schemes import multinomial, systematic
 from bcppl.inference.sizing import merged, replicated, resized
-from bcppl.inference.step import Observed, steps
-from bcppl.inference.tempering import tempered
 from bcppl.inference.variance import evidence_variance
 
 SEEN = [torch.tensor(v, dtype=torch.float64) for v in (0.8, -0.3, 1.9, 1.2, 0.1)]

@@ -10,16 +10,16 @@ import pytest
 import torch
 
 from bcppl import poses
+from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.shapes import block
+from bcppl.inference.design import linearised_information_gain
 from bcppl.inference.population import Population
-from bcppl.inference.probing import linearised_information_gain
 from bcppl.models.look_and_touch import model
 from bcppl.models.view_information import pixel_information, view_information
 from bcppl.models.worlds.bench import bench_scene
-from bcppl.recordings.measurements import View
-from bcppl.recordings.plan import action_of
-from bcppl.simulators.camera import Camera, looking_at
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.shapes import block
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.robot.plan import action_of
+from bcppl.sensors.measurements import View
 from bcppl.traces import generate
 
 
@@ -76,7 +76,7 @@ def test_the_cameras_error_bounds_what_it_tells_and_a_second_image_tells_less() 
 
 
 def _error(scene: object, camera: Camera, part: torch.Tensor) -> torch.Tensor:
-    from bcppl.simulators.stated_cameras import apparent_covariance
+    from bcppl.rendering.stated_cameras import apparent_covariance
 
     settings = scene.settings  # type: ignore[attr-defined]
     return apparent_covariance(camera, part, settings.camera_shift, settings.camera_turn)
@@ -108,7 +108,7 @@ def test_views_and_touches_stand_in_one_ranking() -> None:
 
 
 def _down(world: object) -> object:
-    from bcppl.recordings.plan import Plan
+    from bcppl.robot.plan import Plan
 
     tip = -float(world.peg.vertices[:, 2].min())  # type: ignore[attr-defined]
     top = float(world.part.vertices[:, 2].max())  # type: ignore[attr-defined]

@@ -12,15 +12,15 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
+from bcppl.inference.filters.step import Observed
+from bcppl.inference.filters.tempering import tempered
+from bcppl.inference.filters.waste_free import waste_free_moves
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import Kernel, Move, metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.schemes import multinomial
-from bcppl.inference.step import Observed
 from bcppl.inference.targets import POSTERIOR, Target
-from bcppl.inference.tempering import tempered
-from bcppl.inference.waste_free import waste_free_moves
 from bcppl.traces import Trace, simulate
 
 NOISE = 0.3

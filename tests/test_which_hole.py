@@ -7,12 +7,12 @@ import torch
 
 from bcppl import poses
 from bcppl.cli import loading
+from bcppl.contact.physics import PegPhysics
 from bcppl.errors import InputError
+from bcppl.geometry.shapes import box_peg
 from bcppl.models import which_hole
 from bcppl.models.worlds import which_hole as world
 from bcppl.recordings import ProbeWindow
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.shapes import box_peg
 from bcppl.traces import extend, generate, update
 
 

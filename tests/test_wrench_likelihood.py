@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from bcppl.contact.physics import PegPhysics
+from bcppl.contact.track import ContactTrack
+from bcppl.contact.wrench import Sensing
 from bcppl.distributions.wrench import Wrench
 from bcppl.errors import InputError
-from bcppl.recordings.measurements import Probe
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.shapes import block, box_peg
-from bcppl.simulators.track import ContactTrack
-from bcppl.simulators.wrench import Sensing
+from bcppl.geometry.shapes import block, box_peg
+from bcppl.sensors.measurements import Probe
 
 PEG = box_peg(0.016, 0.05)
 

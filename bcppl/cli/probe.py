@@ -20,8 +20,12 @@ from bcppl.cli import loading
 from bcppl.cli.known import Known, known
 from bcppl.errors import InputError
 from bcppl.figures import action_in_3d
-from bcppl.inference.probing.candidates import KINDS, MIXED, candidates, refuse_settled
-from bcppl.inference.probing.filters import (
+from bcppl.geometry.gap import PegGap
+from bcppl.inference.design.loop import named_apart, prepared, with_views
+from bcppl.inference.design.ranking import Ranking
+from bcppl.inference.design.rules import Rank, by_information, by_reweighing
+from bcppl.inference.planning.candidates import KINDS, MIXED, candidates, refuse_settled
+from bcppl.inference.planning.filters import (
     Candidate,
     Candidates,
     Filter,
@@ -38,17 +42,13 @@ from bcppl.inference.probing.filters import (
     refuse_none,
     within_reach,
 )
-from bcppl.inference.probing.loop import named_apart, prepared, with_views
-from bcppl.inference.probing.ranking import Ranking
-from bcppl.inference.probing.rules import Rank, by_information, by_reweighing
 from bcppl.models.look_and_touch_scene import Scene
 from bcppl.models.robots import load_robot
 from bcppl.models.view_information import view_information
 from bcppl.recordings import Recording
 from bcppl.recordings.action_file import SUFFIXES, load_actions, save_actions
-from bcppl.recordings.measurements import View
-from bcppl.recordings.plan import Plan
-from bcppl.simulators.gap import PegGap
+from bcppl.robot.plan import Plan
+from bcppl.sensors.measurements import View
 
 DEFAULT = ",".join(f"{kind}:{count}" for kind, count in MIXED.items())
 WAYS = ("linearised", "reweighing")

@@ -22,7 +22,7 @@ FARTHEST = 0.02  # m: the range over which an outlier's gap is spread evenly
 
 
 class Gaps(Protocol):
-    """What `bcppl.simulators.gap.PegGap` gives."""
+    """What `bcppl.geometry.gap.PegGap` gives."""
 
     @property
     def distance(self) -> Tensor:
@@ -33,7 +33,7 @@ class Gaps(Protocol):
 
 
 class MeasuresGap(Protocol):
-    """`bcppl.simulators.gap.PegGap`, or what answers alike."""
+    """`bcppl.geometry.gap.PegGap`, or what answers alike."""
 
     def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gaps:  # noqa: D102
         ...
@@ -79,7 +79,7 @@ class ContactManifold(LazyDistribution):
         sink: m that a peg sinks into the part at the forces of a probe.
         outlier: a probability.
         motion: where pegs get to, and whether they touch, (N, T, 8) for poses (N, 7) of the part; asked for
-            samples only. Such is `bcppl.simulators.god_object.GodObject`, along a command.
+            samples only. Such is `bcppl.contact.god_object.GodObject`, along a command.
 
     Raises:
         InputError: a number is out of range.
@@ -166,8 +166,8 @@ class ContactManifold(LazyDistribution):
         if self.motion is None:
             raise InputError(
                 "ContactManifold weighs poses of the part by where a peg got to and cannot say where it will "
-                "get to; give it a `motion`, such as bcppl.simulators.god_object.WindowMotion, or "
-                "simulate the probe with bcppl.simulators.track.ContactTrack."
+                "get to; give it a `motion`, such as bcppl.contact.god_object.WindowMotion, or "
+                "simulate the probe with bcppl.contact.track.ContactTrack."
             )
         if _LATER.get():
             return torch.full((*self.batch_shape, *self.event_shape), torch.nan, dtype=torch.float64)

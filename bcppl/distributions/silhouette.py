@@ -24,7 +24,7 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
-    from bcppl.simulators.camera import Camera
+    from bcppl.geometry.camera import Camera
 
 _REACH = 3.0  # deviations of the outline's wandering that are looked at
 _SURE = 1e-9  # no share of rays is taken for nearer to 0 or 1: the normal's quantiles stay finite
@@ -190,7 +190,7 @@ class Silhouette(LazyDistribution):
 def binned_mask(mask: npt.ArrayLike, k: int) -> npt.NDArray[np.float64]:
     """A mask (H, W) in blocks of k x k pixels, (H // k, W // k): 1 where most of a block's pixels are true.
 
-    `bcppl.simulators.camera.Camera.binned` is the camera that sees it.
+    `bcppl.geometry.camera.Camera.binned` is the camera that sees it.
 
     Raises:
         InputError: the mask has no two dimensions, or no block fits into it.

@@ -1,6 +1,6 @@
 """What a finger feels when it is moved along a known path: where it first touches, and how it is pushed.
 
-The distributions take the signed distance to the part (`bcppl.simulators.distance.SignedDistance`, or any
+The distributions take the signed distance to the part (`bcppl.geometry.distance.SignedDistance`, or any
 callable that maps points (..., 3) in the part's frame to something with `distance` and `normal`) as an
 argument, or a `Placed` that answers for a whole program at once. Scales are floats, or tensors (N,) where
 they are latent.

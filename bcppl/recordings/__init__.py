@@ -3,7 +3,7 @@
 from bcppl.recordings.check import notes, problems, validate
 from bcppl.recordings.describe import describe
 from bcppl.recordings.file import load, save
-from bcppl.recordings.measurements import (
+from bcppl.sensors.measurements import (
     DepthImage,
     Guess,
     Measurement,

@@ -6,7 +6,7 @@ Both hold the same, a list of actions in SI units, frames in the names (schema v
     actions                   a list; in HDF5 a group actions/000000.. with one group for each
 
     kind "plan"   name; times (K), world_from_peg (K, 7), manners (K - 1), force, stiffness (6), damping (6),
-                  rate, sink: the fields of `bcppl.recordings.plan.Plan`; rate and sink may be left out
+                  rate, sink: the fields of `bcppl.robot.plan.Plan`; rate and sink may be left out
     kind "view"   name; width, height, fx, fy, cx, cy, near, far, world_from_camera (7): a camera, as in a
                   recording; distortion, wrist_from_camera (7) and device where there is one
 
@@ -29,11 +29,11 @@ import numpy as np
 from bcppl import poses
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
+from bcppl.geometry.camera import Camera
 from bcppl.recordings.cameras import INTRINSICS, RANGE, read_camera, write_camera
 from bcppl.recordings.datasets import POSE_UNITS, array, number, put
-from bcppl.recordings.measurements import View
-from bcppl.recordings.plan import Plan
-from bcppl.simulators.camera import Camera
+from bcppl.robot.plan import Plan
+from bcppl.sensors.measurements import View
 
 FORMAT = "bcppl actions"
 SCHEMA_VERSION = 1

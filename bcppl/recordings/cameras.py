@@ -5,8 +5,8 @@ from __future__ import annotations
 import h5py
 import numpy as np
 
+from bcppl.geometry.camera import Camera
 from bcppl.recordings.datasets import POSE_UNITS, array, number, put
-from bcppl.simulators.camera import Camera
 
 INTRINSICS = {"width": "pixel", "height": "pixel", "fx": "pixel", "fy": "pixel", "cx": "pixel", "cy": "pixel"}
 RANGE = {"near": "m", "far": "m"}

@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from bcppl.errors import InputError
-from bcppl.parts import LARGEST_EXTENT, Part
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.distortion import coefficients
+from bcppl.geometry.parts import LARGEST_EXTENT, Part
 from bcppl.poses import as_pose, inverse, transform
 from bcppl.recordings.file import same
-from bcppl.recordings.measurements import DepthImage, Guess, Probe, ProbeWindow, Push, Recording, Touch, View
-from bcppl.recordings.plan import FARTHEST
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.distortion import coefficients
+from bcppl.robot.plan import FARTHEST
+from bcppl.sensors.measurements import DepthImage, Guess, Probe, ProbeWindow, Push, Recording, Touch, View
 
 Array = npt.NDArray[np.float64]
 

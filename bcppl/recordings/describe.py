@@ -7,8 +7,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from bcppl.parts import Part
-from bcppl.recordings.measurements import Guess, ProbeWindow, Push, Recording, Touch, View
+from bcppl.geometry.parts import Part
+from bcppl.sensors.measurements import Guess, ProbeWindow, Push, Recording, Touch, View
 
 Array = npt.NDArray[np.float64]
 

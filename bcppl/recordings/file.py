@@ -33,10 +33,11 @@ import numpy as np
 import numpy.typing as npt
 
 from bcppl.errors import InputError
-from bcppl.parts import Part, Piece
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part, Piece
 from bcppl.recordings.cameras import camera_version, read_camera, write_camera
 from bcppl.recordings.datasets import POSE_UNITS, array, number, put
-from bcppl.recordings.measurements import (
+from bcppl.sensors.measurements import (
     DepthImage,
     Guess,
     Measurement,
@@ -47,7 +48,6 @@ from bcppl.recordings.measurements import (
     Touch,
     View,
 )
-from bcppl.simulators.camera import Camera
 
 FORMAT = "bcppl recording"
 SCHEMA_VERSION = 2

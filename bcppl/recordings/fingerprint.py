@@ -6,7 +6,7 @@ import hashlib
 
 import numpy as np
 
-from bcppl.recordings.measurements import DepthImage, Recording
+from bcppl.sensors.measurements import DepthImage, Recording
 
 
 def fingerprint(recording: Recording, taken: int) -> str:

@@ -33,12 +33,12 @@ class Model:
             by address. No answer hangs on proposals, only how soon it comes: a model still never knows how it
             is inferred.
         arrival: two programs, there and back, by which a population may take a new measurement in
-            (`bcppl.inference.smcp3.Pair`): `there(trace)` reads the trace with the new arguments and
+            (`bcppl.inference.filters.smcp3.Pair`): `there(trace)` reads the trace with the new arguments and
             observations and chooses the latent values that come with them, and new ones in place of old ones;
             `back(trace)` chooses the old ones, as they were before. None where the model has none. No answer
             hangs on it either.
         climbs: how many climbs from the prior should look for modes before depth images are let in
-            (`bcppl.inference.tempered_smc.infer`): where the best mode may be narrow. 0 for none.
+            (`bcppl.inference.filters.tempered_smc.infer`): where the best mode may be narrow. 0 for none.
     """
 
     program: Program | Series

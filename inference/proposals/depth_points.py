@@ -19,13 +19,13 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.depth import ClutteredDepth, LaplaceDepth, RobustDepth
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
+from bcppl.geometry.parts import Part
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.least_squares import Alignment, Equations, aligned
 from bcppl.inference.proposals.proposal import Fitted
 from bcppl.inference.proposals.spread import spread_of
-from bcppl.parts import Part
 from bcppl.poses import FREE
-from bcppl.simulators.renderer import Hits
+from bcppl.rendering.renderer import Hits
 from bcppl.traces import Trace
 
 Array = npt.NDArray[np.float64]

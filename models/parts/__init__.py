@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from bcppl.errors import InputError
-from bcppl.parts import Part, Piece
+from bcppl.geometry.parts import Part, Piece
 
 SHAPES = ("round", "rectangular")
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from bcppl.geometry.layers import prismatic
+from bcppl.geometry.meshes import load_mesh
 from bcppl.models.parts import SHAPES
-from bcppl.simulators.layers import prismatic
-from bcppl.simulators.meshes import load_mesh
 
 SOURCE = (
     "IndustReal, from NVIDIA IsaacGymEnvs, BSD-3-Clause, copyright 2018-2023 NVIDIA Corporation; vertices "

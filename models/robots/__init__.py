@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from bcppl.errors import InputError
-from bcppl.simulators.robot import Robot
+from bcppl.robot.kinematics import Robot
 
 SHIPPED = ("iiwa", "panda")
 
@@ -28,7 +28,7 @@ def load_robot(
         tip: a link; the joints that do not lead to it are held.
         held: values of joints that do not move.
         geometry: which of the links' shapes are drawn.
-        mesh_folders: where meshes are looked for; all four as in `bcppl.simulators.robot.Robot`.
+        mesh_folders: where meshes are looked for; all four as in `bcppl.robot.kinematics.Robot`.
 
     Raises:
         InputError: there is neither a shipped robot nor a file of that name; or as `Robot` says.

@@ -17,15 +17,21 @@ import torch
 
 from bcppl import poses
 from bcppl.arguments import number_within, seed_number
+from bcppl.contact.peg_model import ContactParameters
 from bcppl.distributions.poses import SwingTwistPose
+from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.parts import Part
+from bcppl.geometry.shapes import block
 from bcppl.models.worlds.bench_parts import PARTS, BenchPart, bench_part
 from bcppl.models.worlds.bench_sensors import SensorErrors
 from bcppl.models.worlds.guarded_motion import CarriedOut, carry_out, stamps_of
 from bcppl.models.worlds.inserting import InsertionResult, insert, samples_of
 from bcppl.models.worlds.occlusion import occluder
-from bcppl.parts import Part
-from bcppl.recordings.insertion_plan import InsertionPlan
-from bcppl.recordings.measurements import (
+from bcppl.rendering.depth_noise import DepthNoise
+from bcppl.rendering.scene import SceneRenderer
+from bcppl.robot.insertion_plan import InsertionPlan
+from bcppl.robot.plan import Plan
+from bcppl.sensors.measurements import (
     DepthImage,
     Guess,
     Measurement,
@@ -34,12 +40,6 @@ from bcppl.recordings.measurements import (
     Touch,
     View,
 )
-from bcppl.recordings.plan import Plan
-from bcppl.simulators.camera import Camera, looking_at
-from bcppl.simulators.depth_noise import DepthNoise
-from bcppl.simulators.peg_model import ContactParameters
-from bcppl.simulators.scene import SceneRenderer
-from bcppl.simulators.shapes import block
 
 Array = npt.NDArray[np.float64]
 

@@ -10,12 +10,12 @@ import torch
 
 from bcppl import poses
 from bcppl.errors import InputError
+from bcppl.geometry.camera import Camera
 from bcppl.models.worlds.bench import BenchScene
 from bcppl.models.worlds.inserting import InsertionResult
-from bcppl.recordings.insertion_plan import InsertionPlan
-from bcppl.recordings.measurements import DepthImage, Measurement, View
-from bcppl.recordings.plan import Plan
-from bcppl.simulators.camera import Camera
+from bcppl.robot.insertion_plan import InsertionPlan
+from bcppl.robot.plan import Plan
+from bcppl.sensors.measurements import DepthImage, Measurement, View
 
 Array = npt.NDArray[np.float64]
 
@@ -24,7 +24,7 @@ _VIEWS = 9  # what cameras that come later are drawn from, beside what the scene
 
 
 class BenchArm:
-    """A world for `bcppl.inference.probing.loop`, which remembers the time and where its sensor has drifted.
+    """A world for `bcppl.inference.design.loop`, which remembers the time and where its sensor has drifted.
 
     The first plan is felt as in `BenchScene.probe`; every other has new noise, and a zero that has walked on.
     A camera that the scene does not know stands off from where it says, and has a range bias, as the scene's

@@ -11,15 +11,15 @@ import numpy.typing as npt
 import shapely
 
 from bcppl.errors import InputError
-from bcppl.models.parts import insert_tray
-from bcppl.parts import Part
-from bcppl.simulators.outlines import (
+from bcppl.geometry.outlines import (
     block_with_hole,
     named_outline,
     peg_for,
     rectangular_outline,
     round_outline,
 )
+from bcppl.geometry.parts import Part
+from bcppl.models.parts import insert_tray
 
 Array = npt.NDArray[np.float64]
 

@@ -13,10 +13,10 @@ import torch
 from scipy.ndimage import uniform_filter1d
 
 from bcppl import poses
+from bcppl.contact.physics import PegPhysics
+from bcppl.contact.unknowns import Unknowns
 from bcppl.models.worlds import peg_in_hole as bench
-from bcppl.recordings.measurements import Measurement, Probe, ProbeWindow, Recording, Touch
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.unknowns import Unknowns
+from bcppl.sensors.measurements import Measurement, Probe, ProbeWindow, Recording, Touch
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from bcppl.contact.peg_model import ContactParameters, build_model, commands
+from bcppl.contact.stepping import POSE, WRENCH, Clock, Standing
 from bcppl.errors import InputError
-from bcppl.parts import Part
-from bcppl.recordings.measurements import Probe
-from bcppl.recordings.plan import Manner, Plan
-from bcppl.simulators.peg_model import ContactParameters, build_model, commands
-from bcppl.simulators.stepping import POSE, WRENCH, Clock, Standing
+from bcppl.geometry.parts import Part
+from bcppl.robot.plan import Manner, Plan
+from bcppl.sensors.measurements import Probe
 
 Array = npt.NDArray[np.float64]
 

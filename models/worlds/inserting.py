@@ -9,10 +9,10 @@ import numpy.typing as npt
 import torch
 
 from bcppl import poses
+from bcppl.contact.peg_model import ContactParameters
+from bcppl.geometry.parts import Part
 from bcppl.models.worlds.guarded_motion import TARE, carry_out, stamps_of
-from bcppl.parts import Part
-from bcppl.recordings.insertion_plan import InsertionPlan
-from bcppl.simulators.peg_model import ContactParameters
+from bcppl.robot.insertion_plan import InsertionPlan
 
 Array = npt.NDArray[np.float64]
 

@@ -10,10 +10,10 @@ import torch
 
 from bcppl import poses
 from bcppl.errors import InputError
-from bcppl.parts import Part
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.shapes import block
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part
+from bcppl.geometry.shapes import block
+from bcppl.rendering.renderer import DepthRenderer
 
 Array = npt.NDArray[np.float64]
 

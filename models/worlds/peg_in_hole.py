@@ -16,9 +16,14 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from bcppl import poses
+from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.physics import PegPhysics
 from bcppl.distributions.poses import SwingTwistPose
-from bcppl.parts import Part
-from bcppl.recordings.measurements import (
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part
+from bcppl.geometry.shapes import block, block_with_square_hole, box_peg
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.sensors.measurements import (
     DepthImage,
     Guess,
     Measurement,
@@ -28,11 +33,6 @@ from bcppl.recordings.measurements import (
     Touch,
     View,
 )
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.peg_model import ContactParameters
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.shapes import block, block_with_square_hole, box_peg
 
 Array = npt.NDArray[np.float64]
 

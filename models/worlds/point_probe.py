@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
+from bcppl.geometry.parts import Part
 from bcppl.models.point_probe import Scene, point_probe, prepare
-from bcppl.parts import Part
 from bcppl.poses import identity, rotation_matrix, transform
 from bcppl.recordings.importers.point_probe import prism
-from bcppl.recordings.measurements import Guess, Measurement, Push, Recording, Touch
+from bcppl.sensors.measurements import Guess, Measurement, Push, Recording, Touch
 from bcppl.traces import generate
 
 Array = npt.NDArray[np.float64]

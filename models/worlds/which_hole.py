@@ -15,11 +15,15 @@ import trimesh
 from scipy.ndimage import uniform_filter1d
 
 from bcppl import poses
+from bcppl.contact.physics import PegPhysics
 from bcppl.distributions.poses import SwingTwistPose
+from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.parts import Part, Piece
+from bcppl.geometry.shapes import box_peg
 from bcppl.models.which_hole import HOLES, PITCH
 from bcppl.models.worlds import peg_in_hole as bench
-from bcppl.parts import Part, Piece
-from bcppl.recordings.measurements import (
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.sensors.measurements import (
     DepthImage,
     Guess,
     Measurement,
@@ -29,10 +33,6 @@ from bcppl.recordings.measurements import (
     Touch,
     View,
 )
-from bcppl.simulators.camera import Camera, looking_at
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.renderer import DepthRenderer
-from bcppl.simulators.shapes import box_peg
 
 HOLE, PIN, MARGIN, THICK = 0.018, 0.008, 0.03, 0.02
 CLEAR, STROKE = 0.005, 0.006

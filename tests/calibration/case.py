@@ -22,12 +22,12 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.inference.filters.step import Observed
+from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.kernels import Kernel, rejuvenate
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import adaptive, systematic
-from bcppl.inference.step import Observed
 from bcppl.inference.targets import POSTERIOR
-from bcppl.inference.tempering import tempered
 from bcppl.poses import Freedom
 from bcppl.traces import extend, generate, simulate
 from tests.calibration.ranks import ranks

@@ -13,13 +13,13 @@ import trimesh
 from bcppl import poses
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import NormalPose
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part
+from bcppl.inference.filters.tempered_smc import kernel as shipped
 from bcppl.inference.kernels import cycle, metropolis_hastings, repeat
 from bcppl.inference.proposals import depth_alignment, drift, independent
-from bcppl.inference.tempered_smc import kernel as shipped
-from bcppl.parts import Part
 from bcppl.poses import FREE, Freedom
-from bcppl.simulators.camera import Camera
-from bcppl.simulators.renderer import DepthRenderer
+from bcppl.rendering.renderer import DepthRenderer
 from bcppl.traces import Trace
 from tests.calibration.case import Case
 

@@ -9,15 +9,15 @@ import numpy as np
 import pyro
 
 from bcppl import poses
+from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.physics import PegPhysics
+from bcppl.contact.track import ContactTrack
+from bcppl.contact.wrench import Sensing
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime
 from bcppl.distributions.poses import UniformPose
-from bcppl.inference.tempered_smc import kernel as shipped
-from bcppl.recordings.measurements import Probe
-from bcppl.simulators.peg_model import ContactParameters
-from bcppl.simulators.physics import PegPhysics
-from bcppl.simulators.shapes import block, box_peg
-from bcppl.simulators.track import ContactTrack
-from bcppl.simulators.wrench import Sensing
+from bcppl.geometry.shapes import block, box_peg
+from bcppl.inference.filters.tempered_smc import kernel as shipped
+from bcppl.sensors.measurements import Probe
 from bcppl.traces import carried
 from tests.calibration.case import Case
 

@@ -20,7 +20,7 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
-    from bcppl.simulators.camera import Camera
+    from bcppl.geometry.camera import Camera
 
 
 class _Read(NamedTuple):

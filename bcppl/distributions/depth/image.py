@@ -19,7 +19,7 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
-    from bcppl.simulators.camera import Camera
+    from bcppl.geometry.camera import Camera
 
 
 class DepthDistribution(LazyDistribution):
@@ -101,7 +101,7 @@ class DepthDistribution(LazyDistribution):
             raise InputError(
                 f"camera {camera.name!r} is given both a camera_error and a background image, which was "
                 "rendered where the camera is said to stand; leave the background out, or render it as a "
-                "part of the scene (bcppl.simulators.scene.background_part)."
+                "part of the scene (bcppl.rendering.scene.background_part)."
             )
         latent = tuple(x for x in (camera_error, bias) if isinstance(x, Tensor))
         super().__init__(len(pose), shape, inputs=(pose, *latent))

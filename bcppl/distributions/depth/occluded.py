@@ -13,7 +13,7 @@ from bcppl.distributions.depth.rendering import Array, Mask, RendersDepth
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
-    from bcppl.simulators.camera import Camera
+    from bcppl.geometry.camera import Camera
 
 
 class OccludedDepth(DepthDistribution):

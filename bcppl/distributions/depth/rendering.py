@@ -11,7 +11,7 @@ import numpy.typing as npt
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from bcppl.simulators.camera import Camera
+    from bcppl.geometry.camera import Camera
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -34,10 +34,10 @@ class PixelHits(Protocol):
 
 
 class RendersDepth(Protocol):
-    """A simulator of depth images, such as `bcppl.simulators.renderer.DepthRenderer`.
+    """A simulator of depth images, such as `bcppl.rendering.renderer.DepthRenderer`.
 
     One that renders K parts together has them in its attribute `parts` and takes poses (N, K, 7), as
-    `bcppl.simulators.scene.SceneRenderer` does.
+    `bcppl.rendering.scene.SceneRenderer` does.
     """
 
     def hits(self, camera: Camera, world_from_part: Tensor, counted: Mask | None = None) -> PixelHits:

@@ -20,10 +20,10 @@ from PIL import Image
 from scipy.optimize import brentq
 
 from bcppl.errors import InputError
-from bcppl.parts import Part
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part
 from bcppl.poses import from_rotation_matrix, identity, retract
-from bcppl.recordings.measurements import DepthImage, Guess, Measurement, Recording, View
-from bcppl.simulators.camera import Camera
+from bcppl.sensors.measurements import DepthImage, Guess, Measurement, Recording, View
 
 NAME = "bop"
 HELP = (

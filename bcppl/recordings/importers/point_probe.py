@@ -19,9 +19,9 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.parts import Part, Piece
+from bcppl.geometry.parts import Part, Piece
 from bcppl.poses import as_pose, compose, identity, inverse, rotation_matrix
-from bcppl.recordings.measurements import Guess, Measurement, Push, Recording, Touch
+from bcppl.sensors.measurements import Guess, Measurement, Push, Recording, Touch
 
 NAME = "point-probe"
 HELP = "Point-finger pushes on a triangular prism (MLab_EXP logs), the prism at a random known pose."

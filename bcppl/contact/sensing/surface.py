@@ -1,0 +1,200 @@
+"""Where a peg can be touched: its faces as lines enter them, its sharp edges and its corners."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from bcppl.geometry.parts import Part
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+SHARP = np.radians(30.0)  # faces that meet at less than this are one smooth surface, edges one smooth curve
+STEP = 2e-5  # m past a crossing from which the next one is looked for: thinner walls are not seen
+MOST_LAYERS = 12  # how often a line may cross the surface
+
+
+class Crossings(NamedTuple):
+    """Where lines enter a solid, one row for each crossing.
+
+    Attributes:
+        line: (Q,) which line.
+        point: (Q, 3) where.
+        face: (Q,) which triangle.
+    """
+
+    line: Indices
+    point: Array
+    face: Indices
+
+
+class Edges(NamedTuple):
+    """Sharp convex edges.
+
+    Attributes:
+        start: (E, 3).
+        extent: (E, 3) from its start to its end.
+        normals: (E, 9, 3) outward normals from one face's to the other's.
+        chain: (E,) which smooth curve it belongs to.
+    """
+
+    start: Array
+    extent: Array
+    normals: Array
+    chain: Indices
+
+
+def closed_mesh(part: Part) -> trimesh.Trimesh:
+    """A part's mesh, its doubled vertices merged and its empty triangles left out.
+
+    Raises:
+        InputError: it is empty, open, not finite or in millimetres.
+    """
+    mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+    if len(part.vertices) and len(part.faces):
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        mesh.update_faces(mesh.nondegenerate_faces())
+    Part(part.name, np.asarray(mesh.vertices), np.asarray(mesh.faces)).check()
+    return mesh
+
+
+class PegSurface:
+    """The surface of a part that is touched, in its frame.
+
+    Attributes:
+        mesh: closed, its doubled vertices merged.
+        center: (3,) of a ball around it.
+        radius: of that ball, metres.
+        normals: (F, 3) outward normals of its triangles.
+        patch: (F,) which smooth surface each triangle belongs to.
+        area: m^2.
+    """
+
+    def __init__(self, part: Part) -> None:
+        """Prepare a part.
+
+        Raises:
+            InputError: its mesh is empty, open, not finite or in millimetres.
+        """
+        self.mesh = mesh = closed_mesh(part)
+        vertices = np.asarray(mesh.vertices, dtype=np.float64)
+        self.center = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+        self.radius = float(np.linalg.norm(vertices - self.center, axis=1).max())
+        corners = vertices[mesh.faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self.normals = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        self.area = float(mesh.area)
+        self._anchor = corners[:, 0]
+        smooth = mesh.face_adjacency[mesh.face_adjacency_angles < SHARP]
+        self.patch = _groups(smooth, len(mesh.faces))
+        self._layers = 1 if mesh.is_convex else MOST_LAYERS
+
+    @cached_property
+    def _scene(self) -> EmbreeScene:
+        scene = EmbreeScene()
+        TriangleMesh(scene, self.mesh.vertices.astype(np.float32), self.mesh.faces.astype(np.int32))
+        return scene
+
+    def entered(self, point: Array, direction: Array) -> Crossings:
+        """Everywhere that lines through points (L, 3), with unit directions (L, 3), enter the solid.
+
+        In double precision: the ray tracer only says which triangle.
+        """
+        along = np.sum((self.center - point) * direction, axis=1, keepdims=True)
+        origin = point + (along - 1.1 * self.radius) * direction
+        line = np.arange(len(point))
+        found: list[tuple[Indices, Array, Indices]] = []
+        for _ in range(2 * self._layers - 1):
+            if len(line) == 0:
+                break
+            rays = (origin.astype(np.float32), direction.astype(np.float32))
+            face = np.asarray(self._scene.run(*rays), dtype=np.int64)
+            hit = face >= 0
+            line, origin, direction, face = line[hit], origin[hit], direction[hit], face[hit]
+            normal = self.normals[face]
+            slope = np.sum(direction * normal, axis=1)
+            # A ray that grazes a triangle in single precision may be parallel to it in double precision.
+            safe = np.where(np.abs(slope) < 1e-9, 1e-9, slope)
+            reach = np.sum((self._anchor[face] - origin) * normal, axis=1) / safe
+            reach = np.where(np.abs(slope) < 1e-9, 0.0, reach)
+            at = origin + reach[:, None] * direction
+            into = slope < -1e-9
+            found.append((line[into], at[into], face[into]))
+            origin = origin + (np.maximum(reach, 0.0) + STEP)[:, None] * direction
+        if not found:
+            return Crossings(np.empty(0, np.int64), np.empty((0, 3)), np.empty(0, np.int64))
+        return Crossings(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+    @cached_property
+    def edges(self) -> Edges:
+        """The sharp convex edges."""
+        mesh = self.mesh
+        sharp = np.asarray((mesh.face_adjacency_angles >= SHARP) & mesh.face_adjacency_convex)
+        pairs = np.asarray(mesh.face_adjacency_edges[sharp], dtype=np.int64)
+        ends = np.asarray(mesh.vertices, dtype=np.float64)[pairs]
+        start, extent = ends[:, 0], ends[:, 1] - ends[:, 0]
+        a, b = (self.normals[np.asarray(mesh.face_adjacency[sharp])[:, side]] for side in (0, 1))
+        angle = np.arccos(np.clip(np.sum(a * b, axis=1), -1.0, 1.0))[:, None, None]
+        share = np.linspace(0.0, 1.0, 9)[:, None]
+        turned = np.sin((1.0 - share) * angle) * a[:, None] + np.sin(share * angle) * b[:, None]
+        normals = turned / np.linalg.norm(turned, axis=-1, keepdims=True) if len(pairs) else turned
+        return Edges(start, extent, normals, _chains(pairs, extent))
+
+    @cached_property
+    def length(self) -> float:
+        """Of all sharp convex edges, metres."""
+        return float(np.linalg.norm(self.edges.extent, axis=1).sum())
+
+    @cached_property
+    def corners(self) -> tuple[Array, Array]:
+        """Where three or more sharp convex edges meet (C, 3), and outward normals (C, K, 3) at each.
+
+        The normals are those of the faces and between; where there are fewer, some are there twice.
+        """
+        mesh = self.mesh
+        sharp = np.asarray((mesh.face_adjacency_angles >= SHARP) & mesh.face_adjacency_convex)
+        count = np.bincount(mesh.face_adjacency_edges[sharp].reshape(-1), minlength=len(mesh.vertices))
+        chosen = np.flatnonzero(count >= 3)
+        weights = np.array([(i, j, 9 - i - j) for i in range(10) for j in range(10 - i)]) / 9.0
+        normals = []
+        for vertex in chosen:
+            around = self.normals[[f for f in mesh.vertex_faces[vertex] if f >= 0]]
+            around = around[np.unique(np.round(around, 6), axis=0, return_index=True)[1]]
+            threes = np.array([(i, j, k) for i in range(len(around)) for j in range(i) for k in range(j)])
+            mixed = np.einsum("wt,ntx->nwx", weights, around[threes]).reshape(-1, 3)
+            size = np.linalg.norm(mixed, axis=1, keepdims=True)
+            normals.append((mixed / np.maximum(size, 1e-12))[size[:, 0] > 1e-6])
+        most = max((len(n) for n in normals), default=1)
+        padded = np.array([np.resize(n, (most, 3)) for n in normals]).reshape(-1, most, 3)
+        return np.asarray(mesh.vertices, dtype=np.float64)[chosen], padded
+
+
+def _groups(pairs: npt.ArrayLike, count: int) -> Indices:
+    """Labels (count,) of what is connected by pairs (P, 2)."""
+    linked = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
+    graph = coo_array((np.ones(len(linked)), (linked[:, 0], linked[:, 1])), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def _chains(pairs: Indices, extent: Array) -> Indices:
+    """Labels (E,) of edges that go on into one another without a sharp turn."""
+    ends: dict[int, list[int]] = {}
+    for edge, vertices in enumerate(pairs):
+        for vertex in vertices:
+            ends.setdefault(int(vertex), []).append(edge)
+    along = extent / np.maximum(np.linalg.norm(extent, axis=1, keepdims=True), 1e-30)
+    smooth = [
+        pair
+        for pair in (edges for edges in ends.values() if len(edges) == 2)
+        if abs(float(along[pair[0]] @ along[pair[1]])) > np.cos(SHARP)
+    ]
+    return _groups(smooth, len(pairs))

@@ -1,0 +1,1 @@
+"""Geometry: parts, cameras, outlines, convex pieces and distances; nothing here is simulated."""

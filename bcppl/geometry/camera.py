@@ -1,0 +1,286 @@
+"""A camera: a pinhole with Brown's lens distortion, and where it stands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.arguments import number_within, whole_number
+from bcppl.errors import InputError
+from bcppl.geometry.distortion import LARGEST, distorted, undistorted_rays, unfolded
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A camera in its optical frame: x right, y down, z forward; depth is along z, metres.
+
+    A camera on a wrist is one camera for each place it looks from: see `on`.
+
+    Attributes:
+        name: cameras are told apart by name; two views from two places are two cameras.
+        width, height: the image's size in pixels.
+        fx, fy, cx, cy: focal lengths and principal point in pixels; pixel (u, v) is centred at the
+            integers, so without distortion it sees along ((u - cx) / fx, (v - cy) / fy, 1).
+        world_from_camera: (7,) pose of the optical frame.
+        near, far: the sensor's range in metres: a depth outside it is missing, not far away.
+        distortion: k1 k2 p1 p2 (k3) of Brown's model, as OpenCV has them; empty for none. Depth images are
+            often rectified already, and then have none: see the driver's camera information.
+        wrist_from_camera: (7,) where the camera sits on a robot's wrist; None for one that stands still.
+        device: which instrument it is, where one instrument looks from several places; "" where `name` says.
+    """
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_from_camera: Array
+    near: float = 0.05
+    far: float = 10.0
+    distortion: Sequence[float] = field(default=())
+    wrist_from_camera: Array | None = None
+    device: str = ""
+
+    def __post_init__(self) -> None:
+        given = () if self.distortion is None else self.distortion
+        object.__setattr__(self, "distortion", tuple(float(k) for k in np.ravel(np.asarray(given))))
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether a coefficient of its distortion is not zero."""
+        return any(k != 0.0 for k in self.distortion)
+
+    @property
+    def optics(self) -> tuple[int, int, tuple[float, float, float, float], tuple[float, ...]]:
+        """Width, height, (fx, fy, cx, cy) and distortion: all that the rays hang on."""
+        intrinsics = (float(self.fx), float(self.fy), float(self.cx), float(self.cy))
+        return self.width, self.height, intrinsics, tuple(self.distortion)
+
+    def stated_pose(self) -> Tensor:
+        """Its `world_from_camera` (7,) once its pose and optics have been looked at, quaternion normalised.
+
+        A camera may be made with any numbers, so that a recording that holds a wrong one can be read and
+        reported; whoever looks through it asks here.
+
+        Raises:
+            InputError: the pose is none or has no unit quaternion; there are no pixels; a focal length is not
+                positive, the principal point is not finite, or near is not below far.
+        """
+        self._refuse_optics()
+        pose = poses.as_pose(
+            np.asarray(self.world_from_camera, dtype=np.float64), f"the world_from_camera of {self.name!r}"
+        )
+        if pose.ndim != 1:
+            raise InputError(
+                f"the world_from_camera of {self.name!r} has shape {tuple(pose.shape)}; a camera stands at "
+                "one pose (7,): make one camera for each place it looks from."
+            )
+        return pose
+
+    def _refuse_optics(self) -> None:
+        for size, value in (("wide", self.width), ("high", self.height)):
+            whole_number(f"camera {self.name!r} is {{}} pixels {size}", value)
+        for name in ("fx", "fy"):
+            number_within(
+                f"camera {self.name!r} has a focal length {name} {{}} pixels (turn a mirrored image back "
+                "before)",
+                getattr(self, name),
+                above=0.0,
+            )
+        for name in ("cx", "cy"):
+            number_within(
+                f"camera {self.name!r} has its principal point at {name} {{}} pixels", getattr(self, name)
+            )
+        near = number_within(f"camera {self.name!r} sees from {{}} m on", self.near, least=0.0)
+        try:
+            beyond = float(self.far) > near
+        except (TypeError, ValueError):
+            beyond = False
+        if not beyond:
+            raise InputError(
+                f"camera {self.name!r} sees from {self.near} m to {self.far!r} m; give near below far, in "
+                "metres."
+            )
+
+    @property
+    def instrument(self) -> str:
+        """What it shares its errors with: its device, or its name where no device is stated."""
+        return self.device or self.name
+
+    def rays(self) -> Array:
+        """Directions (height * width, 3) of the pixels in the optical frame, z = 1 (lengths are depths).
+
+        Raises:
+            InputError: there are no pixels, a focal length is not positive, the principal point is not
+                finite, near is not below far, or the distortion folds the image over, so that a pixel sees
+                along no ray or several.
+        """
+        self._refuse_optics()
+        if self.is_distorted:
+            return undistorted_rays(*self.optics).copy()
+        u, v = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
+        x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
+        return np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+
+    def project(self, points: npt.ArrayLike) -> Array:
+        """Pixels (..., 2), u then v, at which points (..., 3) in the optical frame (metres) are seen.
+
+        They may lie outside the image. NaN where a point is not in front of the camera, or so far to the
+        side that the distortion would fold it back into the image.
+        """
+        places = np.asarray(points, dtype=np.float64)
+        depth = places[..., 2]
+        ahead = depth > 0.0
+        plane = places[..., :2] / np.where(ahead, depth, 1.0)[..., None]
+        if self.is_distorted:
+            ahead = ahead & unfolded(plane, tuple(self.distortion))
+            plane = distorted(np.clip(plane, -LARGEST, LARGEST), tuple(self.distortion))
+        pixel = plane * np.array([self.fx, self.fy]) + np.array([self.cx, self.cy])
+        return np.where(ahead[..., None], pixel, np.nan)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The camera of a region of interest: `depth[top : top + height, left : left + width]`.
+
+        It keeps its name: crop every image of a camera, and its background, alike.
+
+        Raises:
+            InputError: the region is not of whole pixels, is empty or reaches out of the image.
+        """
+        of = f"a region of camera {self.name!r} is given"
+        left = whole_number(f"{of} left {{}}", left, least=0)
+        top = whole_number(f"{of} top {{}}", top, least=0)
+        width = whole_number(f"{of} width {{}}", width)
+        height = whole_number(f"{of} height {{}}", height)
+        if left + width > self.width or top + height > self.height:
+            raise InputError(
+                f"a region of {width}×{height} pixels from column {left}, row {top} does not lie within "
+                f"camera {self.name!r} of {self.width}×{self.height} pixels; give one that does."
+            )
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
+    def binned(self, k: int) -> Camera:
+        """The camera whose pixels are blocks of k × k of this one's; see `bin_depth` for its images.
+
+        Columns and rows that fill no block are left out at the right and below. It keeps its name.
+
+        Raises:
+            InputError: no block fits into the image.
+        """
+        _refuse_block(k, self.width, self.height)
+        middle = 0.5 * (k - 1)
+        return replace(
+            self,
+            width=self.width // k,
+            height=self.height // k,
+            fx=self.fx / k,
+            fy=self.fy / k,
+            cx=(self.cx - middle) / k,
+            cy=(self.cy - middle) / k,
+        )
+
+    def on(self, world_from_wrist: npt.ArrayLike, name: str | None = None) -> Camera:
+        """The camera where the arm holds it at one view.
+
+        Args:
+            world_from_wrist: (7,) the wrist's pose at that view, from the arm's joints.
+            name: of the camera at this place; give each view its own, for two places are two cameras. They
+                stay one `device`.
+
+        Raises:
+            InputError: the camera states no `wrist_from_camera`, or a pose is none.
+        """
+        if self.wrist_from_camera is None:
+            raise InputError(
+                f"camera {self.name!r} states no wrist_from_camera, so the wrist's pose does not say where "
+                "it is; give it the pose of the optical frame on the wrist (the hand-eye calibration)."
+            )
+        there = poses.compose(
+            poses.as_pose(torch.as_tensor(np.asarray(world_from_wrist)), "world_from_wrist"),
+            poses.as_pose(
+                torch.as_tensor(np.asarray(self.wrist_from_camera)), f"{self.name!r}'s wrist_from_camera"
+            ),
+        )
+        return replace(self, name=name or self.name, world_from_camera=there.numpy(), device=self.instrument)
+
+
+def bin_depth(
+    depth: npt.ArrayLike, k: int, edge: float = 0.01, near: float = 0.0, far: float = np.inf
+) -> Array:
+    """A depth image (H, W) in blocks of k × k pixels, (H // k, W // k) metres, NaN where all are missing.
+
+    A block's depth is the median of its valid readings. Of an even number the two in the middle are averaged
+    only where they lie within `edge` of each other; otherwise the nearer is taken: a mean over an edge is a
+    depth at which nothing stands.
+
+    Args:
+        depth: (H, W) metres; 0, NaN and what is out of range are missing.
+        k: pixels of a block's side.
+        edge: metres.
+        near: the sensor's range begins here, metres.
+        far: the sensor's range ends here, metres.
+
+    Raises:
+        InputError: the image has no two dimensions, or no block fits into it.
+    """
+    image = np.asarray(depth, dtype=np.float64)
+    if image.ndim != 2:
+        raise InputError(f"a depth image of shape {image.shape} cannot be binned; give one (H, W).")
+    height, width = image.shape
+    _refuse_block(k, width, height)
+    rows, columns = height // k, width // k
+    blocks: Array = (
+        image[: rows * k, : columns * k]
+        .reshape(rows, k, columns, k)
+        .transpose(0, 2, 1, 3)
+        .reshape(rows, columns, k * k)
+    )
+    valid = np.isfinite(blocks) & (blocks > 0.0) & (blocks >= near) & (blocks <= far)
+    ordered = np.sort(np.where(valid, blocks, np.inf), axis=-1)
+    count = valid.sum(axis=-1)
+    lower = np.take_along_axis(ordered, np.maximum((count - 1) // 2, 0)[..., None], axis=-1)[..., 0]
+    upper = np.take_along_axis(ordered, np.minimum(count // 2, k * k - 1)[..., None], axis=-1)[..., 0]
+    lower, upper = np.where(count > 0, lower, np.nan), np.where(count > 0, upper, np.nan)
+    return np.asarray(np.where(upper - lower <= edge, 0.5 * (lower + upper), lower))
+
+
+def _refuse_block(k: int, width: int, height: int) -> None:
+    if not (isinstance(k, int | np.integer) and 1 <= k <= min(width, height)):
+        raise InputError(
+            f"an image of {width}×{height} pixels cannot be binned by {k}; give a whole number from 1 to "
+            f"{min(width, height)}."
+        )
+
+
+def looking_at(eye: npt.ArrayLike, point: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+    """The pose (7,) `world_from_camera` of an optical frame at `eye` that sees `point` in its middle.
+
+    Args:
+        eye: (3,) where the camera stands, metres in the world.
+        point: (3,) what it looks at.
+        up: (3,) the direction that is upwards in the image.
+
+    Raises:
+        InputError: the camera would look at itself, or straight along `up`.
+    """
+    there = np.asarray(eye, dtype=np.float64)
+    forward = np.asarray(point, dtype=np.float64) - there
+    right = np.cross(forward, np.asarray(up, dtype=np.float64))
+    if not np.linalg.norm(right) > 1e-9 * max(float(np.linalg.norm(forward)), 1e-9):
+        raise InputError(
+            f"a camera at {there.tolist()} cannot look at {np.asarray(point).tolist()} with "
+            f"{np.asarray(up).tolist()} upwards; give another point, or another direction for up."
+        )
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    axes = np.stack([right, np.cross(forward, right), forward], axis=1)
+    return np.concatenate([there, Rotation.from_matrix(axes).as_quat()[[3, 0, 1, 2]]])

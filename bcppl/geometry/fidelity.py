@@ -1,0 +1,119 @@
+"""How far a part's convex pieces are from its mesh, on both sides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+import numpy.typing as npt
+import torch
+import trimesh
+
+from bcppl.arguments import whole_number
+from bcppl.errors import InputError
+from bcppl.geometry.distance import SignedDistance
+from bcppl.geometry.parts import Part, Piece
+
+Array = npt.NDArray[np.float64]
+
+_BATCH = 4096  # points whose distances to all pieces are held at once
+
+
+@dataclass(frozen=True)
+class GeometricError:
+    """The largest distances found between a mesh and the convex pieces that stand in for it, metres.
+
+    Attributes:
+        added: of points on the pieces' surfaces that lie outside the mesh: material that is not there.
+        lost: of points on the mesh that lie outside all pieces: material that is missing.
+    """
+
+    added: float
+    lost: float
+
+    @property
+    def largest(self) -> float:
+        """The larger of the two, metres."""
+        return max(self.added, self.lost)
+
+
+def geometric_error(part: Part, count: int = 20000, seed: int = 0) -> GeometricError:
+    """The error of a part's pieces, over points spread evenly over both surfaces, and all corners.
+
+    Args:
+        part: with a closed mesh and pieces.
+        count: of points on either surface.
+        seed: of the points.
+
+    Raises:
+        InputError: the mesh is empty, open or not finite, there are no pieces, or the count is none.
+    """
+    if not part.pieces:
+        raise InputError(
+            f"part {part.name!r} has no convex pieces whose error could be measured; make them with "
+            "`extruded`, `prismatic` or `decomposed`."
+        )
+    whole_number("geometric_error is asked for {} points", count)
+    solids = [solid_of(piece) for piece in part.pieces]
+    corners = np.concatenate([solid.vertices for solid in solids])
+    whole = trimesh.util.concatenate(solids)
+    spread, _ = trimesh.sample.sample_surface(whole, count, seed=seed)
+    on_pieces = torch.from_numpy(np.concatenate([corners, spread]))
+    # Where bodies overlap, the nearest surface may be one that lies inside another body.
+    beyond = torch.full((len(on_pieces),), torch.inf, dtype=torch.float64)
+    for body in bodies_of(part.mesh):
+        single = Part(part.name, np.asarray(body.vertices), np.asarray(body.faces, dtype=np.int64))
+        beyond = torch.minimum(beyond, SignedDistance(single)(on_pieces).distance)
+    added = float(beyond.max())
+    on_mesh = np.concatenate([part.vertices, part.surface_points(count, seed)])
+    return GeometricError(max(0.0, added), float(_outside(on_mesh, solids).max()))
+
+
+def bodies_of(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """A mesh's bodies, which may overlap; the whole mesh where one is open or a cavity."""
+    bodies = list(mesh.split(only_watertight=False))
+    sound = len(bodies) > 1 and all(body.is_watertight and body.volume > 0 for body in bodies)
+    return bodies if sound else [mesh]
+
+
+def solid_of(piece: Piece) -> trimesh.Trimesh:
+    """A convex piece as a closed mesh in the part's frame; a cylinder has 256 sides."""
+    if piece.kind == "hull":
+        return trimesh.convex.convex_hull(piece.size)
+    if piece.kind == "box":
+        solid = trimesh.creation.box(2.0 * piece.size)
+    else:
+        solid = trimesh.creation.cylinder(piece.size[0], 2.0 * piece.size[1], sections=256)
+    solid.apply_translation(piece.center)
+    return solid
+
+
+def _outside(points: Array, solids: list[trimesh.Trimesh]) -> Array:
+    """How far points (P, 3) lie outside all of some convex solids; 0 inside any of them."""
+    beyond = np.full(len(points), np.inf)
+    for solid in solids:
+        close = np.flatnonzero(_beyond_box(points, solid) < beyond)
+        beyond[close] = np.minimum(beyond[close], _beyond_planes(points[close], solid))
+    # The farthest plane tells inside from outside; how far is outside, near an edge, the surface tells.
+    distance = np.where(beyond > 1e-9, np.inf, 0.0)
+    for solid in solids:
+        close = np.flatnonzero(_beyond_box(points, solid) < np.minimum(distance, beyond + 1e-4))
+        close = close[_beyond_planes(points[close], solid) < distance[close]]
+        if len(close):
+            corners, faces = np.array(solid.vertices), np.array(solid.faces, dtype=np.int64)
+            squared = igl.point_mesh_squared_distance(points[close], corners, faces)[0]
+            distance[close] = np.minimum(distance[close], np.sqrt(squared))
+    return np.where(np.isfinite(distance), distance, beyond)
+
+
+def _beyond_box(points: Array, solid: trimesh.Trimesh) -> Array:
+    """How far points (P, 3) are outside a solid's bounding box, at least."""
+    return np.asarray(np.maximum(solid.bounds[0] - points, points - solid.bounds[1]).max(axis=1))
+
+
+def _beyond_planes(points: Array, solid: trimesh.Trimesh) -> Array:
+    """How far points (P, 3) are outside a convex solid, at least; 0 inside."""
+    normals, levels = solid.face_normals, np.sum(solid.face_normals * solid.triangles[:, 0], axis=1)
+    found = [(points[k : k + _BATCH] @ normals.T - levels).max(axis=1) for k in range(0, len(points), _BATCH)]
+    return np.maximum(np.concatenate(found), 0.0) if found else np.empty(0)

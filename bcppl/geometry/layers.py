@@ -1,0 +1,261 @@
+"""Meshes of walls along one axis, faces across it, and chamfers, as exact convex prisms."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+import trimesh
+from scipy.spatial import cKDTree
+
+from bcppl.arguments import number_within
+from bcppl.errors import InputError
+from bcppl.geometry.cover import Cell, convex_cells, grown_in, polygons_of, straightened
+from bcppl.geometry.extrusion import RAMP, REACH
+from bcppl.geometry.fidelity import geometric_error
+from bcppl.geometry.parts import Part, Piece
+
+Array = npt.NDArray[np.float64]
+
+_LEVEL = 2e-6  # m: corners nearer in height than this are of one level; files round to 1e-6
+_FLAT = 2e-3  # radians within which two faces are one plane, or a face is a wall: rounding again
+_MANY = 256  # corners from which on a convex part, too, is drawn anew from its sections
+_ROTATIONS = {"x": np.roll(np.eye(3), 2, axis=0), "y": np.roll(np.eye(3), 1, axis=0), "z": np.eye(3)}
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """What a solid is between two levels: upright, or tapering evenly from one section to another.
+
+    Attributes:
+        bottom: height of the lower level, metres.
+        top: height of the upper level, metres.
+        low: the section at the bottom.
+        high: the section at the top, corner by corner where the one at the bottom goes; upright: the same.
+    """
+
+    bottom: float
+    top: float
+    low: shapely.MultiPolygon
+    high: shapely.MultiPolygon
+
+    @property
+    def upright(self) -> bool:
+        """Whether its walls are parallel to the axis."""
+        return self.low is self.high
+
+
+def prismatic(part: Part, axis: str = "z", tolerance: float = 5e-6) -> Part:
+    """The same part with convex prisms as its pieces, from the cross sections of its mesh.
+
+    Between two levels the mesh's walls are parallel to the axis, or taper evenly as a chamfer does. Corners
+    of an outline that lie within the tolerance of a straight line are dropped. Prisms reach through other
+    levels as far as those are solid there too, so that a wall that goes on has no seam.
+
+    Args:
+        part: with a closed mesh.
+        axis: of the prisms, "x", "y" or "z".
+        tolerance: metres by which an outline may be off the mesh's. At 5 um a bore of 9 mm has 72 sides.
+
+    Raises:
+        InputError: the mesh is empty, open, inside out, in millimetres, or has faces that are neither
+            walls, levels nor chamfers, so that pieces are off by more than twice the tolerance; or the
+            tolerance is not above 0.
+    """
+    part.check()
+    number_within(f"part {part.name!r} is to be made of prisms with tolerance {{}}", tolerance, above=0.0)
+    if axis not in _ROTATIONS:
+        raise InputError(f"the axis of part {part.name!r} is {axis!r}; give 'x', 'y' or 'z'.")
+    rotation = _ROTATIONS[axis]
+    mesh = trimesh.Trimesh(part.vertices @ rotation.T, part.faces, process=False)
+    hull = mesh.convex_hull
+    convex = hull.volume - mesh.volume <= 0.1 * tolerance * mesh.area
+    if convex and len(hull.vertices) <= _MANY:
+        pieces = [Piece("hull", np.asarray(hull.vertices))]
+    else:
+        pieces = _pieces(_layers(mesh, tolerance), tolerance)
+    made = replace(part, pieces=tuple(replace(p, size=p.size @ rotation) for p in pieces))
+    error = geometric_error(made, count=5000) if pieces else None
+    if error is None or error.largest > 2 * tolerance + _LEVEL:
+        off = "nothing is left" if error is None else f"they are off by {1000 * error.largest:.2g} mm"
+        raise InputError(
+            f"part {part.name!r} is not made of walls along {axis}, faces across it and chamfers (as prisms "
+            f"{off}); give another axis, or take it apart with `decomposed`."
+        )
+    return made
+
+
+def hole_outline(
+    part: Part, height: float, inside: tuple[float, float] = (0.0, 0.0), tolerance: float = 5e-6
+) -> shapely.Polygon:
+    """The outline of the hole around a point in a cross section, in the part's x-y plane, metres.
+
+    Args:
+        part: with a closed mesh.
+        height: z of the section, metres.
+        inside: a point in the hole.
+        tolerance: metres within which corners that lie on a straight line are dropped, as by `prismatic`.
+
+    Raises:
+        InputError: there is no hole around the point.
+    """
+    section = shapely.simplify(_section(part.mesh, height), tolerance)
+    for polygon in polygons_of(section):
+        for ring in polygon.interiors:
+            if shapely.Polygon(ring).contains(shapely.Point(inside)):
+                return shapely.Polygon(ring)
+    raise InputError(
+        f"part {part.name!r} has no hole around {inside} at z = {height:g} m; give a point inside a hole."
+    )
+
+
+def _levels(mesh: trimesh.Trimesh) -> list[float]:
+    """The heights of the horizontal edges where the surface bends: between them all faces go on evenly."""
+    bent = mesh.face_adjacency_angles > _FLAT
+    ends = mesh.vertices[mesh.face_adjacency_edges[bent], 2]
+    sloped = np.abs(mesh.face_normals[mesh.face_adjacency[bent], 2]).max(axis=1) > _FLAT
+    heights = ends[sloped & (np.ptp(ends, axis=1) < _LEVEL)].ravel()
+    heights = np.sort(np.concatenate([heights, mesh.bounds[:, 2]]))
+    groups = np.split(heights, np.flatnonzero(np.diff(heights) > _LEVEL) + 1)
+    return [float(np.median(group)) for group in groups]
+
+
+def _layers(mesh: trimesh.Trimesh, tolerance: float) -> list[Layer]:
+    """The solid from level to level; sections that are the same are the same object."""
+    layers: list[Layer] = []
+    for bottom, top in itertools.pairwise(_levels(mesh)):
+        inset = 0.01 * (top - bottom)
+        near, far = (_section(mesh, height) for height in (bottom + inset, top - inset))
+        if _same(near, far, 2 * _LEVEL):
+            low = _known(layers, _section(mesh, 0.5 * (bottom + top)), tolerance)
+            layers.append(Layer(bottom, top, low, low))
+        else:
+            low = _known(layers, _section(mesh, bottom + _LEVEL), tolerance)
+            layers.append(Layer(bottom, top, low, _moved(low, far, _corners_at(mesh, top, far, 2 * inset))))
+    return layers
+
+
+def _section(mesh: trimesh.Trimesh, height: float) -> shapely.MultiPolygon:
+    cut = mesh.section(plane_normal=[0.0, 0.0, 1.0], plane_origin=[0.0, 0.0, height])
+    if cut is None:
+        return shapely.MultiPolygon()
+    flat, _ = cut.to_2D(to_2D=np.eye(4))
+    return shapely.MultiPolygon(polygons_of(shapely.union_all([p.buffer(0) for p in flat.polygons_full])))
+
+
+def _known(layers: list[Layer], section: shapely.MultiPolygon, tolerance: float) -> shapely.MultiPolygon:
+    """The section of a layer below if it is the same, else this one without the corners that are none."""
+    simple = shapely.simplify(section, tolerance)
+    if isinstance(simple, shapely.Polygon):
+        simple = shapely.MultiPolygon([simple])
+    alike = (k.high for k in reversed(layers) if _same(k.high, simple, tolerance + _LEVEL))
+    return next(alike, simple)
+
+
+def _same(a: shapely.Geometry, b: shapely.Geometry, tolerance: float) -> bool:
+    """Whether two sections are the same but for a strip no wider than the tolerance on either side."""
+    return bool(a.buffer(tolerance).covers(b) and b.buffer(tolerance).covers(a))
+
+
+def _corners_at(mesh: trimesh.Trimesh, height: float, section: shapely.Geometry, reach: float) -> Array:
+    """The mesh's corners (K, 2) at a height that lie within a reach of a section's outline."""
+    level = mesh.vertices[np.abs(mesh.vertices[:, 2] - height) < _LEVEL][:, :2]
+    return np.asarray(level[shapely.distance(shapely.points(level), section.boundary) <= reach])
+
+
+def _moved(section: shapely.MultiPolygon, far: shapely.MultiPolygon, corners: Array) -> shapely.MultiPolygon:
+    """A section with its corners at the nearest of some others; those on the far outline stay."""
+    if len(corners) == 0:
+        return shapely.transform(section, np.copy)
+    tree = cKDTree(corners)
+
+    def nearest(points: Array) -> Array:
+        stays = shapely.distance(shapely.points(points), far.boundary) <= 2 * _LEVEL
+        return np.where(stays[:, None], points, corners[tree.query(points)[1]])
+
+    return shapely.transform(section, nearest)
+
+
+def _pieces(layers: list[Layer], tolerance: float) -> list[Piece]:
+    """Convex pieces: upright layers with the chamfers that cut them back, then the other chamfers."""
+    found, used = [], set()
+    for k, layer in enumerate(layers):
+        if not layer.upright or layer.low.is_empty:
+            continue
+        caps = {}
+        if k > 0 and not layers[k - 1].upright and layers[k - 1].high is layer.low:
+            caps[-1] = (layers[k - 1].bottom, layers[k - 1].low)
+        if k + 1 < len(layers) and not layers[k + 1].upright and layers[k + 1].low is layer.low:
+            caps[1] = (layers[k + 1].top, layers[k + 1].high)
+        caps = {d: c for d, c in caps.items() if layer.low.buffer(_LEVEL).covers(c[1])}
+        used |= {k + d for d in caps}
+        found += _columns(k, layers, caps, tolerance)
+    for k, layer in enumerate(layers):
+        if k not in used and not layer.upright and not layer.low.is_empty:
+            alone = [Layer(layer.bottom, layer.bottom, layer.low, layer.low)]
+            found += _columns(0, alone, {1: (layer.top, layer.high)}, tolerance)
+    return found
+
+
+def _columns(
+    k: int, layers: list[Layer], caps: dict[int, tuple[float, shapely.MultiPolygon]], tolerance: float
+) -> list[Piece]:
+    """The pieces of layer `k` with its caps (-1 below, 1 above: where they end, and their section there)."""
+    drawn, cells = layers[k].low, convex_cells(layers[k].low, REACH)
+    shapely.prepare(drawn)
+    hulls: list[list[Array]] = [[] for _ in cells]
+    for direction in (-1, 1):
+        if direction in caps:
+            rest = layers[k].bottom if direction < 0 else layers[k].top
+            ends = _capped(cells, drawn, rest, *caps[direction], direction, tolerance)
+        else:
+            ends = [_upright_end(cell, layers, k, direction) for cell in cells]
+        for hull, end in zip(hulls, ends, strict=True):
+            hull += end
+    return [Piece("hull", np.concatenate(hull)) for hull in hulls]
+
+
+def _upright_end(cell: Cell, layers: list[Layer], k: int, direction: int) -> list[Array]:
+    """Corners (C, 3) of one end of a cell that goes on through upright layers as far as they are solid."""
+    grown = shapely.Polygon(cell.grown)
+    while 0 <= k + direction < len(layers):
+        beyond = layers[k + direction]
+        if not (beyond.upright and beyond.low.buffer(1e-11).covers(grown)):
+            break
+        k += direction
+    end = layers[k].bottom if direction < 0 else layers[k].top
+    ramp = min(RAMP, 0.25 * (layers[k].top - layers[k].bottom))
+    return [np.insert(cell.core, 2, end, axis=1), np.insert(cell.grown, 2, end - direction * ramp, axis=1)]
+
+
+def _capped(
+    cells: list[Cell],
+    drawn: shapely.MultiPolygon,
+    rest: float,
+    end: float,
+    section: shapely.MultiPolygon,
+    direction: int,
+    tolerance: float,
+) -> list[list[Array]]:
+    """For each cell the corners (C, 3) of an end that a chamfer cuts back, from `rest` to `end`."""
+    pairs = zip(shapely.get_coordinates(drawn).tolist(), shapely.get_coordinates(section), strict=True)
+    goes = {tuple(a): b for a, b in pairs}
+    halfway = shapely.transform(
+        drawn, lambda points: np.array([0.5 * (p + goes[tuple(p.tolist())]) for p in points])
+    )
+    shapely.prepare(allowed := halfway.buffer(0.2 * tolerance))
+    found = []
+    cores = [np.array([goes.get(tuple(p.tolist()), p) for p in cell.core]) for cell in cells]
+    wide = grown_in(section, [straightened(core) for core in cores], REACH)
+    wide = [wider if len(wider) > 2 else core for wider, core in zip(wide, cores, strict=True)]
+    for cell, core, wider in zip(cells, cores, wide, strict=True):
+        corners = [np.insert(cell.core, 2, rest, axis=1), np.insert(core, 2, end, axis=1)]
+        both = 0.5 * (cell.grown[:, None] + wider[None]).reshape(-1, 2)
+        if allowed.covers(shapely.MultiPoint(both).convex_hull):
+            corners += [np.insert(cell.grown, 2, rest, axis=1)]
+            corners += [np.insert(wider, 2, end - direction * min(RAMP, 0.25 * abs(end - rest)), axis=1)]
+        found.append(corners)
+    return found

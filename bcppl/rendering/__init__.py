@@ -1,0 +1,1 @@
+"""Depth images of parts at many poses: rays, triangles, scenes, and the noise of a depth sensor."""

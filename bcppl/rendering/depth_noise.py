@@ -1,0 +1,216 @@
+"""What a real depth sensor makes of a rendered image: for simulation, never for inference.
+
+A pixel at the edge of a thing may read a depth between the two sides (a flying pixel), or nothing. Surfaces
+seen at a grazing angle are lost. What is left has noise that grows with the square of the range, as stereo
+and structured light have it, is read in steps of depth or of disparity, and only within the sensor's range.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+
+from bcppl.errors import InputError
+from bcppl.geometry.camera import Camera
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class DepthNoise:
+    """How a depth sensor errs. The defaults are the noise of a bench: 2 mm, read in millimetres.
+
+    Attributes:
+        scale: of the noise at any range, m: Laplace's b, or a standard deviation where it is gaussian.
+        growth: the noise grows by this times the squared range beyond `growth_from`, 1/m.
+        growth_from: m.
+        gaussian: whether the noise is normal; Laplace's otherwise.
+        step: depths are read in multiples of this, m; 0 for none.
+        inverse_step: inverse depths are read in multiples of this, 1/m; 0 for none. For stereo it is the
+            smallest step of the disparity (pixels) over focal length (pixels) times baseline (m).
+        dropout: the probability that a pixel is missing, wherever it is.
+        grazing_from: at this angle between the ray and the surface's normal pixels begin to go missing, rad.
+        grazing_to: at this angle all are missing, rad.
+        edge: two neighbours that lie further apart than this, and not on one plane, have an edge between
+            them, m.
+        flying: the probability that a pixel beside an edge reads a depth between the two sides, uniformly.
+        edge_dropout: the probability that a pixel beside an edge is missing.
+    """
+
+    scale: float = 0.002
+    growth: float = 0.0
+    growth_from: float = 0.0
+    gaussian: bool = False
+    step: float = 0.001
+    inverse_step: float = 0.0
+    dropout: float = 0.05
+    grazing_from: float = math.radians(75.0)
+    grazing_to: float = math.radians(88.0)
+    edge: float = 0.01
+    flying: float = 0.5
+    edge_dropout: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in (f.name for f in fields(self) if f.name != "gaussian"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise InputError(f"the depth noise has {name} {value}; give a number of at least 0.")
+            if name in ("dropout", "flying", "edge_dropout") and value > 1.0:
+                raise InputError(f"the depth noise has {name} {value}; give a probability, from 0 to 1.")
+        if not self.grazing_from < self.grazing_to <= math.pi:
+            raise InputError(
+                f"the depth noise loses pixels from {self.grazing_from} to {self.grazing_to} rad; "
+                "give the smaller angle first, in radians."
+            )
+
+    def read(self, camera: Camera, depth: npt.ArrayLike, seed: int | np.random.Generator) -> Array:
+        """What the sensor reads where rendered depths are true.
+
+        Args:
+            camera: its rays tell how surfaces are slanted, its range what can be read.
+            depth: (..., H, W) true depth along the optical axis, m; infinite or NaN where nothing is seen.
+            seed: same seed, same image.
+
+        Returns:
+            (..., H, W) m, NaN where missing.
+
+        Raises:
+            InputError: the image is not the camera's.
+        """
+        true = np.array(depth, dtype=np.float64)
+        if true.shape[-2:] != (camera.height, camera.width) or true.ndim < 2:
+            raise InputError(
+                f"a depth image of shape {true.shape} is not camera {camera.name!r}'s; "
+                f"give (..., {camera.height}, {camera.width})."
+            )
+        true[~np.isfinite(true) | (true <= 0.0)] = np.nan
+        generator = np.random.default_rng(seed)
+        across, beside = _edges(true, self.edge)
+        lost = generator.random(true.shape) < self.dropout
+        lost |= beside & (generator.random(true.shape) < self.edge_dropout)
+        share = np.clip(
+            (_incidence(camera, true) - self.grazing_from) / (self.grazing_to - self.grazing_from), 0.0, 1.0
+        )
+        lost |= generator.random(true.shape) < share
+        flies = np.isfinite(across) & (generator.random(true.shape) < self.flying)
+        between = true + generator.random(true.shape) * (np.where(flies, across, true) - true)
+        read = self._noisy(between, generator)
+        read[lost | ~(read >= camera.near) | ~(read <= camera.far)] = np.nan
+        return read
+
+    def _noisy(self, depth: Array, generator: np.random.Generator) -> Array:
+        size = self.scale + self.growth * np.square(np.maximum(depth - self.growth_from, 0.0))
+        draw = generator.normal if self.gaussian else generator.laplace
+        noisy = depth + size * draw(size=depth.shape)
+        if self.inverse_step > 0.0:
+            steps = np.round(1.0 / (self.inverse_step * np.maximum(noisy, 1e-9)))
+            # Nothing is read of what is so far away that its disparity rounds to zero.
+            noisy = np.where(steps > 0.0, 1.0 / (self.inverse_step * np.maximum(steps, 1.0)), np.nan)
+        if self.step > 0.0:
+            noisy = np.round(noisy / self.step) * self.step
+        return noisy
+
+
+# Intel's D435 at 848 pixels: a focal length of 424 pixels (90 degrees), a baseline of 50 mm, a disparity that
+# is right to 0.08 of a pixel and read in steps of 1/32. Grunnet-Jepsen, Sweetser and Woodfill: Tuning depth
+# cameras for best performance; Subpixel linearity improvement for Intel RealSense depth camera D400 series.
+REALSENSE_D435 = DepthNoise(
+    scale=0.0,
+    growth=0.08 / (424.0 * 0.05),
+    gaussian=True,
+    step=0.001,
+    inverse_step=1.0 / 32.0 / (424.0 * 0.05),
+    dropout=0.02,
+)
+
+# Axial noise of the first Kinect up to 60 degrees, 1.2 mm + 1.9 mm (z/m - 0.4)^2: Nguyen, Izadi and Lovell,
+# Modeling Kinect sensor noise for improved 3D reconstruction and tracking, 3DIMPVT 2012, section 2. Its
+# disparity of 580 pixels x 75 mm is read in eighths: Khoshelham and Elberink, Sensors 12, 2012.
+KINECT = DepthNoise(
+    scale=0.0012,
+    growth=0.0019,
+    growth_from=0.4,
+    gaussian=True,
+    step=0.001,
+    inverse_step=1.0 / 8.0 / (580.0 * 0.075),
+    dropout=0.01,
+    grazing_from=math.radians(60.0),
+    grazing_to=math.radians(85.0),
+)
+
+
+def _edges(depth: Array, edge: float) -> tuple[Array, Mask]:
+    """The depth (..., H, W) across the widest edge beside each pixel, NaN without one; and where one is.
+
+    An edge between two neighbours: they differ by more than `edge`, and by more than twice as much as each
+    differs from its neighbour on its own side, so that a slanted plane has none. A pixel beside nothing at
+    all is at an edge too, with nothing across.
+    """
+    across = np.full(depth.shape, np.nan)
+    widest = np.zeros(depth.shape)
+    beside = np.zeros(depth.shape, dtype=bool)
+    for axis in (-1, -2):
+        # Four in a row: o, a | b, p, the edge between a and b.
+        a, b = _sides(depth, axis)
+        o, p = _outer(depth, axis)
+        gap = np.abs(b - a)
+        slope = np.fmax(np.nan_to_num(np.abs(a - o)), np.nan_to_num(np.abs(p - b)))
+        step = (gap > edge) & (gap > 2.0 * slope)
+        rim = np.isnan(a) ^ np.isnan(b)
+        for here, there, first in ((a, b, True), (b, a, False)):
+            place = _slot(depth.ndim, axis, first)
+            wider = step & (gap > widest[place])
+            across[place] = np.where(wider, there, across[place])
+            widest[place] = np.where(wider, gap, widest[place])
+            beside[place] |= (step | rim) & np.isfinite(here)
+    return across, beside
+
+
+def _slot(dimensions: int, axis: int, first: bool) -> tuple[slice, ...]:
+    place = [slice(None)] * dimensions
+    place[axis] = slice(None, -1) if first else slice(1, None)
+    return tuple(place)
+
+
+def _sides(depth: Array, axis: int) -> tuple[Array, Array]:
+    return depth[_slot(depth.ndim, axis, True)], depth[_slot(depth.ndim, axis, False)]
+
+
+def _outer(depth: Array, axis: int) -> tuple[Array, Array]:
+    """The neighbours beyond each pair of neighbours, the pair's own depth repeated at the border."""
+    moved = np.moveaxis(depth, axis, -1)
+    padded = np.concatenate([moved[..., :1], moved, moved[..., -1:]], axis=-1)
+    return np.moveaxis(padded[..., :-3], -1, axis), np.moveaxis(padded[..., 3:], -1, axis)
+
+
+def _incidence(camera: Camera, depth: Array) -> Array:
+    """The angle (..., H, W) between each ray and its surface's normal, rad; 0 where too little is seen.
+
+    The surface runs to the nearer in depth of the two neighbours along each axis, so not across an edge.
+    """
+    rays = camera.rays().reshape(camera.height, camera.width, 3)
+    points = depth[..., None] * rays
+    tangents = [_tangent(points, depth, axis) for axis in (-1, -2)]
+    normal = np.cross(tangents[0], tangents[1])
+    length = np.linalg.norm(normal, axis=-1) * np.linalg.norm(rays, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        cosine = np.abs((normal * rays).sum(axis=-1)) / length
+    return np.where(np.isfinite(cosine), np.arccos(np.clip(np.nan_to_num(cosine), 0.0, 1.0)), 0.0)
+
+
+def _tangent(points: Array, depth: Array, axis: int) -> Array:
+    """From each point (..., H, W, 3) along the image's axis, on the side on which the depth changes less."""
+    step = np.full(points.shape, np.nan)
+    change = np.full(depth.shape, np.inf)
+    forward = np.diff(points, axis=axis - 1)
+    size = np.abs(np.diff(depth, axis=axis))
+    for first in (True, False):
+        place = _slot(depth.ndim, axis, first)
+        better = size < change[place]
+        step[place] = np.where(better[..., None], forward, step[place])
+        change[place] = np.where(better, size, change[place])
+    return step

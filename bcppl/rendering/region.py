@@ -1,0 +1,54 @@
+"""Which pixels of an image a part can be in."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from bcppl import poses
+from bcppl.errors import InputError
+from bcppl.geometry.camera import Camera
+from bcppl.geometry.parts import Part
+
+
+def region_of(
+    camera: Camera, part: Part, world_from_part: npt.ArrayLike, within: float, least: int = 1
+) -> tuple[int, int, int, int]:
+    """The left, top, width and height of the pixels in which a part can be, for `Camera.cropped`.
+
+    Args:
+        camera: what looks.
+        part: what is looked for.
+        world_from_part: (7,) where it is expected.
+        within: how far from there it may be, metres, turned in any way about its middle.
+        least: pixels that each side has at least, where the image has so many.
+
+    Returns:
+        Whole pixels; the whole image where the part may be beside or behind the camera.
+
+    Raises:
+        InputError: the camera's pose or intrinsics are none, or no pixel can show the part.
+    """
+    camera_from_world = poses.inverse(camera.stated_pose())
+    expected = poses.as_pose(torch.as_tensor(np.asarray(world_from_part)))
+    middle = torch.as_tensor(0.5 * (part.vertices.min(axis=0) + part.vertices.max(axis=0)))[None]
+    there = poses.transform(camera_from_world, poses.transform(expected, middle)).numpy()
+    reach = float(np.linalg.norm(part.extent) / 2 + within)
+    # All corners of the cube around all it may fill: off the axis, its far face reaches farthest inwards.
+    corners = there + reach * np.array(list(product((-1, 1), repeat=3)))
+    pixel = camera.project(corners)
+    if not np.isfinite(pixel).all():
+        return 0, 0, camera.width, camera.height
+    size = np.array([camera.width, camera.height])
+    if (pixel.max(axis=0) < -0.5).any() or (pixel.min(axis=0) > size - 0.5).any():
+        raise InputError(
+            f"camera {camera.name!r} cannot see part {part.name!r} within {within:.3g} m of where it is "
+            "expected: that is beside its image; correct its world_from_camera or the guess, or leave its "
+            "views out."
+        )
+    low = np.clip(np.floor(pixel.min(axis=0)), 0, np.maximum(size - least, 0)).astype(int)
+    high = np.clip(np.ceil(pixel.max(axis=0)), np.minimum(low + least, size), size).astype(int)
+    return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])

@@ -1,0 +1,1 @@
+"""Robots: kinematics, reach, and the motions that an arm is commanded to make."""

@@ -1,0 +1,331 @@
+"""A robot as its URDF file describes it: links, joints, limits, and where its meshes lie.
+
+The format is that of ROS, wiki.ros.org/urdf/XML; the parser is the one that comes with pytorch-kinematics.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import trimesh
+from pytorch_kinematics import chain, frame, transforms
+from pytorch_kinematics.urdf_parser_py import urdf
+from scipy.spatial.transform import Rotation
+
+from bcppl.errors import InputError
+from bcppl.geometry.parts import Part
+
+Array = npt.NDArray[np.float64]
+
+MOVING = ("revolute", "continuous", "prismatic")
+MESHES = (".stl", ".obj", ".dae", ".ply")
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """One joint of a robot.
+
+    Attributes:
+        name: as in the URDF file.
+        kind: "revolute", "continuous", "prismatic" or "fixed".
+        parent, child: names of the links it joins.
+        parent_from_child: (4, 4) transformation at the joint's zero.
+        axis: (3,) of unit length, in the child's frame.
+        lower, upper: limits in radians (metres where prismatic); infinite where there are none.
+        mimics: the joint that it follows, with multiplier and offset; None for a joint of its own.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    parent_from_child: Array
+    axis: Array
+    lower: float = -math.inf
+    upper: float = math.inf
+    mimics: tuple[str, float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """What a link looks like, or one piece of it.
+
+    Attributes:
+        link: the link that carries it.
+        link_from_shape: (4, 4) transformation.
+        geometry: a mesh, box, cylinder or sphere, as parsed.
+    """
+
+    link: str
+    link_from_shape: Array
+    geometry: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """What a URDF file says.
+
+    Attributes:
+        name: of the robot.
+        file: where it was read from.
+        links: names of all links, the base first, each after its parent.
+        joints: each after the joint that carries it.
+        visual, collision: the links' shapes.
+    """
+
+    name: str
+    file: Path
+    links: tuple[str, ...]
+    joints: tuple[Joint, ...]
+    visual: tuple[Shape, ...]
+    collision: tuple[Shape, ...]
+
+
+def read(file: str | Path) -> Description:
+    """Read a URDF file.
+
+    Raises:
+        InputError: the file is missing or no URDF, its links do not form one tree, or a joint is of a kind
+            that is not supported.
+    """
+    file = Path(file)
+    if not file.is_file():
+        raise InputError(f"{file} is missing; give a robot's URDF file.")
+    said = io.StringIO()
+    try:
+        # The parser prints what it does not know (transmissions, xacro) to standard error.
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+            robot = urdf.URDF.from_xml_string(file.read_bytes())
+        for what, named in (("joint", robot.joints), ("link", robot.links)):
+            _refuse_twins(file, what, [each.name for each in named])
+        links = {link.name: link for link in robot.links}
+        joints = {j.child: _joint(j) for j in robot.joints}
+    except InputError:
+        raise
+    except Exception as error:  # the parser raises ParseError, XMLSyntaxError, AssertionError, ValueError
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"{file} cannot be read as a URDF ({reason}); "
+            "give the robot's URDF file, expanded where it is a xacro."
+        ) from error
+    ordered = _ordered(file, list(links), joints, len(robot.joints))
+    named = [(name, links[name]) for name in ordered]
+    return Description(
+        name=robot.name or file.stem,
+        file=file,
+        links=tuple(ordered),
+        joints=tuple(joints[name] for name in ordered if name in joints),
+        visual=tuple(_shape(n, s) for n, link in named for s in link.visuals if s.geometry is not None),
+        collision=tuple(_shape(n, s) for n, link in named for s in link.collisions if s.geometry is not None),
+    )
+
+
+def _refuse_twins(file: Path, what: str, names: Sequence[str]) -> None:
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"{file} has two {what}s of the name {twice[0]!r}; give each a name of its own.")
+
+
+def _ordered(file: Path, links: Sequence[str], joints: Mapping[str, Joint], count: int) -> list[str]:
+    """The links from the base outwards."""
+    roots = [name for name in links if name not in joints]
+    unknown = {j.parent for j in joints.values()} | set(joints)
+    unknown -= set(links)
+    if unknown:
+        raise InputError(
+            f"{file} has a joint to the link {min(unknown)!r}, which it does not define; add the link."
+        )
+    ordered = roots[:1]
+    for name in ordered:
+        ordered += [child for child, joint in joints.items() if joint.parent == name]
+    if len(roots) != 1 or len(ordered) != len(links) or count != len(joints):
+        raise InputError(
+            f"{file} does not describe one tree of links (base links: {', '.join(roots) or 'none'}); "
+            "give each link but the base exactly one joint to its parent."
+        )
+    return ordered
+
+
+def _joint(parsed: Any) -> Joint:
+    if parsed.type not in (*MOVING, "fixed"):
+        raise InputError(
+            f"joint {parsed.name!r} is {parsed.type}, which is not supported; "
+            "make it revolute, continuous, prismatic or fixed."
+        )
+    axis = np.array([1.0, 0.0, 0.0] if parsed.axis is None else parsed.axis, dtype=np.float64)
+    length = float(np.linalg.norm(axis))
+    if parsed.type == "fixed":
+        axis, length = np.array([0.0, 0.0, 1.0]), 1.0
+    if not 0.0 < length < math.inf:
+        raise InputError(f"joint {parsed.name!r} turns about the axis {axis.tolist()}; give it a direction.")
+    bounded = parsed.type in ("revolute", "prismatic") and parsed.limit is not None
+    mimic = parsed.mimic
+    follows = None
+    if mimic is not None:
+        follows = (
+            str(mimic.joint),
+            1.0 if mimic.multiplier is None else float(mimic.multiplier),
+            0.0 if mimic.offset is None else float(mimic.offset),
+        )
+    lower = float(parsed.limit.lower) if bounded else -math.inf
+    upper = float(parsed.limit.upper) if bounded else math.inf
+    if not lower <= upper or any(math.isnan(number) for number in (follows or ())[1:]):
+        raise InputError(
+            f"joint {parsed.name!r} has limits {lower:g} to {upper:g} and mimics {follows}; "
+            "give limits in ascending order, and numbers."
+        )
+    return Joint(
+        name=parsed.name,
+        kind=parsed.type,
+        parent=parsed.parent,
+        child=parsed.child,
+        parent_from_child=_transformation(f"joint {parsed.name!r}", parsed.origin),
+        axis=axis / length,
+        lower=lower,
+        upper=upper,
+        mimics=follows,
+    )
+
+
+def _transformation(whose: str, origin: Any) -> Array:
+    matrix = np.eye(4)
+    if origin is not None:
+        matrix[:3, 3] = [0.0, 0.0, 0.0] if origin.xyz is None else origin.xyz
+        # Roll, pitch and yaw are about the parent's fixed axes.
+        turn = [0.0, 0.0, 0.0] if origin.rpy is None else origin.rpy
+        if not (np.isfinite(matrix[:3, 3]).all() and np.isfinite(turn).all()):
+            raise InputError(
+                f"the origin of {whose} has xyz {matrix[:3, 3].tolist()} and rpy {list(turn)}; "
+                "give finite numbers, metres and radians."
+            )
+        matrix[:3, :3] = Rotation.from_euler("xyz", turn).as_matrix()
+    return matrix
+
+
+def _shape(link: str, parsed: Any) -> Shape:
+    return Shape(link, _transformation(f"a shape of link {link!r}", parsed.origin), parsed.geometry)
+
+
+def chain_of(description: Description) -> Any:
+    """The chain as pytorch-kinematics has it, in float64; its own reader rounds to single precision."""
+    frames = {link: frame.Frame(link, link=frame.Link(link)) for link in description.links}
+    frames[description.links[0]].joint = frame.Joint()
+    for joint in description.joints:
+        child = frames[joint.child]
+        child.joint = frame.Joint(
+            joint.name,
+            offset=transforms.Transform3d(
+                matrix=torch.from_numpy(joint.parent_from_child), dtype=torch.float64
+            ),
+            joint_type="revolute" if joint.kind == "continuous" else joint.kind,
+            axis=torch.from_numpy(joint.axis),
+            dtype=torch.float64,
+        )
+        frames[joint.parent].children.append(child)
+    return chain.Chain(frames[description.links[0]], dtype=torch.float64)
+
+
+# ---- meshes
+
+
+def part_of(description: Description, link: str, shapes: Sequence[Shape], folders: Sequence[Path]) -> Part:
+    """The shapes of one link as one part, in the link's frame.
+
+    Raises:
+        InputError: a mesh is missing, unreadable, or not in metres.
+    """
+    meshes = []
+    for shape in shapes:
+        mesh = _mesh(description, shape, folders)
+        mesh.apply_transform(shape.link_from_shape)
+        meshes.append(mesh)
+    whole: Any = trimesh.util.concatenate(meshes)
+    part = Part(
+        name=link,
+        vertices=np.asarray(whole.vertices, dtype=np.float64),
+        faces=np.asarray(whole.faces, dtype=np.int64),
+        source=f"link of {description.name}; licence as of {description.file.name}",
+    )
+    part.check(closed=False)
+    return part
+
+
+def _mesh(description: Description, shape: Shape, folders: Sequence[Path]) -> Any:
+    geometry = shape.geometry
+    if isinstance(geometry, urdf.Box):
+        return trimesh.creation.box(geometry.size)
+    if isinstance(geometry, urdf.Cylinder):
+        return trimesh.creation.cylinder(geometry.radius, geometry.length)
+    if isinstance(geometry, urdf.Sphere):
+        return trimesh.creation.icosphere(3, geometry.radius)
+    if not isinstance(geometry, urdf.Mesh):
+        raise InputError(
+            f"link {shape.link!r} of {description.file} has a shape that is neither a mesh, a box, "
+            "a cylinder nor a sphere; replace it by one of these."
+        )
+    tried = list(_candidates(description, geometry.filename, folders))
+    file = next((path for path in tried if path.is_file()), None)
+    alike = [] if file is not None else list(dict.fromkeys(_alike(tried)))
+    # A scale tells the unit of the file that is named, and another format may well be in another unit.
+    if len(alike) == 1 and (geometry.scale is None or np.allclose(geometry.scale, 1.0)):
+        file = alike[0]
+    if file is None:
+        looked = ", ".join(dict.fromkeys(str(path.parent) for path in tried))
+        advice = "put it there, or name its folder with mesh_folders"
+        if alike:
+            advice = (
+                f"there lies {', '.join(map(str, alike))}: name that in the URDF file, with the scale that "
+                "makes it metres"
+            )
+        raise InputError(
+            f"link {shape.link!r} of {description.file} needs the mesh {geometry.filename}, "
+            f"which is in none of {looked}; {advice}."
+        )
+    try:
+        # "mesh" also places the nodes of a scene (DAE) and converts its stated unit.
+        mesh: Any = trimesh.load(file, force="mesh")
+    except Exception as error:  # every format has its own loader and its own errors
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"{file} cannot be read as a mesh ({said}); give an STL, OBJ or DAE file."
+        ) from error
+    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    if geometry.scale is not None:
+        mesh.apply_scale(geometry.scale)
+    return mesh
+
+
+def _alike(tried: Sequence[Path]) -> Iterator[Path]:
+    """Meshes that differ from those looked for in nothing but the extension."""
+    for path in tried:
+        if path.parent.is_dir():
+            yield from sorted(
+                other
+                for other in path.parent.iterdir()
+                if other.stem == path.stem and other.suffix.lower() in MESHES and other.is_file()
+            )
+
+
+def _candidates(description: Description, name: str, folders: Sequence[Path]) -> Iterator[Path]:
+    """Where a mesh may lie, the likeliest first."""
+    here = description.file.parent
+    if name.startswith("package://"):
+        inside = Path(name.removeprefix("package://"))
+        without = Path(*inside.parts[1:]) if len(inside.parts) > 1 else inside
+        for folder in (*folders, here):
+            yield folder / inside
+            yield folder / without
+        return
+    plain = Path(name.removeprefix("file://"))
+    yield here / plain
+    if not plain.is_absolute():
+        yield from (folder / plain for folder in folders)

@@ -1,0 +1,151 @@
+"""What an arm is asked to do: straight motions, some of which end where something is felt.
+
+A `Probe` is a command as it was carried out, or would be. A plan is what comes before it: whoever carries it
+out (a robot, or a world that plays one) decides from the wrench where guarded motions end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from bcppl.arguments import number_within
+from bcppl.errors import InputError
+from bcppl.sensors.measurements import Probe, ProbeWindow, View
+
+Array = npt.NDArray[np.float64]
+Manner = Literal["free", "guarded", "held", "searching"]
+MANNERS: tuple[Manner, ...] = ("free", "guarded", "held", "searching")
+
+QUICKEST = 1e5  # samples a second: beyond it a rate is no sensor's
+STIFFEST = (
+    1e7  # N/m, and in the units of the others: no arm is so stiff, and no step of a simulation so short
+)
+LONGEST = 600.0  # s: a plan that lasts longer is in milliseconds
+WIDEST = 5.0  # m between its knots, and
+FARTHEST = 100.0  # m from the world's origin: beyond either it is in millimetres
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Straight motions of a held peg from knot to knot.
+
+    Between knots translations are interpolated linearly and rotations along the geodesic. A "guarded" motion
+    stops where the force felt exceeds `force`; the way that was left then stays undone: "held" motions after
+    it are made as planned but for that way, so a slide goes on along the surface that was met. A "free"
+    motion leads to its knot as planned. "Searching" motions are held ones, made while the peg is pressed
+    on by a command that lies below a surface: once the peg has sunk by `sink` below where a guarded
+    motion was last stopped, along the commanded z, or if none was, it has found a hole; the motion stops, and
+    the searching motions right after it stay undone.
+
+    Attributes:
+        name: of the probe that comes of it.
+        times: (K,) seconds, increasing.
+        world_from_peg: (K, 7) where the peg is commanded to be at the knots.
+        manners: (K - 1,) one of "free", "guarded", "held" and "searching" for each motion.
+        force: newtons at which a guarded motion stops.
+        stiffness: (6,) N/m along, then N m/rad about, the commanded peg's axes.
+        damping: (6,) N s/m, then N m s/rad.
+        rate: samples per second of what is measured.
+        sink: metres; how far below the surface it met a peg is in a hole that is searched for.
+
+    Raises:
+        InputError: shapes do not fit, times do not increase, a manner is unknown, the force is not positive,
+            times or places are so large that they are in milliseconds or millimetres, or a motion searches
+            and nothing says what it finds.
+    """
+
+    name: str
+    times: Array
+    world_from_peg: Array
+    manners: tuple[Manner, ...]
+    force: float
+    stiffness: Array
+    damping: Array
+    rate: float = 100.0
+    sink: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("times", "world_from_peg", "stiffness", "damping"):
+            try:
+                numbers = np.asarray(getattr(self, name), dtype=np.float64)
+            except (TypeError, ValueError):
+                raise InputError(
+                    f"plan {self.name!r} has {name} that are no array of numbers; give numbers in SI units, "
+                    "as many in each row."
+                ) from None
+            object.__setattr__(self, name, numbers)
+        knots = self.times.size if self.times.ndim == 1 else 0
+        if knots < 2 or self.world_from_peg.shape != (knots, 7) or len(self.manners) != knots - 1:
+            raise InputError(
+                f"plan {self.name!r} has {knots} times, poses {self.world_from_peg.shape} and "
+                f"{len(self.manners)} manners; give K >= 2 times, (K, 7) poses and K - 1 manners."
+            )
+        if not (np.isfinite(self.times).all() and (np.diff(self.times) > 0).all()):
+            raise InputError(f"plan {self.name!r} has times that do not increase; sort them, in seconds.")
+        if not np.isfinite(self.world_from_peg).all():
+            raise InputError(f"plan {self.name!r} has a pose that is not finite; give poses in metres.")
+        for manner in self.manners:
+            if manner not in MANNERS:
+                raise InputError(
+                    f"plan {self.name!r} has a motion that is {manner!r}; give one of {', '.join(MANNERS)}."
+                )
+        lasts = float(self.times[-1] - self.times[0])
+        number_within(
+            f"plan {self.name!r} lasts {lasts:.3g} s and has a rate of {{}} a second",
+            self.rate,
+            least=1.0 / lasts,
+            most=QUICKEST,
+        )
+        lengths = np.linalg.norm(self.world_from_peg[:, 3:], axis=1)
+        if not (np.abs(lengths - 1.0) < 1e-3).all():
+            raise InputError(
+                f"plan {self.name!r} has a pose whose quaternion is not of unit length; "
+                "give x y z (m) qw qx qy qz."
+            )
+        self._refuse_units()
+        for name, given in (("stiffness", self.stiffness), ("damping", self.damping)):
+            if given.shape != (6,) or not ((given >= 0.0) & (given <= STIFFEST)).all():
+                raise InputError(
+                    f"plan {self.name!r} has {name} {given.tolist()}; give six numbers from 0 to "
+                    f"{STIFFEST:g}, in N/m and N m/rad, or N s/m and N m s/rad."
+                )
+        number_within(f"plan {self.name!r} stops at {{}} N", self.force, above=0.0)
+        number_within(f"plan {self.name!r} has a sink of {{}} m", self.sink)
+        if "searching" in self.manners and not self.sink > 0.0:
+            raise InputError(
+                f"plan {self.name!r} searches until the peg has sunk by {self.sink:g} m; give a positive "
+                "`sink`, less than how far the command lies below the surface."
+            )
+
+    def _refuse_units(self) -> None:
+        lasts, places = float(self.times[-1] - self.times[0]), self.world_from_peg[:, :3]
+        if lasts > LONGEST:
+            raise InputError(
+                f"plan {self.name!r} lasts {lasts:.0f} s: its times are probably in milliseconds; "
+                "scale them by 0.001 to seconds."
+            )
+        way, away = float(np.ptp(places, axis=0).max()), float(np.abs(places).max())
+        if way > WIDEST or away > FARTHEST:
+            raise InputError(
+                f"plan {self.name!r} leads {way:.4g} m far, to {away:.4g} m from the world's origin: its "
+                "poses are probably in millimetres; scale x, y and z by 0.001 to metres."
+            )
+
+
+def probe_of(plan: Plan) -> Probe:
+    """The command of a plan of which nothing is stopped, with stamps up to but without its last knot."""
+    count = max(1, round(float(plan.times[-1] - plan.times[0]) * plan.rate))
+    stamps = plan.times[0] + np.arange(count) / plan.rate
+    return Probe(plan.name, plan.times, plan.world_from_peg, plan.stiffness, plan.damping, stamps)
+
+
+def action_of(candidate: Plan | View) -> ProbeWindow | View:
+    """What a model takes as an action: a plan as one window of which nothing is stopped, a view as it is."""
+    if isinstance(candidate, View):
+        return candidate
+    probe = probe_of(candidate)
+    return ProbeWindow(probe, 0, len(probe.stamps))

@@ -1,0 +1,1 @@
+"""Sensors: one file for each kind of measurement, and the protocol that they share."""

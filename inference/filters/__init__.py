@@ -1,0 +1,1 @@
+"""Filters: sequential Monte Carlo over measurements, and the steps that it is made of."""

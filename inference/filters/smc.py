@@ -1,0 +1,282 @@
+"""Sequential Monte Carlo over a recording: an iterator that can be stopped, looked into and gone on with.
+
+How one measurement is taken in is a step (`bcppl.inference.filters.step`), such as `tempered(...)`. A program
+without a recording is run by `bcppl.inference.filters.step.steps`.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from bcppl.arguments import seed_number, whole_number
+from bcppl.beliefs import Belief
+from bcppl.errors import InferenceError, InputError
+from bcppl.inference.filters.step import Observed, StepFunction, StepInfo
+from bcppl.inference.filters.tempering import tempered
+from bcppl.inference.importance import importance_sampling
+from bcppl.inference.population import Population
+from bcppl.inference.progress import watched
+from bcppl.recordings import Recording, problems
+from bcppl.traces import Model, Series, Trace, extend, generate
+
+
+class Info(NamedTuple):
+    """What happened while one measurement was taken in.
+
+    Attributes:
+        label: the measurement's kind and number; time: seconds on the recording's clock, NaN if it has none.
+        effective_sample_size, log_evidence, distinct: of the population afterwards.
+        acceptance: the share of proposals accepted, NaN where nothing was moved.
+        exponents: the steps by which the likelihood was let in; the last is 1.
+        truth_gap: log-likelihood of the true pose minus that of the best particle, all measurements so far;
+            NaN where the truth is not known.
+        seconds: wall time.
+        effort: by simulator's name, what it did for this measurement.
+        step: what else the step says about itself.
+    """
+
+    label: str
+    time: float
+    effective_sample_size: float
+    log_evidence: float
+    distinct: int
+    acceptance: float
+    exponents: tuple[float, ...]
+    truth_gap: float
+    seconds: float
+    effort: Mapping[str, Any]
+    step: StepInfo
+
+
+__all__ = ["Info", "Step", "smc", "tempered"]
+
+# Below this many particles, sharing a tensor out among threads takes longer than working on it.
+FEW_PARTICLES = 5000
+
+
+@contextmanager
+def _own_state(box: list[Tensor], particles: int) -> Iterator[None]:
+    """Torch's generator and threads set to the run's own within, and the caller's put back afterwards."""
+    outside, threads = torch.get_rng_state(), torch.get_num_threads()
+    torch.set_rng_state(box[0])
+    if particles < FEW_PARTICLES:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        box[0] = torch.get_rng_state()
+        torch.set_rng_state(outside)
+        torch.set_num_threads(threads)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What `smc` yields: `for belief, info in smc(...)`, and the population to look into.
+
+    Attributes:
+        belief: over the sought pose.
+        info: what happened.
+        population: the particles.
+        random_state: of torch's generator; with the population it is all that a run goes on from.
+        taken: how many measurements were taken in.
+    """
+
+    belief: Belief
+    info: Info
+    population: Population
+    random_state: Tensor = field(repr=False)
+    taken: int = 0
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.belief, self.info))
+
+
+def smc(
+    model: Model,
+    recording: Any,
+    *,
+    step: StepFunction,
+    particles: int = 75,
+    seed: int = 0,
+    scene: Any = None,
+    start: Step | None = None,
+    progress: bool = False,
+) -> Iterator[Step]:
+    """Run SMC over a recording: yields the prior's belief first, then one step for each measurement.
+
+    Args:
+        model: what explains the recording.
+        recording: a `bcppl.recordings.Recording`.
+        step: how one measurement is taken in, such as `tempered(...)`.
+        particles: N.
+        seed: same seed, same beliefs, bit for bit; torch's own generator is left as it was.
+        scene: `model.prepare(recording)` unless given.
+        start: go on from this one, with its particles and its random state: what is yielded are the steps
+            after it, the same to the bit as those of the run that it was taken from.
+        progress: show a bar, on a terminal or in a notebook, until the last step is taken. For a loop that
+            runs through: a bar would stay while you stop and look.
+
+    Raises:
+        InferenceError: no particle is left with any weight; names the measurement.
+        InputError: the particles or the seed are no whole number, the program samples no pose at
+            `model.pose`, or `start` has taken more measurements in than there are.
+
+    Warns:
+        RuntimeWarning: the recording has a problem (`bcppl.recordings.problems`, which is asked where no
+            scene is given): two cameras of one name, places in millimetres, times that go back. The run
+            goes on; `bcppl run` refuses such a recording.
+    """
+    whole_number("SMC is to run {} particles", particles)
+    seed_number(seed)
+    steps = _steps(model, recording, step, particles, seed, scene, start)
+    left = len(recording.measurements) + (1 if start is None else -start.taken)
+    return watched(steps, total=left, describe=lambda each: each.info.label, progress=progress)
+
+
+def _warn_of_problems(recording: Any) -> None:
+    if not isinstance(recording, Recording) or not recording.measurements:
+        return
+    found = problems(recording)
+    if found:
+        more = f" ({len(found) - 1} more: bcppl.recordings.problems)" if len(found) > 1 else ""
+        warnings.warn(f"{found[0].rstrip('.')}{more}.", RuntimeWarning, stacklevel=4)
+
+
+def _steps(
+    model: Model,
+    recording: Any,
+    step: StepFunction,
+    particles: int,
+    seed: int,
+    scene: Any,
+    start: Step | None,
+) -> Iterator[Step]:
+    if scene is None:
+        _warn_of_problems(recording)
+        scene = model.prepare(recording)
+    if start is None:
+        state = [torch.Generator().manual_seed(seed).get_state()]
+        with _own_state(state, particles):
+            population = importance_sampling(model.program, (scene, []), {}, particles)
+        if model.pose not in population.trace:
+            raise InputError(
+                f"the model's pose is said to be at address {model.pose!r}, which its program never samples; "
+                f"it samples {', '.join(population.trace.choices) or 'nothing'} before any measurement."
+            )
+        start = _prior(model, population, state[0])
+        truth = _Truth(model, scene, recording, population, seed)
+        yield start
+    else:
+        if start.taken > len(recording.measurements):
+            raise InputError(
+                f"a run is to go on after {start.taken} measurements, but the recording has "
+                f"{len(recording.measurements)}; give the recording that it was run on."
+            )
+        state, population, particles = [start.random_state], start.population, len(start.population)
+        truth = _Truth(model, scene, recording, population, seed)
+        if start.taken:
+            truth.gap(_observed(model, scene, recording.measurements[: start.taken], {}), population)
+    for count in range(start.taken + 1, len(recording.measurements) + 1):
+        measurement = recording.measurements[count - 1]
+        label = f"{measurement.kind} {count}"
+        begun, before = time.perf_counter(), _effort(scene)
+        observed = _observed(model, scene, recording.measurements[:count], population.trace.observations)
+        try:
+            with _own_state(state, particles):
+                population, happened = step(population, observed)
+        except InferenceError as error:
+            raise InferenceError(f"{label}: {error}") from error
+        belief = population.belief(model.pose)
+        spent = {name: after.since(before[name]) for name, after in _effort(scene).items()}
+        elapsed = time.perf_counter() - begun
+        info = Info(
+            label,
+            _time(measurement),
+            belief.effective_sample_size,
+            population.log_evidence,
+            belief.distinct,
+            happened.acceptance,
+            happened.exponents,
+            truth.gap(observed, population),
+            elapsed,
+            spent,
+            happened,
+        )
+        yield Step(belief, info, population, state[0], count)
+
+
+def _prior(model: Model, population: Population, random_state: Tensor) -> Step:
+    belief, nothing = population.belief(model.pose), float("nan")
+    size = belief.effective_sample_size
+    happened = StepInfo(exponents=(), effective_sample_size=size)
+    info = Info(
+        "prior",
+        nothing,
+        size,
+        population.log_evidence,
+        len(population),
+        nothing,
+        (),
+        nothing,
+        0.0,
+        {},
+        happened,
+    )
+    return Step(belief, info, population, random_state)
+
+
+def _observed(model: Model, scene: Any, measurements: Sequence[Any], known: Mapping[str, Tensor]) -> Observed:
+    """What a step takes in so that the measurements are all taken in."""
+    if isinstance(model.program, Series):
+        # A step of a series is given what is new alone, under its own addresses.
+        measurements, known = measurements[-1:], {}
+    observations = model.observe(scene, measurements)
+    new = {a: v for a, v in observations.items() if a not in known}
+    return Observed((scene, [m.action for m in measurements]), new)
+
+
+class _Truth:
+    """One particle at the true pose, if that is known and the pose is all that is latent."""
+
+    def __init__(self, model: Model, scene: Any, recording: Any, population: Population, seed: int) -> None:
+        self.trace: Trace | None = None
+        # It draws from a generator of its own: a belief does not depend on whether the truth is known.
+        self.state = [torch.Generator().manual_seed(seed).get_state()]
+        self.latent = {model.pose}
+        # A series' pose moves: one true pose is not where it began.
+        moves = isinstance(model.program, Series)
+        if recording.truth is None or moves or set(population.trace.choices) != self.latent:
+            return
+        pose = torch.as_tensor(recording.truth, dtype=torch.float64)[None]
+        with _own_state(self.state, 1):
+            one, _ = generate(model.program, (scene, []), {}, 1)
+            self.trace = one.at({model.pose: pose})
+
+    def gap(self, observed: Observed, population: Population) -> float:
+        """Log-likelihood of the truth minus that of the best particle, NaN where the truth is not known."""
+        if set(population.trace.choices) != self.latent:
+            self.trace = None
+        if self.trace is None:
+            return float("nan")
+        with _own_state(self.state, 1):
+            self.trace, _ = extend(self.trace, *observed)
+        addresses = list(population.trace.observations)
+        best = population.trace.log_prob(*addresses)[population.log_weights > -torch.inf].max()
+        return float(self.trace.log_prob(*addresses) - best)
+
+
+def _effort(scene: Any) -> dict[str, Any]:
+    return {name: effort.copy() for name, effort in getattr(scene, "efforts", {}).items()}
+
+
+def _time(measurement: Any) -> float:
+    times = getattr(measurement.observation, "times", None)
+    return float(times[-1]) if times is not None and len(times) else float("nan")

@@ -1,0 +1,141 @@
+"""One step of SMC, a function (population, what was observed) -> (population, what happened), and its loop.
+
+Any program can be run so, without a recording:
+
+    population = importance_sampling(program, (0,), {}, particles=1000)
+    observed = [Observed((k + 1,), {f"y_{k}": y}) for k, y in enumerate(series)]
+    for population, info in steps(tempered(kernel), population, observed):
+        print(info.effective_sample_size, population.log_evidence)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from bcppl.errors import InputError
+from bcppl.inference.kernels.kernel import takes
+from bcppl.inference.population import Population
+from bcppl.inference.progress import watched
+
+
+class _Observed(NamedTuple):
+    args: tuple[Any, ...]
+    observations: Mapping[str, Tensor]
+
+
+class Observed(_Observed):
+    """What one step takes in.
+
+    Attributes:
+        args: the program's arguments up to and including the new measurement, as a tuple.
+        observations: values of the new addresses, of the sites' event shape.
+
+    Raises:
+        InputError: the arguments are no tuple, or the observations no mapping.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, args: tuple[Any, ...], observations: Mapping[str, Tensor]) -> Observed:  # noqa: D102
+        if not isinstance(args, tuple):
+            raise InputError(
+                f"Observed is given a {type(args).__name__} as the program's arguments; "
+                "give a tuple, (5,) for one argument."
+            )
+        if not isinstance(observations, Mapping):
+            raise InputError(
+                f"Observed is given a {type(observations).__name__} as observations; "
+                "give values by address, {'y': value}."
+            )
+        return super().__new__(cls, args, observations)
+
+
+class StepInfo(NamedTuple):
+    """What happened in one step.
+
+    Attributes:
+        acceptance: the share of proposals accepted, NaN where nothing was moved.
+        exponents: the steps by which the likelihood was let in; the last is 1. Where sites are let in one
+            after another, those of each in turn, each ending with 1.
+        resampled: how many times.
+        effective_sample_size_before: just before the last resampling; where there was none, at the end.
+        effective_sample_size: at the end.
+        log_evidence: what the step added to the log of the evidence.
+        ancestors: (N,) int64, the particle before the step that each one descends from; None where
+            nothing was resampled, and each descends from itself.
+        displacement: how far the particles came since the last resampling, in variances, on the axis on which
+            they came least; NaN where none was made, or where sweeps were not `until(displacement=...)`.
+    """
+
+    acceptance: float = float("nan")
+    exponents: tuple[float, ...] = (1.0,)
+    resampled: int = 0
+    effective_sample_size_before: float = float("nan")
+    effective_sample_size: float = float("nan")
+    log_evidence: float = 0.0
+    ancestors: Tensor | None = None
+    displacement: float = float("nan")
+
+    def __repr__(self) -> str:
+        shown = {name: f"{value:.4g}" for name, value in self._asdict().items() if isinstance(value, float)}
+        shown["exponents"] = f"<{len(self.exponents)} steps>"
+        shown["resampled"] = f"{self.resampled}"
+        if self.ancestors is not None:
+            shown["ancestors"] = f"<{len(self.ancestors.unique())} of {len(self.ancestors)}>"
+        return f"StepInfo({', '.join(f'{name}={shown[name]}' for name in self._fields if name in shown)})"
+
+
+class Stepped(NamedTuple):
+    """A population that has taken something in, and what happened."""
+
+    population: Population
+    info: StepInfo
+
+
+StepFunction = Callable[[Population, Observed], Stepped]
+
+
+def steps(
+    step: StepFunction, population: Population, observed: Iterable[Observed], *, progress: bool = False
+) -> Iterator[Stepped]:
+    """The population after each step: an iterator that can be stopped, looked into and gone on with.
+
+    It draws from torch's own generator, so it goes on bit for bit from a population and torch's state.
+
+    Args:
+        step: such as `bcppl.inference.filters.tempering.tempered(...)`.
+        population: before the first step, such as that of `importance_sampling(...)`.
+        observed: what each step takes in.
+        progress: show a bar, on a terminal or in a notebook, until the last step is taken. For a loop that
+            runs through: a bar would stay while you stop and look.
+
+    Raises:
+        InputError: what is given is no step (a kernel, say), no population, or no list of `Observed`.
+    """
+    if not callable(step) or not takes(step, 2):
+        raise InputError(
+            "steps is given something else than a step; if it is a kernel, give tempered(kernel) from "
+            "bcppl.inference.filters.tempering."
+        )
+    if not isinstance(population, Population):
+        hint = "Population(*...)" if isinstance(population, tuple) else "Population(trace, log_weights)"
+        raise InputError(
+            f"steps is given a {type(population).__name__} in place of a population; make it one, {hint}."
+        )
+    if isinstance(observed, Observed):
+        raise InputError("steps is given one Observed; give a list of them, one for each step.")
+    total = len(observed) if isinstance(observed, Sized) else None
+    return watched(_stepping(step, population, observed), total=total, description="steps", progress=progress)
+
+
+def _stepping(step: StepFunction, population: Population, observed: Iterable[Observed]) -> Iterator[Stepped]:
+    for each in observed:
+        if not isinstance(each, Observed):
+            raise InputError(
+                f"steps is to take in a {type(each).__name__}; give a list of Observed(args, observations)."
+            )
+        population, info = step(population, each)
+        yield Stepped(population, info)

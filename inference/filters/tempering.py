@@ -1,0 +1,265 @@
+"""Tempering: a likelihood is let in by steps that the particles can follow, with moves after each.
+
+The next exponent is the largest whose conditional effective sample size stays above a share of N, found by
+bisection: Zhou, Johansen and Aston, Toward automatic model comparison: an adaptive sequential Monte Carlo
+approach, JCGS 25, 2016, section 3.3.2 (CESS, eq. 3.16). The step is that of Del Moral, Doucet and Jasra,
+Sequential Monte Carlo samplers, JRSS B 68, 2006, and of Chopin and Papaspiliopoulos, An Introduction to
+Sequential Monte Carlo, 2020, chapter 17.
+
+With fixed exponents, fixed proposals, and moves whose number does not hang on the particles (`always_move`,
+or resampling always), the estimate of the evidence is unbiased; otherwise it is consistent only. Evidence
+that contains a surrogate likelihood is a surrogate's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from bcppl.arguments import number_within, whole_number
+from bcppl.beliefs import normalised
+from bcppl.errors import InputError
+from bcppl.inference.filters.step import Observed, StepInfo, Stepped
+from bcppl.inference.kernels import Kernel, Until, refuse_other, rejuvenate, takes
+from bcppl.inference.population import Population
+from bcppl.inference.resampling import Resample, adaptive, refuse_scheme
+from bcppl.inference.targets import POSTERIOR, Target, cost_of
+from bcppl.traces import Trace, extend
+
+SMALLEST_STEP = 1e-6
+
+
+def conditional_effective_sample_size(log_weights: Tensor, log_factor: Tensor) -> float:
+    """N (sum W w)^2 / sum W w^2 for weights W and incremental weights w = exp(log_factor), each (N,)."""
+    return _conditional(normalised(log_weights), log_factor)
+
+
+def _conditional(weights: Tensor, log_factor: Tensor) -> float:
+    factor = torch.exp(log_factor - log_factor.max())
+    weighted = weights * factor
+    return float(len(weights) * weighted.sum() ** 2 / (weighted @ factor))
+
+
+def next_exponent(log_weights: Tensor, log_likelihood: Tensor, exponent: float, share: float = 0.5) -> float:
+    """The next exponent in (exponent, 1] for a likelihood (N,) let in up to `exponent`.
+
+    Particles with a log-likelihood of -inf lose their weight at any exponent; the others are bisected over.
+    """
+    finite = torch.isfinite(log_likelihood) & (log_weights > -torch.inf)
+    if not bool(finite.any()):
+        return 1.0
+    weights, likelihood = normalised(log_weights[finite]), log_likelihood[finite]
+    target = share * len(weights)
+    low, high = 0.0, 1.0 - exponent
+    if _conditional(weights, high * likelihood) >= target:
+        return 1.0
+    # The sharpest likelihoods need steps of 1e-5 and less; one part in ten thousand of a step is nothing.
+    while high - low > 1e-4 * high and high > SMALLEST_STEP:
+        middle = 0.5 * (low + high)
+        if _conditional(weights, middle * likelihood) >= target:
+            low = middle
+        else:
+            high = middle
+    return min(1.0, exponent + max(low, SMALLEST_STEP))
+
+
+class Rejuvenated(NamedTuple):
+    """A population after resampling and moves; ancestors (N,) and acceptance are None where not done."""
+
+    population: Population
+    ancestors: Tensor | None
+    acceptance: float | None
+    displacement: float = float("nan")
+
+
+# Resamples if it sees need, and moves the particles towards a target that they are weighted for.
+Rejuvenation = Callable[[Population, Target], Rejuvenated]
+
+
+def resample_move(
+    kernel: Kernel | None,
+    sweeps: int | Until | Callable[[Trace], int | Until],
+    resample: Resample,
+    always_move: bool = False,
+) -> Rejuvenation:
+    """Resample when needed, then move every particle: after a resampling, or always.
+
+    Gilks and Berzuini, Following a moving target: Monte Carlo inference for dynamic Bayesian models, JRSS B
+    63, 2001.
+    """
+
+    def rejuvenation(population: Population, target: Target) -> Rejuvenated:
+        population, ancestors = resample(population)
+        if kernel is None or (ancestors is None and not always_move):
+            return Rejuvenated(population, ancestors, None)
+        times = sweeps(population.trace) if callable(sweeps) else sweeps
+        moved = rejuvenate(population, kernel, target, times)
+        return Rejuvenated(moved.population, ancestors, moved.acceptance, moved.displacement)
+
+    return rejuvenation
+
+
+def kept_share(share: object) -> float:
+    """A share of the particles that tempering is to keep, from 0 up to below 1."""
+    what = "tempering is asked to keep a share of {} of the particles"
+    return number_within(what, share, least=0.0, below=1.0)
+
+
+class _Schedule(NamedTuple):
+    share: float | Callable[[Trace], float]
+    fixed: tuple[float, ...] | None
+
+    def after(self, reached: float, population: Population, log_likelihood: Tensor) -> float:
+        """The exponent that follows `reached`."""
+        if self.fixed is not None:
+            return next(e for e in self.fixed if e > reached)
+        kept = kept_share(self.share(population.trace)) if callable(self.share) else self.share
+        if kept <= 0.0:
+            return 1.0
+        return next_exponent(population.log_weights, log_likelihood, reached, kept)
+
+
+@dataclass(frozen=True, eq=False)
+class Tempered:
+    """A step that tempers: see `tempered`, which makes it."""
+
+    rejuvenation: Rejuvenation
+    schedule: _Schedule
+    by_site: bool = False
+
+    def __call__(self, population: Population, observed: Observed) -> Stepped:
+        """Take in what was observed, at new addresses."""
+        longer, log_likelihood = extend(population.trace, *observed)
+        # Sites that the program itself fixes (`obs=`, `pyro.factor`) are let in with the observations.
+        new = [a for a in longer.since(population.trace) if a not in longer.choices]
+        return self.let_in(population.with_trace(longer), new, log_likelihood)
+
+    def let_in(self, population: Population, new: Sequence[str], log_likelihood: Tensor) -> Stepped:
+        """Let sites in that the trace has and the weights do not yet count.
+
+        Args:
+            population: weighed for all other sites.
+            new: addresses of the sites; none of them is latent.
+            log_likelihood: their log-probability (N,).
+        """
+        start = population.log_evidence
+        groups = [[a] for a in _by_cost(population.trace, new)] if self.by_site and new else [list(new)]
+        done, acceptances, ancestors, before, resampled = [], [], None, None, 0
+        displacement = float("nan")
+        for number, group in enumerate(groups):
+            later = {a: 0.0 for others in groups[number + 1 :] for a in others}
+            exponent = 0.0
+            if len(groups) > 1:
+                log_likelihood = population.trace.log_prob(*group)
+            while exponent < 1.0:
+                reached = exponent
+                exponent = self.schedule.after(reached, population, log_likelihood)
+                done.append(exponent)
+                # 0 times -inf is no number, so a particle that cannot be loses its weight here, once.
+                population = weighed = population.reweighed((exponent - reached) * log_likelihood)
+                partly = {**later, **(dict.fromkeys(group, exponent) if exponent < 1.0 else {})}
+                population, chosen, acceptance, come = self.rejuvenation(
+                    population, Target(partly) if partly else POSTERIOR
+                )
+                if chosen is not None:
+                    displacement = come
+                    resampled += 1
+                    ancestors = chosen if ancestors is None else ancestors[chosen]
+                    before = weighed.effective_sample_size
+                if acceptance is not None:
+                    acceptances.append(acceptance)
+                # Of no address at all, `log_prob` would give all sites.
+                if exponent < 1.0 and group:
+                    log_likelihood = population.trace.log_prob(*group)
+        info = StepInfo(
+            sum(acceptances) / len(acceptances) if acceptances else float("nan"),
+            tuple(done),
+            resampled,
+            population.effective_sample_size if before is None else before,
+            population.effective_sample_size,
+            population.log_evidence - start,
+            ancestors,
+            displacement,
+        )
+        return Stepped(population, info)
+
+
+def tempered(
+    kernel: Kernel | None = None,
+    *,
+    sweeps: int | Until | Callable[[Trace], int | Until] = 3,
+    resample: Resample | None = None,
+    share: float | Callable[[Trace], float] = 0.5,
+    exponents: Sequence[float] | None = None,
+    by_site: bool = False,
+    rejuvenation: Rejuvenation | None = None,
+    always_move: bool = False,
+) -> Tempered:
+    """A step that lets a measurement's likelihood in bit by bit, and resamples and moves after each.
+
+    Args:
+        kernel: moves the particles after each resampling; None leaves them where they are.
+        sweeps: how many moves of every particle after each resampling, `until(...)`, or a function of the
+            trace that gives either.
+        resample: when and how; by default systematic below half the effective sample size.
+        share: tempering keeps the conditional effective sample size above this share of the particles;
+            0 lets a likelihood in at once. A number, or a function of the trace, as `sweeps`.
+        exponents: fixed ones to let the likelihood in by, increasing, the last 1; then `share` counts for
+            nothing.
+        by_site: let the new sites in one after another, in the order of their cost and then of the program,
+            each by exponents of its own; otherwise all at once.
+        always_move: move after each exponent, whether or not that resampled. Whether particles resample hangs
+            on where they are, so moves that are made only then leave a bias of order 1/N in the evidence (one
+            of 2 % with three particles). With it, or resampling always, and with fixed exponents and
+            proposals, the estimate of the evidence is unbiased.
+        rejuvenation: in place of `kernel`, `sweeps` and `resample`, such as `waste_free(...)`.
+
+    Returns:
+        The step. It raises InferenceError where no particle is left with any weight.
+
+    Raises:
+        InputError: what is given is no kernel, `share` is not in [0, 1), `sweeps` is no whole number, 1 or
+            more, the exponents do not increase to 1, or a rejuvenation is given beside a kernel or a
+            resampling.
+    """
+    if kernel is not None:
+        if callable(kernel) and takes(kernel, 2) and not takes(kernel, 1):
+            raise InputError(
+                "tempered is given a function of two arguments in place of a kernel; "
+                "if it is a rejuvenation such as waste_free_moves(...), give it as rejuvenation=..."
+            )
+        refuse_other("tempered", kernel)
+    if not callable(share):
+        share = kept_share(share)
+    if not callable(sweeps) and not isinstance(sweeps, Until):
+        # Without moves there is no kernel: None.
+        sweeps = whole_number("tempering is to move the particles in {} sweeps", sweeps)
+    fixed = None
+    if exponents is not None:
+        if not isinstance(exponents, Iterable):
+            raise InputError(f"tempering is given the exponents {exponents!r}; give a list, [0.1, 1.0].")
+        fixed = tuple(number_within("tempering is given the exponent {}", e) for e in exponents)
+    if fixed is not None and (fixed[-1:] != (1.0,) or any(b <= a for a, b in pairwise((0.0, *fixed)))):
+        raise InputError(
+            f"tempering is given the exponents {list(fixed)}; give increasing ones that end with 1."
+        )
+    if resample is not None:
+        refuse_scheme("tempered", resample)
+    if rejuvenation is None:
+        rejuvenation = resample_move(
+            kernel, sweeps, adaptive() if resample is None else resample, always_move
+        )
+    elif kernel is not None or resample is not None:
+        raise InputError(
+            "a step is given a rejuvenation beside a kernel or a resampling; give one or the other."
+        )
+    return Tempered(rejuvenation, _Schedule(share, fixed), by_site)
+
+
+def _by_cost(trace: Trace, addresses: Sequence[str]) -> list[str]:
+    return sorted(addresses, key=lambda address: cost_of(trace.distributions[address]))

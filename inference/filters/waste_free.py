@@ -1,0 +1,85 @@
+"""Waste-free SMC: few particles are resampled, each starts a chain, and all states of the chains are kept.
+
+Dau and Chopin, Waste-free sequential Monte Carlo, JRSS B 84, 2022, algorithm 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from bcppl.arguments import number_within, whole_number
+from bcppl.errors import InputError
+from bcppl.inference.filters.tempering import Rejuvenated, Rejuvenation
+from bcppl.inference.kernels import Kernel, fitted, put, refuse_other
+from bcppl.inference.population import Population, log_pair
+from bcppl.inference.schemes import Scheme, systematic
+from bcppl.inference.targets import Target
+
+
+def waste_free_moves(
+    kernel: Kernel, chains: int, *, scheme: Scheme = systematic, threshold: float = 1.0
+) -> Rejuvenation:
+    """A rejuvenation for `tempered`: M of N particles are resampled, and N / M - 1 moves made of each.
+
+    A move is fitted to the weighted particles of the other half of the chains, before resampling, and stays
+    the same along a chain.
+
+    Args:
+        kernel: moves the particles; one that mixes well matters more than here the number of chains.
+        chains: M. It divides N.
+        scheme: resamples.
+        threshold: resample when the effective sample size is below this share of N; 1 is always.
+
+    Raises:
+        InputError: what is given is no kernel, no whole number of chains, or no threshold from 0 to 1.
+            When it runs: M does not divide N.
+    """
+    refuse_other("waste_free_moves", kernel)
+    chains = whole_number("waste-free SMC is asked for {} chains", chains)
+    threshold = number_within("waste-free SMC is given the threshold {}", threshold, least=0.0, most=1.0)
+
+    def rejuvenation(population: Population, target: Target) -> Rejuvenated:
+        count = len(population)
+        if count % chains:
+            raise InputError(
+                f"{count} particles are no whole number of states for {chains} chains; give a number of "
+                "chains that divides that of the particles."
+            )
+        if threshold < 1.0 and population.effective_sample_size >= threshold * count:
+            return Rejuvenated(population, None, None)
+        ancestors = scheme(population.log_weights, chains)
+        # States of one chain stand `chains` apart, and are of one half: a particle teaches no copy of itself.
+        side = (torch.randperm(chains) % 2)[torch.arange(count) % chains]
+        sides = [s for s in (0, 1) if bool((side[ancestors] == s).any())]
+        halves = [(side[ancestors] == s).nonzero().flatten() for s in sides]
+        moves = [fitted(kernel, _teachers(population, side == 1 - s)) for s in sides]
+        current, acceptances = population.trace[ancestors], []
+        whole = population.trace[ancestors.repeat(count // chains)]
+        for state in range(1, count // chains):
+            for mine, move in zip(halves, moves, strict=True):
+                moved, accepted = move(current[mine], target)
+                current = put(current, mine, moved)
+                acceptances.append(accepted.to(torch.float64))
+            whole = put(whole, torch.arange(chains) + state * chains, current)
+        kept = Population(
+            whole,
+            torch.zeros(count, dtype=torch.float64),
+            population.log_evidence,
+            population.founders[ancestors].repeat(count // chains),
+            population.log_pairs + log_pair(chains),
+        )
+        acceptance = float(torch.cat(acceptances).mean()) if acceptances else None
+        return Rejuvenated(kept, ancestors.repeat(count // chains), acceptance)
+
+    return rejuvenation
+
+
+def _teachers(population: Population, others: torch.Tensor) -> Population:
+    """What is learned from: all, where the others are none; equal weights, where they have none."""
+    index = others.nonzero().flatten()
+    taught = population[index] if len(index) else population
+    if bool((taught.log_weights > -torch.inf).any()):
+        return taught
+    return replace(taught, log_weights=torch.zeros_like(taught.log_weights))

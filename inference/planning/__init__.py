@@ -1,0 +1,1 @@
+"""Planning: touches, slides, searches and insertions that an arm can carry out."""

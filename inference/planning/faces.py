@@ -1,0 +1,153 @@
+"""Where a part can be touched from above and from its sides, from its mesh."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+from shapely.affinity import translate
+
+from bcppl.errors import InputError
+from bcppl.geometry.cover import polygons_of
+from bcppl.geometry.parts import Part
+
+Array = npt.NDArray[np.float64]
+
+_BELOW = 0.0002  # m below the top at which its outline is taken
+_HOLE = 0.002  # m
+_TRIES = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the margin that is asked for
+_CANDIDATES = 60
+_WORTH_A_LIFT = 2.0  # times as large must the triangle be that a lift makes possible
+
+
+class Side(NamedTuple):
+    """An upright face, in the part's x-y plane.
+
+    Attributes:
+        start, stop: (2,) its ends, metres.
+        normal: (2,) its outward unit normal.
+    """
+
+    start: Array
+    stop: Array
+    normal: Array
+
+    @property
+    def length(self) -> float:
+        """Metres."""
+        return float(np.linalg.norm(self.stop - self.start))
+
+
+class Spots(NamedTuple):
+    """Where a top is touched, in the part's x-y plane.
+
+    Attributes:
+        places: (3, 2) metres; a peg can slide from the first to the second.
+        lifted: whether the peg must be lifted from the second to the third; else it can slide there too.
+    """
+
+    places: Array
+    lifted: bool
+
+
+def section(part: Part, height: float) -> shapely.Polygon:
+    """The cross section of a part at a height z in its frame, the largest piece of it, metres.
+
+    Raises:
+        InputError: the part does not reach there.
+    """
+    path = part.mesh.section(plane_origin=[0.0, 0.0, height], plane_normal=[0.0, 0.0, 1.0])
+    if path is None:
+        raise InputError(
+            f"part {part.name!r} has no cross section at z = {height:g} m; give a height within it."
+        )
+    planar, to_3d = path.to_2D(normal=[0.0, 0.0, 1.0])
+    found = [translate(p, to_3d[0, 3], to_3d[1, 3]) for p in planar.polygons_full]
+    pieces = [p for each in found for p in polygons_of(each)]
+    return shapely.simplify(max(pieces, key=lambda p: p.area), 1e-5)
+
+
+def spots_on_top(part: Part, peg: Part, margin: float) -> Spots:
+    """Three spots on a part's top, far apart, between which a peg can slide on it, in that order.
+
+    The peg's whole cross section stays on the top, `margin` metres from its outer edge where there is room
+    for so much, and 2 mm from holes. Of all such triples of candidates, the one whose triangle is largest;
+    where slides lead nowhere, as on a narrow rim, the peg is lifted to the third.
+
+    Raises:
+        InputError: the top has no room for the peg.
+    """
+    top = float(part.vertices[:, 2].max())
+    outline = section(part, top - _BELOW)
+    across = float(np.linalg.norm(peg.vertices[:, :2], axis=1).max())
+    holes = shapely.union_all([shapely.Polygon(ring) for ring in outline.interiors])
+    room = shapely.Polygon()
+    for share in _TRIES:
+        outside = shapely.Polygon(outline.exterior).buffer(-(across + share * margin))
+        room = outside.difference(holes.buffer(across + share * _HOLE))
+        if _spread(room) >= 1.5 * across:
+            break
+    if room.is_empty:
+        room = outline.buffer(-0.5 * across)
+    if room.is_empty:
+        raise InputError(
+            f"the top of part {part.name!r} has no room for a peg {2e3 * across:.3g} mm across; "
+            "plan touches by hand."
+        )
+    candidates = _boundary_points(room)
+    reachable = _straight_ways(room, candidates)
+    from_middle = candidates[None] - candidates[:, None]
+    sizes = np.abs(  # (M, M, M): twice the area, by the second spot, the first and the third
+        from_middle[:, :, None, 0] * from_middle[:, None, :, 1]
+        - from_middle[:, :, None, 1] * from_middle[:, None, :, 0]
+    )
+    slid, lifted = (
+        np.where(ways, sizes, -1.0)
+        for ways in (reachable[:, :, None] & reachable[:, None, :], reachable[:, :, None])
+    )
+    worth = bool(lifted.max() > _WORTH_A_LIFT * slid.max())
+    found = lifted if worth else slid
+    second, first, third = np.unravel_index(int(found.argmax()), found.shape)
+    return Spots(candidates[[first, second, third]], worth)
+
+
+def sides(part: Part, height: float) -> list[Side]:
+    """The upright faces that a part's cross section at a height z has on its outside, the longest first."""
+    ring = shapely.geometry.polygon.orient(section(part, height).convex_hull).exterior
+    corners = np.asarray(shapely.simplify(ring, 1e-4).coords)
+    found = []
+    for start, stop in pairwise(corners):
+        along = (stop - start) / np.linalg.norm(stop - start)
+        found.append(Side(start, stop, np.array([along[1], -along[0]])))
+    return sorted(found, key=lambda side: -side.length)
+
+
+def _spread(room: shapely.Geometry) -> float:
+    if room.is_empty:
+        return 0.0
+    low, high = np.reshape(room.bounds, (2, 2))
+    return float((high - low).min())
+
+
+def _boundary_points(room: shapely.Geometry) -> Array:
+    """Points (M, 2) along the outer boundaries: three points far apart lie there."""
+    pieces = [shapely.Polygon(piece.exterior) for piece in polygons_of(room)]
+    whole = sum(piece.length for piece in pieces)
+    points = []
+    for ring in pieces:
+        inner = ring.buffer(-1e-6) if not ring.buffer(-1e-6).is_empty else ring
+        line = inner.exterior
+        shares = np.linspace(0, 1, max(3, round(_CANDIDATES * ring.length / whole)))
+        points.append(np.asarray(shapely.simplify(line, 1e-4).coords))
+        points.append(np.asarray([line.interpolate(share, normalized=True).coords[0] for share in shares]))
+    return np.unique(np.round(np.concatenate(points), 7), axis=0)
+
+
+def _straight_ways(room: shapely.Geometry, points: Array) -> npt.NDArray[np.bool_]:
+    count = len(points)
+    i, j = np.meshgrid(np.arange(count), np.arange(count), indexing="ij")
+    ways = shapely.linestrings(np.stack([points[i.ravel()], points[j.ravel()]], axis=1))
+    return np.asarray(shapely.covers(room.buffer(1e-5), ways)).reshape(count, count)
