@@ -24,6 +24,7 @@ from report import DATA, Row, finish, options, show
 from bcppl import poses
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.geometry.camera import Camera
+from bcppl.geometry.guess import Guess
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.summaries import mean
 from bcppl.models.arm_calibration import (
@@ -38,7 +39,6 @@ from bcppl.models.arm_in_view import arm_in_view, fitted, prepare
 from bcppl.models.arm_in_view import observations as images_of
 from bcppl.recordings.importers.bop import draw
 from bcppl.robot.kinematics import Robot
-from bcppl.sensors.measurements import Guess
 
 BALL = DATA / "ball_in_socket"
 XARM = DATA / "xarm7_realsense"

@@ -30,7 +30,7 @@ from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.peg_in_hole import CONTACT, model
 from bcppl.models.worlds.peg_in_hole import record
 from bcppl.recordings import Recording
-from bcppl.sensors.measurements import Probe, ProbeWindow
+from bcppl.robot.motion import Probe, ProbeWindow
 
 PARTICLES = 75
 TOUCHING = 0.1  # N more or less than in free motion: what a wrist sensor's noise is

@@ -22,6 +22,7 @@ from rich.console import Console
 from scenes import PARTICLES, every, one_line, quantile, taken_in
 
 from bcppl.beliefs import Belief
+from bcppl.contact.touch import Touch
 from bcppl.geometry.gap import PegGap
 from bcppl.inference.design import mode_entropy
 from bcppl.inference.design.loop import Round, probing_loop
@@ -34,7 +35,6 @@ from bcppl.inference.planning.touching import Spot, touch
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
-from bcppl.sensors.measurements import Touch
 
 SCENES, PROBES = 50, 3
 WAYS = ("chosen", "random", "script", "variance")

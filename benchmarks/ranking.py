@@ -31,7 +31,8 @@ from bcppl.inference.schemes import systematic
 from bcppl.models.look_and_touch import model
 from bcppl.models.look_and_touch_scene import Scene, touch_of
 from bcppl.models.worlds.bench import bench_scene
-from bcppl.robot.plan import Plan, action_of, probe_of
+from bcppl.robot.plan import Plan, probe_of
+from bcppl.sensors.candidates import action_of
 from bcppl.traces import Trace
 
 PARTICLES, CANDIDATES = 75, 32

@@ -22,12 +22,13 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.beliefs import Belief, average_distance
 from bcppl.beliefs.regions import Measure, average_point_distance, rotation_angle, translation_deviation
+from bcppl.contact.touch import Touch
 from bcppl.geometry.distance import SignedDistance
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.point_probe import Settings, felt, learn, model, registration_pose
 from bcppl.recordings.importers.point_probe import command
-from bcppl.sensors.measurements import Push, Recording, Touch
+from bcppl.sensors.measurements import Push, Recording
 
 LOGS = DATA / "point_probe_pushes"
 OTHER = {"10_90": "10_130", "10_130": "10_90"}  # where the finger is learnt for the pushes of a log

@@ -26,6 +26,7 @@ from touches import LOGS, OTHER, learnt
 
 from bcppl import poses
 from bcppl.beliefs import Belief
+from bcppl.contact.touch import Touch
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.gap import Gap
 from bcppl.inference.design import (
@@ -38,7 +39,7 @@ from bcppl.inference.filters.smc import Step
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.point_probe import felt, model
 from bcppl.recordings.importers.point_probe import command
-from bcppl.sensors.measurements import Push, Recording, Touch
+from bcppl.sensors.measurements import Push, Recording
 from bcppl.traces import Trace, extend
 
 LOG = "10_90"

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.touch import Touch
 from bcppl.contact.track import ContactTrack
 from bcppl.distributions.contact import ChamferContacts, PegPose
 from bcppl.distributions.depth import RobustDepth
@@ -24,7 +25,8 @@ from bcppl.distributions.wrench import Wrench
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models import peg_in_hole
 from bcppl.models.worlds.peg_in_hole import record
-from bcppl.sensors.measurements import Measurement, ProbeWindow, Touch, View
+from bcppl.robot.motion import ProbeWindow
+from bcppl.sensors.measurements import Measurement, View
 from bcppl.traces import Model, carried
 
 PARTICLES = 75

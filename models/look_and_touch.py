@@ -18,6 +18,7 @@ from torch import Tensor
 
 from bcppl.contact.god_object import GodObject
 from bcppl.contact.sensing.felt import accelerations
+from bcppl.contact.touch import Touch
 from bcppl.contact.wrench import Sensing
 from bcppl.distributions.poses import NormalPose, prior_from_guess
 from bcppl.errors import InputError
@@ -29,7 +30,8 @@ from bcppl.models.look_and_touch_scene import Scene, Settings, image_of, touch_o
 from bcppl.rendering.region import region_of
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.rendering.stated_cameras import apparent_covariance, seen_elsewhere
-from bcppl.sensors.measurements import DepthImage, Measurement, ProbeWindow, Recording, Touch, View
+from bcppl.robot.motion import ProbeWindow
+from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
 from bcppl.traces import Model
 
 

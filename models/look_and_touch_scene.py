@@ -23,7 +23,7 @@ from bcppl.geometry.camera import Camera
 from bcppl.geometry.gap import PegGap
 from bcppl.models.camera_error import Cameras, Look
 from bcppl.rendering.renderer import DepthRenderer
-from bcppl.sensors.measurements import ProbeWindow
+from bcppl.robot.motion import ProbeWindow
 
 
 @dataclass(frozen=True)

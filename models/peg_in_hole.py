@@ -22,6 +22,7 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.contact.peg_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
+from bcppl.contact.touch import Touch
 from bcppl.contact.track import ContactTrack
 from bcppl.contact.wrench import Sensing
 from bcppl.distributions.contact import ChamferContacts, PegPose
@@ -32,7 +33,8 @@ from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.rendering.scene import RendersPart
-from bcppl.sensors.measurements import DepthImage, Measurement, ProbeWindow, Recording, Touch, View
+from bcppl.robot.motion import ProbeWindow
+from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
 from bcppl.traces import Model, carried
 
 # What inference believes of the contact. The worlds that make recordings have parameters of their own.

@@ -18,6 +18,7 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
+from bcppl.contact.touch import Touch
 from bcppl.distributions.path import Path
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.distributions.shared_error import SharedError, SharedOnset
@@ -26,7 +27,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.parts import Part
 from bcppl.poses import compose, inverse, rotation_matrix, transform
-from bcppl.sensors.measurements import Measurement, Push, Recording, Touch
+from bcppl.sensors.measurements import Measurement, Push, Recording
 from bcppl.traces.model import Model
 
 

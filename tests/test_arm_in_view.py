@@ -16,6 +16,7 @@ from bcppl import poses
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
 from bcppl.inference.filters.tempered_smc import kernel
 from bcppl.inference.filters.tempering import tempered
@@ -34,7 +35,6 @@ from bcppl.models.arm_in_view import (
 from bcppl.models.robots import load_robot
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.robot.kinematics import Robot
-from bcppl.sensors.measurements import Guess
 from bcppl.traces import generate
 
 XARM = Path(__file__).parents[2] / "shared/data/xarm7_realsense"

@@ -20,8 +20,8 @@ from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, bench_part
 from bcppl.models.worlds.guarded_motion import CarriedOut, command_of
 from bcppl.recordings import Recording
 from bcppl.rendering.renderer import DepthRenderer
+from bcppl.robot.motion import Probe
 from bcppl.robot.plan import Plan
-from bcppl.sensors.measurements import Probe
 
 STIFFNESS = np.array([2500.0] * 3 + [150.0] * 3)
 DAMPING = np.array([120.0] * 3 + [2.5] * 3)

@@ -21,7 +21,7 @@ from bcppl.contact.wrench import Sensing
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part, Piece
 from bcppl.geometry.shapes import block, round_peg
-from bcppl.sensors.measurements import Probe
+from bcppl.robot.motion import Probe
 from tests.pressed_pegs import COVARIANCE, PEG, fork, noisy, pressed, wrench
 
 

@@ -22,7 +22,7 @@ from bcppl.geometry.outlines import block_with_hole, cylinder_peg, named_outline
 from bcppl.geometry.parts import Part, Piece
 from bcppl.geometry.shapes import block, box_peg
 from bcppl.models.parts import insert_peg, insert_tray
-from bcppl.sensors.measurements import Probe
+from bcppl.robot.motion import Probe
 
 Array = npt.NDArray[np.float64]
 

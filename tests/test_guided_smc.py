@@ -21,6 +21,7 @@ from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
+from bcppl.geometry.guess import Guess
 from bcppl.inference.filters import tempered_smc
 from bcppl.inference.filters.guided_smc import guided, infer, kernel
 from bcppl.inference.filters.smc import smc
@@ -32,7 +33,7 @@ from bcppl.inference.targets import POSTERIOR
 from bcppl.models import look_and_touch
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.poses import Freedom
-from bcppl.sensors.measurements import Guess, Recording
+from bcppl.sensors.measurements import Recording
 from bcppl.traces import Model, Trace, generate
 from tests.made_recordings import assert_one_sentence
 

@@ -22,8 +22,9 @@ from bcppl.geometry.shapes import block, box_peg
 from bcppl.inference.design import linearised_information_gain, mode_entropy
 from bcppl.inference.design.gaussians import Gaussians, right_jacobian
 from bcppl.inference.population import Population
-from bcppl.robot.plan import Plan, action_of
-from bcppl.sensors.measurements import ProbeWindow
+from bcppl.robot.motion import ProbeWindow
+from bcppl.robot.plan import Plan
+from bcppl.sensors.candidates import action_of
 from bcppl.traces import Trace, generate
 from tests.probing_programs import CENTER, SPREAD, at, doubled, particles
 

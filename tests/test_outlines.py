@@ -37,7 +37,7 @@ from bcppl.geometry.outlines import (
 from bcppl.geometry.parts import Part
 from bcppl.geometry.shapes import block, box_peg
 from bcppl.models.parts import SHAPES, insert_peg, insert_tray
-from bcppl.sensors.measurements import Probe
+from bcppl.robot.motion import Probe
 
 NIST = Path(__file__).parents[2] / "shared/data/nist_insertion"
 BORDER = [(0, -0.05), (0.06, -0.05), (0.06, 0.05), (0, 0.05)]

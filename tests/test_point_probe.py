@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.models.point_probe import Settings, felt, learn, model, prepare
 from bcppl.models.worlds.point_probe import noise_seed
 from bcppl.recordings.importers.point_probe import command
-from bcppl.sensors.measurements import Measurement, Push, Recording, Touch
+from bcppl.sensors.measurements import Measurement, Push, Recording
 from bcppl.traces import assess, generate
 
 LOGS = File(__file__).parents[2] / "shared/data/point_probe_pushes"

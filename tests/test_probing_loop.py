@@ -26,7 +26,7 @@ from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
 from bcppl.recordings import Recording, View, problems
-from bcppl.sensors.measurements import ProbeWindow
+from bcppl.robot.motion import ProbeWindow
 from tests.made_recordings import assert_one_sentence
 
 PARTICLES = 30

@@ -16,13 +16,14 @@ from bcppl import poses
 from bcppl.contact.physics import PegPhysics
 from bcppl.contact.sensing.load import identify_load, in_frame
 from bcppl.contact.sensing.onset import OnsetDetector
+from bcppl.contact.touch import Touch
 from bcppl.contact.track import ContactTrack
 from bcppl.contact.wrench import Sensing
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.shapes import block
 from bcppl.recordings.importers.point_probe import LoggedPush, force_on_object, prism, read_log
-from bcppl.sensors.measurements import Probe, Touch
+from bcppl.robot.motion import Probe
 from tests.pressed_pegs import LOAD, LOGS, PEG, noisy, orientations
 
 # ---------------------------------------------------------------- weight

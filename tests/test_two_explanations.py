@@ -13,8 +13,10 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from bcppl import poses
+from bcppl.contact.touch import Touch
 from bcppl.distributions.manifold_fit import Normal, Told, Window, told_by
 from bcppl.distributions.pose_normals import Modes, matched, widened, widened_modes
+from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
 from bcppl.geometry.shapes import box_peg
 from bcppl.inference.filters.guided_smc import guided, infer, kernel
@@ -24,7 +26,8 @@ from bcppl.models import look_and_touch
 from bcppl.models.look_and_touch_proposals import met_anew, passing, unsure
 from bcppl.models.look_and_touch_scene import touch_of
 from bcppl.recordings import problems
-from bcppl.sensors.measurements import Guess, Measurement, Probe, ProbeWindow, Recording, Touch
+from bcppl.robot.motion import Probe, ProbeWindow
+from bcppl.sensors.measurements import Measurement, Recording
 
 APART, THICK, HIGH, WIDE = 0.012, 0.004, 0.01, 0.004  # m: of the ridges, and of the peg
 LENGTH, DEEP = 0.05, 0.006  # m: the peg, and how far below the ridges' tops its tip is

@@ -20,7 +20,7 @@ from bcppl.distributions.contact import ChamferContacts
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part, Piece
 from bcppl.geometry.shapes import block, block_with_square_hole, box_peg
-from bcppl.sensors.measurements import Probe
+from bcppl.robot.motion import Probe
 
 STIFFNESS = np.array([1500.0, 1000.0, 2000.0, 60.0, 50.0, 40.0])
 DAMPING = np.array([80.0, 80.0, 80.0, 2.0, 2.0, 2.0])

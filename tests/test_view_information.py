@@ -18,7 +18,7 @@ from bcppl.models.look_and_touch import model
 from bcppl.models.view_information import pixel_information, view_information
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.rendering.renderer import DepthRenderer
-from bcppl.robot.plan import action_of
+from bcppl.sensors.candidates import action_of
 from bcppl.sensors.measurements import View
 from bcppl.traces import generate
 

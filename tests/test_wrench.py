@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 from bcppl import poses
 from bcppl.contact.peg_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
+from bcppl.contact.touch import Touch
 from bcppl.contact.track import ContactTrack
 from bcppl.contact.wrench import Sensing
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose
 from bcppl.errors import InputError
 from bcppl.geometry.shapes import block, block_with_square_hole, box_peg, round_peg
-from bcppl.sensors.measurements import Probe, Touch
+from bcppl.robot.motion import Probe
 
 PEG = box_peg(0.016, 0.05)
 PLAIN = Sensing(PEG, rate=100.0, tare=0, cutoff=None)

@@ -16,7 +16,7 @@ from bcppl.contact.wrench import Sensing
 from bcppl.distributions.wrench import Wrench
 from bcppl.errors import InputError
 from bcppl.geometry.shapes import block, box_peg
-from bcppl.sensors.measurements import Probe
+from bcppl.robot.motion import Probe
 
 PEG = box_peg(0.016, 0.05)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import bcppl.inference
+import bcppl.inference.filters
 import bcppl.models
 from bcppl.errors import InputError
 from bcppl.recordings import Recording, load, validate
@@ -69,7 +69,7 @@ def inference(name: str) -> Any:
     Raises:
         InputError: there is no such program, or the file cannot be run.
     """
-    return _defined(name, bcppl.inference, "infer", None)
+    return _defined(name, bcppl.inference.filters, "infer", None)
 
 
 def refuse_seed(seed: int) -> None:

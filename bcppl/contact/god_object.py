@@ -27,7 +27,7 @@ from bcppl.contact.tangent_planes import nearest_allowed
 from bcppl.errors import InputError
 from bcppl.geometry.gap import Frames, PegGap, frames_of
 from bcppl.geometry.parts import Part
-from bcppl.sensors.measurements import ProbeWindow
+from bcppl.robot.motion import ProbeWindow
 
 Array = npt.NDArray[np.float64]
 Numbers = npt.NDArray[np.int64]

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part, Piece
-from bcppl.sensors.measurements import Probe
+from bcppl.robot.motion import Probe
 
 Array = npt.NDArray[np.float64]
 

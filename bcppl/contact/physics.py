@@ -22,7 +22,7 @@ from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 from bcppl.poses import as_pose
-from bcppl.sensors.measurements import Probe
+from bcppl.robot.motion import Probe
 
 Array = npt.NDArray[np.float64]
 Selection = Tensor | npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from bcppl.contact.grasp import as_gripped
 from bcppl.contact.model_copies import ModelCopies
 from bcppl.contact.peg_model import SENSED, controls, hold, steps_of
-from bcppl.sensors.measurements import Probe
+from bcppl.robot.motion import Probe
 from bcppl.threads import thread_count
 
 Array = npt.NDArray[np.float64]

@@ -11,7 +11,7 @@ from bcppl import poses
 from bcppl.contact.physics import PegPhysics, Rollout, Selection, rows_of
 from bcppl.contact.unknowns import Unknowns
 from bcppl.contact.wrench import Sensing, SensingState
-from bcppl.sensors.measurements import Probe
+from bcppl.robot.motion import Probe
 
 Array = npt.NDArray[np.float64]
 

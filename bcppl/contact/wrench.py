@@ -24,9 +24,9 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.contact.sensing.load import ToolLoad
 from bcppl.contact.sensing.surface import closed_mesh
 from bcppl.contact.sensing.units import refuse_millimetres
+from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
-from bcppl.sensors.measurements import Touch
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice

@@ -8,14 +8,17 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
+from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.distortion import coefficients
+from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import LARGEST_EXTENT, Part
 from bcppl.poses import as_pose, inverse, transform
 from bcppl.recordings.file import same
+from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.robot.plan import FARTHEST
-from bcppl.sensors.measurements import DepthImage, Guess, Probe, ProbeWindow, Push, Recording, Touch, View
+from bcppl.sensors.measurements import DepthImage, Push, Recording, View
 
 Array = npt.NDArray[np.float64]
 

@@ -7,8 +7,11 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from bcppl.contact.touch import Touch
+from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
-from bcppl.sensors.measurements import Guess, ProbeWindow, Push, Recording, Touch, View
+from bcppl.robot.motion import ProbeWindow
+from bcppl.sensors.measurements import Push, Recording, View
 
 Array = npt.NDArray[np.float64]
 

@@ -32,22 +32,15 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
+from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part, Piece
 from bcppl.recordings.cameras import camera_version, read_camera, write_camera
 from bcppl.recordings.datasets import POSE_UNITS, array, number, put
-from bcppl.sensors.measurements import (
-    DepthImage,
-    Guess,
-    Measurement,
-    Probe,
-    ProbeWindow,
-    Push,
-    Recording,
-    Touch,
-    View,
-)
+from bcppl.robot.motion import Probe, ProbeWindow
+from bcppl.sensors.measurements import DepthImage, Measurement, Push, Recording, View
 
 FORMAT = "bcppl recording"
 SCHEMA_VERSION = 2

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from bcppl.arguments import number_within
 from bcppl.errors import InputError
-from bcppl.sensors.measurements import Probe, ProbeWindow, View
+from bcppl.robot.motion import Probe
 
 Array = npt.NDArray[np.float64]
 Manner = Literal["free", "guarded", "held", "searching"]
@@ -141,11 +141,3 @@ def probe_of(plan: Plan) -> Probe:
     count = max(1, round(float(plan.times[-1] - plan.times[0]) * plan.rate))
     stamps = plan.times[0] + np.arange(count) / plan.rate
     return Probe(plan.name, plan.times, plan.world_from_peg, plan.stiffness, plan.damping, stamps)
-
-
-def action_of(candidate: Plan | View) -> ProbeWindow | View:
-    """What a model takes as an action: a plan as one window of which nothing is stopped, a view as it is."""
-    if isinstance(candidate, View):
-        return candidate
-    probe = probe_of(candidate)
-    return ProbeWindow(probe, 0, len(probe.stamps))

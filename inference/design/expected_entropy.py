@@ -75,7 +75,7 @@ def expected_information_gain(
         candidates: what may be done next; anything that `extend_args` understands.
         extend_args: the program's arguments once a candidate is done as well, those of all measurements so
             far included; for a `Series`, those of its next step. `Batched` simulates several at once. A
-            `Plan` is no action yet: `bcppl.robot.plan.action_of(plan)` is.
+            `Plan` is no action yet: `bcppl.sensors.candidates.action_of(plan)` is.
         entropy: what is to fall: `weight_entropy()` (the default, the paper's), `mode_entropy(address)`,
             `neighbour_entropy(address)`, `value_entropy(address)`, or what answers alike.
         hypotheses: how many play the truth, drawn systematically by weight; None: every particle, once.

@@ -74,7 +74,7 @@ def linearised_information_gain(
         population: weighted particles.
         candidates: what may be done next; anything that `extend_args` understands.
         extend_args: the program's arguments once a candidate is done as well, those of all measurements so
-            far included; a `Plan` is no action yet, `bcppl.robot.plan.action_of(plan)` is.
+            far included; a `Plan` is no action yet, `bcppl.sensors.candidates.action_of(plan)` is.
         address: of the pose; the first latent address unless given.
         hypotheses: how many play the truth, drawn systematically by weight; None: every particle, once.
         information: what a candidate tells at the hypotheses, (H, 6, 6) in the tangent space at their poses,

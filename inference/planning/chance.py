@@ -19,8 +19,8 @@ from bcppl.geometry.holes import Hole, aside_of, depth_reached, hole_of
 from bcppl.geometry.parts import Part
 from bcppl.inference.schemes import systematic
 from bcppl.robot.insertion_plan import InsertionPlan
+from bcppl.robot.motion import Probe
 from bcppl.robot.plan import Plan
-from bcppl.sensors.measurements import Probe
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

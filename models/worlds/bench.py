@@ -18,8 +18,10 @@ import torch
 from bcppl import poses
 from bcppl.arguments import number_within, seed_number
 from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.touch import Touch
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
 from bcppl.geometry.shapes import block
 from bcppl.models.worlds.bench_parts import PARTS, BenchPart, bench_part
@@ -30,16 +32,9 @@ from bcppl.models.worlds.occlusion import occluder
 from bcppl.rendering.depth_noise import DepthNoise
 from bcppl.rendering.scene import SceneRenderer
 from bcppl.robot.insertion_plan import InsertionPlan
+from bcppl.robot.motion import ProbeWindow
 from bcppl.robot.plan import Plan
-from bcppl.sensors.measurements import (
-    DepthImage,
-    Guess,
-    Measurement,
-    ProbeWindow,
-    Recording,
-    Touch,
-    View,
-)
+from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
 
 Array = npt.NDArray[np.float64]
 

@@ -14,9 +14,11 @@ from scipy.ndimage import uniform_filter1d
 
 from bcppl import poses
 from bcppl.contact.physics import PegPhysics
+from bcppl.contact.touch import Touch
 from bcppl.contact.unknowns import Unknowns
 from bcppl.models.worlds import peg_in_hole as bench
-from bcppl.sensors.measurements import Measurement, Probe, ProbeWindow, Recording, Touch
+from bcppl.robot.motion import Probe, ProbeWindow
+from bcppl.sensors.measurements import Measurement, Recording
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from bcppl.contact.peg_model import ContactParameters, build_model, commands
 from bcppl.contact.stepping import POSE, WRENCH, Clock, Standing
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
+from bcppl.robot.motion import Probe
 from bcppl.robot.plan import Manner, Plan
-from bcppl.sensors.measurements import Probe
 
 Array = npt.NDArray[np.float64]
 

@@ -18,21 +18,15 @@ from scipy.spatial.transform import Rotation
 from bcppl import poses
 from bcppl.contact.peg_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
+from bcppl.contact.touch import Touch
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.camera import Camera
+from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
 from bcppl.geometry.shapes import block, block_with_square_hole, box_peg
 from bcppl.rendering.renderer import DepthRenderer
-from bcppl.sensors.measurements import (
-    DepthImage,
-    Guess,
-    Measurement,
-    Probe,
-    ProbeWindow,
-    Recording,
-    Touch,
-    View,
-)
+from bcppl.robot.motion import Probe, ProbeWindow
+from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
 
 Array = npt.NDArray[np.float64]
 

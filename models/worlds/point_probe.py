@@ -10,12 +10,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
+from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
 from bcppl.models.point_probe import Scene, point_probe, prepare
 from bcppl.poses import identity, rotation_matrix, transform
 from bcppl.recordings.importers.point_probe import prism
-from bcppl.sensors.measurements import Guess, Measurement, Push, Recording, Touch
+from bcppl.sensors.measurements import Measurement, Push, Recording
 from bcppl.traces import generate
 
 Array = npt.NDArray[np.float64]

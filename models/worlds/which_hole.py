@@ -16,23 +16,17 @@ from scipy.ndimage import uniform_filter1d
 
 from bcppl import poses
 from bcppl.contact.physics import PegPhysics
+from bcppl.contact.touch import Touch
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part, Piece
 from bcppl.geometry.shapes import box_peg
 from bcppl.models.which_hole import HOLES, PITCH
 from bcppl.models.worlds import peg_in_hole as bench
 from bcppl.rendering.renderer import DepthRenderer
-from bcppl.sensors.measurements import (
-    DepthImage,
-    Guess,
-    Measurement,
-    Probe,
-    ProbeWindow,
-    Recording,
-    Touch,
-    View,
-)
+from bcppl.robot.motion import Probe, ProbeWindow
+from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
 
 HOLE, PIN, MARGIN, THICK = 0.018, 0.008, 0.03, 0.02
 CLEAR, STROKE = 0.005, 0.006

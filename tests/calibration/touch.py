@@ -17,7 +17,7 @@ from bcppl.distributions.contact import ChamferContacts, ContactsInTime
 from bcppl.distributions.poses import UniformPose
 from bcppl.geometry.shapes import block, box_peg
 from bcppl.inference.filters.tempered_smc import kernel as shipped
-from bcppl.sensors.measurements import Probe
+from bcppl.robot.motion import Probe
 from bcppl.traces import carried
 from tests.calibration.case import Case
 

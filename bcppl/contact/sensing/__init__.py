@@ -6,7 +6,7 @@ against the peg's side, 30 mm from its root, with 6 N:
 
     >>> import numpy as np
     >>> from scipy.spatial.transform import Rotation
-    >>> from bcppl.sensors.measurements import Touch
+    >>> from bcppl.contact.touch import Touch
     >>> from bcppl.contact.sensing.intrinsic import IntrinsicSensing
     >>> from bcppl.contact.sensing.load import ToolLoad, identify_load
     >>> from bcppl.contact.sensing.noise import noise_at_rest

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
-from bcppl.sensors.measurements import ProbeWindow
+from bcppl.robot.motion import ProbeWindow
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,26 @@
+"""What is read while something held touches a part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """Observation: the raw wrench, and the held peg's measured pose.
+
+    Attributes:
+        times: (T,) seconds, increasing.
+        wrench: (T, 6) force (N) then torque (N m) that the environment exerts on the peg or finger, in the
+            peg's frame about its origin (for a push: in the world's axes, about the tip). Not tared.
+        world_from_peg: (T, 7) measured pose of the peg; empty (0, 7) for a push, whose path is in the action.
+    """
+
+    times: Array
+    wrench: Array
+    world_from_peg: Array
