@@ -38,6 +38,8 @@ class Population:
             its own. What `bcppl.inference.variance` reads.
         log_pairs: sum over the first population and every resampling since of log M / (M - 1), M the
             particles that were then drawn independently of one another.
+        approximation: the filter's approximation of the posterior, an immutable value that guides proposals
+            and that the target never depends on (`bcppl.inference.approximation`); None where there is none.
     """
 
     trace: Trace
@@ -45,6 +47,7 @@ class Population:
     log_evidence: float = math.nan
     founders: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64), repr=False)
     log_pairs: float = math.nan
+    approximation: Any = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "log_weights", _checked(self.trace, self.log_weights))
@@ -91,6 +94,12 @@ class Population:
             later.__dict__["log_total"] = self.log_total
         if "effective_sample_size" in self.__dict__:
             later.__dict__["effective_sample_size"] = self.effective_sample_size
+        return later
+
+    def with_approximation(self, approximation: Any) -> Population:
+        """The same particles with another approximation of their posterior."""
+        later = self.with_trace(self.trace)
+        later.__dict__["approximation"] = approximation
         return later
 
     def reweighed(self, log_factor: Tensor) -> Population:

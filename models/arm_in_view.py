@@ -25,7 +25,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import fitted_normal
-from bcppl.distributions.pose_normals import normal_like, within
+from bcppl.distributions.pose_normals import normal_like, truncated
 from bcppl.distributions.poses import NormalPose
 from bcppl.distributions.silhouette import Silhouette, binned_mask
 from bcppl.effort import Effort
@@ -296,7 +296,7 @@ def fitted(scene: Scene, seen: Mapping[str, Tensor], draws: int = 100) -> Callab
         left = covariance[:6, :6] - gain.T @ covariance[6:, :6]
         center = poses.retract(prior.center, mean[:6] + away @ gain)
         spread = WIDER**2 * (0.5 * (left + left.T)).expand(len(center), 6, 6)
-        pyro.sample("camera", within(prior, NormalPose(center, spread)))
+        pyro.sample("camera", truncated(prior, NormalPose(center, spread)))
 
     return proposal
 

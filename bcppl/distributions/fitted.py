@@ -27,7 +27,7 @@ class FittedNormal(NamedTuple):
     mean: Tensor
     covariance: Tensor
 
-    def around(self) -> Tensor:
+    def sigma_points(self) -> Tensor:
         """The mean, then a deviation up and down each column of a root of the covariance: (1 + 2 d, d).
 
         Half the sum of the squares of the deviations is the covariance, and remains so where they are mapped

@@ -1,7 +1,8 @@
-"""Normals over poses as proposals need them: widened, multiplied, kept within a prior, as wide as one."""
+"""Gaussians over poses as proposals need them: mixtures, products, truncation, optimal transport."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -12,36 +13,69 @@ from bcppl.distributions.boxed import BoxedNormal
 from bcppl.distributions.mixture import MixturePose
 from bcppl.distributions.poses import NormalPose
 
-# How proposals are widened, in deviations, and how often.
+# Proposals are mixtures of scaled copies: their scales, in standard deviations, and their probabilities.
 WIDTHS = torch.tensor([1.1, 3.0], dtype=torch.float64)
 SHARES = torch.tensor([0.85, 0.15], dtype=torch.float64)
 
 
-class Modes(NamedTuple):
-    """A mixture of M normals: centres (..., M, 7), covariances (..., M, 6, 6), log-weights (..., M)."""
+class GaussianMixture(NamedTuple):
+    """A mixture of M Gaussians: centres (..., M, 7), covariances (..., M, 6, 6), log-weights (..., M)."""
 
     centers: Tensor
     covariances: Tensor
     log_weights: Tensor
 
-    def own(self, pose: Tensor) -> Tensor:
-        """Of which of M normals poses (N, 7) most likely are: (N,) int64."""
+    def component(self, pose: Tensor) -> Tensor:
+        """The most probable component of each of the poses (N, 7), (N,) int64."""
         if len(self.centers) == 1:
             return torch.zeros(len(pose), dtype=torch.int64)
-        said = NormalPose(self.centers, self.covariances).log_prob(pose[:, None])
-        return (self.log_weights + said).argmax(dim=1)
+        log_prob = NormalPose(self.centers, self.covariances).log_prob(pose[:, None])
+        return (self.log_weights + log_prob).argmax(dim=1)
+
+
+class PoseFactor(NamedTuple):
+    """A Gaussian factor over a part's pose.
+
+    Attributes:
+        pose: (N, 7) its mean.
+        covariance: (N, 6, 6) in the tangent space at a centre (N, 7), at which it is linearised.
+    """
+
+    pose: Tensor
+    covariance: Callable[[Tensor], Tensor]
+
+
+def product_of_factors(prior: Any, factors: Sequence[PoseFactor]) -> NormalPose:
+    """The Gaussian that approximates a product of factors, on the axes that a prior leaves free.
+
+    Each factor is taken as normal in the tangent space about the product's mean.
+    """
+    free = prior.freedom
+    axes = list(free.axes)
+    start = free.coordinates(poses.local(prior.center, factors[0].pose))
+    center = poses.retract(prior.center, free.embed(start))
+    for _ in range(2):  # the first centre is a few millimetres off, which changes the covariances by 1 %
+        precision: Any = 0.0
+        pull: Any = 0.0
+        for pose, covariance_at in factors:
+            own = torch.linalg.inv(covariance_at(center))[..., axes, :]
+            precision = precision + own[..., axes]
+            pull = pull + own @ poses.local(center, pose)[..., None]
+        covariance = torch.linalg.inv(precision)
+        center = poses.retract(center, free.embed((covariance @ pull)[..., 0]))
+    return NormalPose(center, 0.5 * (covariance + covariance.transpose(-1, -2)), free)
 
 
 def widened(center: Tensor, covariance: Tensor) -> MixturePose:
-    """A normal with centres (N, 7) and covariances (N, 6, 6), and a share of it wider."""
+    """A Gaussian with centres (N, 7) and covariances (N, 6, 6), mixed with a wider one."""
     alone = torch.zeros(1, dtype=torch.float64)
-    return widened_modes(Modes(center[..., None, :], covariance[..., None, :, :], alone))
+    return widened_mixture(GaussianMixture(center[..., None, :], covariance[..., None, :, :], alone))
 
 
-def widened_modes(modes: Modes) -> MixturePose:
-    """A mixture of M normals for each of N, (N, M, 7) and so on, and a share of each wider."""
-    centers, wide = modes.centers, WIDTHS[:, None, None] ** 2 * modes.covariances[..., None, :, :]
-    log_weights = modes.log_weights.log_softmax(dim=-1)[..., None] + SHARES.log()
+def widened_mixture(mixture: GaussianMixture) -> MixturePose:
+    """A mixture of M Gaussians for each of N particles, (N, M, 7) and so on, each mixed with a wider one."""
+    centers, wide = mixture.centers, WIDTHS[:, None, None] ** 2 * mixture.covariances[..., None, :, :]
+    log_weights = mixture.log_weights.log_softmax(dim=-1)[..., None] + SHARES.log()
     return MixturePose(
         log_weights.flatten(-2),
         centers[..., None, :].expand(*centers.shape[:-1], len(WIDTHS), 7).flatten(-3, -2),
@@ -49,23 +83,23 @@ def widened_modes(modes: Modes) -> MixturePose:
     )
 
 
-def matched(modes: MixturePose) -> NormalPose:
-    """The normal with the mean and the covariance of what `widened_modes` gives, but for the wider shares."""
+def matched(mixture: MixturePose) -> NormalPose:
+    """The Gaussian with the mean and covariance of a `widened_mixture`, its wider copies aside."""
     every = len(WIDTHS)
-    chances = modes.log_weights[..., ::every].softmax(dim=-1)
-    centers = modes.components.center[..., ::every, :]
-    covariances = modes.components.covariance[..., ::every, :, :]
+    probabilities = mixture.log_weights[..., ::every].softmax(dim=-1)
+    centers = mixture.components.center[..., ::every, :]
+    covariances = mixture.components.covariance[..., ::every, :, :]
     away = poses.local(centers[..., :1, :], centers)
-    mean = (chances[..., None] * away).sum(dim=-2)
+    mean = (probabilities[..., None] * away).sum(dim=-2)
     off = away - mean[..., None, :]
     covariance = covariances + off[..., :, None] * off[..., None, :]
     return NormalPose(
-        poses.retract(centers[..., 0, :], mean), (chances[..., None, None] * covariance).sum(dim=-3)
+        poses.retract(centers[..., 0, :], mean), (probabilities[..., None, None] * covariance).sum(dim=-3)
     )
 
 
-def within(prior: Any, normal: NormalPose) -> NormalPose | BoxedNormal:
-    """A normal (N,) cut off where a prior's box ends: near its border few draws would lie within."""
+def truncated(prior: Any, normal: NormalPose) -> NormalPose | BoxedNormal:
+    """A Gaussian (N,) truncated to a prior's box; near its border few draws would lie within."""
     if not bool((prior.widths > 0.0).all()):
         return normal
     low, high = prior.center[:3] - prior.widths, prior.center[:3] + prior.widths
@@ -73,7 +107,7 @@ def within(prior: Any, normal: NormalPose) -> NormalPose | BoxedNormal:
 
 
 def product(first: NormalPose, second: NormalPose) -> NormalPose:
-    """The normal that is like the product of two."""
+    """The Gaussian that approximates the product of two."""
     own, other = torch.linalg.inv(first.covariance), torch.linalg.inv(second.covariance)
     covariance = torch.linalg.inv(own + other)
     away = poses.local(first.center, second.center)
@@ -82,9 +116,9 @@ def product(first: NormalPose, second: NormalPose) -> NormalPose:
 
 
 def transport(first: Tensor, second: Tensor) -> Tensor:
-    """The symmetric matrix (d, d) that carries a normal with one covariance to another by the shortest ways.
+    """The optimal transport map (d, d) between zero-mean Gaussians with two covariances.
 
-    Points (..., d) about the mean are multiplied by it. Gaussian optimal transport: Olkin and Pukelsheim, The
+    Deviations (..., d) from the mean are multiplied by it. Source: Olkin and Pukelsheim, The
     distance between two random vectors with given dispersion matrices, Linear Algebra and its Applications
     48, 1982.
     """
@@ -100,7 +134,7 @@ def _root(matrix: Tensor) -> Tensor:
 
 
 def normal_like(prior: Any) -> NormalPose:
-    """A normal with about the spread of a prior that is uniform within limits."""
+    """A Gaussian with about the spread of a prior that is uniform within limits."""
     angle = getattr(prior, "angle", None)
     turns = [angle] * 3 if angle is not None else [prior.tilt, prior.tilt, prior.yaw]
     widths = torch.cat([torch.as_tensor(prior.widths), torch.tensor(turns, dtype=torch.float64)])
@@ -108,6 +142,6 @@ def normal_like(prior: Any) -> NormalPose:
 
 
 def allowed(prior: Any, there: Tensor) -> Tensor:
-    """Whether a prior allows poses (M, 7), or would if its limits were a third wider."""
+    """Whether poses (M, 7) lie in the prior's support, its limits widened by a third."""
     inwards = poses.retract(prior.center, 0.75 * poses.local(prior.center, there))
     return prior.log_prob(inwards) > -torch.inf

@@ -57,6 +57,7 @@ def _spread(mask: Tensor, like: Tensor) -> Tensor:
 class _Frame:
     available: Mapping[str, Entry]
     used: dict[str, Entry] = field(default_factory=dict)
+    shared: dict[str, Any] = field(default_factory=dict)
 
 
 _frame: ContextVar[_Frame | None] = ContextVar("bcppl_carried", default=None)
@@ -86,6 +87,23 @@ def carried(name: str, inputs: Tensor | tuple[Tensor, ...], start: Callable[[], 
         entry = Entry(inputs, start())
     frame.used[name] = entry
     return entry.state
+
+
+T = TypeVar("T")
+
+
+def once(name: str, make: Callable[[], T]) -> T:
+    """The value of `make()`, called the first time that one run of a program asks for this name.
+
+    For latent values that several measurements share: the first that needs them samples their sites.
+    """
+    frame = _frame.get()
+    if frame is None:
+        return make()
+    if name not in frame.shared:
+        frame.shared[name] = make()
+    value: T = frame.shared[name]
+    return value
 
 
 @contextmanager

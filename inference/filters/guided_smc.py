@@ -1,21 +1,23 @@
-"""SMC in which the model's own programs take measurements in, and moves repair what they do not know.
+"""SMC guided by a Gaussian approximation of the posterior, with tempering where the approximation is poor.
 
-A program that goes straight to where the new measurement says that the part is, weighed by SMCP3
-(`smcp3`), spares the many small steps by which tempering lets a sharp likelihood in. Where
-such a step leaves too few particles with weight, it is undone and the likelihood is tempered in.
+A measurement is assimilated by SMCP3: a forward kernel moves particles to where the approximation places the
+part given the new measurement, and the weights correct for it. That spares the many small steps by which
+tempering assimilates a sharp likelihood. Where too few particles keep weight, the step is undone and the
+likelihood is tempered.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.errors import InferenceError, InputError
+from bcppl.errors import NoWeightError
+from bcppl.inference.approximation import GaussianApproximation
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair, smcp3
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
@@ -24,33 +26,82 @@ from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence
 from bcppl.inference.kernels.kernel import Move
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Program, drift
+from bcppl.inference.proposals.approximated import (
+    backward_kernel,
+    conditional_proposal,
+    forward_kernel,
+    joint_random_walk,
+)
 from bcppl.inference.proposals.together import continuous
 from bcppl.inference.resampling import adaptive, never, systematic
 from bcppl.inference.sizing import replicated
 from bcppl.inference.targets import POSTERIOR
-from bcppl.traces import Model, extend
+from bcppl.traces import Model, Trace, extend
 
 WALK = (0.2, 2.0)  # scales of the random walks
-CERTAIN = 0.01  # nats: what is expected for sure tells nothing
-ASKED = 4  # particles that are asked first whether all had to expect a measurement
+CERTAIN = 0.01  # nats: a log-likelihood as small for all particles carries no information
+ASKED = 4  # particles that are evaluated first for that
 
 
-def kernel(pose: str, proposals: Sequence[Program]) -> Kernel:
-    """One other latent value walks, then the pose is drawn anew by the model's proposals, then it walks."""
+class Approximation(Protocol):
+    """What guides the filter; `GaussianApproximation` is one. It is immutable."""
+
+    def including(
+        self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]
+    ) -> Any:
+        """The approximation given one more measurement."""
+
+    def deferring(
+        self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]
+    ) -> Any:
+        """The same for a measurement that all particles predict with certainty."""
+
+    def updated(self) -> Any:
+        """The approximation with all that was deferred."""
+
+
+class Programs(Protocol):
+    """The proposals that go with an approximation; `GaussianPrograms` are those of a Gaussian one."""
+
+    def pair(self, before: Any, after: Any, action: Any) -> Pair:
+        """Forward and backward kernels of one measurement."""
+
+    def proposals(self, approximation: Any) -> Sequence[Program]:
+        """Proposals of Metropolis-Hastings moves."""
+
+
+class GaussianPrograms:
+    """The proposals of a Gaussian approximation."""
+
+    def pair(self, before: Any, after: Any, action: Any) -> Pair:  # noqa: D102
+        return Pair(forward_kernel(before, after, action), backward_kernel(before, after, action))
+
+    def proposals(self, approximation: Any) -> Sequence[Program]:  # noqa: D102
+        return conditional_proposal(approximation), joint_random_walk(approximation)
+
+
+def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]]) -> Kernel:
+    """A random walk of one other latent value, the approximation's proposals, and a random walk of the pose.
+
+    Args:
+        pose: its address.
+        proposals: those that go with the approximation that the population carries.
+    """
 
     def moved(population: Population) -> Move:
         others = [address for address in continuous(population.trace) if address != pose]
         walks = [metropolis_hastings(drift(other, WALK)) for other in others]
-        given = [metropolis_hastings(proposal) for proposal in proposals]
-        # One for all: drawn for each particle, every walk would have to run.
+        guided = [metropolis_hastings(proposal) for proposal in proposals(population.approximation)]
+        # One for all: chosen for each particle, every walk would have to run.
         chosen = [walks[int(torch.randint(len(walks), ()))]] if walks else []
-        return sequence([*chosen, *given, metropolis_hastings(drift(pose, WALK))])(population)
+        return sequence([*chosen, *guided, metropolis_hastings(drift(pose, WALK))])(population)
 
     return moved
 
 
 def guided(
-    pair: Pair,
+    start: Callable[[Any], Approximation],
+    programs: Programs,
     moves: Kernel,
     *,
     sweeps: int = 1,
@@ -60,59 +111,57 @@ def guided(
     least: float = 0.03,
     room: int = 40_000,
 ) -> StepFunction:
-    """A step that takes a measurement in by a pair of programs, resamples when needed, and moves.
+    """A step that assimilates a measurement by SMCP3, resamples when needed, and moves the particles.
 
     Args:
-        pair: there and back.
+        start: the approximation before any measurement, given the program's first argument.
+        programs: the kernels and proposals that go with it.
         moves: of every particle after each step.
         sweeps: how many of them.
         share: particles are resampled below this effective sample size, as a share of N.
-        few: so many are to be left effective by the pair, as a share of N.
-        most: it is run anew with more copies of each particle, as many as seem needed and at most so many,
-            until they are; N of all are kept.
-        least: where even with `most` copies fewer would be left effective, as a share of N, the measurement
-            is tempered in.
-        room: so many copies in all at most: memory and time grow with them.
+        few: the effective sample size that SMCP3 is to leave, as a share of N.
+        most: where it does not, it is run again with more copies of each particle, as many as seem needed and
+            at most so many; N of all are kept.
+        least: where even with `most` copies the effective sample size would be smaller, as a share of N, the
+            measurement is tempered.
+        room: at most so many copies in all: memory and time grow with them.
     """
-    by_pair = smcp3(pair, resample=never)
     resample = adaptive(systematic, share)
     rejuvenation = resample_move(moves, sweeps, resample, always_move=True)
     by_tempering = tempered(moves, sweeps=2 * sweeps, resample=resample)
 
-    def weighed(population: Population, observed: Observed) -> Population | None:
-        try:
-            return by_pair(population, observed).population
-        except InferenceError:
-            return None
-
-    def as_expected(population: Population, observed: Observed) -> Population | None:
-        """The particles as they are, where all had to expect the measurement and nothing latent comes."""
-        alive = (population.log_weights > -torch.inf).nonzero()[:, 0]
-        few = population.trace.chosen(alive[:ASKED])
-        with torch.random.fork_rng(devices=[]):
-            asked, gained = extend(few, *observed)
-        if len(asked.choices) == len(few.choices) and not bool((gained.abs() < CERTAIN).all()):
-            return None  # mostly so, and a few are asked in no time
-        longer, gained = extend(population.trace, *observed)
-        if len(longer.choices) > len(population.trace.choices):
-            return None
-        certain = bool((gained[alive].abs() < CERTAIN).all())
-        return population.with_trace(longer).reweighed(gained) if certain else None
-
     def step(population: Population, observed: Observed) -> Stepped:
-        count = len(population)
-        chosen: Tensor | None = None
-        stayed = as_expected(population, observed)
-        if stayed is not None:
+        scene, actions = observed.args
+        known = population.trace.observations
+        newest = (scene, len(actions) - 1, actions[-1], {**known, **observed.observations})
+        before = population.approximation
+        if before is None:
+            before = _given_all(start(scene), population.trace, actions[:-1])
+        certain = _certain(population, observed)
+        if certain is not None:
+            stayed = certain.with_approximation(before.deferring(*newest))
             return Stepped(stayed, _info(population, stayed, stayed.effective_sample_size))
+        before = before.updated()
+        after = before.including(*newest)
+        by_pair = smcp3(programs.pair(before, after, actions[-1]), resample=never)
+
+        def weighted(population: Population) -> Population | None:
+            try:
+                return by_pair(population, observed).population
+            except NoWeightError:
+                return None
+
+        count = len(population)
+        population = population.with_approximation(after)
+        chosen: Tensor | None = None
         times, goal = 1, few * count
         allowed = max(1, min(most, room // count))
-        reached = weighed(population, observed)
+        reached = weighted(population)
         while times < allowed and (reached is None or reached.effective_sample_size < goal):
             each = 0.0 if reached is None else reached.effective_sample_size / times
-            # Effective sizes are often taken for too large: ask for more than would just do.
+            # The estimate is often too large: ask for more copies than would just do.
             times = min(allowed, max(2 * times, math.ceil(1.5 * goal / max(each, goal / most))))
-            reached = weighed(replicated(population, times), observed)
+            reached = weighted(replicated(population, times))
         if reached is None or reached.effective_sample_size < least * count * times / most:
             return by_tempering(population, observed)
         effective = reached.effective_sample_size
@@ -126,6 +175,28 @@ def guided(
         return Stepped(moved, _info(population, moved, effective, acceptance, ancestors))
 
     return step
+
+
+def _given_all(approximation: Any, trace: Trace, actions: Sequence[Any]) -> Any:
+    """The approximation given the measurements that a trace already holds."""
+    for number, action in enumerate(actions):
+        approximation = approximation.including(trace.args[0], number, action, trace.observations)
+    return approximation
+
+
+def _certain(population: Population, observed: Observed) -> Population | None:
+    """The particles as they are, where all predict the measurement with certainty; None where not."""
+    alive = (population.log_weights > -torch.inf).nonzero()[:, 0]
+    few = population.trace.chosen(alive[:ASKED])
+    with torch.random.fork_rng(devices=[]):
+        longer, gained = extend(few, *observed)
+    if len(longer.choices) == len(few.choices) and not bool((gained.abs() < CERTAIN).all()):
+        return None  # the usual case, decided by a few particles
+    longer, gained = extend(population.trace, *observed)
+    if len(longer.choices) > len(population.trace.choices):
+        return None
+    certain = bool((gained[alive].abs() < CERTAIN).all())
+    return population.with_trace(longer).reweighed(gained) if certain else None
 
 
 def _info(
@@ -156,28 +227,29 @@ def infer(
     scene: Any = None,
     start: Step | None = None,
 ) -> Iterator[Step]:
-    """Beliefs over a recording, one step for each measurement, the prior first.
+    """Beliefs over a recording: first the prior's, then one step for each measurement.
 
     Args:
-        model: what explains the recording; it has an `arrival`.
+        model: its scene is one of sensors (`bcppl.sensors.Scene`).
         recording: a `bcppl.recordings.Recording`.
-        particles: how many.
+        particles: N.
         seed: same seed, same beliefs.
         sweeps: moves of every particle after each measurement.
         share: particles are resampled below this effective sample size, as a share of N.
-        scene: what `model.prepare(recording)` gives, if it is at hand.
-        start: a step to go on from, as `bcppl.inference.filters.smc.smc` does.
+        scene: `model.prepare(recording)` unless given.
+        start: a step to continue from, as for `bcppl.inference.smc`.
 
     Raises:
-        InputError: a number is out of range, or the model brings no `arrival`.
+        InputError: a number is out of range, or the model's scene is not made of sensors.
     """
     particles = whole_number("SMC is to run {} particles", particles)
     sweeps = whole_number("SMC is to make {} sweeps", sweeps)
     share = number_within("particles are to be resampled below a share of {}", share, least=0.0, most=1.0)
-    if model.arrival is None:
-        raise InputError(
-            "guided SMC is given a model without programs that take measurements in; give it an `arrival`, "
-            "or use bcppl.inference.filters.tempered_smc."
-        )
-    step = guided(Pair(*model.arrival), kernel(model.pose, model.proposals), sweeps=sweeps, share=share)
+    programs = GaussianPrograms()
+
+    def gaussian(scene: Any) -> GaussianApproximation:
+        return GaussianApproximation(model.pose, scene)
+
+    moves = kernel(model.pose, programs.proposals)
+    step = guided(gaussian, programs, moves, sweeps=sweeps, share=share)
     return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)

@@ -1,0 +1,80 @@
+"""Capabilities that a likelihood may have beyond its sites; filters and rankings ask for them by protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+from torch import Tensor
+
+from bcppl.distributions.pose_normals import PoseFactor
+from bcppl.distributions.poses import NormalPose
+
+
+class Approximated(NamedTuple):
+    """A measurement of which an approximation is made.
+
+    Attributes:
+        number: in the recording.
+        action: what the robot did.
+        value: observed at its address.
+    """
+
+    number: int
+    action: Any
+    value: Tensor
+
+
+@runtime_checkable
+class FitsPose(Protocol):
+    """An instrument with nuisance parameters: a measurement is approximated by a Gaussian over both."""
+
+    def instrument(self, action: Any) -> str:
+        """The name of the instrument; all its measurements share its nuisance parameters."""
+
+    def fit(self, number: int, action: Any, observations: Mapping[str, Tensor]) -> Any:
+        """A Gaussian approximation of one measurement's likelihood."""
+
+    def factor(self, action: Any, values: Mapping[str, Tensor]) -> PoseFactor:
+        """The Gaussian over the part's pose (N, 7), given the nuisance parameters' values by address."""
+
+    def marginal_factor(self, action: Any, fit: Any) -> PoseFactor:
+        """The Gaussian over the part's pose (1, 7), the nuisance parameters integrated out."""
+
+    def brings_nuisances(self, action: Any, trace: Any) -> bool:
+        """Whether the measurement comes with nuisance parameters that a trace does not yet have."""
+
+    def propose(self, action: Any, fit: Any, part: NormalPose | None) -> Mapping[str, Tensor]:
+        """Sample the nuisance parameters, given the part's pose (N, 7); None where it is known by nothing."""
+
+    def accompany(
+        self, action: Any, fit: Any, trace: Any, old: Tensor, new: Tensor, correlation: float
+    ) -> None:
+        """Sample the nuisance parameters that fit a part that moves from (N, 7) to (N, 7)."""
+
+
+@runtime_checkable
+class Linearised(Protocol):
+    """Sites with a quadratic approximation around any pose of the part (`quadratic`), and none of their own."""
+
+    def address(self, number: int) -> str:
+        """The address of a measurement's site."""
+
+    def sites(
+        self, measurements: Sequence[Approximated], part: Tensor, blur: float
+    ) -> Iterator[tuple[Any, Tensor]]:
+        """Each measurement's likelihood at poses (S, 7), errors `blur` metres wider, and its value."""
+
+
+@runtime_checkable
+class Contacts(Protocol):
+    """Measurements that are informative only near the part, and several of whose explanations may fit."""
+
+    def is_informative(self, action: Any, value: Tensor, part: Tensor) -> bool:
+        """Whether a measurement depends on the part's pose at all, near poses (M, 7)."""
+
+    def new_contact(self, measurements: Sequence[Approximated], newest: bool) -> bool:
+        """Whether contact begins in one of the measurements, or in the newest of them."""
+
+    def heading(self, measurements: Sequence[Approximated]) -> Tensor | None:
+        """The direction (3,) of motion when contact last began; None without contact."""

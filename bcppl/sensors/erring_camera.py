@@ -1,0 +1,305 @@
+"""Likelihood of depth images by cameras whose extrinsics are in error and whose ranges are biased."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.arguments import number_within, whole_number
+from bcppl.distributions.depth import RobustDepth
+from bcppl.distributions.fitted import FittedNormal, fitted_normal
+from bcppl.distributions.pose_normals import PoseFactor, allowed, normal_like, product, widened
+from bcppl.distributions.poses import NormalPose
+from bcppl.effort import Effort
+from bcppl.errors import InputError
+from bcppl.geometry.camera import Camera, bin_depth
+from bcppl.rendering.region import region_of
+from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.stated_cameras import apparent_covariance, line_of_sight, seen_elsewhere
+from bcppl.sensors.measurements import Recording, View
+from bcppl.sensors.scene import Numbered
+from bcppl.traces.carried import once
+
+# The Gaussian fit of an image is no sharper than this: metres, radians, metres of bias.
+SHARPEST = torch.tensor([5e-5] * 3 + [1e-3] * 3 + [1e-4], dtype=torch.float64)
+_WIDER = 1.3  # standard deviations of a proposed bias, in those of the fit
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """Prior standard deviations of a camera's errors, and the noise of its pixels.
+
+    Attributes:
+        camera_shift, camera_turn: standard deviations of the error of a camera's stated pose, along and about
+            each of its axes, metres and radians: those that an extrinsic calibration reports.
+        bias: standard deviation of the bias of a camera's range, metres.
+        scale: of the Laplace noise of a pixel, metres.
+        outlier: the probability that a pixel does not show the part that is rendered there.
+        bins: the side of the square of pixels that is replaced by its median.
+        effective_pixels: number of independent pixels that an image is worth; None for all of them. The
+            errors carry what all pixels have in common, not what neighbours at an edge have.
+        temperature: the divisor of an image's log-likelihood, instead of `effective_pixels`.
+    """
+
+    camera_shift: float = 0.002
+    camera_turn: float = math.radians(0.5)
+    bias: float = 0.002
+    scale: float = 0.002
+    outlier: float = 0.1
+    bins: int = 3
+    effective_pixels: float | None = 100.0
+    temperature: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("camera_shift", "camera_turn", "bias", "scale"):
+            number_within(
+                f"a site's spread must be positive and {name} is {{}}", getattr(self, name), above=0.0
+            )
+        whole_number("a camera's images are read with bins {}", self.bins)
+
+
+class Look(NamedTuple):
+    """The pixels of a camera's images that count.
+
+    Attributes:
+        region: left, top, width and height of where the part may be, pixels.
+        camera: of that region, binned.
+    """
+
+    region: tuple[int, int, int, int]
+    camera: Camera
+
+
+class Instrument(NamedTuple):
+    """One camera, which has the same errors in all its images, also of one on a wrist.
+
+    Attributes:
+        camera: where it took its first image.
+        apparent: (N, 7) where it measures the part, range bias included, if its stated pose is taken as true.
+        bias: (N,) of its range, metres.
+    """
+
+    camera: Camera
+    apparent: Tensor
+    bias: Tensor
+
+
+class ErringCamera:
+    """Depth images by cameras whose stated poses are in error and whose ranges are biased.
+
+    A camera's error is not sampled as such but as the pose at which the camera, were its stated pose true,
+    sees the part (`seen_by_*`). The image determines that pose whatever the error is, so particles need not
+    follow a ridge; both parametrisations are the same model. One error and one bias (`bias_*`) is shared by
+    all images of an instrument.
+
+    Args:
+        recording: its part, guess and views.
+        prior: of the part's pose.
+        settings: of the cameras.
+
+    Raises:
+        InputError: a camera cannot see the part near its guess.
+    """
+
+    def __init__(self, recording: Recording, prior: Any, settings: CameraSettings) -> None:
+        self.settings, self.prior = settings, prior
+        self.renderer = DepthRenderer(recording.part)
+        self.looks: dict[str, Look] = {}
+        within = float(np.linalg.norm(recording.guess.translation))
+        for view in (m.action for m in recording.measurements if isinstance(m.action, View)):
+            if view.camera.name not in self.looks:
+                camera, bins = view.camera, settings.bins
+                region = region_of(camera, recording.part, recording.guess.world_from_part, within, bins)
+                self.looks[camera.name] = Look(region, camera.cropped(*region).binned(bins))
+
+    @property
+    def efforts(self) -> Mapping[str, Effort]:
+        """The cost of rendering."""
+        return {"rendering": self.renderer.effort}
+
+    def camera(self, action: View) -> Camera:
+        """The cropped and binned camera of a view.
+
+        Raises:
+            InputError: the scene was prepared without views of this camera.
+        """
+        try:
+            return self.looks[action.camera.name].camera
+        except KeyError:
+            raise InputError(
+                f"the scene was prepared without camera {action.camera.name!r}; prepare it with a recording "
+                "that holds a view of it."
+            ) from None
+
+    # ---- the program's sites
+
+    def observe(self, number: int, action: View, world_from_part: Tensor) -> None:
+        """Sample `depth_*`, and with an instrument's first image its `bias_*` and `seen_by_*`."""
+        camera = self.camera(action)
+        name = action.camera.instrument
+        first = once(f"instrument {name}", partial(self._instrument, name, camera, world_from_part))
+        there = without_bias(first.camera, first.apparent, first.bias)
+        if camera.name != first.camera.name:
+            there = seen_elsewhere(first.camera, camera, world_from_part, there)
+        pyro.sample(f"depth_{number}", self.image(camera, there, first.bias))
+
+    def _instrument(self, name: str, camera: Camera, part: Tensor) -> Instrument:
+        bias = pyro.sample(
+            f"bias_{name}", dist.Normal(torch.zeros((), dtype=torch.float64), self.settings.bias)
+        )
+        apparent = pyro.sample(f"seen_by_{name}", self._apparent(camera, part, bias))
+        return Instrument(camera, apparent, bias)
+
+    def _apparent(self, camera: Camera, part: Tensor, bias: Tensor) -> NormalPose:
+        """The distribution of where a camera with a bias (N,) measures a part at poses (N, 7)."""
+        settings = self.settings
+        error = apparent_covariance(camera, part, settings.camera_shift, settings.camera_turn)
+        return NormalPose(with_bias(camera, part, bias), error)
+
+    def image(self, camera: Camera, there: Tensor, bias: Tensor | float) -> RobustDepth:
+        """The likelihood of an image by a camera with a bias (N,) of a part at poses (N, 7)."""
+        settings = self.settings
+        return RobustDepth(
+            self.renderer,
+            camera,
+            there,
+            scale=settings.scale,
+            outlier=settings.outlier,
+            effective_pixels=settings.effective_pixels,
+            temperature=settings.temperature,
+            bias=bias,
+        )
+
+    def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
+        """The cropped and binned images, by address."""
+        values = {}
+        for number, (view, image) in ((n, (m.action, m.observation)) for n, m in measurements):
+            camera = view.camera
+            self.camera(view)
+            left, top, width, height = self.looks[camera.name].region
+            region = image.depth[top : top + height, left : left + width]
+            binned = bin_depth(region, self.settings.bins, near=camera.near, far=camera.far)
+            values[f"depth_{number}"] = torch.from_numpy(binned)
+        return values
+
+    # ---- a Gaussian approximation of an image's likelihood (`bcppl.sensors.capabilities.FitsPose`)
+
+    def instrument(self, action: View) -> str:
+        """The name of the instrument, which has one error for all its measurements."""
+        return action.camera.instrument
+
+    def fit(self, number: int, action: View, observations: Mapping[str, Tensor]) -> FittedNormal:
+        """A Gaussian over the apparent pose, in the tangent space at the prior's centre, and the bias (7,)."""
+        camera, prior, image = self.camera(action), self.prior, observations[f"depth_{number}"]
+
+        def log_density(point: Tensor) -> Tensor:
+            seen, bias = poses.retract(prior.center, point[:, :6]), point[:, 6]
+            image_here = self.image(camera, without_bias(camera, seen, bias), bias).log_prob(image)
+            return torch.where(allowed(prior, seen), image_here, -torch.inf)
+
+        spread = normal_like(prior).covariance.diagonal().sqrt()
+        bias = torch.tensor([self.settings.bias], dtype=torch.float64)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)  # a fit depends on the image alone
+            return fitted_normal(log_density, torch.cat([spread, bias]), SHARPEST)
+
+    def factor(self, action: View, values: Mapping[str, Tensor]) -> PoseFactor:
+        """The Gaussian over the part's pose, given where its camera measures it (N, 7) and its bias (N,)."""
+        name, camera = action.camera.instrument, self.camera(action)
+        there = without_bias(camera, values[f"seen_by_{name}"], values[f"bias_{name}"])
+        return PoseFactor(there, self._covariance(camera))
+
+    def marginal_factor(self, action: View, fit: FittedNormal) -> PoseFactor:
+        """The Gaussian over the part's pose (1, 7), given a fit of an image."""
+        camera, points = self.camera(action), fit.sigma_points()
+        seen, bias = poses.retract(self.prior.center, points[:, :6]), points[:, 6]
+        # Where the image leaves the part's pose open, so does the approximation.
+        parts = without_bias(camera, seen, bias)
+        away = poses.local(parts[:1], parts[1:])
+        return PoseFactor(parts[:1], self._covariance(camera, 0.5 * away.T @ away))
+
+    def _covariance(self, camera: Camera, more: Tensor | float = 0.0) -> Any:
+        settings = self.settings
+
+        def covariance(center: Tensor) -> Tensor:
+            error = apparent_covariance(camera, center, settings.camera_shift, settings.camera_turn)
+            return error + more
+
+        return covariance
+
+    # ---- proposals of the nuisance parameters
+
+    def brings_nuisances(self, action: View, trace: Any) -> bool:
+        """Whether this is the first image of its instrument."""
+        return f"seen_by_{action.camera.instrument}" not in trace
+
+    def propose(self, action: View, fit: FittedNormal, part: NormalPose | None) -> Mapping[str, Tensor]:
+        """Sample the nuisance parameters from their approximate conditional.
+
+        Args:
+            action: the first view of its instrument.
+            fit: of its image.
+            part: the part's pose given all measurements before, (N, 7); None where there are none.
+        """
+        name, camera = action.camera.instrument, self.camera(action)
+        bias = pyro.sample(f"bias_{name}", dist.Normal(fit.mean[6], _WIDER * fit.covariance[6, 6].sqrt()))
+        around = self._given_bias(fit, bias)
+        if part is not None:
+            seen = self._apparent(camera, part.center, bias)
+            around = product(around, NormalPose(seen.center, part.covariance + seen.covariance))
+        covariance = around.covariance.expand(len(bias), 6, 6)
+        return {
+            f"bias_{name}": bias,
+            f"seen_by_{name}": pyro.sample(f"seen_by_{name}", widened(around.center, covariance)),
+        }
+
+    def accompany(
+        self, action: View, fit: FittedNormal, trace: Any, old: Tensor, new: Tensor, correlation: float
+    ) -> None:
+        """Sample the apparent pose for a part that moves, at the same quantile of its conditional.
+
+        Contacts move the part by more than a camera's error; what the image leaves open has to follow.
+
+        Args:
+            action: the first view of its instrument.
+            fit: of its image.
+            trace: of the particles as they are.
+            old: (N, 7) the part's pose in it.
+            new: (N, 7) the part's proposed pose.
+            correlation: of the standardised deviation from the conditional mean with that before.
+        """
+        name, camera = action.camera.instrument, self.camera(action)
+        bias = trace[f"bias_{name}"]
+        seen = self._given_bias(fit, bias)
+        before, after = (product(seen, self._apparent(camera, part, bias)) for part in (old, new))
+        away = poses.local(before.center, trace[f"seen_by_{name}"])
+        center = poses.retract(after.center, correlation * away)
+        pyro.sample(f"seen_by_{name}", NormalPose(center, (1.0 - correlation**2) * after.covariance))
+
+    def _given_bias(self, fit: FittedNormal, bias: Tensor) -> NormalPose:
+        """The apparent pose, given an image and the bias (N,)."""
+        own, both = fit.covariance[6, 6], fit.covariance[:6, 6]
+        off = fit.mean[:6] + (bias - fit.mean[6])[:, None] * both / own
+        covariance = fit.covariance[:6, :6] - torch.outer(both, both) / own
+        return NormalPose(poses.retract(self.prior.center, off), covariance)
+
+
+def with_bias(camera: Camera, part: Tensor, bias: Tensor) -> Tensor:
+    """The apparent pose (..., 7) of a part (..., 7) when a bias (...,) in metres is added to the ranges."""
+    moved = part[..., :3] + bias[..., None] * line_of_sight(camera, part)
+    return torch.cat([moved, part[..., 3:]], dim=-1)
+
+
+def without_bias(camera: Camera, seen: Tensor, bias: Tensor) -> Tensor:
+    """The pose (..., 7) of a part that is measured at (..., 7) with a bias (...,) in metres."""
+    return with_bias(camera, seen, -bias)

@@ -1,0 +1,121 @@
+"""A scene: the prior of a part's pose, and a likelihood for each kind of measurement of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+from torch import Tensor
+
+from bcppl.effort import Effort
+from bcppl.errors import InputError
+from bcppl.sensors.measurements import Measurement, Recording
+from bcppl.sensors.protocol import kind_of, sensor_named
+
+
+class Numbered(NamedTuple):
+    """A measurement and its number in the recording, from 0; addresses end with it."""
+
+    number: int
+    measurement: Measurement
+
+
+class Likelihood(Protocol):
+    """The likelihood of one kind of measurement, prepared from one recording.
+
+    Capabilities that a filter or a ranking asks for by protocol are in `bcppl.sensors.capabilities`.
+    """
+
+    def observe(self, number: int, action: Any, world_from_part: Tensor) -> None:
+        """Sample the sites of one measurement, and its nuisance parameters with the first that needs them.
+
+        Args:
+            number: of the measurement in the recording; addresses end with it.
+            action: what the robot did.
+            world_from_part: (N, 7).
+        """
+
+    def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
+        """The observed values of these measurements, by address."""
+
+    @property
+    def efforts(self) -> Mapping[str, Effort]:
+        """The cumulative cost of each simulator, by name."""
+
+
+Prepare = Callable[[Recording], Likelihood | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What stays the same over a run.
+
+    Attributes:
+        prior: of the part's pose.
+        likelihoods: by kind of measurement.
+        model: the model's name, for messages.
+    """
+
+    prior: Any
+    likelihoods: Mapping[str, Likelihood]
+    model: str
+
+    def sensor(self, action: Any) -> Any:
+        """The likelihood of measurements that were made by an action of this kind.
+
+        Raises:
+            InputError: the model does not explain this kind of measurement.
+        """
+        kind = kind_of(action)
+        if kind not in self.likelihoods:
+            raise InputError(
+                f"{self.model} does not explain a measurement of kind {kind!r}; choose another model "
+                f"(it explains {', '.join(self.likelihoods) or 'none here'})."
+            )
+        return self.likelihoods[kind]
+
+    def observed(self, measurements: Sequence[Measurement]) -> dict[str, Tensor]:
+        """The observed values of a recording's first measurements, by address.
+
+        Raises:
+            InputError: the model does not explain a measurement.
+        """
+        by_kind: dict[str, list[Numbered]] = {}
+        for number, measurement in enumerate(measurements):
+            self.sensor(measurement.action)
+            by_kind.setdefault(kind_of(measurement.action), []).append(Numbered(number, measurement))
+        return {
+            address: value
+            for kind, numbered in by_kind.items()
+            for address, value in self.likelihoods[kind].observed(numbered).items()
+        }
+
+    @property
+    def efforts(self) -> Mapping[str, Effort]:
+        """The cumulative cost of each simulator, by name."""
+        return {name: effort for each in self.likelihoods.values() for name, effort in each.efforts.items()}
+
+
+S = TypeVar("S", bound=Scene)
+
+
+def likelihoods_for(
+    recording: Recording, chosen: Mapping[str, Prepare], only: bool = False
+) -> dict[str, Likelihood]:
+    """A likelihood for each kind of measurement.
+
+    Args:
+        recording: what was measured.
+        chosen: by kind, how this model prepares its likelihood; None from it where the recording lacks what
+            the kind needs.
+        only: leave out the kinds that are not chosen; otherwise those in the recording get the default of
+            their sensor.
+    """
+    prepared = {kind: prepare(recording) for kind, prepare in chosen.items()}
+    if not only:
+        for kind in dict.fromkeys(kind_of(m.action) for m in recording.measurements):
+            default = getattr(sensor_named(kind), "prepare", None)
+            if kind not in prepared and default is not None:
+                prepared[kind] = default(recording)
+    return {kind: each for kind, each in prepared.items() if each is not None}

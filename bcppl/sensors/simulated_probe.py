@@ -1,0 +1,123 @@
+"""Likelihood of a compliant probe by contact physics: BayesContact's Chamfer surrogate and the peg's pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import pyro
+from torch import Tensor
+
+from bcppl.arguments import number_within, whole_number
+from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.physics import PegPhysics
+from bcppl.contact.track import ContactTrack
+from bcppl.contact.unknowns import Unknowns
+from bcppl.contact.wrench import Sensing
+from bcppl.distributions.contact import ChamferContacts, PegPose
+from bcppl.effort import Effort
+from bcppl.errors import InputError
+from bcppl.robot.motion import ProbeWindow
+from bcppl.sensors.measurements import Recording
+from bcppl.sensors.scene import Numbered
+from bcppl.traces import carried
+
+# The contact that inference assumes. Worlds that simulate recordings have parameters of their own.
+CONTACT = ContactParameters(time_step=0.004, friction=0.3, time_constant=0.008)
+
+
+@dataclass(frozen=True)
+class ProbeSettings:
+    """Noise of a simulated probe.
+
+    Attributes:
+        contact_scale: sigma of the Chamfer surrogate, metres.
+        one_empty: its cost where only one of the two point sets is empty, square metres.
+        translation_scale, rotation_scale: standard deviations of the peg's pose, metres and radians: the
+            error of the physics' friction and stiffness, larger than the sensor's noise.
+        pose_every: stride of the stamps at which the peg's pose counts.
+        contact: parameters of the physics.
+    """
+
+    contact_scale: float = 0.003
+    one_empty: float = 2.0 * 0.005**2
+    translation_scale: float = 0.0007
+    rotation_scale: float = 0.005
+    pose_every: int = 25
+    contact: ContactParameters = CONTACT
+
+    def __post_init__(self) -> None:
+        for name in ("contact_scale", "translation_scale", "rotation_scale"):
+            number_within(
+                f"a site's spread must be positive and {name} is {{}}", getattr(self, name), above=0.0
+            )
+        number_within("a simulated probe is given one_empty {}", self.one_empty, least=0.0)
+        whole_number("a simulated probe is given pose_every {}", self.pose_every)
+
+
+class SimulatedProbe:
+    """Windows of a probe, simulated for every pose of the part; windows of one probe share one rollout.
+
+    Each window has two sites: `contacts_*`, the contact locations in the peg's frame (a surrogate), and
+    `peg_*`, its pose (a density). A window without contact is evidence that nothing was in the way.
+
+    Args:
+        recording: its part, peg and probes.
+        settings: of the probe.
+
+    Raises:
+        InputError: the recording has no peg, or the part cannot be touched in simulation.
+    """
+
+    def __init__(self, recording: Recording, settings: ProbeSettings) -> None:
+        if recording.peg is None:
+            raise InputError("the recording has probe windows but no peg; add the peg that was held.")
+        windows = [m.action for m in recording.measurements if isinstance(m.action, ProbeWindow)]
+        self.settings = settings
+        self.physics = PegPhysics(recording.part, recording.peg, settings.contact)
+        rate = 1.0 / float(np.median(np.diff(windows[0].probe.stamps)))
+        self.sensing = Sensing(recording.peg, rate=rate)
+
+    @classmethod
+    def prepare(cls, recording: Recording, settings: ProbeSettings) -> SimulatedProbe | None:
+        """The likelihood of a recording's probes; None for one without."""
+        touched = any(isinstance(m.action, ProbeWindow) for m in recording.measurements)
+        return cls(recording, settings) if touched else None
+
+    @property
+    def efforts(self) -> Mapping[str, Effort]:
+        """The cost of physics."""
+        return {"physics": self.physics.effort}
+
+    def observe(
+        self, number: int, action: ProbeWindow, world_from_part: Tensor, unknowns: Unknowns | None = None
+    ) -> None:
+        """Sample `contacts_*` and `peg_*`, given nuisance parameters of the contact."""
+        settings, own = self.settings, () if unknowns is None else (unknowns,)
+        begin = partial(
+            ContactTrack.start, self.physics, self.sensing, world_from_part, action.probe, *own
+        )
+        inputs = (world_from_part, *(() if unknowns is None else unknowns.tensors))
+        track = carried(f"probe {action.probe.name}", inputs, begin)
+        window = (track, action.first, action.last)
+        pyro.sample(
+            f"contacts_{number}", ChamferContacts(*window, settings.contact_scale, settings.one_empty)
+        )
+        peg = PegPose(
+            *window, settings.translation_scale, settings.rotation_scale, every=settings.pose_every
+        )
+        pyro.sample(f"peg_{number}", peg)
+
+    def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
+        """Contact locations and peg poses, by address; each probe's wrench is filtered whole."""
+        by_probe: dict[str, list[Numbered]] = {}
+        for each in measurements:
+            by_probe.setdefault(each.measurement.action.probe.name, []).append(each)
+        values: dict[str, Tensor] = {}
+        for windows in by_probe.values():
+            read = self.sensing.measure([measurement.observation for _, measurement in windows])
+            for (number, _), (contacts, peg) in zip(windows, read, strict=True):
+                values[f"contacts_{number}"], values[f"peg_{number}"] = contacts, peg
+        return values

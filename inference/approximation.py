@@ -1,0 +1,223 @@
+"""A Gaussian approximation of the posterior of a part's pose, carried by a population from step to step.
+
+An image is approximated by a Gaussian over the pose at which its camera sees the part and the camera's bias;
+contacts and ranges by the quadratic approximation of their likelihood around its modes. It guides proposals
+only: the target never depends on it. It is immutable, and `including` a measurement gives a new one, so that
+a run that is resumed, branched or repeated gives the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bcppl.distributions.mixture import MixturePose
+from bcppl.distributions.pose_normals import (
+    GaussianMixture,
+    PoseFactor,
+    matched,
+    normal_like,
+    product_of_factors,
+    truncated,
+    widened_mixture,
+)
+from bcppl.errors import InputError
+from bcppl.inference.laplace import Normal, QuadraticApproximation, quadratic_approximation
+from bcppl.sensors.capabilities import Approximated, Contacts, FitsPose, Linearised
+
+UNSURE = 0.0005  # m: beyond this standard deviation the contact may be with another place of the part
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """The fit of an instrument's first measurement.
+
+    Attributes:
+        action: of the measurement.
+        fit: a Gaussian over the apparent pose and the nuisance parameters.
+    """
+
+    action: Any
+    fit: Any
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianApproximation:
+    """The posterior given some measurements, as a mixture of Gaussians.
+
+    Attributes:
+        pose: the address of the part's pose.
+        scene: of the model; it has the prior and the sensors' likelihoods.
+        fits: by instrument.
+        contacts: measurements with a quadratic approximation.
+        quadratic: of the contacts' likelihood; None before the first.
+        relevant: by number of the measurement, whether it is informative near the fits' estimate.
+        stale: whether contacts were added after `quadratic` was computed.
+    """
+
+    pose: str
+    scene: Any
+    fits: Mapping[str, Fitted] = field(default_factory=dict)
+    contacts: tuple[Approximated, ...] = ()
+    quadratic: QuadraticApproximation | None = None
+    relevant: Mapping[int, bool] = field(default_factory=dict)
+    stale: bool = False
+
+    def __post_init__(self) -> None:
+        if not hasattr(self.scene, "prior") or not hasattr(self.scene, "sensor"):
+            raise InputError(
+                "a Gaussian approximation needs a scene with a prior and sensors (bcppl.sensors.Scene); "
+                "compose the model of sensors, or use tempered SMC."
+            )
+
+    def including(
+        self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]
+    ) -> GaussianApproximation:
+        """The approximation given one more measurement.
+
+        Args:
+            scene: of the model, which knows the measurement.
+            number: of the measurement in the recording.
+            action: what the robot did.
+            observations: values by address, the measurement's among them.
+        """
+        longer = self.updated().deferring(scene, number, action, observations)
+        return replace(longer, stale=longer.stale or bool(longer.contacts)).updated()
+
+    def deferring(
+        self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]
+    ) -> GaussianApproximation:
+        """The same with a measurement that changes little; the quadratic approximation is updated later."""
+        sensor = scene.sensor(action)
+        if isinstance(sensor, FitsPose):
+            name = sensor.instrument(action)
+            if name in self.fits:
+                return replace(self, scene=scene)
+            fits = {**self.fits, name: Fitted(action, sensor.fit(number, action, observations))}
+            # The estimate moves, so it is asked again which contacts are informative there.
+            return replace(self, scene=scene, fits=fits, relevant={})
+        if isinstance(sensor, Linearised):
+            contact = Approximated(number, action, observations[sensor.address(number)])
+            return replace(self, scene=scene, contacts=(*self.contacts, contact), stale=True)
+        return replace(self, scene=scene)
+
+    def updated(self) -> GaussianApproximation:
+        """The same with the quadratic approximation of all contacts."""
+        if not self.stale:
+            return self
+        relevant = dict(self.relevant)
+        for contact in self.contacts:
+            sensor = self.scene.sensor(contact.action)
+            if contact.number not in relevant:
+                relevant[contact.number] = not isinstance(sensor, Contacts) or sensor.is_informative(
+                    contact.action, contact.value, self.prior.center
+                )
+        informative = tuple(c for c in self.contacts if relevant[c.number])
+        by_sensor = list(self._by_sensor(informative))
+        contacts = [(sensor, own) for sensor, own in by_sensor if isinstance(sensor, Contacts)]
+        first = self.quadratic is None
+        ambiguous = any(sensor.new_contact(own, newest=not first) for sensor, own in contacts)
+        headings = [sensor.heading(own) for sensor, own in contacts]
+
+        def sites(pose: Tensor, blur: float) -> Iterator[tuple[Any, Tensor]]:
+            for sensor, own in by_sensor:
+                yield from sensor.sites(own, pose, blur)
+
+        quadratic = quadratic_approximation(
+            sites,
+            self.prior,
+            None if self.quadratic is None else self.quadratic.around,
+            next((heading for heading in headings if heading is not None), None),
+            ambiguous and self._is_unsure(),
+        )
+        return replace(self, quadratic=quadratic, relevant=relevant, stale=False)
+
+    def _by_sensor(self, contacts: tuple[Approximated, ...]) -> Iterator[tuple[Any, list[Approximated]]]:
+        groups: dict[int, tuple[Any, list[Approximated]]] = {}
+        for contact in contacts:
+            sensor = self.scene.sensor(contact.action)
+            groups.setdefault(id(sensor), (sensor, []))[1].append(contact)
+        yield from groups.values()
+
+    def _is_unsure(self) -> bool:
+        """Whether the part may be at several places so far, or at one that is not known well."""
+        if self.quadratic is None:
+            covariances = torch.linalg.inv(self.prior.precision)
+        else:
+            covariances = self.quadratic.posterior(self.prior.center[0], self.prior.precision[0]).covariances
+        wide = torch.linalg.eigvalsh(covariances[:, :3, :3])[:, -1].sqrt()
+        return len(wide) > 1 or bool((wide > UNSURE).any())
+
+    @cached_property
+    def prior(self) -> Normal:
+        """The Gaussian given the instruments' fits; the model's prior where there is none."""
+        factors = [
+            self.scene.sensor(each.action).marginal_factor(each.action, each.fit)
+            for each in self.fits.values()
+        ]
+        prior = self.scene.prior
+        if factors:
+            normal = product_of_factors(prior, factors)
+            return Normal(normal.center, torch.linalg.inv(normal.covariance))
+        normal = normal_like(prior)
+        return Normal(normal.center[None], torch.linalg.inv(normal.covariance)[None])
+
+    @cached_property
+    def mixture(self) -> GaussianMixture:
+        """The posterior of the part's pose, the nuisance parameters integrated out."""
+        center, precision = self.prior.center[0], self.prior.precision[0]
+        if self.quadratic is None:
+            alone = torch.zeros(1, dtype=torch.float64)
+            return GaussianMixture(center[None], torch.linalg.inv(precision)[None], alone)
+        return self.quadratic.posterior(center, precision)
+
+    def conditional(self, trace: Any, values: Mapping[str, Tensor] | None = None) -> Any:
+        """The approximate conditional distribution of the pose, given each particle's nuisance parameters.
+
+        Args:
+            trace: of N particles.
+            values: nuisance parameters that it does not have, by address.
+        """
+        looked_up = _Values(trace, {} if values is None else values)
+        factors: list[PoseFactor] = [
+            self.scene.sensor(each.action).factor(each.action, looked_up) for each in self.fits.values()
+        ]
+        prior = self.scene.prior
+        given = product_of_factors(prior, factors) if factors else None
+        if self.quadratic is None:
+            return prior if given is None else truncated(prior, given)
+        if given is None:
+            expected = normal_like(prior)
+            center = expected.center.expand(trace.particles, 7)
+            precision = torch.linalg.inv(expected.covariance).expand(trace.particles, 6, 6)
+        else:
+            center, precision = given.center, torch.linalg.inv(given.covariance)
+        return widened_mixture(self.quadratic.posterior(center, precision))
+
+    def predicted(self, trace: Any) -> Any:
+        """The Gaussian with the moments of `conditional`; None where no measurement is included yet."""
+        before = self.conditional(trace)
+        if before is self.scene.prior:
+            return None
+        return matched(before) if isinstance(before, MixturePose) else before
+
+
+class _Values(Mapping[str, Tensor]):
+    """Given values by address, then a trace's."""
+
+    def __init__(self, trace: Any, given: Mapping[str, Tensor]) -> None:
+        self.trace, self.given = trace, given
+
+    def __getitem__(self, address: str) -> Tensor:
+        return self.given[address] if address in self.given else self.trace[address]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**self.trace.choices, **self.given})
+
+    def __len__(self) -> int:
+        return len({**self.trace.choices, **self.given})

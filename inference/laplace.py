@@ -1,0 +1,171 @@
+"""Quadratic approximations of a likelihood around its modes, located by Gauss-Newton from several starts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.pose_normals import GaussianMixture
+
+# Standard deviations (m) that are added to the errors, one for each Gauss-Newton step: of the starts about the
+# prior mean, of those from outside the part, and of those from many places.
+BLURS = (0.003, 0.002, 0.001, 0.0005, 0.0002, 0.0, 0.0, 0.0)
+SHARP = (0.0005, 0.0005, 0.0002, 0.0, 0.0, 0.0, 0.0)
+FINE = (0.0002, 0.0002, 0.0001, 0.00005, 0.0, 0.0, 0.0)
+_AHEAD = torch.tensor([0.0, 0.003, 0.006, 0.01], dtype=torch.float64)  # m
+_STEP_LENGTHS = torch.tensor([0.0, 0.15, 0.5, 1.0], dtype=torch.float64)
+# Starts of Gauss-Newton, in prior standard deviations; they are the same in every run.
+_STARTS = torch.randn(6, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+_PLACES = torch.randn(32, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+# At most so many modes are kept, of a weight no more than so many nats below the largest, and at least so many
+# squared standard deviations apart.
+_MODES, _FAINT, _SAME = 4, 6.0, 12.0
+_LEFT = 12  # starts from many places that are followed to the end
+
+# The sites of the likelihood at poses (S, 7), errors `blur` metres wider, each with its observed value.
+Sites = Callable[[Tensor, float], Iterable[tuple[Any, Tensor]]]
+
+
+class Normal(NamedTuple):
+    """A Gaussian prior of a pose: its mean (1, 7), and a precision (1, 6, 6) in its tangent space."""
+
+    center: Tensor
+    precision: Tensor
+
+
+class QuadraticApproximation(NamedTuple):
+    """A log-likelihood to second order around each of its M modes, the one of largest weight first.
+
+    Attributes:
+        around: (M, 7) the modes.
+        gradient: (M, 6) of minus the log-likelihood in the tangent space at the modes.
+        information: (M, 6, 6) Gauss-Newton approximation of its Hessian.
+        log_likelihood: (M,) at the modes.
+    """
+
+    around: Tensor
+    gradient: Tensor
+    information: Tensor
+    log_likelihood: Tensor
+
+    def posterior(self, center: Tensor, precision: Tensor) -> GaussianMixture:
+        """The posterior under Gaussian priors with means (..., 7) and precisions (..., 6, 6): M components."""
+        away = poses.local(self.around, center[..., None, :])
+        pull = (precision[..., None, :, :] @ away[..., None])[..., 0]
+        covariance = torch.linalg.inv(precision[..., None, :, :] + self.information)
+        step = (covariance @ (pull - self.gradient)[..., None])[..., 0]
+        # The integral of prior times likelihood over all poses, by completing the square.
+        squares = (step * (pull - self.gradient)).sum(dim=-1) - (away * pull).sum(dim=-1)
+        sizes = torch.linalg.slogdet(covariance)[1] + torch.linalg.slogdet(precision)[1][..., None]
+        return GaussianMixture(
+            poses.retract(self.around, step),
+            0.5 * (covariance + covariance.transpose(-1, -2)),
+            self.log_likelihood + 0.5 * (squares + sizes),
+        )
+
+
+def quadratic_approximation(
+    sites: Sites,
+    prior: Normal,
+    before: Tensor | None = None,
+    heading: Tensor | None = None,
+    everywhere: bool = False,
+) -> QuadraticApproximation:
+    """The quadratic approximation around the posterior modes that Gauss-Newton reaches.
+
+    It starts from the prior mean and from places around it, at first with errors of millimetres. Where a part
+    is estimated too near, a peg penetrates it deeply, and would leave a thin wall on the wrong side; so it
+    starts from outside as well, the part displaced along the direction of the last contact. Errors of
+    millimetres lead all starts to one mode, and which corner or edge was touched may be ambiguous:
+    `everywhere` starts from many places with small errors too, each of which leads to the nearest mode.
+
+    Args:
+        sites: the likelihood.
+        prior: of the pose.
+        before: (M, 7) modes given fewer measurements; None for none.
+        heading: (3,) the direction of motion at the last contact; None for none.
+        everywhere: whether to search for all modes.
+    """
+    center, precision = prior
+    scale = torch.linalg.cholesky(torch.linalg.inv(precision[0]))
+    starts = [center, poses.retract(center, _STARTS @ scale.T), *([] if before is None else [before[:1]])]
+    reached = [gauss_newton(sites, torch.cat(starts), prior, BLURS)]
+    if heading is not None:
+        ahead = torch.cat([center, center if before is None else before[:1]]).repeat_interleave(
+            len(_AHEAD), 0
+        )
+        ahead[:, :3] += _AHEAD.repeat(2)[:, None] * heading
+        reached.append(gauss_newton(sites, ahead, prior, SHARP))
+    best, _ = max(reached, key=lambda fit: float(fit[1][0]))
+    others = [] if before is None or len(before) == 1 else [before]
+    if everywhere:
+        others.append(poses.retract(center, _PLACES @ scale.T))
+    if others:
+        each, _ = gauss_newton(sites, torch.cat(others), prior, FINE, _LEFT)
+        best = torch.cat([best, each])
+    return _distinct(_quadratic(sites, best), prior)
+
+
+def gauss_newton(
+    sites: Sites, starts: Tensor, prior: Normal, blurs: Sequence[float], least: int = 1
+) -> tuple[Tensor, Tensor]:
+    """The poses (M, 7) of highest posterior density that are reached, and their log-densities (M,).
+
+    Args:
+        sites: the likelihood.
+        starts: (S, 7).
+        prior: of the pose.
+        blurs: metres that are added to the errors at each step, 0 in the end.
+        least: half of the starts are kept at each step, but at least so many.
+    """
+    center, precision = prior
+    pose, density = starts, torch.zeros(len(starts))
+    for blur in blurs:
+        quadratic = _quadratic(sites, pose, blur)
+        pull = (precision @ poses.local(pose, center)[..., None])[..., 0] - quadratic.gradient
+        step = torch.linalg.solve(precision + quadratic.information, pull[..., None])
+        # Which corner touches changes along the step: it is made only as long as it gains.
+        tried = poses.retract(pose[:, None], _STEP_LENGTHS[:, None] * step[:, None, :, 0])
+        away = poses.local(center, tried.reshape(-1, 7))
+        total = -0.5 * ((away @ precision[0]) * away).sum(dim=-1)
+        for site, value in sites(tried.reshape(-1, 7), blur):
+            total = total + site.log_prob(value)
+        density, farthest = total.reshape(tried.shape[:2]).max(dim=1)
+        kept = density.topk(min(len(pose), max(least, len(pose) // 2))).indices
+        pose, density = tried[kept, farthest[kept]], density[kept]
+    return pose[:least], density[:least]
+
+
+def _quadratic(sites: Sites, pose: Tensor, blur: float = 0.0) -> QuadraticApproximation:
+    """The sum of all sites' quadratic approximations around poses (S, 7)."""
+    gradient, information = pose.new_zeros(len(pose), 6), pose.new_zeros(len(pose), 6, 6)
+    log_likelihood = pose.new_zeros(len(pose))
+    for site, value in sites(pose, blur):
+        own = site.quadratic(value)
+        gradient, information = gradient + own.gradient, information + own.information
+        log_likelihood = log_likelihood + site.log_prob(value)
+    return QuadraticApproximation(pose, gradient, information, log_likelihood)
+
+
+def _distinct(modes: QuadraticApproximation, prior: Normal) -> QuadraticApproximation:
+    """The modes that carry weight, of those that coincide the one with the largest."""
+    if len(modes.around) == 1:
+        return modes
+    away = poses.local(modes.around, prior.center)
+    covariance = torch.linalg.inv(prior.precision + modes.information)
+    # Laplace's weights at the poses themselves: Gauss-Newton has not converged at some.
+    weight = modes.log_likelihood - 0.5 * ((away @ prior.precision[0]) * away).sum(dim=-1)
+    weight = weight + 0.5 * torch.linalg.slogdet(covariance)[1]
+    kept: list[int] = []
+    for one in weight.argsort(descending=True).tolist():
+        if kept and (len(kept) == _MODES or weight[one] < weight[kept[0]] - _FAINT):
+            break
+        off = poses.local(modes.around[kept], modes.around[one])
+        squared = (off * torch.linalg.solve(covariance[kept], off[..., None])[..., 0]).sum(dim=-1)
+        if not bool((squared < _SAME).any()):
+            kept.append(one)
+    return QuadraticApproximation(*(each[kept] for each in modes))
