@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.errors import InferenceError, InputError
+from bcppl.errors import InputError, NoWeightError
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair, smcp3
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
@@ -82,7 +82,7 @@ def guided(
     def weighed(population: Population, observed: Observed) -> Population | None:
         try:
             return by_pair(population, observed).population
-        except InferenceError:
+        except NoWeightError:
             return None
 
     def as_expected(population: Population, observed: Observed) -> Population | None:
