@@ -9,7 +9,12 @@ class InputError(ValueError):
 
 
 class InferenceError(RuntimeError):
-    """Inference cannot go on: a log-probability is not a number, or no particle has any weight left.
+    """Inference cannot go on. The message names the site and the particles, and what to try."""
 
-    The message names the site and the particles, and says what to try.
-    """
+
+class NoWeightError(InferenceError):
+    """Every particle's weight is zero: no particle explains what was measured."""
+
+
+class NotANumberError(InferenceError):
+    """A log-probability is NaN or +inf: a mistake in a program, a distribution or a simulator."""

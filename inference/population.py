@@ -71,7 +71,8 @@ class Population:
         """1 / sum of squared normalised weights (Kong, Liu and Wong, JASA 89, 1994).
 
         Raises:
-            InferenceError: no particle has any weight, or a weight is not a number.
+            NoWeightError: no particle has any weight.
+            NotANumberError: a weight is NaN or +inf.
         """
         if not math.isfinite(self.log_total):
             normalised(self.log_weights, self.trace.impossible())
@@ -109,7 +110,8 @@ class Population:
         population was resampled before.
 
         Raises:
-            InferenceError: no particle has any weight left.
+            NoWeightError: no particle has any weight left.
+            NotANumberError: a weight is NaN or +inf.
         """
         log_weights = self.log_weights + log_factor
         highest = float(log_weights.max())

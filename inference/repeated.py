@@ -19,7 +19,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief, normalised
-from bcppl.errors import InferenceError, InputError
+from bcppl.errors import InferenceError, InputError, NoWeightError
 from bcppl.inference.arviz import at_draws, check_alike, draw, import_arviz, seeded
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
@@ -88,7 +88,7 @@ class Repeated:
     def _alive(self) -> tuple[Population, ...]:
         alive = [p for number, p in enumerate(self.populations, start=1) if number not in self.dead]
         if not alive:
-            raise InferenceError(
+            raise NoWeightError(
                 f"no particle has any weight in any of {len(self)} runs: every particle says that what was "
                 "measured cannot be; widen the prior, or use more particles."
             )
@@ -141,7 +141,7 @@ class Repeated:
 
         Raises:
             InputError: no latent site has that address, or no pose is there.
-            InferenceError: all runs are dead.
+            NoWeightError: all runs are dead.
         """
         first = self._alive[0].belief(address)
         each = torch.cat([p.trace.choices[address] for p in self.populations])
@@ -152,7 +152,7 @@ class Repeated:
 
         Raises:
             InputError: no latent site has that address.
-            InferenceError: all runs are dead.
+            NoWeightError: all runs are dead.
         """
         alive = self._alive
         if is_pose(alive[0], address):
@@ -199,7 +199,7 @@ class Repeated:
         Raises:
             InputError: ArviZ is not installed, or there are fewer than two runs alive, or fewer than four
                 draws.
-            InferenceError: all runs are dead.
+            NoWeightError: all runs are dead.
         """
         arviz, alive = import_arviz(), self._alive
         if len(alive) < 2:
@@ -276,7 +276,7 @@ def _population(run: Run, seed: int, number: int) -> Population:
                 last = deque(result, maxlen=1)
                 result = last[0] if last else None
     except InferenceError as error:
-        raise InferenceError(f"run {number} (seed {seed}): {error}") from error
+        raise type(error)(f"run {number} (seed {seed}): {error}") from error
     found = getattr(result, "population", result)
     if not isinstance(found, Population):
         raise InputError(

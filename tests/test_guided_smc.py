@@ -20,7 +20,7 @@ from torch.distributions import MultivariateNormal
 from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.distributions.poses import NormalPose
-from bcppl.errors import InputError
+from bcppl.errors import InputError, NotANumberError
 from bcppl.geometry.guess import Guess
 from bcppl.inference.filters import tempered_smc
 from bcppl.inference.filters.guided_smc import guided, infer, kernel
@@ -156,6 +156,18 @@ def test_programs_that_lead_nowhere_fall_back_on_tempering() -> None:
     off = (last.belief.mean[:3] - SEEN.sum(dim=0) / NOISE**2 / precision) * precision.sqrt()
     assert float(off.abs().max()) < 1.0
     assert last.info.log_evidence == pytest.approx(evidence(), abs=1.5)
+
+
+def test_a_density_that_is_not_a_number_stops_the_run_and_is_not_tempered_over() -> None:
+    class Broken(NormalPose):
+        def log_prob(self, value: Tensor) -> Tensor:
+            return super().log_prob(value) * math.nan
+
+    def broken(trace: Trace) -> None:
+        pyro.sample("part", Broken(poses.identity(), torch.diag(PRIOR**2), SLIDING))
+
+    with pytest.raises(NotANumberError, match=r"^sight 1: .* nan"):
+        list(infer(toy(broken, back), RECORDING, particles=20, seed=0))
 
 
 def test_a_model_without_programs_is_refused_in_a_sentence() -> None:

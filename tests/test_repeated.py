@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.poses import UniformPose
-from bcppl.errors import InferenceError, InputError
+from bcppl.errors import InputError, NoWeightError
 from bcppl.inference.population import Population
 from bcppl.inference.repeated import Repeated, repeated
 from bcppl.inference.summaries import mean
@@ -196,7 +196,7 @@ def test_runs_that_all_died_say_so() -> None:
     runs = Repeated((dead, dead), (1, 2))
     assert "in runs 1, 2 no particle" in str(runs) and runs.log_evidence == -math.inf
     for ask in (lambda: runs.mean("x"), lambda: runs.r_hat()):
-        with pytest.raises(InferenceError, match="in any of 2 runs"):
+        with pytest.raises(NoWeightError, match="in any of 2 runs"):
             ask()
 
 
@@ -204,5 +204,5 @@ def test_a_run_that_cannot_go_on_is_named() -> None:
     def run(seed: int) -> Population:
         return importance(1, 5).reweighed(torch.full((5,), -torch.inf, dtype=torch.float64))
 
-    with pytest.raises(InferenceError, match=r"run 1 \(seed \d+\): no particle has any weight left"):
+    with pytest.raises(NoWeightError, match=r"run 1 \(seed \d+\): no particle has any weight left"):
         repeated(run, 2, progress=False)

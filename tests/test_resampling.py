@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bcppl.errors import InferenceError, InputError
+from bcppl.errors import InputError, NotANumberError, NoWeightError
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import adaptive, always, never
 from bcppl.inference.schemes import Scheme, multinomial, residual, ssp, stratified, systematic
@@ -126,9 +126,9 @@ def test_the_last_point_falls_to_a_particle_with_weight(
 
 @pytest.mark.parametrize("name", SCHEMES)
 def test_what_cannot_be_resampled(name: str) -> None:
-    with pytest.raises(InferenceError, match="no particle has any weight left"):
+    with pytest.raises(NoWeightError, match="no particle has any weight left"):
         SCHEMES[name](torch.full((4,), -torch.inf, dtype=torch.float64))
-    with pytest.raises(InferenceError, match="not a number"):
+    with pytest.raises(NotANumberError, match="not a number"):
         SCHEMES[name](torch.tensor([0.0, torch.nan], dtype=torch.float64))
     with pytest.raises(InputError, match="0 particles are to be resampled"):
         SCHEMES[name](torch.zeros(4, dtype=torch.float64), 0)

@@ -15,7 +15,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bcppl.errors import InferenceError
+from bcppl.errors import NoWeightError
 from bcppl.inference.filters import bayes_contact, smcp3, tempered_smc
 from bcppl.inference.filters.bayes_contact import drift_and_weigh
 from bcppl.inference.filters.smc import Step, smc
@@ -245,11 +245,11 @@ def test_an_error_names_the_measurement(recording: Recording) -> None:
     for infer in (tempered_smc.infer, bayes_contact.infer):
         seen = []
         state = torch.get_rng_state()
-        with pytest.raises(InferenceError, match=r"^push 2: no particle has any weight left"):
+        with pytest.raises(NoWeightError, match=r"^push 2: no particle has any weight left"):
             seen.extend(infer(broken, recording, particles=20))
         assert torch.equal(state, torch.get_rng_state())
     iterator = smc(broken, recording, step=tempered(None, resample=never, share=0.0), particles=20)
-    with pytest.raises(InferenceError, match=r"^push 2: no particle"):
+    with pytest.raises(NoWeightError, match=r"^push 2: no particle"):
         list(iterator)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from bcppl.errors import InferenceError, InputError
+from bcppl.errors import InputError, NotANumberError, NoWeightError
 
 
 def normalised(log_weights: Tensor, impossible: Sequence[str] = ()) -> Tensor:
@@ -19,13 +19,16 @@ def normalised(log_weights: Tensor, impossible: Sequence[str] = ()) -> Tensor:
         impossible: addresses that no particle can explain (`bcppl.traces.Trace.impossible`), for the error.
 
     Raises:
-        InferenceError: no particle has any weight.
+        NoWeightError: no particle has any weight.
+        NotANumberError: a weight is NaN or +inf.
     """
     if bool((torch.isnan(log_weights) | (log_weights == torch.inf)).any()):
-        raise InferenceError("a particle's weight is not a number; a kernel or a resampler gave NaN or +inf.")
+        raise NotANumberError(
+            "a particle's weight is not a number; a kernel or a resampler gave NaN or +inf."
+        )
     if not bool((log_weights > -torch.inf).any()):
         where = f" at {', '.join(map(repr, impossible))}" if impossible else ""
-        raise InferenceError(
+        raise NoWeightError(
             f"no particle has any weight left: every particle says that what was measured{where} cannot be; "
             "widen the prior, use more particles, or check the recording with `bcppl check`."
         )

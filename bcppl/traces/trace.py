@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.support import log_prob_inside
-from bcppl.errors import InferenceError, InputError
+from bcppl.errors import InputError, NotANumberError
 from bcppl.traces.carried import Entry, same_inputs
 from bcppl.traces.hiding import Hiding, refused
 from bcppl.traces.indexing import Index, particles_at
@@ -98,7 +98,7 @@ class Trace:
 
         Raises:
             InputError: no site has that address.
-            InferenceError: a log-probability is NaN or +inf; names the site and the particles.
+            NotANumberError: a log-probability is NaN or +inf; names the site and the particles.
         """
         values = [self._site(address) for address in addresses or self.addresses]
         return sum(values[1:], values[0]) if values else torch.zeros(self.particles, dtype=torch.float64)
@@ -134,12 +134,12 @@ class Trace:
             which = (torch.isnan(value) | (value == torch.inf)).nonzero().flatten().tolist()
             if address in self.observations and bool(torch.isnan(self.observations[address]).any()):
                 seen = torch.isnan(self.observations[address])
-                raise InferenceError(
+                raise NotANumberError(
                     f"the observation at site {address!r} is NaN in {int(seen.sum())} of {seen.numel()} "
                     "entries; leave out what was not measured, or mask it in the site's distribution."
                 )
             dense = address in self.choices and float(value[which[0]]) == torch.inf
-            raise InferenceError(
+            raise NotANumberError(
                 f"site {address!r} has a log-probability of {float(value[which[0]])} for "
                 f"{len(which)} of {self.particles} particles (first: {', '.join(map(str, which[:5]))}); "
                 + (

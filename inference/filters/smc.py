@@ -193,7 +193,7 @@ def _steps(
             with _own_state(state, particles):
                 population, happened = step(population, observed)
         except InferenceError as error:
-            raise InferenceError(f"{label}: {error}") from error
+            raise type(error)(f"{label}: {error}") from error
         belief = population.belief(model.pose)
         spent = {name: after.since(before[name]) for name, after in _effort(scene).items()}
         elapsed = time.perf_counter() - begun
