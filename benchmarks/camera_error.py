@@ -46,7 +46,7 @@ class Run(NamedTuple):
 
 def run(name: str, seed: int, particles: int) -> Run:
     """One bench and one belief."""
-    recording = camera_error.invent(seed)
+    recording = camera_error.simulate_recording(seed)
     begun, own = time.perf_counter(), time.process_time()
     *_, last = infer(MODELS[name], recording, particles=particles, seed=seed, climbs=0)
     seconds, own = time.perf_counter() - begun, time.process_time() - own

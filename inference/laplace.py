@@ -11,8 +11,8 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.pose_normals import GaussianMixture
 
-# Standard deviations (m) that are added to the errors, one for each Gauss-Newton step: of the starts about the
-# prior mean, of those from outside the part, and of those from many places.
+# Standard deviations (m) that are added to the errors, one for each Gauss-Newton step: of starts about the
+# prior mean, from outside the part, and from many places.
 BLURS = (0.003, 0.002, 0.001, 0.0005, 0.0002, 0.0, 0.0, 0.0)
 SHARP = (0.0005, 0.0005, 0.0002, 0.0, 0.0, 0.0, 0.0)
 FINE = (0.0002, 0.0002, 0.0001, 0.00005, 0.0, 0.0, 0.0)
@@ -21,7 +21,7 @@ _STEP_LENGTHS = torch.tensor([0.0, 0.15, 0.5, 1.0], dtype=torch.float64)
 # Starts of Gauss-Newton, in prior standard deviations; they are the same in every run.
 _STARTS = torch.randn(6, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 _PLACES = torch.randn(32, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-# At most so many modes are kept, of a weight no more than so many nats below the largest, and at least so many
+# Modes that are kept: at most so many, of weights within so many nats of the largest, and at least so many
 # squared standard deviations apart.
 _MODES, _FAINT, _SAME = 4, 6.0, 12.0
 _LEFT = 12  # starts from many places that are followed to the end
@@ -53,7 +53,7 @@ class QuadraticApproximation(NamedTuple):
     log_likelihood: Tensor
 
     def posterior(self, center: Tensor, precision: Tensor) -> GaussianMixture:
-        """The posterior under Gaussian priors with means (..., 7) and precisions (..., 6, 6): M components."""
+        """The posterior, M components, under Gaussian priors: means (..., 7), precisions (..., 6, 6)."""
         away = poses.local(self.around, center[..., None, :])
         pull = (precision[..., None, :, :] @ away[..., None])[..., 0]
         covariance = torch.linalg.inv(precision[..., None, :, :] + self.information)

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import pyro
@@ -22,64 +21,43 @@ import torch
 
 from bcppl import poses
 from bcppl.arguments import number_within
-from bcppl.contact.track import ContactTrack
-from bcppl.contact.unknowns import Unknowns
-from bcppl.distributions.contact import ChamferContacts, PegPose
-from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.models import peg_in_hole
-from bcppl.robot.motion import ProbeWindow
-from bcppl.sensors.measurements import Recording, View
-from bcppl.traces import Model, carried
+from bcppl.sensors.capabilities import Grasping
+from bcppl.sensors.measurements import Recording
+from bcppl.sensors.scene import Scene
+from bcppl.traces import Model
 
 
 @dataclass(frozen=True, eq=False)
-class Scene(peg_in_hole.Scene):
-    """What stays the same over a run, and what is thought of the hand."""
+class GraspScene(Scene):
+    """The scene, and the prior of the peg's pose in the hand."""
 
     hand: NormalPose
 
 
-def grasped_peg(scene: Scene, actions: Sequence[View | ProbeWindow]) -> None:
-    """The program: the part's pose, the peg's place in the hand, then what every view and window shows."""
-    settings = scene.settings
+def grasped_peg(scene: GraspScene, actions: Sequence[Any]) -> None:
+    """The program: the part's pose, the peg's pose in the hand, then each measurement's sites."""
     hole = pyro.sample("hole", scene.prior)
-    unknowns = Unknowns(grip_from_peg=pyro.sample("grip_from_peg", scene.hand))
-    for k, action in enumerate(actions):
-        if isinstance(action, View):
-            depth = RobustDepth(
-                scene.renderer,
-                action.camera,
-                hole,
-                scale=settings.depth_scale,
-                outlier=settings.outlier,
-                background=scene.background.get(action.camera.name),
-                effective_pixels=settings.effective_pixels,
-            )
-            pyro.sample(f"depth_{k}", depth)
-        else:
-            assert scene.physics is not None and scene.sensing is not None
-            begin = partial(ContactTrack.start, scene.physics, scene.sensing, hole, action.probe, unknowns)
-            track = carried(f"probe {action.probe.name}", (hole, *unknowns.tensors), begin)
-            window = (track, action.first, action.last)
-            pyro.sample(f"contacts_{k}", ChamferContacts(*window, settings.contact_scale, settings.one_empty))
-            peg = PegPose(
-                *window, settings.translation_scale, settings.rotation_scale, every=settings.pose_every
-            )
-            pyro.sample(f"peg_{k}", peg)
+    grip_from_peg = pyro.sample("grip_from_peg", scene.hand)
+    for number, action in enumerate(actions):
+        sensor = scene.sensor(action)
+        if isinstance(sensor, Grasping):
+            sensor = sensor.grasping(grip_from_peg)
+        sensor.observe(number, action, hole)
 
 
 def prepare(
     recording: Recording, grip_shift: float = 0.0015, grip_turn: float = math.radians(1.5), **settings: Any
-) -> Scene:
+) -> GraspScene:
     """The scene of a recording.
 
     Args:
         recording: what was measured.
         grip_shift: how far the peg may sit off in the hand along each axis of the grip, metres.
         grip_turn: likewise about each axis, radians; both are standard deviations.
-        settings: fields of `peg_in_hole.Settings`, or `renderer`.
+        settings: as for `peg_in_hole.prepare`.
 
     Raises:
         InputError: a spread is not positive, grip_shift is longer than the peg or grip_turn beyond pi; or as
@@ -101,14 +79,20 @@ def prepare(
         )
     spread = torch.tensor([grip_shift] * 3 + [grip_turn] * 3, dtype=torch.float64)
     known = peg_in_hole.prepare(recording, **settings)
-    return Scene(**known.__dict__, hand=NormalPose(poses.identity(), spread))
+    return GraspScene(known.prior, known.likelihoods, "grasped_peg", NormalPose(poses.identity(), spread))
 
 
-def invent(seed: int, **options: Any) -> Recording:
+def simulate_recording(seed: int, **options: Any) -> Recording:
     """A block with a hole, touched twice with the hand turned between: `bcppl.models.worlds.grasped_peg`."""
     from bcppl.models.worlds.grasped_peg import record
 
     return record(seed, **options)
 
 
-model = Model(program=grasped_peg, prepare=prepare, observe=peg_in_hole.observe, pose="hole", invent=invent)
+model = Model(
+    program=grasped_peg,
+    prepare=prepare,
+    observe=Scene.observed,
+    pose="hole",
+    simulate_recording=simulate_recording,
+)

@@ -7,26 +7,21 @@ on from one pixel to the next. No mask is needed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import pyro
-import torch
-from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.distributions.depth import ClutteredDepth, RobustDepth
 from bcppl.distributions.poses import prior_from_guess
-from bcppl.effort import Effort
-from bcppl.errors import InputError
-from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.rendering.scene import RendersPart
-from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
+from bcppl.sensors.cameras import ClutteredCamera
+from bcppl.sensors.measurements import Recording
+from bcppl.sensors.scene import Scene, likelihoods_for
+from bcppl.sensors.settings import chosen
 from bcppl.traces import Model
 
 
@@ -63,60 +58,11 @@ class Settings:
         whole_number("part_in_view is given stride {}", self.stride)
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """What stays the same over a run: the part, its pose's prior, its renderer, and what may be seen."""
-
-    part: Part
-    prior: Any
-    renderer: RendersPart
-    background: Mapping[str, npt.NDArray[np.float64]]
-    settings: Settings
-    regions: dict[str, npt.NDArray[np.bool_]] = field(default_factory=dict)
-
-    @property
-    def efforts(self) -> Mapping[str, Effort]:
-        """What each simulator has done so far."""
-        return {"rendering": self.renderer.effort}
-
-    def region(self, camera: Camera) -> npt.NDArray[np.bool_]:
-        """The pixels that count: a grid of the given stride."""
-        if camera.name not in self.regions:
-            grid = np.zeros((camera.height, camera.width), dtype=bool)
-            grid[:: self.settings.stride, :: self.settings.stride] = True
-            self.regions[camera.name] = grid
-        return self.regions[camera.name]
-
-
-def part_in_view(scene: Scene, actions: Sequence[View]) -> None:
+def part_in_view(scene: Scene, actions: Sequence[Any]) -> None:
     """The program: the part's pose, then a depth image for every view."""
     part = pyro.sample("part", scene.prior)
-    for k, view in enumerate(actions):
-        pyro.sample(f"depth_{k}", depth(scene, view.camera, part))
-
-
-def depth(scene: Scene, camera: Camera, part: Tensor) -> ClutteredDepth | RobustDepth:
-    """The depth image of one view."""
-    settings, background = scene.settings, scene.background.get(camera.name)
-    if settings.clutter and background is None:
-        return ClutteredDepth(
-            scene.renderer,
-            camera,
-            part,
-            settings.scale,
-            lines=settings.stride,
-            temperature=settings.temperature,
-        )
-    return RobustDepth(
-        scene.renderer,
-        camera,
-        part,
-        scale=settings.scale,
-        outlier=settings.outlier,
-        background=background,
-        effective_pixels=settings.effective_pixels,
-        region=scene.region(camera),
-    )
+    for number, action in enumerate(actions):
+        scene.sensor(action).observe(number, action, part)
 
 
 def prepare(
@@ -130,33 +76,18 @@ def prepare(
         settings: fields of `Settings`.
 
     Raises:
-        InputError: a spread is not positive, or the stride is no whole number of pixels.
+        InputError: a setting is unknown or out of range.
     """
-    return Scene(
-        recording.part,
-        prior_from_guess(recording.guess),
-        renderer(recording.part),
-        recording.background,
-        Settings(**settings),
-    )
+    (own,) = chosen("part_in_view", settings, Settings())
+    camera = ClutteredCamera(recording, renderer(recording.part), **vars(own))
+    likelihoods = likelihoods_for(recording, {"view": lambda _: camera}, only=True)
+    return Scene(prior_from_guess(recording.guess), likelihoods, "part_in_view")
 
 
-def observe(scene: Scene, measurements: Sequence[Measurement]) -> Mapping[str, Tensor]:
-    """The depth images, by address.
-
-    Raises:
-        InputError: a measurement is not a view.
-    """
-    values: dict[str, Tensor] = {}
-    for k, measurement in enumerate(measurements):
-        image = measurement.observation
-        if not isinstance(measurement.action, View) or not isinstance(image, DepthImage):
-            raise InputError(
-                f"measurement {k} is a {measurement.kind} and part_in_view explains views only; "
-                "choose another model."
-            )
-        values[f"depth_{k}"] = torch.from_numpy(image.depth)
-    return values
-
-
-model = Model(program=part_in_view, prepare=prepare, observe=observe, pose="part", climbs=240)
+model = Model(
+    program=part_in_view,
+    prepare=prepare,
+    observe=Scene.observed,
+    pose="part",
+    inference=("tempered_smc", {"climbs": 240}),
+)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,14 +23,11 @@ from pyro.distributions import Categorical
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.contact.track import ContactTrack
-from bcppl.distributions.contact import ChamferContacts, PegPose
-from bcppl.distributions.depth import RobustDepth
 from bcppl.errors import InputError
 from bcppl.models import peg_in_hole
-from bcppl.robot.motion import ProbeWindow
-from bcppl.sensors.measurements import Recording, View
-from bcppl.traces import Model, carried
+from bcppl.sensors.measurements import Recording
+from bcppl.sensors.scene import Scene
+from bcppl.traces import Model
 
 # Where the holes are in the frame of the first, metres: those of the plate that `invent` makes.
 PITCH = 0.034
@@ -39,49 +35,30 @@ HOLES = ((0.0, 0.0), (PITCH, 0.0), (0.0, PITCH), (PITCH, PITCH))
 
 
 @dataclass(frozen=True, eq=False)
-class Scene(peg_in_hole.Scene):
-    """What stays the same over a run; `hole_from_part` (K, 7) is the plate seen from each of its holes."""
+class PlateScene(Scene):
+    """The scene, and `hole_from_part` (K, 7): the plate's pose in the frame of each of its holes."""
 
     hole_from_part: Tensor
 
 
-def which_hole(scene: Scene, actions: Sequence[View | ProbeWindow]) -> None:
-    """The program: which hole is seen and where it is, then what every view and window shows of the plate."""
-    settings = scene.settings
+def which_hole(scene: PlateScene, actions: Sequence[Any]) -> None:
+    """The program: which hole is seen and its pose, then each measurement's sites of the plate."""
     which = pyro.sample("which", Categorical(torch.ones(len(scene.hole_from_part), dtype=torch.float64)))
     hole = pyro.sample("hole", scene.prior)
     part = poses.compose(hole, scene.hole_from_part[which])
-    for k, action in enumerate(actions):
-        if isinstance(action, View):
-            depth = RobustDepth(
-                scene.renderer,
-                action.camera,
-                part,
-                scale=settings.depth_scale,
-                outlier=settings.outlier,
-                background=scene.background.get(action.camera.name),
-                effective_pixels=settings.effective_pixels,
-            )
-            pyro.sample(f"depth_{k}", depth)
-        else:
-            assert scene.physics is not None and scene.sensing is not None
-            begin = partial(ContactTrack.start, scene.physics, scene.sensing, part, action.probe)
-            track = carried(f"probe {action.probe.name}", part, begin)
-            window = (track, action.first, action.last)
-            pyro.sample(f"contacts_{k}", ChamferContacts(*window, settings.contact_scale, settings.one_empty))
-            peg = PegPose(
-                *window, settings.translation_scale, settings.rotation_scale, every=settings.pose_every
-            )
-            pyro.sample(f"peg_{k}", peg)
+    for number, action in enumerate(actions):
+        scene.sensor(action).observe(number, action, part)
 
 
-def prepare(recording: Recording, holes: Sequence[tuple[float, float]] = HOLES, **settings: Any) -> Scene:
+def prepare(
+    recording: Recording, holes: Sequence[tuple[float, float]] = HOLES, **settings: Any
+) -> PlateScene:
     """The scene of a recording.
 
     Args:
         recording: what was measured; its part's frame sits in the first hole.
         holes: where the holes are, x and y in the part's frame, metres.
-        settings: fields of `peg_in_hole.Settings`, or `renderer`.
+        settings: as for `peg_in_hole.prepare`.
 
     Raises:
         InputError: there are fewer than two holes, the first is not at the origin, two are at one place or
@@ -108,14 +85,21 @@ def prepare(recording: Recording, holes: Sequence[tuple[float, float]] = HOLES, 
         raise InputError(f"which_hole is given one hole twice, {places.tolist()}; give each once.")
     hole_from_part = poses.identity(len(places))
     hole_from_part[:, :2] = -torch.from_numpy(places)
-    return Scene(**peg_in_hole.prepare(recording, **settings).__dict__, hole_from_part=hole_from_part)
+    scene = peg_in_hole.prepare(recording, **settings)
+    return PlateScene(scene.prior, scene.likelihoods, "which_hole", hole_from_part)
 
 
-def invent(seed: int, **options: Any) -> Recording:
+def simulate_recording(seed: int, **options: Any) -> Recording:
     """A plate with four holes, one of them seen and two neighbours' places touched, in a finer simulation."""
     from bcppl.models.worlds.which_hole import record
 
     return record(seed, **options)
 
 
-model = Model(program=which_hole, prepare=prepare, observe=peg_in_hole.observe, pose="hole", invent=invent)
+model = Model(
+    program=which_hole,
+    prepare=prepare,
+    observe=Scene.observed,
+    pose="hole",
+    simulate_recording=simulate_recording,
+)

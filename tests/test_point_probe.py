@@ -71,7 +71,7 @@ def moved(recording: Recording, by: Tensor) -> Recording:
 
 @pytest.mark.parametrize("use_free_path", [False, True])
 def test_the_program_explains_what_it_invents(use_free_path: bool) -> None:
-    recording = model.invent(3, pushes=8, use_free_path=use_free_path)
+    recording = model.simulate_recording(3, pushes=8, use_free_path=use_free_path)
     likelihood = log_likelihood(
         recording, around(torch.from_numpy(recording.truth), 0.002), use_free_path=use_free_path
     )
@@ -79,7 +79,7 @@ def test_the_program_explains_what_it_invents(use_free_path: bool) -> None:
 
 
 def test_what_is_invented_is_read_back() -> None:
-    recording = model.invent(5, pushes=12)
+    recording = model.simulate_recording(5, pushes=12)
     scene = prepare(recording)
     actions = [m.action for m in recording.measurements]
     torch.manual_seed(noise_seed(5))
@@ -101,7 +101,9 @@ def test_settings_are_learnt_from_pushes_at_a_known_pose() -> None:
         outlier=0.0,
     )
     keys = ("finger", "registration", "drift", "offset", "spread", "friction", "outlier")
-    recording = model.invent(4, pushes=80, direction_outlier=0.0, **{k: getattr(said, k) for k in keys})
+    recording = model.simulate_recording(
+        4, pushes=80, direction_outlier=0.0, **{k: getattr(said, k) for k in keys}
+    )
     touching = [m for m in recording.measurements if np.abs(m.observation.wrench[-1, :2]).max() > 2.0]
     learnt = learn(replace(recording, measurements=touching))
     assert learnt.finger == pytest.approx(said.finger, abs=2e-4)
@@ -117,7 +119,7 @@ def test_settings_are_learnt_from_pushes_at_a_known_pose() -> None:
 
 
 def test_a_push_that_misses_is_evidence() -> None:
-    recording = model.invent(1, pushes=3)
+    recording = model.simulate_recording(1, pushes=3)
     away = np.array(recording.measurements[0].action.world_from_tip)
     away[:, 2] += 0.2
     push = recording.measurements[0].action
@@ -133,7 +135,7 @@ def test_a_push_that_misses_is_evidence() -> None:
 
 @pytest.mark.parametrize("use_free_path", [False, True])
 def test_likelihood_does_not_hang_on_the_world(use_free_path: bool) -> None:
-    recording = model.invent(2, pushes=5)
+    recording = model.simulate_recording(2, pushes=5)
     by = t(0.3, -0.2, 0.1, math.cos(0.4), 0.0, 0.0, math.sin(0.4))
     at = around(torch.from_numpy(recording.truth), 0.0004)
     here = log_likelihood(recording, at, use_free_path=use_free_path)
@@ -142,7 +144,7 @@ def test_likelihood_does_not_hang_on_the_world(use_free_path: bool) -> None:
 
 
 def test_bad_pushes_are_refused() -> None:
-    recording = model.invent(0, pushes=1)
+    recording = model.simulate_recording(0, pushes=1)
     push, touch = recording.measurements[0].action, recording.measurements[0].observation
     short = Touch(touch.times[:8], touch.wrench[:8], touch.world_from_peg)
     with pytest.raises(InputError, match="too few to tare"):

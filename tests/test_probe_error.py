@@ -14,7 +14,7 @@ def test_six_probes_end_within_three_millimetres_in_the_median() -> None:
     """A world that inference is not told of: friction, stiffness, steps and cameras differ."""
     errors, gaps = [], []
     for seed in range(100, 106):
-        recording = model.invent(seed)
+        recording = model.simulate_recording(seed)
         *_, last = infer(model, recording, seed=seed)
         errors.append(last.belief.weighted_add(recording.part.surface_points(), recording.truth))
         gaps.append(last.info.truth_gap)

@@ -10,7 +10,7 @@ from bcppl.traces import simulate
 
 def test_truth_is_drawn_apart_from_the_particles() -> None:
     for seed in (0, 1):
-        recording = model.invent(seed)
+        recording = model.simulate_recording(seed)
         torch.manual_seed(seed)
         prior = simulate(model.program, (model.prepare(recording), []), particles=75)
         apart = (prior[model.pose] - torch.from_numpy(recording.truth)).abs().max(dim=-1).values

@@ -76,7 +76,7 @@ def known(
     found = loading.recording(name)
     check(found)
     chosen = _chosen(model or found.model)
-    infer = loading.inference(inference or ("tempered_smc" if chosen.arrival is None else "guided_smc"))
+    infer = loading.inference(inference or chosen.inference[0])
     scene = chosen.prepare(found)
     population = None
     with sole_bar(console) as progress:

@@ -93,9 +93,9 @@ def _files(package: ModuleType) -> list[str]:
     return [info.name for info in pkgutil.iter_modules(package.__path__) if not info.ispkg]
 
 
-def inventing() -> list[str]:
+def simulating() -> list[str]:
     """The names of the shipped models that make recordings up."""
-    return [n for n in offered(bcppl.models, "model") if model(n).invent is not None]
+    return [n for n in offered(bcppl.models, "model") if model(n).simulate_recording is not None]
 
 
 def _defined(name: str, package: ModuleType, attribute: str, kind: type | None) -> Any:

@@ -48,12 +48,12 @@ def simulate(
     """Write a recording that a model's own world makes up: a true pose from the prior, and noisy sensors."""
     loading.refuse_seed(seed)
     chosen = loading.model(model)
-    if chosen.invent is None:
+    if chosen.simulate_recording is None:
         raise InputError(
-            f"model {model!r} invents no recordings; these do: {', '.join(loading.inventing())}. A model of "
-            "your own does once it has an `invent(seed)`."
+            f"model {model!r} simulates no recordings; these do: {', '.join(loading.simulating())}. "
+            "A model of your own does once it has a `simulate_recording(seed)`."
         )
-    _write(chosen.invent(seed), out)
+    _write(chosen.simulate_recording(seed), out)
 
 
 import_app = typer.Typer(help="Make a recording from data in another format.", no_args_is_help=True)

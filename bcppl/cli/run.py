@@ -70,7 +70,7 @@ def run(
     loading.refuse_seed(seed)
     found = loading.recording(recording)
     chosen = loading.model(model or found.model)
-    inference = inference or ("tempered_smc" if chosen.arrival is None else "guided_smc")
+    inference = inference or chosen.inference[0]
     infer = loading.inference(inference)
     try:
         inspect.signature(infer).bind(chosen, found, particles=particles, seed=seed, scene=None)

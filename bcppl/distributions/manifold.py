@@ -43,11 +43,11 @@ class Quadratic(NamedTuple):
     """A log-likelihood to second order around poses, in their tangent space.
 
     Attributes:
-        slope: (N, 6) of minus the log-likelihood, 1/m and 1/rad.
-        information: (N, 6, 6) its curvature as Gauss and Newton take it.
+        gradient: (N, 6) of minus the log-likelihood, 1/m and 1/rad.
+        information: (N, 6, 6) the Gauss-Newton approximation of its Hessian.
     """
 
-    slope: Tensor
+    gradient: Tensor
     information: Tensor
 
 

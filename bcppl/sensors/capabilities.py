@@ -55,7 +55,7 @@ class FitsPose(Protocol):
 
 @runtime_checkable
 class Linearised(Protocol):
-    """Sites with a quadratic approximation around any pose of the part (`quadratic`), and none of their own."""
+    """Sites with a quadratic approximation (`quadratic`) around any pose, and no nuisance parameters."""
 
     def address(self, number: int) -> str:
         """The address of a measurement's site."""
@@ -78,3 +78,11 @@ class Contacts(Protocol):
 
     def heading(self, measurements: Sequence[Approximated]) -> Tensor | None:
         """The direction (3,) of motion when contact last began; None without contact."""
+
+
+@runtime_checkable
+class Grasping(Protocol):
+    """A likelihood of what a held peg touches, which may sit off in the hand."""
+
+    def grasping(self, grip_from_peg: Tensor) -> Any:
+        """The likelihood given the peg's pose (N, 7) in the grip's frame."""

@@ -196,5 +196,3 @@ class _Measured(NamedTuple):
 
     def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gaps:
         return self
-
-

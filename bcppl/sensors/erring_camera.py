@@ -199,7 +199,7 @@ class ErringCamera:
         return action.camera.instrument
 
     def fit(self, number: int, action: View, observations: Mapping[str, Tensor]) -> FittedNormal:
-        """A Gaussian over the apparent pose, in the tangent space at the prior's centre, and the bias (7,)."""
+        """A Gaussian (7,) over the apparent pose, in the tangent space of the prior's mean, and the bias."""
         camera, prior, image = self.camera(action), self.prior, observations[f"depth_{number}"]
 
         def log_density(point: Tensor) -> Tensor:

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from bcppl.contact.touch import Touch
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
@@ -53,8 +53,8 @@ class DepthImage:
 class Measurement:
     """One action and what was observed."""
 
-    action: View | ProbeWindow | Push
-    observation: DepthImage | Touch
+    action: Any
+    observation: Any
 
     @property
     def kind(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 
@@ -71,11 +72,13 @@ class SimulatedProbe:
         InputError: the recording has no peg, or the part cannot be touched in simulation.
     """
 
+    unknowns: Unknowns | None
+
     def __init__(self, recording: Recording, settings: ProbeSettings) -> None:
         if recording.peg is None:
             raise InputError("the recording has probe windows but no peg; add the peg that was held.")
         windows = [m.action for m in recording.measurements if isinstance(m.action, ProbeWindow)]
-        self.settings = settings
+        self.settings, self.unknowns = settings, None
         self.physics = PegPhysics(recording.part, recording.peg, settings.contact)
         rate = 1.0 / float(np.median(np.diff(windows[0].probe.stamps)))
         self.sensing = Sensing(recording.peg, rate=rate)
@@ -91,23 +94,28 @@ class SimulatedProbe:
         """The cost of physics."""
         return {"physics": self.physics.effort}
 
-    def observe(
-        self, number: int, action: ProbeWindow, world_from_part: Tensor, unknowns: Unknowns | None = None
-    ) -> None:
-        """Sample `contacts_*` and `peg_*`, given nuisance parameters of the contact."""
-        settings, own = self.settings, () if unknowns is None else (unknowns,)
-        begin = partial(
-            ContactTrack.start, self.physics, self.sensing, world_from_part, action.probe, *own
-        )
+    def grasping(self, grip_from_peg: Tensor) -> SimulatedProbe:
+        """The same with the peg's surface at poses (N, 7) in the grip's frame."""
+        return self.given(Unknowns(grip_from_peg=grip_from_peg))
+
+    def given(self, unknowns: Unknowns) -> SimulatedProbe:
+        """The same, given nuisance parameters of the contact, one value for each particle."""
+        other = copy(self)
+        other.unknowns = unknowns
+        return other
+
+    def observe(self, number: int, action: ProbeWindow, world_from_part: Tensor) -> None:
+        """Sample `contacts_*` and `peg_*`."""
+        settings, unknowns = self.settings, self.unknowns
+        own = () if unknowns is None else (unknowns,)
+        begin = partial(ContactTrack.start, self.physics, self.sensing, world_from_part, action.probe, *own)
         inputs = (world_from_part, *(() if unknowns is None else unknowns.tensors))
         track = carried(f"probe {action.probe.name}", inputs, begin)
         window = (track, action.first, action.last)
         pyro.sample(
             f"contacts_{number}", ChamferContacts(*window, settings.contact_scale, settings.one_empty)
         )
-        peg = PegPose(
-            *window, settings.translation_scale, settings.rotation_scale, every=settings.pose_every
-        )
+        peg = PegPose(*window, settings.translation_scale, settings.rotation_scale, every=settings.pose_every)
         pyro.sample(f"peg_{number}", peg)
 
     def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:

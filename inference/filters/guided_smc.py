@@ -46,14 +46,10 @@ ASKED = 4  # particles that are evaluated first for that
 class Approximation(Protocol):
     """What guides the filter; `GaussianApproximation` is one. It is immutable."""
 
-    def including(
-        self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]
-    ) -> Any:
+    def including(self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]) -> Any:
         """The approximation given one more measurement."""
 
-    def deferring(
-        self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]
-    ) -> Any:
+    def deferring(self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]) -> Any:
         """The same for a measurement that all particles predict with certainty."""
 
     def updated(self) -> Any:

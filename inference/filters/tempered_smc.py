@@ -82,7 +82,7 @@ def infer(
     seed: int = 0,
     sweeps: tuple[int | Until, int | Until] | None = None,
     share: tuple[float, float] = (0.8, 0.6),
-    climbs: int | None = None,
+    climbs: int = 0,
     scene: Any = None,
     start: Step | None = None,
 ) -> Iterator[Step]:
@@ -101,7 +101,7 @@ def infer(
             that keep this conditional one, as shares of N: without, and with physics.
         climbs: how many draws of the prior climb before a measurement is let in, to find the modes between
             which particles jump (`bcppl.inference.proposals.climbing`; it needs depth images). 0 for
-            none; by default as many as the model asks for.
+            none.
         scene: what `model.prepare(recording)` gives, if it is at hand.
         start: a step to go on from, as `bcppl.inference.filters.smc.smc` does.
 
@@ -112,9 +112,7 @@ def infer(
     for kept in share:
         number_within("a share of {} of the particles is to be kept", kept, least=0.0, below=1.0)
     enough = until(displacement=0.5, distinct=max(1, round(0.8 * particles)), most=60)
-    climbing = whole_number(
-        "{} climbs are to find modes", model.climbs if climbs is None else climbs, least=0
-    )
+    climbing = whole_number("{} climbs are to find modes", climbs, least=0)
     if climbing and isinstance(model.program, Series):
         raise InputError("climbs find modes of one pose, and the model's is a series; give climbs=0.")
     moves = (6 if model.proposals else 12, enough) if sweeps is None else sweeps

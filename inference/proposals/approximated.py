@@ -25,8 +25,8 @@ from bcppl.traces import Trace
 
 Program = Callable[[Trace], None]
 
-# Correlations of standardised deviations before and after a proposal: of the part, of nuisance parameters when
-# a measurement is assimilated, and of those in a random walk.
+# Correlations of standardised deviations before and after a proposal: of the part, of nuisance parameters
+# when a measurement is assimilated, and of those in a random walk.
 MOVED, ASSIMILATING, WALKING = 0.9, 0.98, 0.9
 SCALES = torch.tensor([0.1, 1.5], dtype=torch.float64).log()  # of a random walk
 _SAME = 25.0  # squared standard deviations: components that are nearer are the same before and after
@@ -63,7 +63,7 @@ def backward_kernel(before: GaussianApproximation, after: GaussianApproximation,
 
 
 def conditional_proposal(approximation: GaussianApproximation) -> Program:
-    """An independence proposal: the part's pose from its approximate conditional given nuisance parameters."""
+    """An independence proposal of the part's pose, from its conditional given the nuisance parameters."""
 
     def program(trace: Trace) -> None:
         pyro.sample(approximation.pose, approximation.conditional(trace))

@@ -14,10 +14,11 @@ from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
-from bcppl.models.point_probe import Scene, point_probe, prepare
+from bcppl.models.point_probe import point_probe, prepare
 from bcppl.poses import identity, rotation_matrix, transform
 from bcppl.recordings.importers.point_probe import prism
 from bcppl.sensors.measurements import Measurement, Push, Recording
+from bcppl.sensors.point_finger import PointFinger
 from bcppl.traces import generate
 
 Array = npt.NDArray[np.float64]
@@ -32,7 +33,7 @@ STIFFNESS = 2000.0  # N/m: how fast the force grows beyond the onset
 NOISE = 0.005  # N
 
 
-def invent(
+def simulate_recording(
     seed: int,
     pushes: int = 10,
     part: Part | None = None,
@@ -50,7 +51,7 @@ def invent(
         part: what is pushed; the aluminium triangle of MLab_EXP by default.
         translation: half width of the prior in x and y, metres.
         yaw: half width of the prior in yaw, radians.
-        settings: fields of `bcppl.models.point_probe.Settings`.
+        settings: fields of `bcppl.sensors.point_finger.FingerSettings`.
 
     Raises:
         InputError: the part has no upright face, or none that a finger can approach.
@@ -62,7 +63,9 @@ def invent(
     turn = 0.5 * rng.uniform(-yaw, yaw)
     truth = np.array([x, y, 0.0, math.cos(turn), 0.0, 0.0, math.sin(turn)])
     scene = prepare(Recording(part, guess, [], truth=truth), **settings)
-    actions = [_push(rng, scene, truth) for _ in range(pushes)]
+    finger = scene.likelihoods["push"]
+    assert isinstance(finger, PointFinger)
+    actions = [_push(rng, finger, truth) for _ in range(pushes)]
 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(noise_seed(seed))
@@ -71,10 +74,10 @@ def invent(
     for k, push in enumerate(actions):
         angle = (
             float(trace[f"direction_{k}"][0])
-            if scene.settings.use_direction
+            if finger.settings.use_direction
             else rng.uniform(-math.pi, math.pi)
         )
-        measurements.append(Measurement(push, _touch(rng, scene, push, trace[f"onset_{k}"][0], angle)))
+        measurements.append(Measurement(push, _touch(rng, finger, push, trace[f"onset_{k}"][0], angle)))
     return Recording(part, guess, measurements, truth=truth, model="point_probe", source="made up by bcppl")
 
 
@@ -83,14 +86,14 @@ def noise_seed(seed: int) -> int:
     return int(np.random.default_rng([seed, 1]).integers(2**62))
 
 
-def _push(rng: np.random.Generator, scene: Scene, truth: Array) -> Push:
+def _push(rng: np.random.Generator, finger: PointFinger, truth: Array) -> Push:
     """A straight path onto a random place of an upright face, the finger's touching place leading."""
-    mesh = scene.part.mesh
+    mesh = finger.part.mesh
     upright = np.abs(mesh.face_normals[:, 2]) < 1e-3
     if not upright.any():
-        raise InputError(f"part {scene.part.name!r} has no upright face to push; give one, z up, that has.")
+        raise InputError(f"part {finger.part.name!r} has no upright face to push; give one, z up, that has.")
     area = np.where(upright, mesh.area_faces, 0.0)
-    low, high = scene.part.vertices[:, 2].min(), scene.part.vertices[:, 2].max()
+    low, high = finger.part.vertices[:, 2].min(), finger.part.vertices[:, 2].max()
     for _ in range(1000):
         face = rng.choice(len(area), p=area / area.sum())
         # Uniform in the triangle, then lowered to where a finger reaches: a fifth of the way up.
@@ -102,27 +105,27 @@ def _push(rng: np.random.Generator, scene: Scene, truth: Array) -> Push:
         heading = math.atan2(inward[1], inward[0]) + rng.uniform(-math.pi / 3, math.pi / 3)
         way = np.array([math.cos(heading), math.sin(heading), 0.0])
         start = torch.from_numpy(place - REACH * way)
-        if float(scene.distance(start).distance) > CLEAR:
+        if float(finger.distance(start).distance) > CLEAR:
             break
     else:
         raise InputError(
-            f"part {scene.part.name!r} leaves a finger no room to approach it; give one that does."
+            f"part {finger.part.name!r} leaves a finger no room to approach it; give one that does."
         )
 
     times = np.arange(0.0, STROKE / SPEED, TIP_PERIOD)
     in_part = place + (SPEED * times - REACH)[:, None] * way
-    finger = transform(torch.from_numpy(truth), torch.from_numpy(in_part))
+    places = transform(torch.from_numpy(truth), torch.from_numpy(in_part))
     turn = 0.5 * rng.uniform(-math.pi, math.pi)
     pose = identity(len(times))
     pose[:, 3], pose[:, 6] = math.cos(turn), math.sin(turn)
-    offset = torch.tensor(scene.settings.finger, dtype=torch.float64)
-    pose[:, :3] = finger - rotation_matrix(pose[0]) @ offset
+    offset = torch.tensor(finger.settings.finger, dtype=torch.float64)
+    pose[:, :3] = places - rotation_matrix(pose[0]) @ offset
     return Push(times, pose.numpy())
 
 
-def _touch(rng: np.random.Generator, scene: Scene, push: Push, onset: Tensor, angle: float) -> Touch:
+def _touch(rng: np.random.Generator, finger: PointFinger, push: Push, onset: Tensor, angle: float) -> Touch:
     """The raw wrench that reads as this onset (NaN for never) and this angle of the force on the part."""
-    settings, path = scene.settings, scene.path(push)
+    settings, path = finger.settings, finger.path(push)
     times = np.arange(push.times[0], push.times[-1], FORCE_PERIOD)
     force = np.zeros(len(times))
     if bool(onset.isnan().any()):
