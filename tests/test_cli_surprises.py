@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from bcppl.cli.surprises import MEANING, NAMED, sentence, together
-from bcppl.inference.predictive import Surprise
+from bcppl.inference.predictive import Check
 from bcppl.models.worlds.bench import Bench, bench_scene
 from bcppl.recordings import save
 from tests.command_line import Ran, short
@@ -45,8 +45,8 @@ def test_a_model_of_which_nothing_can_be_told_says_so(bcppl: Callable[..., Ran],
     assert ran.code == 0 and "p value: empty" in ran.out and "surprising" not in ran.out
 
 
-def of(kind: str, probability: float = 1e-9) -> Mapping[str, Surprise]:
-    return {kind: Surprise(probability, kind, 9.0)}
+def of(kind: str, probability: float = 1e-9) -> Mapping[str, Check]:
+    return {kind: Check(probability, kind, 9.0)}
 
 
 def test_one_sentence_names_the_measurements_and_what_each_kind_may_mean() -> None:
@@ -61,6 +61,6 @@ def test_one_sentence_names_the_measurements_and_what_each_kind_may_mean() -> No
 
 
 def test_sites_that_came_together_are_counted() -> None:
-    three = [Surprise(p, "normal", 0.0) for p in (0.2, 0.01, 0.9)]
+    three = [Check(p, "normal", 0.0) for p in (0.2, 0.01, 0.9)]
     assert together(three) == pytest.approx(0.03)
     assert together(three[:1]) == 0.2 and together([three[2]] * 2) == 1.0

@@ -259,13 +259,6 @@ def test_of_touches_those_that_meet_the_part_tell_its_height() -> None:
     assert again.difference(again.of(1), again.of(2)) == (0.0, 0.0)
 
 
-class Unknown:
-    """A list of actions with one that a scene does not know."""
-
-    def __iter__(self) -> Iterator[Reading]:
-        raise KeyError("view")
-
-
 def test_what_cannot_be_ranked_is_refused_in_a_sentence() -> None:
     population = drawn(50, 5)
     with pytest.raises(InputError, match="no candidates to choose from"):
@@ -278,10 +271,6 @@ def test_what_cannot_be_ranked_is_refused_in_a_sentence() -> None:
     for name in ("translation", "rotation"):
         with pytest.raises(InputError, match="modes are to be parted by 0"):
             linearised_information_gain(population, ASKED, arguments, **{name: 0.0})  # type: ignore[arg-type]
-    with pytest.raises(
-        InputError, match="candidate 0 cannot be simulated, for the scene does not know 'view'"
-    ):
-        linearised_information_gain(population, ["view"], lambda one: (SPREADS, Unknown()))
     with pytest.raises(InputError, match="a rate of 5 is given without a cost"):
         linearised_information_gain(population, ASKED, arguments, rate=5)
     with pytest.raises(InputError, match="adds no site"):

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.depth import RobustDepth
+from bcppl.distributions.depth.image import DepthDistribution
 from bcppl.distributions.manifold import ContactManifold
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
-from bcppl.inference import predictive
 from bcppl.inference.population import Population
-from bcppl.inference.predictive import THRESHOLD, Surprise, surprise
+from bcppl.inference.predictive import THRESHOLD, Check, surprise
 from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
 from bcppl.recordings import DepthImage
 from bcppl.rendering.renderer import DepthRenderer
@@ -155,7 +155,7 @@ def pressed(value: Tensor) -> None:
     pyro.sample("touch", ContactManifold(ledge, part, len(value), 8e-5, 3e-5, 2e-5))
 
 
-def of_touch(heights: list[float], felt: list[float]) -> Surprise | None:
+def of_touch(heights: list[float], felt: list[float]) -> Check | None:
     value = window(heights, felt)
     return surprise(belief(pressed, (value,), {"touch": value})).get("touch")
 
@@ -203,5 +203,5 @@ def test_a_mutant_that_draws_over_missing_pixels_is_found(monkeypatch: pytest.Mo
     image[torch.rand_like(image) < 0.6] = math.nan
     population = belief(program, (torch.zeros(3).double(),), {"depth": image})
     assert surprise(population)["depth"].surprising
-    monkeypatch.setattr(predictive, "_drawn_like", lambda site, many, image: many.sample())
+    monkeypatch.setattr(DepthDistribution, "_replicated", lambda site, image, many: many.sample())
     assert not surprise(population)["depth"].surprising

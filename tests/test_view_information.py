@@ -15,8 +15,8 @@ from bcppl.geometry.shapes import block
 from bcppl.inference.design import linearised_information_gain
 from bcppl.inference.population import Population
 from bcppl.models.look_and_touch import model
-from bcppl.models.view_information import pixel_information, view_information
 from bcppl.models.worlds.bench import bench_scene
+from bcppl.rendering.information import pixel_information
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.sensors.candidates import action_of
 from bcppl.sensors.measurements import View
@@ -60,25 +60,23 @@ def test_the_cameras_error_bounds_what_it_tells_and_a_second_image_tells_less() 
     views = [m.action for m in recording.measurements]
     torch.manual_seed(0)
     trace, _ = generate(model.program, (scene, []), {}, 12)
-    first = view_information(views[0], trace)
-    assert first is not None and view_information(object(), trace) is None
+    sensor, part = scene.likelihoods["view"], trace["part"]
+    assert isinstance(sensor, ErringCamera)
+    first = sensor.information([], views[0], part)
     assert bool((torch.linalg.eigvalsh(first) > -1e-6).all())
-    bound = torch.linalg.inv(_error(scene, views[0].camera, trace["part"]))
+    bound = torch.linalg.inv(_error(sensor, views[0].camera, part))
     assert bool((torch.linalg.eigvalsh(bound - first) > -1e-3 * float(bound.abs().max())).all())
-    observed = model.observe(scene, recording.measurements[:1])
-    looked, _ = generate(model.program, (scene, views[:1]), observed, 12, choices={"part": trace["part"]})
-    again, other = (view_information(v, looked) for v in views)
-    assert again is not None and other is not None
+    again, other = (sensor.information(views[:1], v, part) for v in views)
     size = [
         float(torch.linalg.slogdet(torch.eye(6) * 1e4 + each)[1].mean()) for each in (first, again, other)
     ]
     assert size[1] < size[2] and size[1] < size[0]
 
 
-def _error(scene: object, camera: Camera, part: torch.Tensor) -> torch.Tensor:
+def _error(sensor: ErringCamera, camera: Camera, part: torch.Tensor) -> torch.Tensor:
     from bcppl.rendering.stated_cameras import apparent_covariance
 
-    settings = scene.settings  # type: ignore[attr-defined]
+    settings = sensor.settings
     return apparent_covariance(camera, part, settings.camera_shift, settings.camera_turn)
 
 
@@ -94,13 +92,9 @@ def test_views_and_touches_stand_in_one_ranking() -> None:
     away = replace(recording.measurements[0].action.camera, name="away", device="")
     blind = replace(away, world_from_camera=looking_at(np.array([0.5, 0.5, 1.9]), np.array([0.5, 0.0, 0.1])))
     plan = _down(world)
-    ranking = linearised_information_gain(
-        population,
-        [plan, recording.measurements[0].action, View(blind)],
-        lambda one: (scene, [action_of(one)]),
-        information=view_information,
-        seed=0,
-    )
+    scene = model.prepare(with_views(recording, [View(blind)]))
+    candidates = [plan, recording.measurements[0].action, View(blind)]
+    ranking = by_information("part", seed=0)(population, candidates, scene)
     gain = [ranking.of(k).information_gain for k in range(3)]
     assert gain[0] > 2.0 and gain[1] > 1.0
     assert 0.0 <= gain[2] < gain[1]

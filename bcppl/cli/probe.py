@@ -21,9 +21,9 @@ from bcppl.cli.known import Known, known
 from bcppl.errors import InputError
 from bcppl.figures import action_in_3d
 from bcppl.geometry.gap import PegGap
-from bcppl.inference.design.loop import named_apart, prepared, with_views
+from bcppl.inference.design.loop import named_apart, with_views
 from bcppl.inference.design.ranking import Ranking
-from bcppl.inference.design.rules import Rank, by_information, by_reweighing
+from bcppl.inference.design.rules import Rank, by_information, by_reweighing, can_be_linearised
 from bcppl.inference.planning.candidates import KINDS, MIXED, candidates, refuse_settled
 from bcppl.inference.planning.filters import (
     Candidate,
@@ -42,9 +42,7 @@ from bcppl.inference.planning.filters import (
     refuse_none,
     within_reach,
 )
-from bcppl.models.look_and_touch_scene import Scene
 from bcppl.models.robots import load_robot
-from bcppl.models.view_information import view_information
 from bcppl.recordings import Recording
 from bcppl.recordings.action_file import SUFFIXES, load_actions, save_actions
 from bcppl.robot.plan import Plan
@@ -145,10 +143,10 @@ def probe(
     before = known(recording, of, model, inference, particles, seed, console, pegless)
     found = _found(before, own, kinds, [*_table(before, table), *filters], seed)
     console.print(escape(str(found)), soft_wrap=True)
-    scene = prepared(before.model, with_views(before.recording, found), before.scene)
+    scene = before.model.prepare(with_views(before.recording, found))
     with console.status("ranking"):
         settings = {"hypotheses": hypotheses, "cost": lasting, "rate": rate, "depth": depth, "seed": seed}
-        rank = _rank(by, before, scene, settings)
+        rank = _rank(by, before, scene, found, settings)
         try:
             ranking = rank(before.population, found, scene)
         except (AttributeError, KeyError, TypeError) as error:
@@ -183,13 +181,13 @@ def _picture(output: Path, given: Sequence[str]) -> Path:
     return picture
 
 
-def _rank(by: str | None, before: Known, scene: Any, settings: dict[str, Any]) -> Rank:
-    """By the linearised likelihoods of touches where the model has them, else by reweighing."""
-    felt = isinstance(scene, Scene)
-    if by == "reweighing" or (by is None and not felt):
+def _rank(
+    by: str | None, before: Known, scene: Any, found: Sequence[Candidate], settings: dict[str, Any]
+) -> Rank:
+    """By linearised likelihoods where the model's sensors have them, else by reweighing."""
+    if by == "reweighing" or (by is None and not can_be_linearised(scene, found)):
         return by_reweighing(before.model.pose, **settings)
-    information = view_information if felt else None
-    return by_information(before.model.pose, information=information, **settings)
+    return by_information(before.model.pose, **settings)
 
 
 def _pegless(own: Sequence[Plan | View] | None, kinds: dict[str, int]) -> Callable[[Recording], None]:

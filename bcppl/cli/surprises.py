@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bcppl.inference.population import Population
-from bcppl.inference.predictive import THRESHOLD, Surprise, surprise
+from bcppl.inference.predictive import THRESHOLD, Check, surprise
 
 MARK = "!"
 NOT_TOLD = "p value: empty, for nothing in this model is a depth image, a contact manifold or normal."
@@ -52,19 +52,19 @@ class Watch:
         if not isinstance(population, Population) or not self.told:
             return None
         found = surprise(population, list(self.labels))
-        by_label: dict[str, dict[str, Surprise]] = {}
+        by_label: dict[str, dict[str, Check]] = {}
         for address, each in found.items():
             by_label.setdefault(self.labels[address], {})[address] = each
         off = {label: sites for label, sites in by_label.items() if together(sites.values()) < THRESHOLD}
         return None if not off else sentence(off)
 
 
-def together(found: Collection[Surprise]) -> float:
+def together(found: Collection[Check]) -> float:
     """The p value of several sites together, after Bonferroni."""
     return min(1.0, len(found) * min(each.probability for each in found))
 
 
-def sentence(off: Mapping[str, Mapping[str, Surprise]]) -> str:
+def sentence(off: Mapping[str, Mapping[str, Check]]) -> str:
     """The warning for surprising sites by measurement and address."""
     labels = list(off)
     more = f" and {len(labels) - NAMED} more" if len(labels) > NAMED else ""

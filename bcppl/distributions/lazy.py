@@ -50,6 +50,10 @@ class LazyDistribution(TorchDistribution):
             f"a plate of shape {tuple(batch_shape)}; build it from values sampled in the same program."
         )
 
+    def undrawn(self) -> Tensor:
+        """NaN in the shape of a sample."""
+        return torch.full((*self.batch_shape, *self.event_shape), torch.nan, dtype=torch.float64)
+
     @property
     def log_prob_bound(self) -> float:
         """What no log-probability exceeds, whatever the value and the inputs; +inf where that is not known.

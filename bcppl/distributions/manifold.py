@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import torch
+from scipy.stats import binom
 from torch import Tensor
 from torch.special import log_ndtr
 
 from bcppl.arguments import number_within
+from bcppl.distributions.checks import Check, chi_square
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 
-_LATER: ContextVar[bool] = ContextVar("_LATER", default=False)
 _FAR = 4.0  # standard deviations
 FARTHEST = 0.02  # m: the range over which an outlier's gap is spread evenly
 
@@ -154,6 +153,25 @@ class ContactManifold(LazyDistribution):
         found = torch.where(felt == 1.0, distance + self.sink, distance.clamp(max=0.0))
         return torch.where(torch.isnan(felt), torch.nan, found)
 
+    def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check | None:
+        """The check of a window (T, 8) at P particles (`bcppl.distributions.checks.Checked`).
+
+        Squared residuals of the contacts, whitened by the noise and the shared error, against chi-square; the
+        number of stamps without contact that lie four standard deviations deep in the part against the number
+        of outliers. The smaller of the two p values, doubled; None where contact is undecided throughout.
+        """
+        if not bool((value[:, 7] == value[:, 7]).any()):
+            return None
+        residual, felt = self.residual(value), value[:, 7]
+        contact, free = residual[:, felt == 1.0], residual[:, felt == 0.0]
+        variance, common, count = self.noise**2, self.shared**2, contact.shape[1]
+        share = common / (variance + count * common)
+        squared = (contact.square().sum(dim=1) - share * contact.sum(dim=1).square()) / variance
+        whole = chi_square(squared, count, "contacts") if count else Check(1.0, "contacts", 0.0)
+        deep = (free < -_FAR * math.hypot(self.noise, self.shared)).sum(dim=1)
+        outliers = float(binom.sf(deep.numpy() - 1, free.shape[1], self.outlier).mean())
+        return Check(min(1.0, 2.0 * min(whole.probability, outliers)), "contacts", whole.excess)
+
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Where pegs get to as `motion` says, with errors, (N, T, 8); none is an outlier.
 
@@ -169,19 +187,7 @@ class ContactManifold(LazyDistribution):
                 "get to; give it a `motion`, such as bcppl.contact.god_object.WindowMotion, or "
                 "simulate the probe with bcppl.contact.track.ContactTrack."
             )
-        if _LATER.get():
-            return torch.full((*self.batch_shape, *self.event_shape), torch.nan, dtype=torch.float64)
         return self._with_errors(self.motion(self.pose))
-
-    @staticmethod
-    @contextmanager
-    def drawn_later() -> Iterator[None]:
-        """Samples within are NaN, and cost nothing: what they are is asked for with `samples` afterwards."""
-        token = _LATER.set(True)
-        try:
-            yield
-        finally:
-            _LATER.reset(token)
 
     @staticmethod
     def samples(sites: Sequence[ContactManifold]) -> list[Tensor]:

@@ -86,3 +86,11 @@ class Grasping(Protocol):
 
     def grasping(self, grip_from_peg: Tensor) -> Any:
         """The likelihood given the peg's pose (N, 7) in the grip's frame."""
+
+
+@runtime_checkable
+class Informative(Protocol):
+    """The expected information of a measurement is known without simulating it."""
+
+    def information(self, done: Sequence[Any], action: Any, part: Tensor) -> Tensor:
+        """The information (N, 6, 6) that a measurement adds about the part's pose (N, 7)."""

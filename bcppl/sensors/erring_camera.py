@@ -23,6 +23,7 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, bin_depth
+from bcppl.rendering.information import pixel_information
 from bcppl.rendering.region import region_of
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.rendering.stated_cameras import apparent_covariance, line_of_sight, seen_elsewhere
@@ -236,6 +237,41 @@ class ErringCamera:
             return error + more
 
         return covariance
+
+    def information(self, done: Sequence[Any], action: View, part: Tensor) -> Tensor:
+        """The information (N, 6, 6) that an image adds to the part's pose (N, 7).
+
+        Pixels are weighted as by `RobustDepth`; range bias and extrinsic error are integrated out. Images of
+        one instrument share both, so the tenth adds less than the first. It is information about one mode:
+        it does not discriminate between modes.
+
+        Args:
+            done: the actions before, of whatever kind.
+            action: the view.
+            part: where the part is.
+        """
+        before = [
+            a.camera for a in done if isinstance(a, View) and a.camera.instrument == action.camera.instrument
+        ]
+        return self._information([*before, action.camera], part) - self._information(before, part)
+
+    def _information(self, cameras: Sequence[Camera], part: Tensor) -> Tensor:
+        """The information (N, 6, 6) of images of one instrument together."""
+        settings = self.settings
+        whole = torch.zeros(len(part), 7, 7, dtype=torch.float64)
+        if not cameras:
+            return whole[:, :6, :6]
+        weight = (1.0 - settings.outlier) / settings.scale**2 / (settings.temperature or 1.0)
+        for camera in cameras:
+            whole = whole + weight * pixel_information(self.renderer, camera, part, settings.bins)
+        both = whole[:, :6, 6:]
+        own = whole[:, 6:, 6:] + 1.0 / settings.bias**2
+        seen = whole[:, :6, :6] - both @ both.transpose(-1, -2) / own
+        error = apparent_covariance(cameras[0], part, settings.camera_shift, settings.camera_turn)
+        # (seen^-1 + error)^-1, also where the image leaves an axis open.
+        eye = torch.eye(6, dtype=torch.float64)
+        left = torch.linalg.solve(eye + seen @ error, seen)
+        return 0.5 * (left + left.transpose(-1, -2))
 
     # ---- proposals of the nuisance parameters
 

@@ -22,6 +22,7 @@ from pyro.poutine.runtime import _DIM_ALLOCATOR, _PYRO_STACK
 from pyro.poutine.subsample_messenger import _Subsample
 from torch import Tensor
 
+from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry, carrying
 from bcppl.traces.explained import explained, unfit, unfit_particles
@@ -60,8 +61,12 @@ def run(
     particles: int,
     given: Mapping[str, Tensor],
     carried: Mapping[str, Entry],
+    *,
+    draws_lazy: bool = True,
 ) -> Run:
     """Run a program under a plate of `particles`, its sites set to `given` and the others sampled.
+
+    Lazy sites are NaN instead of samples unless `draws_lazy`.
 
     Raises:
         InputError: no particles, arguments that are no tuple, a duplicate address, an enumerated site, a
@@ -78,7 +83,7 @@ def run(
             f"a program was to be run for {particles} particles; give 1 or more, a whole number."
         )
     refuse_other_than_tensors(given)
-    recorder = _Recorder(particles, given)
+    recorder = _Recorder(particles, given, draws_lazy)
     with carrying(carried) as used, torch.no_grad(), pyro.validation_enabled(False):
         try:
             with _apart(), recorder, _Particles(PARTICLES, particles, dim=-1) as plate:
@@ -162,8 +167,9 @@ class _Particles(IndepMessenger):
 class _Recorder(Messenger):
     """Sets sites to given values and records all; the outermost handler, it sees them as plates made them."""
 
-    def __init__(self, particles: int, given: Mapping[str, Tensor]) -> None:
+    def __init__(self, particles: int, given: Mapping[str, Tensor], draws_lazy: bool = True) -> None:
         super().__init__()
+        self.draws_lazy = draws_lazy
         self.particles = particles
         self.given = given
         self.distributions: dict[str, Any] = {}
@@ -206,7 +212,8 @@ class _Recorder(Messenger):
             message["value"], message["is_observed"] = inward(value, distribution), True
             self.values[address] = value
         elif message["value"] is None:
-            message["value"] = drawn(distribution)
+            lazy = not self.draws_lazy and isinstance(distribution, LazyDistribution)
+            message["value"] = distribution.undrawn() if lazy else drawn(distribution)
 
     def _pyro_post_sample(self, message: Any) -> None:
         address = message["name"]

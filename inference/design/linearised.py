@@ -21,7 +21,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import LARGEST_SEED, seed_number, whole_number
-from bcppl.distributions.manifold import ContactManifold
+from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.design.expected_entropy import warn_of_lost
 from bcppl.inference.design.gaussians import Gaussians, nats
@@ -29,7 +29,8 @@ from bcppl.inference.design.hypotheses import Hypotheses, chosen_hypotheses, mea
 from bcppl.inference.design.observations import Arguments, seeded
 from bcppl.inference.design.ranking import Price, Prospect, Ranking, costs_in_nats, ranked
 from bcppl.inference.population import Population
-from bcppl.traces import Trace, extend
+from bcppl.traces import Trace
+from bcppl.traces.undrawn import undrawn
 
 # What a candidate tells of the pose at particles of a trace, (H, 6, 6); None where its sites say it.
 Information = Callable[[Any, Trace], Tensor | None]
@@ -109,14 +110,14 @@ def linearised_information_gain(
     whites: list[Tensor] = []
     uncounted: list[int] = []
     prospects: list[Prospect] = []
-    for k, told in enumerate(_all_told(trace, candidates, extend_args, information, seed)):
-        white = belief.carried(told.information(), trace[address], mode)
+    for k, predicted in enumerate(_predicted(trace, candidates, extend_args, information, seed)):
+        white = belief.carried(predicted.information(), trace[address], mode)
         gains = nats(white)
         if bool(torch.isnan(gains).all()):
             raise InferenceError(f"the simulation of candidate {k} failed for every hypothesis.")
         warn_of_lost(k, torch.isnan(gains))
-        if len(belief) > 1 and told.sites:
-            gains = belief.entropy - _left(belief, told, trace, address, mode, gains)
+        if len(belief) > 1 and predicted.sites:
+            gains = belief.entropy - _left(belief, predicted, trace, address, mode, gains)
         elif len(belief) > 1:
             uncounted.append(k)
         whites.append(white)
@@ -147,14 +148,14 @@ def linearised_information_gain(
 
 
 @dataclass(frozen=True, eq=False)
-class _Told:
-    """What a candidate would tell.
+class _Predicted:
+    """A candidate's predicted observations.
 
     Attributes:
         args: the program's arguments once it is done.
-        known: (H, 6, 6) the information; None where it is asked of the sites.
-        sites: those that are observed, at the hypotheses, by address.
-        values: (H, *event) what hypotheses would observe there.
+        known: (H, 6, 6) its information; None where the sites are asked for it.
+        sites: those that would be observed, at the hypotheses, by address.
+        values: (H, *event) samples of what would be observed there, one for each hypothesis.
     """
 
     args: tuple[Any, ...]
@@ -166,39 +167,32 @@ class _Told:
         """(H, 6, 6) at the hypotheses."""
         if self.known is not None:
             return self.known
-        said = [site.quadratic(self.values[a]).information for a, site in self.sites.items()]
-        return torch.stack(said).sum(dim=0)
+        own = [site.quadratic(self.values[a]).information for a, site in self.sites.items()]
+        return torch.stack(own).sum(dim=0)
 
     def elsewhere(self, trace: Trace) -> list[tuple[Any, Tensor]]:
-        """The sites at other particles of a trace, and what the hypotheses would observe at them."""
-        with ContactManifold.drawn_later():
-            longer, _ = extend(trace, self.args, {})
+        """The sites at other particles of a trace, and the hypotheses' observations at them."""
+        longer = undrawn(trace, self.args)
         return [(longer.distributions[a], value) for a, value in self.values.items()]
 
 
-def _all_told(
+def _predicted(
     trace: Trace,
     candidates: Sequence[Any],
     arguments: Arguments,
     information: Information | None,
     seed: int,
-) -> list[_Told]:
-    """What each candidate would tell hypotheses, the touches of all drawn together."""
-    found: list[_Told] = []
+) -> list[_Predicted]:
+    """Each candidate's predicted observations at the hypotheses; alike sites are sampled in one batch."""
+    found: list[_Predicted] = []
     for k, candidate in enumerate(candidates):
         args = arguments(candidate)
         known = None if information is None else information(candidate, trace)
         if known is not None:
-            found.append(_Told(args, _positive(k, known, trace.particles)))
+            found.append(_Predicted(args, _positive(k, known, trace.particles)))
             continue
-        try:
-            with seeded(seed), ContactManifold.drawn_later():
-                longer, _ = extend(trace, args, {})
-        except KeyError as error:
-            raise InputError(
-                f"candidate {k} cannot be simulated, for the scene does not know {error}; prepare the scene "
-                "with it, or give `information` (for views bcppl.models.view_information.view_information)."
-            ) from error
+        with seeded(seed):
+            longer = undrawn(trace, args)
         added = [a for a in longer.since(trace) if a in longer.choices]
         if not added:
             raise InputError(
@@ -210,22 +204,28 @@ def _all_told(
             if not hasattr(site, "quadratic"):
                 raise InputError(
                     f"candidate {k} is observed at {one!r}, whose {type(site).__name__} has no `quadratic`; "
-                    "give `information` for it (for views bcppl.models.view_information.view_information), "
-                    "or use expected_information_gain."
+                    "give `information` for it, or use expected_information_gain."
                 )
-        found.append(_Told(args, None, sites, {one: longer[one] for one in added}))
-    drawn = [
-        (told, a, site)
-        for told in found
-        for a, site in told.sites.items()
-        if isinstance(site, ContactManifold)
-    ]
-    if drawn:
-        with seeded(seed):
-            samples = ContactManifold.samples([site for *_, site in drawn])
-        for (told, a, _), value in zip(drawn, samples, strict=True):
-            told.values[a] = value
+        found.append(_Predicted(args, None, sites, {one: longer[one] for one in added}))
+    _sample(found, seed)
     return found
+
+
+def _sample(predicted: Sequence[_Predicted], seed: int) -> None:
+    """Sample the lazy sites: those of one type that can be simulated together in one batch."""
+    batches: dict[type, list[tuple[_Predicted, str, Any]]] = {}
+    for each in predicted:
+        for address, site in each.sites.items():
+            if hasattr(type(site), "samples"):
+                batches.setdefault(type(site), []).append((each, address, site))
+            elif isinstance(site, LazyDistribution):
+                with seeded(seed):
+                    each.values[address] = site.sample()
+    for kind, batch in batches.items():
+        with seeded(seed):
+            samples = kind.samples([site for *_, site in batch])  # type: ignore[attr-defined]
+        for (each, address, _), value in zip(batch, samples, strict=True):
+            each.values[address] = value
 
 
 def _positive(number: int, information: object, count: int) -> Tensor:
@@ -253,7 +253,9 @@ def _positive(number: int, information: object, count: int) -> Tensor:
     return known
 
 
-def _left(belief: Gaussians, told: _Told, trace: Trace, address: str, mode: Tensor, within: Tensor) -> Tensor:
+def _left(
+    belief: Gaussians, predicted: _Predicted, trace: Trace, address: str, mode: Tensor, within: Tensor
+) -> Tensor:
     """Entropies (H,) that are left of a belief of several modes, each asked how it explains what is felt.
 
     The evidence of a mode is Laplace's: the likelihood at the place that explains the observation best, that
@@ -263,9 +265,9 @@ def _left(belief: Gaussians, told: _Told, trace: Trace, address: str, mode: Tens
     log_evidence, falls = [], []
     for k in range(len(belief)):
         start = torch.where((mode == k)[:, None], trace[address], belief.center[k])
-        at, white = _best(belief, told, trace, address, k, start)
+        at, white = _best(belief, predicted, trace, address, k, start)
         found = trace.at({address: at})
-        log_prob = torch.stack([site.log_prob(value) for site, value in told.elsewhere(found)]).sum(0)
+        log_prob = torch.stack([site.log_prob(value) for site, value in predicted.elsewhere(found)]).sum(0)
         coordinates = belief.freedom.coordinates(poses.local(belief.center[k], at))
         off = torch.linalg.solve_triangular(belief.factor[k], coordinates.T, upper=False)
         falls.append(torch.where(mode == k, within, nats(white)))
@@ -277,25 +279,25 @@ def _left(belief: Gaussians, told: _Told, trace: Trace, address: str, mode: Tens
 
 
 def _best(
-    belief: Gaussians, told: _Told, trace: Trace, address: str, k: int, start: Tensor
+    belief: Gaussians, predicted: _Predicted, trace: Trace, address: str, k: int, start: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Where (H, 7) a mode explains each hypothesis' observation best, and the white information (H, d, d)."""
     at, count = start, len(start)
     modes = torch.full((count,), k)
     eye = torch.eye(belief.freedom.dimension, dtype=torch.float64)
     for _ in range(_STEPS):
-        said = [s.quadratic(v) for s, v in told.elsewhere(trace.at({address: at}))]
-        slope, information = (torch.stack(each).sum(0) for each in zip(*said, strict=True))
+        own = [s.quadratic(v) for s, v in predicted.elsewhere(trace.at({address: at}))]
+        gradient, information = (torch.stack(each).sum(0) for each in zip(*own, strict=True))
         white = torch.nan_to_num(belief.carried(information, at, modes))
         axes = list(belief.freedom.axes)
-        pull = torch.nan_to_num(slope[:, axes] @ belief.factor[k])
+        pull = torch.nan_to_num(gradient[:, axes] @ belief.factor[k])
         here = belief.freedom.coordinates(poses.local(belief.center[k], at))
         off = torch.linalg.solve_triangular(belief.factor[k], here.T, upper=False).T
         step = -torch.linalg.solve(eye + white, (pull + off)[..., None])[..., 0]
         step = step * (2.0 / step.norm(dim=1, keepdim=True).clamp(min=2.0))
         at = poses.retract(at, belief.freedom.embed(step @ belief.factor[k].T))
-    said = [s.quadratic(v) for s, v in told.elsewhere(trace.at({address: at}))]
-    return at, belief.carried(torch.stack([each.information for each in said]).sum(0), at, modes)
+    own = [s.quadratic(v) for s, v in predicted.elsewhere(trace.at({address: at}))]
+    return at, belief.carried(torch.stack([each.information for each in own]).sum(0), at, modes)
 
 
 def _followed(

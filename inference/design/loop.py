@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -43,10 +43,6 @@ from bcppl.robot.motion import ProbeWindow
 from bcppl.robot.plan import Plan
 from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
 from bcppl.traces import Model
-
-# What a model's scene finds out as it goes, by address or number of actions, and what hangs on solids alone.
-FOUND = ("fits", "near", "told")
-SOLID = ("gap", "proxy")
 
 # Candidates for a belief; the number counts rounds, from 0.
 CandidatesFrom = Callable[[Belief, int], Sequence[Candidate]]
@@ -149,7 +145,7 @@ def probing_loop(
     for what, given in (("candidates_from", candidates_from), ("rank", rank), ("infer", infer)):
         if not callable(given):
             raise InputError(f"the loop's {what} is a {type(given).__name__}; give a function.")
-    scene = prepared(model, recording, None if start is None else start.population.trace.args[0])
+    scene = model.prepare(recording)
     step = _last(infer(model, recording, particles=particles, seed=seed, scene=scene, start=start), start)
     if chance is not None and (likely := _likely(chance, step.belief)) >= enough:
         _nothing_done(f"an insertion succeeds with a chance of {likely:.3g} as it is")
@@ -163,7 +159,7 @@ def probing_loop(
                 if number == 0:
                     _nothing_done(f"all candidates last longer than {left:.3g} s")
                 return
-        scene = prepared(model, with_views(recording, found), scene)
+        scene = model.prepare(with_views(recording, found))
         ranking = _ranked(rank(step.population, found, scene), least_gain is not None)
         if least_gain is not None and ranking.best.value < least_gain:
             if number == 0:
@@ -175,7 +171,7 @@ def probing_loop(
         measured = _measured(world.carry_out(chosen), chosen)
         left = max(0.0, left - lasting(chosen))
         recording = _going_on(recording, measured, chosen)
-        scene, before = prepared(model, recording, scene), step
+        scene, before = model.prepare(recording), step
         count = len(before.population)
         step = _last(infer(model, recording, particles=count, seed=seed, scene=scene, start=before), None)
         likely = math.nan if chance is None else _likely(chance, step.belief)
@@ -297,15 +293,3 @@ def with_views(recording: Recording, candidates: Sequence[Candidate]) -> Recordi
     views = [c for c in candidates if isinstance(c, View) and c.camera.name not in known]
     empty = [Measurement(v, DepthImage(np.full((v.camera.height, v.camera.width), np.nan))) for v in views]
     return replace(recording, measurements=[*recording.measurements, *empty])
-
-
-def prepared(model: Model, recording: Recording, before: Any) -> Any:
-    """The scene of a recording that goes on: what was found out is kept, solids are not measured again."""
-    scene = model.prepare(recording)
-    if before is None or type(before) is not type(scene) or not is_dataclass(scene):
-        return scene
-    names = {each.name for each in fields(scene)}
-    for name in names.intersection(FOUND):
-        getattr(scene, name).update(getattr(before, name))
-    kept = {name: getattr(before, name) for name in names.intersection(SOLID)}
-    return replace(scene, **{name: value for name, value in kept.items() if value is not None})  # type: ignore[type-var]

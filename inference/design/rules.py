@@ -21,6 +21,7 @@ from bcppl.inference.planning.filters import Candidate
 from bcppl.inference.planning.touching import leading_point, middles_of_strokes
 from bcppl.inference.population import Population
 from bcppl.sensors.candidates import action_of
+from bcppl.sensors.capabilities import Informative, Linearised
 from bcppl.sensors.measurements import View
 
 # Ranks candidates for a population, given a scene of the model that knows their cameras.
@@ -28,22 +29,37 @@ Rank = Callable[[Population, Sequence[Candidate], Any], Ranking]
 
 
 def by_information(pose: str, **settings: Any) -> Rank:
-    """By the nats that each is expected to tell of a pose: `linearised_information_gain`.
+    """The rule that ranks by expected entropy reduction of a pose: `linearised_information_gain`.
 
     Args:
         pose: the address of the sought pose.
-        settings: further arguments, such as `hypotheses`, `cost` and `rate`; where there are views among the
-            candidates, `information`, which for look_and_touch is
-            `bcppl.models.view_information.view_information`.
+        settings: further arguments, such as `hypotheses`, `cost` and `rate`; `information` unless the sensors
+            of the scene give it (`bcppl.sensors.capabilities.Informative`).
     """
 
     def rank(population: Population, candidates: Sequence[Candidate], scene: Any) -> Ranking:
         _, done = population.trace.args
+
+        def information(candidate: Candidate, trace: Any) -> Any:
+            action = action_of(candidate)
+            sensor = scene.sensor(action) if hasattr(scene, "sensor") else None
+            return sensor.information(done, action, trace[pose]) if isinstance(sensor, Informative) else None
+
         return linearised_information_gain(
-            population, candidates, lambda c: (scene, [*done, action_of(c)]), pose, **settings
+            population,
+            candidates,
+            lambda c: (scene, [*done, action_of(c)]),
+            pose,
+            **{"information": information, **settings},
         )
 
     return rank
+
+
+def can_be_linearised(scene: Any, candidates: Sequence[Candidate]) -> bool:
+    """Whether `by_information` can rank these candidates with the sensors of a scene."""
+    sensors = [scene.sensor(action_of(each)) for each in candidates] if hasattr(scene, "sensor") else []
+    return bool(sensors) and all(isinstance(each, Informative | Linearised) for each in sensors)
 
 
 def by_reweighing(pose: str, **settings: Any) -> Rank:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.stats import norm
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.distributions.checks import Check
 from bcppl.distributions.depth.observed import KEPT, Observed
 from bcppl.distributions.depth.rendering import Array, HitsOfPoses, Mask, RendersDepth
 from bcppl.distributions.lazy import LazyDistribution
@@ -233,6 +236,25 @@ class DepthDistribution(LazyDistribution):
         unknown = torch.isinf(rendered)
         noisy = self._noisy(torch.where(unknown, 0.0, rendered))
         return torch.where(unknown, self._uniform(rendered), noisy)
+
+    def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check:
+        """The check of an image (H, W) at P particles (`bcppl.distributions.checks.Checked`).
+
+        The discrepancy is -log p(y | theta), which is a sum over pixels and so nearly normal. Replicated
+        images are missing where the observed one is.
+        """
+        many, observed = replicas(), -self.log_prob(value)
+        replicated = -many.log_prob(self._replicated(value, many)).reshape(len(observed), -1)
+        # One spread for all: that of a sum over pixels hardly depends on the pose.
+        spread = float(replicated.var(dim=1).mean().sqrt())
+        if not spread > 0.0:  # no pixel of the image counts
+            return Check(1.0, "image", 0.0)
+        excess = (observed - replicated.mean(dim=1)) / spread
+        return Check(float(norm.sf(excess.numpy()).mean()), "image", float(excess.mean()))
+
+    def _replicated(self, value: Tensor, many: Any) -> Tensor:
+        missing = torch.from_numpy(~self.observed(value).valid.any(axis=0)).reshape(value.shape)
+        return torch.where(missing, torch.nan, many.sample())
 
     def _uniform(self, like: Tensor) -> Tensor:
         return self.camera.near + (self.camera.far - self.camera.near) * torch.rand_like(like)

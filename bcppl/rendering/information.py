@@ -1,0 +1,51 @@
+"""Fisher information of a depth image's pixels, by finite differences of the rendered depth."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.geometry.camera import Camera
+from bcppl.rendering.region import region_of
+from bcppl.rendering.renderer import DepthRenderer
+
+Array = npt.NDArray[np.float64]
+
+# Steps of the differences; with smaller ones a ray's jumps from face to face dominate.
+STEPS = (5e-4, 5e-4, 5e-4, 5e-3, 5e-3, 5e-3)
+JUMP = 0.01  # m: a pixel that changes by more goes from the part to its background, and is an outlier
+WITHIN = 0.01  # m: margin of the rendered region around the mean pose
+
+
+def pixel_information(renderer: DepthRenderer, camera: Camera, part: Tensor, bins: int = 1) -> Tensor:
+    """The sum (N, 7, 7) over pixels of the outer products of their gradients.
+
+    The gradient of a pixel's depth is with respect to the part's pose (N, 7), in its tangent space, and to a
+    range bias. Pixels at which the part appears or disappears, or that are out of the sensor's range, are
+    left out. With `bins` one pixel stands for a square of so many.
+    """
+    middle = part[0].numpy()
+    spread = float((part[:, :3] - part[0, :3]).norm(dim=1).max())
+    near = camera.cropped(*region_of(camera, renderer.part, middle, WITHIN + spread)).binned(bins)
+    gradients = []
+    for axis, step in enumerate(STEPS):
+        away = torch.zeros(6, dtype=torch.float64)
+        away[axis] = step
+        ahead, behind = (_read(renderer, near, poses.retract(part, s * away)) for s in (1.0, -1.0))
+        with np.errstate(invalid="ignore"):
+            change = ahead - behind
+        change = np.where(np.isfinite(change) & (np.abs(change) < JUMP), change, 0.0)
+        gradients.append(torch.from_numpy(change.reshape(len(part), -1) / (2.0 * step)))
+    sees = np.isfinite(_read(renderer, near, part)).reshape(len(part), -1)
+    rows = torch.stack([*gradients, torch.from_numpy(sees.astype(np.float64))], dim=1)
+    return rows @ rows.transpose(-1, -2)
+
+
+def _read(renderer: DepthRenderer, camera: Camera, part: Tensor) -> Array:
+    """Depths (N, height, width) in the sensor's range, NaN elsewhere."""
+    depth = renderer.images(camera, part)
+    with np.errstate(invalid="ignore"):
+        return np.where((depth >= camera.near) & (depth <= camera.far), depth, np.nan)
