@@ -31,7 +31,7 @@ from bcppl.geometry.camera import Camera, bin_depth
 from bcppl.rendering.region import region_of
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.rendering.stated_cameras import apparent_covariance, line_of_sight, seen_elsewhere
-from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
+from bcppl.sensors import DepthImage, Measurement, Recording, View
 from bcppl.traces import Model, Trace
 
 # Logarithms of how far what a camera sees is moved, in spreads of the particles.

@@ -30,7 +30,7 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.models import peg_in_hole
 from bcppl.robot.motion import ProbeWindow
-from bcppl.sensors.measurements import Recording, View
+from bcppl.sensors import Recording, View
 from bcppl.traces import Model, carried
 
 

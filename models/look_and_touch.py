@@ -31,7 +31,7 @@ from bcppl.rendering.region import region_of
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.rendering.stated_cameras import apparent_covariance, seen_elsewhere
 from bcppl.robot.motion import ProbeWindow
-from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
+from bcppl.sensors import DepthImage, Measurement, Recording, View
 from bcppl.traces import Model
 
 

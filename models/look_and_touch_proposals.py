@@ -38,7 +38,7 @@ from bcppl.models.camera_error import farther
 from bcppl.models.look_and_touch_scene import Scene, image_of, touch_of
 from bcppl.rendering.stated_cameras import apparent_covariance
 from bcppl.robot.motion import ProbeWindow
-from bcppl.sensors.measurements import View
+from bcppl.sensors import View
 from bcppl.traces import Trace
 
 # What an image says is taken for no surer than this: metres, radians, metres of bias.

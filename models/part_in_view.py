@@ -26,7 +26,7 @@ from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.rendering.scene import RendersPart
-from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
+from bcppl.sensors import DepthImage, Measurement, Recording, View
 from bcppl.traces import Model
 
 

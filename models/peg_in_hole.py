@@ -34,7 +34,7 @@ from bcppl.geometry.parts import Part
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.rendering.scene import RendersPart
 from bcppl.robot.motion import ProbeWindow
-from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
+from bcppl.sensors import DepthImage, Measurement, Recording, View
 from bcppl.traces import Model, carried
 
 # What inference believes of the contact. The worlds that make recordings have parameters of their own.

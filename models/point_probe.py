@@ -27,7 +27,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.parts import Part
 from bcppl.poses import compose, inverse, rotation_matrix, transform
-from bcppl.sensors.measurements import Measurement, Push, Recording
+from bcppl.sensors import Measurement, Push, Recording
 from bcppl.traces.model import Model
 
 

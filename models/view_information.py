@@ -20,7 +20,7 @@ from bcppl.geometry.camera import Camera
 from bcppl.rendering.region import region_of
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.rendering.stated_cameras import apparent_covariance
-from bcppl.sensors.measurements import View
+from bcppl.sensors import View
 from bcppl.traces import Trace
 
 Array = npt.NDArray[np.float64]

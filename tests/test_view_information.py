@@ -18,8 +18,8 @@ from bcppl.models.look_and_touch import model
 from bcppl.models.view_information import pixel_information, view_information
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.rendering.renderer import DepthRenderer
+from bcppl.sensors import View
 from bcppl.sensors.candidates import action_of
-from bcppl.sensors.measurements import View
 from bcppl.traces import generate
 
 

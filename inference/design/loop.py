@@ -41,7 +41,7 @@ from bcppl.inference.planning.filters import (
 from bcppl.recordings.check import problems
 from bcppl.robot.motion import ProbeWindow
 from bcppl.robot.plan import Plan
-from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
+from bcppl.sensors import DepthImage, Measurement, Recording, View
 from bcppl.traces import Model
 
 # What a model's scene finds out as it goes, by address or number of actions, and what hangs on solids alone.

@@ -20,8 +20,8 @@ from bcppl.inference.design.ranking import Prospect, Ranking
 from bcppl.inference.planning.filters import Candidate
 from bcppl.inference.planning.touching import leading_point, middles_of_strokes
 from bcppl.inference.population import Population
+from bcppl.sensors import View
 from bcppl.sensors.candidates import action_of
-from bcppl.sensors.measurements import View
 
 # Ranks candidates for a population, given a scene of the model that knows their cameras.
 Rank = Callable[[Population, Sequence[Candidate], Any], Ranking]

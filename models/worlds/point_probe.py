@@ -17,7 +17,7 @@ from bcppl.geometry.parts import Part
 from bcppl.models.point_probe import Scene, point_probe, prepare
 from bcppl.poses import identity, rotation_matrix, transform
 from bcppl.recordings.importers.point_probe import prism
-from bcppl.sensors.measurements import Measurement, Push, Recording
+from bcppl.sensors import Measurement, Push, Recording
 from bcppl.traces import generate
 
 Array = npt.NDArray[np.float64]
