@@ -1,4 +1,4 @@
-"""Pictures of a belief: its error over time, its particles around the part, and what is to be done next.
+"""Pictures of a belief: its error over time, its particles around the part, and the next measurement.
 
 Every function returns a matplotlib `Figure` of its own, made without pyplot: nothing is shown or kept in a
 global state, and `figure.savefig("name.png")` works without a display.
@@ -31,12 +31,11 @@ from bcppl.drawn_in_3d import (
     limits_of,
     outline,
     placed,
-    rotation,
 )
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
-from bcppl.robot.plan import Plan
-from bcppl.sensors.measurements import View
+from bcppl.sensors.candidates import Candidate
+from bcppl.sensors.protocol import FAINT, Drawable, sensor_of
 
 Array = npt.NDArray[np.float64]
 
@@ -45,15 +44,6 @@ TRUTH = "#00A6D6"
 
 HEAVIEST = 10
 SMALLEST_ADD = 0.01  # mm: below it a logarithmic axis shows nothing of interest
-# How a peg moves along a planned way, or that a camera looks.
-OTHER = "#c7a6d8"  # candidates that were not chosen
-WAYS = {
-    "free": "#56B4E9",
-    "guarded": STRONG,
-    "held": "#CC79A7",
-    "searching": "#009E73",
-    "looking": STRONG,
-}
 
 
 def add_over_time(
@@ -219,23 +209,21 @@ def belief_in_3d(
 def action_in_3d(
     part: Part,
     belief: tuple[str, Array, Array],
-    action: Plan | View,
+    action: Candidate,
     peg: Part | None = None,
-    others: Sequence[Plan | View] = (),
+    others: Sequence[Candidate] = (),
 ) -> Figure:
-    """What is to be done next: the part at a belief's mean, its particles, and the way of the peg's tip.
-
-    The way is the commanded one, as if nothing were met: guarded motions end where the surface is.
+    """A candidate that was chosen, drawn around the part at a belief's mean and its particles.
 
     Args:
         part: whose pose is sought.
         belief: (title, `world_from_part` (N, 7), log weights (N,)); weights in any scale.
-        action: the plan or view that was chosen.
-        peg: what is held; without one the way of its frame's origin is drawn.
-        others: what else might have been done, drawn faintly.
+        action: the plan, view or other candidate that was chosen.
+        peg: the held peg; without one the path of its frame's origin is drawn.
+        others: candidates that were not chosen, drawn faintly.
 
     Raises:
-        InputError: as `belief_in_3d`.
+        InputError: as `belief_in_3d`; or a candidate is of a kind that cannot be drawn.
     """
     title, poses, weights, mean = belief[0], *checked(*belief)
     length = 0.2 * 1000.0 * part.diameter
@@ -252,35 +240,25 @@ def action_in_3d(
         axes, poses[np.argsort(-weights, kind="stable")], length, PARTICLE, width=0.8, alpha=0.35, zorder=3
     )
     for other in others:
-        way = _way(other, peg, mean)
-        axes.plot(*way.T, color=OTHER, linewidth=0.7, alpha=0.8, zorder=4)
-    way = _way(action, peg, mean)
-    manners = action.manners if isinstance(action, Plan) else ("looking",)
-    entries: dict[str, Line2D] = {}
-    for k, manner in enumerate(manners):
-        color = WAYS[manner]
-        wide, over = (1.4, 5) if manner == "free" else (2.6, 6)  # a way back must not hide the touch
-        axes.plot(*way[k : k + 2].T, color=color, linewidth=wide, zorder=over)
-        entries[manner] = Line2D([], [], color=color, linewidth=2.4)
+        _drawer(other).draw(axes, other, mean, peg, faint=True)
+    drawer = _drawer(action)
+    reached = drawer.draw(axes, action, mean, peg)
+    handles, labels = axes.get_legend_handles_labels()
+    entries = dict(zip(labels, handles, strict=True))
     entries["particles (z axes)"] = Line2D([], [], color=PARTICLE, linewidth=1.0)
     if len(others) > 1:
-        entries["other candidates"] = Line2D([], [], color=OTHER, linewidth=1.0)
-    shown = np.concatenate([limits_of(part, length, poses, mean), way])
+        entries["other candidates"] = Line2D([], [], **FAINT)
+    shown = np.concatenate([limits_of(part, length, poses, mean), reached])
     frame(axes, shown.min(axis=0), shown.max(axis=0))
-    commanded = "the tip's way as commanded, as if nothing were met"
-    said = f"{title}\n{in_words(poses, weights, mean, None)}"
-    axes.set_title(f"{said}\n{commanded}" if isinstance(action, Plan) else said, fontsize=10)
+    lines = [title, in_words(poses, weights, mean, None), drawer.caption]
+    axes.set_title("\n".join(filter(None, lines)), fontsize=10)
     figure.legend(entries.values(), entries.keys(), loc="lower center", ncols=4, frameon=False, fontsize=9)
     figure.subplots_adjust(left=0.02, right=0.95, top=0.87, bottom=0.14)
     return figure
 
 
-def _way(action: Plan | View, peg: Part | None, mean: Array) -> Array:
-    """Where a plan leads the peg's tip (K, 3), or from where to where a camera looks, in millimetres."""
-    if isinstance(action, View):
-        return 1000.0 * np.stack([np.asarray(action.camera.world_from_camera)[:3], mean[:3]])
-    tip = np.zeros(3)
-    if peg is not None:
-        lowest = peg.vertices[peg.vertices[:, 2] < peg.vertices[:, 2].min() + 1e-6]
-        tip = lowest.mean(axis=0)
-    return np.asarray(1000.0 * (rotation(action.world_from_peg).apply(tip) + action.world_from_peg[:, :3]))
+def _drawer(candidate: Candidate) -> Drawable:
+    sensor = sensor_of(candidate)
+    if not isinstance(sensor, Drawable):
+        raise InputError(f"a {sensor.names[0]} cannot be drawn; leave it out of the picture.")
+    return sensor

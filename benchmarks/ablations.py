@@ -36,7 +36,7 @@ from bcppl.inference.proposals.together import continuous, drift_together
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.models import look_and_touch, peg_in_hole
 from bcppl.models.worlds.bench import bench_scene
-from bcppl.sensors.measurements import Recording, View
+from bcppl.sensors import Recording, View
 
 DEFAULT, SEEN, FREE_SPACE = "default", "vision only", "no free-space evidence"
 MANY, FEW = 1000, 10  # particles that only so many scenes are run with

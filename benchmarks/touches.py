@@ -28,7 +28,7 @@ from bcppl.inference.filters.smc import Step
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.point_probe import Settings, felt, learn, model, registration_pose
 from bcppl.recordings.importers.point_probe import command
-from bcppl.sensors.measurements import Push, Recording
+from bcppl.sensors import Push, Recording
 
 LOGS = DATA / "point_probe_pushes"
 OTHER = {"10_90": "10_130", "10_130": "10_90"}  # where the finger is learnt for the pushes of a log

@@ -39,7 +39,7 @@ from bcppl.inference.filters.smc import Step
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.point_probe import felt, model
 from bcppl.recordings.importers.point_probe import command
-from bcppl.sensors.measurements import Push, Recording
+from bcppl.sensors import Push, Recording
 from bcppl.traces import Trace, extend
 
 LOG = "10_90"

@@ -26,7 +26,7 @@ from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models import peg_in_hole
 from bcppl.models.worlds.peg_in_hole import record
 from bcppl.robot.motion import ProbeWindow
-from bcppl.sensors.measurements import Measurement, View
+from bcppl.sensors import Measurement, View
 from bcppl.traces import Model, carried
 
 PARTICLES = 75

@@ -41,7 +41,7 @@ from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.recordings.action_file import load_actions, save_actions
 from bcppl.robot.plan import Plan
 from bcppl.robot.reach import joint_paths
-from bcppl.sensors.measurements import View
+from bcppl.sensors import View
 from tests.made_recordings import assert_one_sentence
 
 KINDS = {"touch": 5, "slide": 3, "pair": 3, "search": 1, "attempt": 1, "view": 2}
@@ -304,10 +304,10 @@ def test_files_of_actions_that_make_no_sense_are_refused_in_a_sentence(tmp_path:
         "damping": [1.0] * 6,
     }
     wrong: dict[str, dict[str, Any]] = {
-        "has 'Rate', which a plan does not have": plan | {"Rate": 50.0},
-        "has 'distorsion', which a view does not have": {"kind": "view", "distorsion": []},
+        "a Plan has no field 'Rate'": plan | {"Rate": 50.0},
+        "a View has no field 'distorsion'": {"kind": "view", "distorsion": []},
         "plan.json: plan 'a' stops at -4.0 N": plan | {"force": -4.0},
-        "times that are no array of numbers|holds what is no number": plan | {"times": [0.0, "a"]},
+        "times that are no array of numbers|cannot be read": plan | {"times": [0.0, "a"]},
     }
     for says, action in wrong.items():
         (tmp_path / "plan.json").write_text(json.dumps({"actions": [action]}))
@@ -358,10 +358,11 @@ def test_a_damaged_file_of_actions_says_which_of_them_it_is(tmp_path: Path) -> N
         group.create_group("times")
 
     refused("lacks 'times'", lacking)
-    refused("times in 'a group'", deep)
-    refused("neither of kind", lambda group: group.attrs.update(kind="vieuw"))
+    refused("cannot be read .times is in 'a group'", deep)
+    refused("is of kind 'vieuw'", lambda group: group.attrs.update(kind="vieuw"))
     refused(
-        "world_from_peg in 'mm", lambda group: group["world_from_peg"].attrs.update(units="mm mm mm 1 1 1 1")
+        "cannot be read .world_from_peg is in 'mm",
+        lambda group: group["world_from_peg"].attrs.update(units="mm mm mm 1 1 1 1"),
     )
 
 

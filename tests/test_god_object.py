@@ -23,8 +23,8 @@ from bcppl.geometry.shapes import block, box_peg
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.robot.plan import Plan, probe_of
+from bcppl.sensors import View
 from bcppl.sensors.candidates import action_of
-from bcppl.sensors.measurements import View
 
 LENGTH = 0.05
 STIFF, DAMP = np.array([2500.0] * 3 + [150.0] * 3), np.array([120.0] * 3 + [2.5] * 3)

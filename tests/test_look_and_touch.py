@@ -13,7 +13,7 @@ from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models.look_and_touch import model
 from bcppl.models.look_and_touch_proposals import placed_by_images
 from bcppl.models.worlds.bench import bench_scene
-from bcppl.sensors.measurements import View
+from bcppl.sensors import View
 
 
 def covariance(seed: int) -> torch.Tensor:

@@ -16,7 +16,7 @@ from bcppl.geometry.distance import SignedDistance
 from bcppl.models.point_probe import Settings, felt, learn, model, prepare
 from bcppl.models.worlds.point_probe import noise_seed
 from bcppl.recordings.importers.point_probe import command
-from bcppl.sensors.measurements import Measurement, Push, Recording
+from bcppl.sensors import Measurement, Push, Recording
 from bcppl.traces import assess, generate
 
 LOGS = File(__file__).parents[2] / "shared/data/point_probe_pushes"

@@ -141,11 +141,11 @@ WRONG: dict[str, tuple[Recording, str]] = {
         "measurement 3's wrench .* backwards at row 20",
     ),
     "path times": (
-        push_with_path_times(changed(full().measurements[3].action.times, 5, to=0.0)),  # type: ignore[union-attr]
+        push_with_path_times(changed(full().measurements[3].action.times, 5, to=0.0)),
         "measurement 3's finger path .* backwards at row 5",
     ),
     "path on another clock": (
-        push_with_path_times(full().measurements[3].action.times + 1e9),  # type: ignore[union-attr]
+        push_with_path_times(full().measurements[3].action.times + 1e9),
         "measurement 3: .* one clock",
     ),
     "path not unit": (
@@ -179,11 +179,11 @@ WRONG: dict[str, tuple[Recording, str]] = {
     "peg poses short": (with_measurement(5, world_from_peg=np.zeros((2, 7))), "measurement 5's peg pose"),
     "wrench NaN": (
         with_measurement(1, wrench=changed(at(1, "wrench"), 4, 2, to=np.nan)),
-        "measurement 1 has a wrench that is not finite at row 4; fill it by interpolation, or cut",
+        "measurement 1's wrench has a number that is not finite at row 4; fill it by interpolation, or cut",
     ),
     "wrench NaN in a push": (
         with_measurement(3, wrench=changed(at(3, "wrench"), 9, 2, to=np.nan)),
-        "measurement 3 has a wrench that is not finite at row 9; leave that row out",
+        "measurement 3's wrench has a number that is not finite at row 9; leave that row out",
     ),
     "wrench too large": (
         with_measurement(3, wrench=changed(at(3, "wrench"), 9, 2, to=-2e4)),
@@ -191,7 +191,7 @@ WRONG: dict[str, tuple[Recording, str]] = {
     ),
     "view with a touch": (
         replace(full(), measurements=[Measurement(View(camera("left")), full().measurements[3].observation)]),
-        "measurement 0 pairs a View with a Touch",
+        "measurement 0: a View is paired with a Touch",
     ),
     "window left out": (
         replace(full(), measurements=[m for m in full().measurements if getattr(m.action, "last", 0) != 7]),

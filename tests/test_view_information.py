@@ -12,14 +12,15 @@ import torch
 from bcppl import poses
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.shapes import block
-from bcppl.inference.design import linearised_information_gain
+from bcppl.inference.design.loop import with_views
+from bcppl.inference.design.rules import by_information
 from bcppl.inference.population import Population
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.rendering.information import pixel_information
 from bcppl.rendering.renderer import DepthRenderer
-from bcppl.sensors.candidates import action_of
-from bcppl.sensors.measurements import View
+from bcppl.sensors import View
+from bcppl.sensors.erring_camera import ErringCamera
 from bcppl.traces import generate
 
 

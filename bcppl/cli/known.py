@@ -17,7 +17,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.progress import sole_bar
 from bcppl.recordings import Recording
 from bcppl.recordings.beliefs import is_belief, load_belief, load_fingerprint, load_label, load_latent
-from bcppl.recordings.fingerprint import fingerprint
+from bcppl.recordings.fingerprint import is_of
 from bcppl.traces import Model, Series, generate
 
 
@@ -119,7 +119,7 @@ def _read(path: Path, of: str | None, model: str | None, check: Callable[[Record
             f"{path} stands after {label}, but {of} has {len(whole.measurements)} measurements; "
             "give the recording that it was run on with --of."
         )
-    if load_fingerprint(path) not in ("", fingerprint(whole, taken)):
+    if not is_of(load_fingerprint(path), whole, taken):
         raise InputError(
             f"{path} is of another recording than {of}: part, guess or measurements differ; give the "
             "one that it was run on with --of."

@@ -46,7 +46,7 @@ from bcppl.models.robots import load_robot
 from bcppl.recordings import Recording
 from bcppl.recordings.action_file import SUFFIXES, load_actions, save_actions
 from bcppl.robot.plan import Plan
-from bcppl.sensors.measurements import View
+from bcppl.sensors import View
 
 DEFAULT = ",".join(f"{kind}:{count}" for kind, count in MIXED.items())
 WAYS = ("linearised", "reweighing")

@@ -1,19 +1,15 @@
-"""Says in a few rows what a recording holds."""
+"""Describes a recording in a few rows."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-from bcppl.contact.touch import Touch
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
-from bcppl.robot.motion import ProbeWindow
-from bcppl.sensors.measurements import Push, Recording, View
-
-Array = npt.NDArray[np.float64]
+from bcppl.sensors.measurements import Recording
+from bcppl.sensors.protocol import by_sensor
 
 
 def describe(recording: Recording) -> list[tuple[str, str]]:
@@ -21,24 +17,11 @@ def describe(recording: Recording) -> list[tuple[str, str]]:
     rows = [("part", _part(recording.part))]
     if recording.peg is not None:
         rows.append(("peg", _part(recording.peg)))
-    rows += [("prior", _guess(recording.guess)), ("measurements", _count(recording))]
-    actions = [m.action for m in recording.measurements]
-    cameras = {a.camera.name: a.camera for a in actions if isinstance(a, View)}
-    for name, camera in cameras.items():
-        seen = f"{camera.width}×{camera.height} pixels, {camera.near:g} to {camera.far:g} m"
-        known = "background known" if name in recording.background else "background unknown"
-        rows.append((f"camera {name}", f"{seen}, {known}"))
-    probes = {a.probe.name: a.probe for a in actions if isinstance(a, ProbeWindow)}
-    for name, probe in probes.items():
-        rows.append((f"probe {name}", f"{_span(probe.stamps):.2f} s, stamps at {_rates([probe.stamps])}"))
-    touches = [m.observation for m in recording.measurements if isinstance(m.observation, Touch)]
-    if touches:
-        total = sum(_span(touch.times) for touch in touches)
-        rate = _rates([touch.times for touch in touches])
-        rows.append(("touching", f"{total:.1f} s, wrench at {rate}"))
-    pushes = [a for a in actions if isinstance(a, Push)]
-    if pushes:
-        rows.append(("finger path", f"at {_rates([push.times for push in pushes])}"))
+    groups = by_sensor(recording.measurements)
+    counts = [f"{len(each)} {sensor.names[len(each) > 1]}" for sensor, each in groups]
+    rows += [("prior", _guess(recording.guess)), ("measurements", ", ".join(counts) or "none")]
+    for sensor, measurements in groups:
+        rows += sensor.describe([measurement for _, measurement in measurements], recording)
     rows.append(("truth", "known" if recording.truth is not None else "unknown"))
     rows.append(("model", recording.model))
     rows.append(("source", recording.source or "not stated"))
@@ -59,24 +42,3 @@ def _guess(guess: Guess) -> str:
     if guess.angle is not None:
         return f"±{widths} mm, any rotation within {math.degrees(guess.angle):.3g}°"
     return f"±{widths} mm, tilt up to {math.degrees(guess.tilt):.3g}°, yaw ±{math.degrees(guess.yaw):.3g}°"
-
-
-def _count(recording: Recording) -> str:
-    kinds = [m.kind for m in recording.measurements]
-    names = {
-        "view": ("view", "views"),
-        "window": ("probe window", "probe windows"),
-        "push": ("push", "pushes"),
-    }
-    found = [f"{kinds.count(k)} {names[k][kinds.count(k) > 1]}" for k in names if k in kinds]
-    return ", ".join(found) or "none"
-
-
-def _span(times: Array) -> float:
-    return float(times[-1] - times[0]) if times.size else 0.0
-
-
-def _rates(series: list[Array]) -> str:
-    steps = np.concatenate([np.diff(times) for times in series])
-    middle = float(np.median(steps)) if steps.size else 0.0
-    return f"{1 / middle:.0f} Hz" if middle > 0 else "an unknown rate"

@@ -17,7 +17,8 @@ from bcppl.effort import Effort
 from bcppl.geometry.camera import Camera
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.rendering.scene import RendersPart
-from bcppl.sensors.measurements import Recording, View
+from bcppl.sensors.depth import View
+from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Numbered
 
 

@@ -1,15 +1,40 @@
-"""From what may be done next to a model's action."""
+"""Candidates: measurements that may be made next, of every kind that can be planned."""
 
 from __future__ import annotations
 
-from bcppl.robot.motion import ProbeWindow
-from bcppl.robot.plan import Plan, probe_of
-from bcppl.sensors.measurements import View
+from typing import Any
+
+from bcppl.errors import InputError
+from bcppl.sensors.protocol import Plannable, sensor_of
+
+Candidate = Any  # of a type that a plannable sensor has registered: a Plan, a View
 
 
-def action_of(candidate: Plan | View) -> ProbeWindow | View:
-    """What a model takes as an action: a plan as one window of which nothing is stopped, a view as it is."""
-    if isinstance(candidate, View):
-        return candidate
-    probe = probe_of(candidate)
-    return ProbeWindow(probe, 0, len(probe.stamps))
+def planner_of(candidate: Candidate) -> Plannable:
+    """The sensor by which a candidate is measured.
+
+    Raises:
+        InputError: its kind is not known, or cannot be planned.
+    """
+    sensor = sensor_of(candidate)
+    if not isinstance(sensor, Plannable):
+        raise InputError(f"a {sensor.names[0]} cannot be planned; give candidates of another kind.")
+    return sensor
+
+
+def action_of(candidate: Candidate) -> Any:
+    """The action that a model takes, if the candidate is carried out as planned.
+
+    A plan becomes one window of which nothing is stopped; a view is its own action.
+    """
+    return planner_of(candidate).action_of(candidate)
+
+
+def name_of(candidate_or_action: Any) -> str:
+    """The name of a candidate, or that of the probe or camera of an action."""
+    return planner_of(candidate_or_action).name_of(candidate_or_action)
+
+
+def duration_of(candidate: Candidate) -> float:
+    """Seconds that a candidate takes."""
+    return planner_of(candidate).duration(candidate)

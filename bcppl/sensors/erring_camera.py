@@ -27,7 +27,8 @@ from bcppl.rendering.information import pixel_information
 from bcppl.rendering.region import region_of
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.rendering.stated_cameras import apparent_covariance, line_of_sight, seen_elsewhere
-from bcppl.sensors.measurements import Recording, View
+from bcppl.sensors.depth import View
+from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Numbered
 from bcppl.traces.carried import once
 

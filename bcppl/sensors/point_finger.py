@@ -21,7 +21,8 @@ from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.poses import compose, transform
-from bcppl.sensors.measurements import Push, Recording
+from bcppl.sensors.measurements import Recording
+from bcppl.sensors.push import Push
 from bcppl.sensors.scene import Numbered
 from bcppl.traces.carried import once
 

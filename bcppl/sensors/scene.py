@@ -11,7 +11,7 @@ from torch import Tensor
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.sensors.measurements import Measurement, Recording
-from bcppl.sensors.protocol import kind_of, sensor_named
+from bcppl.sensors.protocol import sensor_named, sensor_of
 
 
 class Numbered(NamedTuple):
@@ -67,7 +67,7 @@ class Scene:
         Raises:
             InputError: the model does not explain this kind of measurement.
         """
-        kind = kind_of(action)
+        kind = sensor_of(action).kind
         if kind not in self.likelihoods:
             raise InputError(
                 f"{self.model} does not explain a measurement of kind {kind!r}; choose another model "
@@ -84,7 +84,7 @@ class Scene:
         by_kind: dict[str, list[Numbered]] = {}
         for number, measurement in enumerate(measurements):
             self.sensor(measurement.action)
-            by_kind.setdefault(kind_of(measurement.action), []).append(Numbered(number, measurement))
+            by_kind.setdefault(sensor_of(measurement.action).kind, []).append(Numbered(number, measurement))
         return {
             address: value
             for kind, numbered in by_kind.items()
@@ -114,7 +114,7 @@ def likelihoods_for(
     """
     prepared = {kind: prepare(recording) for kind, prepare in chosen.items()}
     if not only:
-        for kind in dict.fromkeys(kind_of(m.action) for m in recording.measurements):
+        for kind in dict.fromkeys(sensor_of(m.action).kind for m in recording.measurements):
             default = getattr(sensor_named(kind), "prepare", None)
             if kind not in prepared and default is not None:
                 prepared[kind] = default(recording)

@@ -41,7 +41,7 @@ from bcppl.inference.planning.filters import (
 from bcppl.recordings.check import problems
 from bcppl.robot.motion import ProbeWindow
 from bcppl.robot.plan import Plan
-from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
+from bcppl.sensors import DepthImage, Measurement, Recording, View
 from bcppl.traces import Model
 
 # Candidates for a belief; the number counts rounds, from 0.

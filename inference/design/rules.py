@@ -22,7 +22,7 @@ from bcppl.inference.planning.touching import leading_point, middles_of_strokes
 from bcppl.inference.population import Population
 from bcppl.sensors.candidates import action_of
 from bcppl.sensors.capabilities import Informative, Linearised
-from bcppl.sensors.measurements import View
+from bcppl.sensors.depth import View
 
 # Ranks candidates for a population, given a scene of the model that knows their cameras.
 Rank = Callable[[Population, Sequence[Candidate], Any], Ranking]

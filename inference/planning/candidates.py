@@ -28,7 +28,7 @@ from bcppl.inference.planning.filters import (
 from bcppl.inference.planning.insertion import Attempt
 from bcppl.inference.planning.kinds import SHORT, SOURCES, Setup
 from bcppl.inference.planning.touching import Touching
-from bcppl.sensors.measurements import View
+from bcppl.sensors import View
 
 KINDS = tuple(SOURCES)
 MIXED: Mapping[str, int] = {"touch": 16, "slide": 12, "pair": 4}

@@ -25,7 +25,7 @@ from bcppl.inference.planning.touching import middles_of_strokes
 from bcppl.robot.kinematics import Robot
 from bcppl.robot.plan import Plan
 from bcppl.robot.reach import joint_paths
-from bcppl.sensors.measurements import View
+from bcppl.sensors import View
 
 Array = npt.NDArray[np.float64]
 Candidate = Plan | View

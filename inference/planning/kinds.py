@@ -29,7 +29,7 @@ from bcppl.inference.planning.touching import (
     touch,
 )
 from bcppl.robot.plan import Plan
-from bcppl.sensors.measurements import View
+from bcppl.sensors import View
 
 Array = npt.NDArray[np.float64]
 

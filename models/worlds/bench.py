@@ -34,7 +34,7 @@ from bcppl.rendering.scene import SceneRenderer
 from bcppl.robot.insertion_plan import InsertionPlan
 from bcppl.robot.motion import ProbeWindow
 from bcppl.robot.plan import Plan
-from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
+from bcppl.sensors import DepthImage, Measurement, Recording, View
 
 Array = npt.NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from bcppl.models.worlds.bench import BenchScene
 from bcppl.models.worlds.inserting import InsertionResult
 from bcppl.robot.insertion_plan import InsertionPlan
 from bcppl.robot.plan import Plan
-from bcppl.sensors.measurements import DepthImage, Measurement, View
+from bcppl.sensors import DepthImage, Measurement, View
 
 Array = npt.NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from bcppl.geometry.parts import Part
 from bcppl.geometry.shapes import block, block_with_square_hole, box_peg
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.robot.motion import Probe, ProbeWindow
-from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
+from bcppl.sensors import DepthImage, Measurement, Recording, View
 
 Array = npt.NDArray[np.float64]
 

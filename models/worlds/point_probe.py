@@ -17,8 +17,9 @@ from bcppl.geometry.parts import Part
 from bcppl.models.point_probe import point_probe, prepare
 from bcppl.poses import identity, rotation_matrix, transform
 from bcppl.recordings.importers.point_probe import prism
-from bcppl.sensors.measurements import Measurement, Push, Recording
+from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.point_finger import PointFinger
+from bcppl.sensors.push import Push
 from bcppl.traces import generate
 
 Array = npt.NDArray[np.float64]

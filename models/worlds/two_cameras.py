@@ -19,7 +19,7 @@ from bcppl.geometry.shapes import block_with_square_hole
 from bcppl.models.worlds.peg_in_hole import GUESS, cameras, shifted, table
 from bcppl.rendering.depth_noise import DepthNoise
 from bcppl.rendering.scene import SceneRenderer
-from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
+from bcppl.sensors import DepthImage, Measurement, Recording, View
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from bcppl.models.which_hole import HOLES, PITCH
 from bcppl.models.worlds import peg_in_hole as bench
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.robot.motion import Probe, ProbeWindow
-from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
+from bcppl.sensors import DepthImage, Measurement, Recording, View
 
 HOLE, PIN, MARGIN, THICK = 0.018, 0.008, 0.03, 0.02
 CLEAR, STROKE = 0.005, 0.006

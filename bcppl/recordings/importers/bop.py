@@ -24,7 +24,7 @@ from bcppl.geometry.camera import Camera
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
 from bcppl.poses import from_rotation_matrix, identity, retract
-from bcppl.sensors.measurements import DepthImage, Measurement, Recording, View
+from bcppl.sensors import DepthImage, Measurement, Recording, View
 
 NAME = "bop"
 HELP = (

@@ -23,7 +23,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part, Piece
 from bcppl.poses import as_pose, compose, identity, inverse, rotation_matrix
-from bcppl.sensors.measurements import Measurement, Push, Recording
+from bcppl.sensors import Measurement, Push, Recording
 
 NAME = "point-probe"
 HELP = "Point-finger pushes on a triangular prism (MLab_EXP logs), the prism at a random known pose."

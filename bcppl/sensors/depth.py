@@ -1,0 +1,256 @@
+"""Views: a camera takes a depth image."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from bcppl import poses
+from bcppl.errors import InputError
+from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.distortion import coefficients
+from bcppl.geometry.parts import Part
+from bcppl.sensors import checks
+from bcppl.sensors.layout import POSE_UNITS, Attribute, Layout, Numbers, Reference, number
+from bcppl.sensors.measurements import Measurement, Recording
+from bcppl.sensors.protocol import FAINT, Indexed, register
+
+Array = npt.NDArray[np.float64]
+
+MOST_DEPTH = 100.0  # m: beyond it a median depth is in millimetres
+COLOUR = "#D55E00"
+USUAL = Camera("camera", 160, 120, 160.0, 160.0, 79.5, 59.5, poses.identity().numpy(), near=0.1, far=2.0)
+DISTANCE = 0.45  # m from the part, of a camera like no other
+HEIGHTS = (50.0, 70.0, 35.0)  # degrees above the horizon, in turn
+GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Action: a depth image is taken with a camera, whose pose is the one that its owner states."""
+
+    camera: Camera
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """Observation: depth along the optical axis, (H, W) metres, NaN where missing; colour (H, W, 3)."""
+
+    depth: Array
+    rgb: npt.NDArray[np.uint8] | None = None
+
+
+CAMERA = Layout(
+    Camera,
+    {
+        "world_from_camera": Numbers(POSE_UNITS),
+        **{name: number("pixel", np.int64) for name in ("width", "height")},
+        **{name: number("pixel") for name in ("fx", "fy", "cx", "cy")},
+        **{name: number("m") for name in ("near", "far")},
+        "distortion": Numbers("1"),
+        "wrist_from_camera": Numbers(POSE_UNITS),
+        "device": Attribute(),
+    },
+    optional={"distortion": 2, "wrist_from_camera": 2, "device": 2},
+)
+
+
+def _refuse_camera(view: View) -> None:
+    view.camera.stated_pose()
+    if view.camera.wrist_from_camera is not None:
+        poses.as_pose(view.camera.wrist_from_camera, f"the wrist_from_camera of {view.camera.name!r}")
+
+
+class DepthSensor:
+    """Depth images, each observed from one camera; a view that may be taken next is the view itself."""
+
+    kind = "view"
+    names = ("view", "views")
+    contact = False
+    action = Layout(View, {"camera": Reference("cameras", CAMERA)})
+    observation = Layout(
+        DepthImage, {"depth": Numbers("m", np.float32), "rgb": Numbers("1", np.uint8)}, optional={"rgb": 1}
+    )
+
+    candidate_kind = "view"
+    needs_peg = False
+    caption = ""
+    candidate = Layout(
+        View,
+        {"name": Attribute(), **CAMERA.fields},
+        optional=CAMERA.optional,
+        holder=(Camera, "camera"),
+        check=_refuse_camera,
+    )
+
+    def problems(self, measurements: Indexed, recording: Recording) -> Iterator[tuple[int, str]]:
+        """Problems of cameras, of their backgrounds and of their images."""
+        cameras: dict[str, Camera] = {}
+        for index, measurement in measurements:
+            where, camera, image = f"measurement {index}", measurement.action.camera, measurement.observation
+            found: list[str] = []
+            if camera.name not in cameras:
+                found += _camera(f"{where}: camera {camera.name!r}", camera, recording)
+                found += _background(camera, recording)
+            found += checks.named_alike(where, "camera", camera, cameras)
+            found += _depth(where, image.depth, camera)
+            if image.rgb is not None and image.rgb.shape != (camera.height, camera.width, 3):
+                found.append(
+                    f"{where}: the colour image is {image.rgb.shape}, its camera {_frame(camera)} pixels."
+                )
+            for problem in found:
+                yield index, problem
+
+    def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:
+        """Each camera's size and range."""
+        cameras = {m.action.camera.name: m.action.camera for m in measurements}
+        return [
+            (
+                f"camera {name}",
+                f"{_frame(camera)} pixels, {camera.near:g} to {camera.far:g} m, "
+                f"background {'known' if name in recording.background else 'unknown'}",
+            )
+            for name, camera in cameras.items()
+        ]
+
+    # ---- candidates: views
+
+    def action_of(self, candidate: View) -> View:
+        """The view itself."""
+        return candidate
+
+    def name_of(self, candidate_or_action: View) -> str:
+        """The camera's name."""
+        return candidate_or_action.camera.name
+
+    def renamed(self, candidate: View, name: str) -> View:
+        """The view under another name; it stays one of the same instrument, whose error it shares."""
+        camera = candidate.camera
+        return View(replace(camera, name=name, device=camera.device or camera.name))
+
+    def duration(self, candidate: View) -> float:
+        """No time."""
+        return 0.0
+
+    def blank(self, candidate: View) -> DepthImage:
+        """An image without a depth."""
+        return DepthImage(np.full((candidate.camera.height, candidate.camera.width), np.nan))
+
+    def around(self, mean: Array, part: Part, like: View | None, count: int, seed: int) -> Iterator[View]:
+        """Views of the part from all around, in turn from three heights, as far off as `like` is."""
+        whole = poses.transform(torch.as_tensor(mean), torch.from_numpy(part.vertices)).numpy()
+        middle = 0.5 * (whole.min(axis=0) + whole.max(axis=0))
+        camera, distance = USUAL, DISTANCE
+        if like is not None:
+            camera = like.camera
+            distance = float(np.linalg.norm(np.asarray(camera.world_from_camera)[:3] - middle))
+        turn = float(np.random.default_rng([seed, 3]).uniform(0.0, 2.0 * math.pi))
+        for k in range(count):
+            height, heading = math.radians(HEIGHTS[k % len(HEIGHTS)]), turn + k * GOLDEN
+            flat = math.cos(height)
+            eye = middle + distance * np.array(
+                [flat * math.cos(heading), flat * math.sin(heading), math.sin(height)]
+            )
+            degrees = f"{round(math.degrees(heading)) % 360}°, {HEIGHTS[k % len(HEIGHTS)]:g}° up"
+            pose = looking_at(eye, middle)
+            yield View(replace(camera, name=f"view #: from {degrees}", world_from_camera=pose))
+
+    def draw(
+        self, axes: Any, candidate: View, mean: Array, peg: Part | None, *, faint: bool = False
+    ) -> Array:
+        """Draw a line from the camera to the part's origin at the mean."""
+        line = 1000.0 * np.stack([np.asarray(candidate.camera.world_from_camera)[:3], mean[:3]])
+        chosen = {"color": COLOUR, "linewidth": 2.6, "zorder": 6, "label": "looking"}
+        axes.plot(*line.T, **(FAINT if faint else chosen))
+        return line
+
+
+def _size(image: Array) -> str:
+    return f"{image.shape[1]}×{image.shape[0]}" if image.ndim == 2 else f"of shape {image.shape}"
+
+
+def _frame(camera: Camera) -> str:
+    return f"{camera.width}×{camera.height}"
+
+
+def _background(camera: Camera, recording: Recording) -> Iterator[str]:
+    depth = recording.background.get(camera.name)
+    if depth is not None and depth.shape != (camera.height, camera.width):
+        yield (
+            f"the background of camera {camera.name!r} is {_size(depth)}, the camera {_frame(camera)} "
+            "pixels; give one of the camera's size."
+        )
+
+
+def _depth(where: str, depth: Array, camera: Camera) -> Iterator[str]:
+    if depth.shape != (camera.height, camera.width):
+        yield (
+            f"{where}: the depth image is {_size(depth)}, camera {camera.name!r} {_frame(camera)} pixels; "
+            "give the camera that took it."
+        )
+        return
+    read = depth[np.isfinite(depth) & (depth != 0)]
+    if read.size == 0:
+        yield f"{where}: the depth image is missing in every pixel; leave the view out."
+    elif (read < 0).any():
+        yield f"{where}: the depth image has {(read < 0).sum()} negative depths; mark missing ones by NaN."
+    elif (middle := float(np.median(read))) > MOST_DEPTH:
+        yield f"{where}: the median depth is {middle:.0f}, probably millimetres; scale it by 0.001 to metres."
+    elif not ((read >= camera.near) & (read <= camera.far)).any():
+        yield (
+            f"{where}: no depth lies within the range of camera {camera.name!r}, {camera.near:.4g} to "
+            f"{camera.far:.4g} m (median {middle:.4g} m); check the units and the range."
+        )
+
+
+def _camera(what: str, camera: Camera, recording: Recording) -> Iterator[str]:
+    if camera.width < 1 or camera.height < 1 or not (camera.fx > 0 and camera.fy > 0):
+        yield f"{what} has no pixels or no focal length; give its width, height, fx and fy in pixels."
+    elif not np.isfinite([camera.fx, camera.fy, camera.cx, camera.cy]).all():
+        yield f"{what} has intrinsics that are not finite; give fx, fy, cx and cy in pixels."
+    elif camera.distortion:
+        try:
+            coefficients(tuple(camera.distortion))
+            camera.rays()
+        except InputError as error:
+            yield f"{what}: {error}"
+    if camera.wrist_from_camera is not None:
+        yield from checks.pose(f"{what}'s wrist_from_camera", camera.wrist_from_camera)
+    if not 0 <= camera.near < camera.far:
+        yield f"{what} sees from {camera.near:.4g} m to {camera.far:.4g} m; give near below far, in metres."
+    wrong = list(checks.pose(f"{what}'s world_from_camera", camera.world_from_camera))
+    yield from wrong
+    guessed = not list(checks.pose("the guess", recording.guess.world_from_part))
+    if not wrong and guessed and not list(checks.part(recording.part, closed=False)):
+        yield from _stands_off(what, camera, recording)
+
+
+def _stands_off(what: str, camera: Camera, recording: Recording) -> Iterator[str]:
+    """Problems of the camera's place relative to the part at its guess: inside it, or out of its range."""
+    part_from_world = poses.inverse(poses.as_pose(recording.guess.world_from_part))
+    place = poses.as_pose(camera.world_from_camera)[None, :3]
+    eye = poses.transform(part_from_world, place)[0].numpy()
+    low, high = recording.part.vertices.min(axis=0), recording.part.vertices.max(axis=0)
+    radius, middle = np.linalg.norm(high - low) / 2, (low + high) / 2
+    away = np.linalg.norm(eye - middle)
+    to_box = np.linalg.norm(np.maximum(0.0, np.maximum(low - eye, eye - high)))
+    # A long part fills a wide sphere: a camera beside it is too near only if it is near its box.
+    if away <= radius and to_box < max(camera.near, 1e-3):
+        yield (
+            f"{what} stands {1e3 * away:.0f} mm from the middle of the part at its guess, inside it (radius "
+            f"{1e3 * radius:.0f} mm): probably wrong units; give its world_from_camera in metres."
+        )
+    elif away - radius - np.linalg.norm(recording.guess.translation) > camera.far:
+        yield (
+            f"{what} stands {away:.4g} m from the part at its guess but sees only to {camera.far:.4g} m: "
+            "probably wrong units; give its world_from_camera in metres."
+        )
+
+
+register(DepthSensor())

@@ -1,0 +1,52 @@
+"""Touches as probe windows and pushes observe them: their layout, their checks, their rows in a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from bcppl.contact.touch import Touch
+from bcppl.sensors import checks
+from bcppl.sensors.layout import POSE_UNITS, WRENCH_UNITS, Layout, Numbers
+
+Array = npt.NDArray[np.float64]
+
+MOST_FORCE = 1e4  # N or N m: beyond it a sensor would have been torn off, so the units are wrong
+
+TOUCH = Layout(
+    Touch,
+    {"times": Numbers("s"), "wrench": Numbers(WRENCH_UNITS), "world_from_peg": Numbers(POSE_UNITS)},
+)
+
+
+def problems(where: str, touch: Touch, remedy: str) -> Iterator[str]:
+    """Problems of a touch's times and wrenches."""
+    yield from checks.times(f"{where}'s wrench", touch.times, remedy)
+    wrong = list(checks.rows(f"{where}'s wrench", touch.wrench, touch.times, "fx fy fz mx my mz", remedy))
+    yield from wrong
+    if wrong:
+        return
+    largest = np.abs(touch.wrench).max(axis=1)
+    if (largest > MOST_FORCE).any():
+        row = checks.first(largest > MOST_FORCE)
+        yield f"{where} has a wrench of {largest[row]:.3g} at row {row}; give newtons and newton metres."
+
+
+def span(times: Array) -> float:
+    """Seconds from the first time to the last."""
+    return float(times[-1] - times[0]) if times.size else 0.0
+
+
+def rate(series: Sequence[Array]) -> str:
+    """The rate of several series of times, in words: "500 Hz"."""
+    steps = np.concatenate([np.diff(times) for times in series])
+    middle = float(np.median(steps)) if steps.size else 0.0
+    return f"{1 / middle:.0f} Hz" if middle > 0 else "an unknown rate"
+
+
+def length(touches: Sequence[Touch]) -> str:
+    """The total length of touches and the rate of their wrenches, in words."""
+    times = [touch.times for touch in touches]
+    return f"{sum(map(span, times)):.1f} s, wrench at {rate(times)}"
