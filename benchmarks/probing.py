@@ -30,11 +30,11 @@ from bcppl.inference.design.rules import Rank, at_random, by_information, by_lar
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.candidates import MIXED, candidates
 from bcppl.inference.planning.faces import sides, spots_on_top
-from bcppl.inference.planning.filters import Candidate, name_of
 from bcppl.inference.planning.touching import Spot, touch
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
+from bcppl.sensors.candidates import Candidate, name_of
 
 SCENES, PROBES = 50, 3
 WAYS = ("chosen", "random", "script", "variance")

@@ -30,7 +30,6 @@ from bcppl.inference.planning.filters import (
     filtered,
     from_within,
     meeting,
-    name_of,
     no_harder_than,
     pressing_force,
     within_reach,
@@ -42,6 +41,7 @@ from bcppl.recordings.action_file import load_actions, save_actions
 from bcppl.robot.plan import Plan
 from bcppl.robot.reach import joint_paths
 from bcppl.sensors import View
+from bcppl.sensors.candidates import name_of
 from tests.made_recordings import assert_one_sentence
 
 KINDS = {"touch": 5, "slide": 3, "pair": 3, "search": 1, "attempt": 1, "view": 2}

@@ -20,13 +20,13 @@ from bcppl.inference.design.rules import at_random, by_information, in_order
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.candidates import candidates
-from bcppl.inference.planning.filters import Candidate, lasting, name_of
 from bcppl.inference.planning.insertion import insertion_plan
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
 from bcppl.recordings import Recording, View, problems
 from bcppl.robot.motion import ProbeWindow
+from bcppl.sensors.candidates import Candidate, duration_of, name_of
 from tests.made_recordings import assert_one_sentence
 
 PARTICLES = 30
@@ -186,15 +186,15 @@ def test_probes_together_last_no_longer_than_they_may() -> None:
     made = list(begin)
     left = 3.0
     for each in made:
-        assert all(lasting(candidate) <= left + 1e-9 for candidate in each.candidates)
-        left -= lasting(each.chosen)
+        assert all(duration_of(candidate) <= left + 1e-9 for candidate in each.candidates)
+        left -= duration_of(each.chosen)
     assert 0.0 <= left < 3.0 and 1 <= len(made) < 4
 
 
 def test_a_probe_may_last_all_that_is_left() -> None:
     scene, look, last, _ = seen()
     only = asked(last.belief, 0)[:1]
-    seconds = lasting(only[0]) - 5e-10  # rounding must not leave less than none
+    seconds = duration_of(only[0]) - 5e-10  # rounding must not leave less than none
     loop = probing_loop(
         model, look, BenchArm(scene), lambda *now: only, at_random(0), start=last, seconds=seconds
     )

@@ -12,7 +12,6 @@ import torch
 from bcppl import poses
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.shapes import block
-from bcppl.inference.design.loop import with_views
 from bcppl.inference.design.rules import by_information
 from bcppl.inference.population import Population
 from bcppl.models.look_and_touch import model
@@ -20,6 +19,7 @@ from bcppl.models.worlds.bench import bench_scene
 from bcppl.rendering.information import pixel_information
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.sensors import View
+from bcppl.sensors.candidates import with_candidates
 from bcppl.sensors.erring_camera import ErringCamera
 from bcppl.traces import generate
 
@@ -93,7 +93,7 @@ def test_views_and_touches_stand_in_one_ranking() -> None:
     away = replace(recording.measurements[0].action.camera, name="away", device="")
     blind = replace(away, world_from_camera=looking_at(np.array([0.5, 0.5, 1.9]), np.array([0.5, 0.0, 0.1])))
     plan = _down(world)
-    scene = model.prepare(with_views(recording, [View(blind)]))
+    scene = model.prepare(with_candidates(recording, [View(blind)]))
     candidates = [plan, recording.measurements[0].action, View(blind)]
     ranking = by_information("part", seed=0)(population, candidates, scene)
     gain = [ranking.of(k).information_gain for k in range(3)]

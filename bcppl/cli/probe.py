@@ -21,12 +21,10 @@ from bcppl.cli.known import Known, known
 from bcppl.errors import InputError
 from bcppl.figures import action_in_3d
 from bcppl.geometry.gap import PegGap
-from bcppl.inference.design.loop import named_apart, with_views
 from bcppl.inference.design.ranking import Ranking
 from bcppl.inference.design.rules import Rank, by_information, by_reweighing, can_be_linearised
-from bcppl.inference.planning.candidates import KINDS, MIXED, candidates, refuse_settled
+from bcppl.inference.planning.candidates import MIXED, candidates, refuse_settled
 from bcppl.inference.planning.filters import (
-    Candidate,
     Candidates,
     Filter,
     Mounted,
@@ -34,19 +32,27 @@ from bcppl.inference.planning.filters import (
     clear_of_table,
     filtered,
     from_within,
-    lasting,
-    name_of,
     no_harder_than,
     no_longer_than,
     pressing_force,
     refuse_none,
     within_reach,
 )
+from bcppl.inference.planning.kinds import SOURCES, kinds
 from bcppl.models.robots import load_robot
 from bcppl.recordings import Recording
 from bcppl.recordings.action_file import SUFFIXES, load_actions, save_actions
 from bcppl.robot.plan import Plan
-from bcppl.sensors import View
+from bcppl.sensors import View, sensor_of
+from bcppl.sensors.candidates import (
+    Candidate,
+    duration_of,
+    motion_of,
+    name_of,
+    named_apart,
+    planner_of,
+    with_candidates,
+)
 
 DEFAULT = ",".join(f"{kind}:{count}" for kind, count in MIXED.items())
 WAYS = ("linearised", "reweighing")
@@ -143,9 +149,9 @@ def probe(
     before = known(recording, of, model, inference, particles, seed, console, pegless)
     found = _found(before, own, kinds, [*_table(before, table), *filters], seed)
     console.print(escape(str(found)), soft_wrap=True)
-    scene = before.model.prepare(with_views(before.recording, found))
+    scene = before.model.prepare(with_candidates(before.recording, found))
     with console.status("ranking"):
-        settings = {"hypotheses": hypotheses, "cost": lasting, "rate": rate, "depth": depth, "seed": seed}
+        settings = {"hypotheses": hypotheses, "cost": duration_of, "rate": rate, "depth": depth, "seed": seed}
         rank = _rank(by, before, scene, found, settings)
         try:
             ranking = rank(before.population, found, scene)
@@ -192,8 +198,8 @@ def _rank(
 
 def _pegless(own: Sequence[Plan | View] | None, kinds: dict[str, int]) -> Callable[[Recording], None]:
     """Refuses a recording without a peg where one is needed, before anything is run."""
-    asked = [name_of(each) for each in own or () if isinstance(each, Plan)] or [
-        kind for kind, count in kinds.items() if count and kind != "view"
+    asked = [name_of(each) for each in own or () if planner_of(each).needs_peg] or [
+        kind for kind, count in kinds.items() if count and kind in SOURCES
     ]
 
     def check(recording: Recording) -> None:
@@ -215,10 +221,10 @@ def _kinds(words: str) -> dict[str, int]:
     found: dict[str, int] = {}
     for word in filter(None, (each.strip() for each in words.split(","))):
         kind, _, count = word.partition(":")
-        if kind not in KINDS or (count and not count.isdecimal()):
+        if kind not in kinds() or (count and not count.isdecimal()):
             raise InputError(
-                f"--candidates has {word!r}; give kinds ({', '.join(KINDS)}), each with a number if you like "
-                "(touch:20,slide:12), or a file that ends in .h5 or .json."
+                f"--candidates has {word!r}; give kinds ({', '.join(kinds())}), each with a number if you "
+                "like (touch:20,slide:12), or a file that ends in .h5 or .json."
             )
         if len(count) > len(str(MOST)) or int(count or COUNT) > MOST:
             raise InputError(f"--candidates asks for {count[:20]} of {kind}; give {MOST} at most.")
@@ -295,19 +301,18 @@ def _found(
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise InputError(f"two candidates are called {twice!r}; give each a name of its own.")
-        if before.recording.peg is not None and any(isinstance(each, Plan) for each in own):
+        if before.recording.peg is not None and any(planner_of(each).needs_peg for each in own):
             gap = PegGap(before.recording.part, before.recording.peg)
             filters = [clear_of_part(gap, belief.mean), *filters]
         return filtered(own, filters)
     recording = before.recording
-    cameras = [m.action.camera for m in recording.measurements if isinstance(m.action, View)]
     return candidates(
         belief,
         recording.part,
         recording.peg,
         kinds,
         filters=filters,
-        camera=cameras[0] if cameras else None,
+        like=[m.action for m in recording.measurements],
         seed=seed,
     )
 
@@ -327,10 +332,11 @@ def _shown(ranking: Ranking, top: int) -> Table:
         shown.add_column(name, justify="left" if k == 1 else "right", no_wrap=True)
     for k, each in enumerate(ranking[:top]):
         what = each.candidate
-        cells = (each.information_gain, each.standard_error, each.cost, each.value, lasting(what))
+        cells = (each.information_gain, each.standard_error, each.cost, each.value, duration_of(what))
         numbers = [f"{value:.2f}" for value in cells]
         numbers[1] = f"± {numbers[1]}"
-        press = f"{pressing_force(what):.1f}" if isinstance(what, Plan) else ""
+        motion = motion_of(what)
+        press = "" if motion is None else f"{pressing_force(motion):.1f}"
         shown.add_row(str(k + 1), escape(name_of(what)), *numbers, press)
     return shown
 
@@ -338,5 +344,5 @@ def _shown(ranking: Ranking, top: int) -> Table:
 def _draw(before: Known, best: Candidate, found: Sequence[Candidate]) -> Any:
     belief = _belief(before)
     shown = f"next: {name_of(best)}", belief.world_from_part.numpy(), belief.log_weights.numpy()
-    others = [c for c in found if isinstance(c, Plan)] if isinstance(best, Plan) else []
+    others = [c for c in found if sensor_of(c) is sensor_of(best)] if planner_of(best).needs_peg else []
     return action_in_3d(before.recording.part, shown, best, before.recording.peg, others)

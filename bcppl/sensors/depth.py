@@ -19,7 +19,7 @@ from bcppl.geometry.parts import Part
 from bcppl.sensors import checks
 from bcppl.sensors.layout import POSE_UNITS, Attribute, Layout, Numbers, Reference, number
 from bcppl.sensors.measurements import Measurement, Recording
-from bcppl.sensors.protocol import FAINT, Indexed, register
+from bcppl.sensors.protocol import FAINT, Indexed, Placement, register
 
 Array = npt.NDArray[np.float64]
 
@@ -137,6 +137,10 @@ class DepthSensor:
     def duration(self, candidate: View) -> float:
         """No time."""
         return 0.0
+
+    def placement(self, candidate: View) -> Placement:
+        """The camera's pose."""
+        return Placement(np.asarray(candidate.camera.world_from_camera), candidate.camera.wrist_from_camera)
 
     def blank(self, candidate: View) -> DepthImage:
         """An image without a depth."""

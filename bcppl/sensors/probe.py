@@ -136,6 +136,10 @@ class ProbeSensor:
         """The same plan under another name."""
         return replace(candidate, name=name)
 
+    def motion(self, candidate: Plan) -> Plan:
+        """The plan itself."""
+        return candidate
+
     def duration(self, candidate: Plan) -> float:
         """Seconds from a plan's first knot to its last."""
         return float(candidate.times[-1] - candidate.times[0])

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ from bcppl.sensors.layout import Layout
 
 if TYPE_CHECKING:
     from bcppl.geometry.parts import Part
+    from bcppl.robot.plan import Plan
     from bcppl.sensors.measurements import Measurement, Recording
 
 GROUP = "bcppl.sensors"  # of entry points
@@ -132,6 +133,34 @@ class AroundPart(Protocol):
             count: how many.
             seed: same seed, same candidates.
         """
+
+
+@runtime_checkable
+class Moving(Protocol):
+    """A sensor whose candidates are motions of a held peg."""
+
+    def motion(self, candidate: Any) -> Plan:
+        """The motion that the arm is commanded to make."""
+
+
+class Placement(NamedTuple):
+    """Where a sensor stands.
+
+    Attributes:
+        world_from_sensor: (7,) its z axis is the direction of measurement.
+        wrist_from_sensor: (7,) for a sensor on the arm's wrist; None for one that stands by itself.
+    """
+
+    world_from_sensor: Array
+    wrist_from_sensor: Array | None
+
+
+@runtime_checkable
+class Placed(Protocol):
+    """A sensor whose candidates measure from one place."""
+
+    def placement(self, candidate: Any) -> Placement:
+        """Where the sensor stands."""
 
 
 @runtime_checkable

@@ -19,8 +19,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-import numpy as np
-
 from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
@@ -30,18 +28,21 @@ from bcppl.inference.filters import guided_smc
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.candidates import refuse_settled
 from bcppl.inference.planning.filters import (
-    Candidate,
     Candidates,
-    lasting,
-    name_of,
     no_longer_than,
     refuse_none,
     sifted,
 )
 from bcppl.recordings.check import problems
-from bcppl.robot.motion import ProbeWindow
-from bcppl.robot.plan import Plan
-from bcppl.sensors import DepthImage, Measurement, Recording, View
+from bcppl.sensors import Measurement, Recording
+from bcppl.sensors.candidates import (
+    Candidate,
+    duration_of,
+    name_of,
+    named_apart,
+    planner_of,
+    with_candidates,
+)
 from bcppl.traces import Model
 
 # Candidates for a belief; the number counts rounds, from 0.
@@ -51,7 +52,7 @@ CandidatesFrom = Callable[[Belief, int], Sequence[Candidate]]
 class World(Protocol):
     """What plays the robot: a simulation such as `bcppl.models.worlds.bench_arm.BenchArm`, or a real one."""
 
-    def carry_out(self, candidate: Plan | View) -> Sequence[Measurement]:
+    def carry_out(self, candidate: Candidate) -> Sequence[Measurement]:
         """Do what is asked, and say what was measured.
 
         The windows of one probe with the plan's name, or an image of the view's camera.
@@ -159,7 +160,7 @@ def probing_loop(
                 if number == 0:
                     _nothing_done(f"all candidates last longer than {left:.3g} s")
                 return
-        scene = model.prepare(with_views(recording, found))
+        scene = model.prepare(with_candidates(recording, found))
         ranking = _ranked(rank(step.population, found, scene), least_gain is not None)
         if least_gain is not None and ranking.best.value < least_gain:
             if number == 0:
@@ -169,7 +170,7 @@ def probing_loop(
             return
         chosen = named_apart(ranking.best.candidate, recording)
         measured = _measured(world.carry_out(chosen), chosen)
-        left = max(0.0, left - lasting(chosen))
+        left = max(0.0, left - duration_of(chosen))
         recording = _going_on(recording, measured, chosen)
         scene, before = model.prepare(recording), step
         count = len(before.population)
@@ -219,12 +220,10 @@ def _listed(found: object, recording: Recording) -> Sequence[Candidate]:
         raise InputError(f"candidates are given as a {type(found).__name__}; give a list of plans and views.")
     listed = found if isinstance(found, Candidates) else tuple(found)
     for each in listed:
-        if not isinstance(each, Plan | View):
-            raise InputError(f"a candidate is a {type(each).__name__}; give plans and views.")
-        if isinstance(each, Plan) and recording.peg is None:
+        if planner_of(each).needs_peg and recording.peg is None:
             raise InputError(
-                f"there is no peg to carry out {each.name!r} with; add the peg to the recording, or ask for "
-                "views."
+                f"there is no peg to carry out {name_of(each)!r} with; add the peg to the recording, or "
+                "ask for views."
             )
     refuse_none(Candidates(tuple(listed)))
     return listed
@@ -240,20 +239,13 @@ def _measured(given: object, chosen: Candidate) -> list[Measurement]:
                 f"the world gave a {type(each).__name__} when it was asked for {name_of(chosen)!r}; give "
                 "measurements, each an action and what was observed."
             )
-        name = _asked(each.action)
+        name = name_of(each.action)
         if name != name_of(chosen):
             raise InputError(
                 f"the world was asked for {name_of(chosen)!r} and gave a measurement of {name!r}; give the "
                 "windows of a probe with the plan's name, or an image of the view's camera."
             )
     return measured
-
-
-def _asked(action: object) -> str:
-    """The name of the probe or camera that an action is of."""
-    if isinstance(action, View):
-        return action.camera.name
-    return action.probe.name if isinstance(action, ProbeWindow) else type(action).__name__
 
 
 def _going_on(recording: Recording, measured: Sequence[Measurement], chosen: Candidate) -> Recording:
@@ -264,32 +256,3 @@ def _going_on(recording: Recording, measured: Sequence[Measurement], chosen: Can
         if problem not in found:
             raise InputError(f"what the world measured for {name_of(chosen)!r} does not fit: {problem}")
     return longer
-
-
-def named_apart(candidate: Candidate, recording: Recording) -> Candidate:
-    """The candidate under a name that no camera or probe of a recording has."""
-    actions = [m.action for m in recording.measurements]
-    if isinstance(candidate, View):
-        taken = {a.camera.name for a in actions if isinstance(a, View)}
-        name = _free(candidate.camera.name, taken)
-        camera = candidate.camera
-        # An instrument keeps its error from view to view.
-        device = camera.device or (camera.name if name != camera.name else "")
-        return candidate if name == camera.name else View(replace(camera, name=name, device=device))
-    taken = {a.probe.name for a in actions if isinstance(a, ProbeWindow)}
-    return replace(candidate, name=_free(candidate.name, taken))
-
-
-def _free(name: str, taken: set[str]) -> str:
-    number = 2
-    while (name if number == 2 else f"{name} ({number - 1})") in taken:
-        number += 1
-    return name if number == 2 else f"{name} ({number - 1})"
-
-
-def with_views(recording: Recording, candidates: Sequence[Candidate]) -> Recording:
-    """A recording with an empty image from each candidate's camera, so that a scene knows them."""
-    known = {m.action.camera.name for m in recording.measurements if isinstance(m.action, View)}
-    views = [c for c in candidates if isinstance(c, View) and c.camera.name not in known]
-    empty = [Measurement(v, DepthImage(np.full((v.camera.height, v.camera.width), np.nan))) for v in views]
-    return replace(recording, measurements=[*recording.measurements, *empty])

@@ -17,12 +17,10 @@ from bcppl.inference.design.entropies import mode_entropy
 from bcppl.inference.design.expected_entropy import expected_information_gain
 from bcppl.inference.design.linearised import linearised_information_gain
 from bcppl.inference.design.ranking import Prospect, Ranking
-from bcppl.inference.planning.filters import Candidate
 from bcppl.inference.planning.touching import leading_point, middles_of_strokes
 from bcppl.inference.population import Population
-from bcppl.sensors.candidates import action_of
+from bcppl.sensors.candidates import Candidate, action_of, motion_of
 from bcppl.sensors.capabilities import Informative, Linearised
-from bcppl.sensors.depth import View
 
 # Ranks candidates for a population, given a scene of the model that knows their cameras.
 Rank = Callable[[Population, Sequence[Candidate], Any], Ranking]
@@ -110,7 +108,8 @@ def surface_variance(belief: Belief, peg: Part, candidate: Candidate) -> float:
 
     Of several strokes the largest; -inf where there is none, and for views.
     """
-    strokes = [] if isinstance(candidate, View) else middles_of_strokes(candidate)
+    motion = motion_of(candidate)
+    strokes = [] if motion is None else middles_of_strokes(motion)
     found = [-math.inf]
     for middle, way in strokes:
         world_from_peg, direction = torch.from_numpy(middle), torch.from_numpy(way)

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import islice
+from typing import Any
 
 import torch
 
 from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief
 from bcppl.errors import InferenceError, InputError
-from bcppl.geometry.camera import Camera
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.holes import Hole
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.filters import (
-    Candidate,
     Candidates,
     Filter,
     clear_of_part,
@@ -26,11 +24,12 @@ from bcppl.inference.planning.filters import (
     sifted,
 )
 from bcppl.inference.planning.insertion import Attempt
-from bcppl.inference.planning.kinds import SHORT, SOURCES, Setup
+from bcppl.inference.planning.kinds import SHORT, SOURCES, Setup, source
+from bcppl.inference.planning.kinds import kinds as known_kinds
 from bcppl.inference.planning.touching import Touching
-from bcppl.sensors import View
+from bcppl.sensors import sensor_of
+from bcppl.sensors.candidates import Candidate, name_of, planner_of
 
-KINDS = tuple(SOURCES)
 MIXED: Mapping[str, int] = {"touch": 16, "slide": 12, "pair": 4}
 _AT_ONCE = 8  # places that are looked at together, at least
 _DRAWS = 8  # times as many places as candidates that are asked for are looked at, at most
@@ -47,7 +46,7 @@ def candidates(
     hole: Hole | None = None,
     touching: Touching | None = None,
     attempt: Attempt | None = None,
-    camera: Camera | None = None,
+    like: Sequence[Any] = (),
     seed: int = 0,
 ) -> Candidates:
     """Candidates of several kinds, so many of each as are asked for if so many can be carried out.
@@ -66,7 +65,7 @@ def candidates(
         hole: the one that is searched for; None: the part's only one.
         touching: speeds and forces of touches and slides.
         attempt: speeds and forces of searches and attempts.
-        camera: views are taken with one like it, from as far off.
+        like: actions that candidates of their kinds resemble, such as the recording's views.
         seed: same seed, same candidates.
 
     Raises:
@@ -78,13 +77,14 @@ def candidates(
     asked = MIXED if kinds is None else kinds
     if not isinstance(asked, Mapping):
         raise InputError(f"kinds of candidates are given as {asked!r}; say how many of each: {{'touch': 8}}.")
+    kinds_known = known_kinds()
     if peg is not None:
         peg.check(closed=False)
     for kind, count in asked.items():
-        if kind not in KINDS:
-            raise InputError(f"there are no candidates of kind {kind!r}; kinds are {', '.join(KINDS)}.")
+        if kind not in kinds_known:
+            raise InputError(f"there are no candidates of kind {kind!r}; kinds are {', '.join(kinds_known)}.")
         whole_number(f"{{}} candidates of kind {kind!r} were asked for", count, least=0)
-    if peg is not None and gap is None and any(asked.get(kind) for kind in KINDS if kind != "view"):
+    if peg is not None and gap is None and any(asked.get(kind) for kind in SOURCES):
         gap = PegGap(part, peg)
     setup = Setup(
         belief,
@@ -94,7 +94,7 @@ def candidates(
         hole,
         Touching() if touching is None else touching,
         SHORT if attempt is None else attempt,
-        camera,
+        {sensor_of(each).kind: each for each in reversed(like)},
         seed_number(seed),
     )
     found: list[Candidate] = []
@@ -139,11 +139,11 @@ def _of_kind(kind: str, count: int, setup: Setup, filters: Sequence[Filter]) -> 
     if not count:
         return Candidates(())
     every = [*_usual(kind, setup), *filters]
-    source = SOURCES[kind](setup, _DRAWS * count)
+    drawn = source(kind, setup, _DRAWS * count)
     kept: list[Candidate] = []
     removed: dict[str, int] = {}
     while len(kept) < count:
-        batch = list(islice(source, max(2 * (count - len(kept)), _AT_ONCE)))
+        batch = list(islice(drawn, max(2 * (count - len(kept)), _AT_ONCE)))
         if not batch:
             break
         found = sifted(batch, every)
@@ -155,7 +155,7 @@ def _of_kind(kind: str, count: int, setup: Setup, filters: Sequence[Filter]) -> 
 
 def _usual(kind: str, setup: Setup) -> list[Filter]:
     """The filters that every candidate of a kind passes."""
-    if kind == "view":
+    if kind not in SOURCES:
         return []
     mean, gap = setup.belief.mean, setup.measured
     found = [not_from_below(), clear_of_part(gap, mean)]
@@ -164,7 +164,6 @@ def _usual(kind: str, setup: Setup) -> list[Filter]:
 
 def _numbered(candidate: Candidate, number: int) -> Candidate:
     """The same with `#` in its name replaced."""
-    if isinstance(candidate, View):
-        camera = candidate.camera
-        return View(replace(camera, name=camera.name.replace("#", str(number))))
-    return replace(candidate, name=candidate.name.replace("#", str(number)))
+    name = name_of(candidate).replace("#", str(number))
+    renamed: Candidate = planner_of(candidate).renamed(candidate, name)
+    return renamed

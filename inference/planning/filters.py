@@ -25,10 +25,9 @@ from bcppl.inference.planning.touching import middles_of_strokes
 from bcppl.robot.kinematics import Robot
 from bcppl.robot.plan import Plan
 from bcppl.robot.reach import joint_paths
-from bcppl.sensors import View
+from bcppl.sensors.candidates import Candidate, duration_of, motion_of, placement_of
 
 Array = npt.NDArray[np.float64]
-Candidate = Plan | View
 
 _APART = 0.002  # m between the places at which a free motion is looked at
 _MET = 0.0005  # m: a stroke whose middle is so near to the part meets it there
@@ -89,11 +88,6 @@ class Mounted(NamedTuple):
     link: str
     link_from_peg: Array
     world_from_base: Array
-
-
-def name_of(candidate: Candidate) -> str:
-    """A plan's name, or a view's camera's."""
-    return candidate.name if isinstance(candidate, Plan) else candidate.camera.name
 
 
 def filtered(candidates: Iterable[Candidate], filters: Sequence[Filter]) -> Candidates:
@@ -178,11 +172,11 @@ def from_within(direction: Sequence[float], angle: float, removes: str = "") -> 
     along = along / np.linalg.norm(along)
 
     def keeps(candidate: Candidate) -> bool:
-        if isinstance(candidate, View):
-            pose = torch.as_tensor(candidate.camera.world_from_camera)
-            ways = [poses.rotation_matrix(pose)[:, 2].numpy()]
-        else:
-            ways = [way for _, way in middles_of_strokes(candidate)]
+        motion, placement = motion_of(candidate), placement_of(candidate)
+        ways = [] if motion is None else [way for _, way in middles_of_strokes(motion)]
+        if placement is not None:
+            pose = torch.as_tensor(placement.world_from_sensor)
+            ways.append(poses.rotation_matrix(pose)[:, 2].numpy())
         return all(bool(way @ along > math.cos(angle) - 1e-9) for way in ways)
 
     says = removes or f"come from more than {math.degrees(angle):.3g}° beside the direction that was asked"
@@ -207,7 +201,8 @@ def clear_of_part(gap: PegGap, world_from_part: Array | torch.Tensor) -> Filter:
     there = poses.as_pose(world_from_part, "where the part is thought to be")[None]
 
     def keeps(candidates: Sequence[Candidate]) -> list[bool]:
-        ways = [free_ways(c) if isinstance(c, Plan) else np.empty((0, 7)) for c in candidates]
+        motions = [motion_of(c) for c in candidates]
+        ways = [np.empty((0, 7)) if motion is None else free_ways(motion) for motion in motions]
         if not sum(map(len, ways)):
             return [True] * len(candidates)
         distance = gap(there, torch.from_numpy(np.concatenate(ways))).distance[0].numpy()
@@ -227,7 +222,8 @@ def meeting(gap: PegGap, world_from_part: Array | torch.Tensor) -> Filter:
     there = poses.as_pose(world_from_part, "where the part is thought to be")[None]
 
     def keeps(candidates: Sequence[Candidate]) -> list[bool]:
-        met = [middles_of_strokes(c) if isinstance(c, Plan) else [] for c in candidates]
+        motions = [motion_of(c) for c in candidates]
+        met = [[] if motion is None else middles_of_strokes(motion) for motion in motions]
         middles = [middle for strokes in met for middle, _ in strokes]
         if not middles:
             return [True] * len(candidates)
@@ -244,9 +240,12 @@ def clear_of_table(peg: Part, height: float, margin: float = 0.002) -> Filter:
     corners = torch.from_numpy(np.ascontiguousarray(peg.mesh.convex_hull.vertices))
 
     def keeps(candidate: Candidate) -> bool:
-        if isinstance(candidate, View):
-            return bool(candidate.camera.world_from_camera[2] > height)
-        lowest = poses.transform(torch.from_numpy(candidate.world_from_peg), corners)[..., 2].min()
+        motion, placement = motion_of(candidate), placement_of(candidate)
+        if placement is not None and not placement.world_from_sensor[2] > height:
+            return False
+        if motion is None:
+            return True
+        lowest = poses.transform(torch.from_numpy(motion.world_from_peg), corners)[..., 2].min()
         return bool(lowest > height + margin)
 
     return Filter("lead into the table", lambda candidates: [keeps(c) for c in candidates])
@@ -257,22 +256,19 @@ def no_longer_than(seconds: float) -> Filter:
     number_within("candidates may last {} s", seconds, least=0.0)
     return Filter(
         f"last longer than {seconds:.3g} s",
-        lambda candidates: [lasting(c) <= seconds + 1e-9 for c in candidates],
+        lambda candidates: [duration_of(c) <= seconds + 1e-9 for c in candidates],
     )
-
-
-def lasting(candidate: Candidate) -> float:
-    """Seconds from a plan's beginning to its end; a view takes none."""
-    return 0.0 if isinstance(candidate, View) else float(candidate.times[-1] - candidate.times[0])
 
 
 def no_harder_than(force: float) -> Filter:
     """Keeps plans that press with no more than a force (N), by `pressing_force`."""
     limit = number_within("candidates may press with {} N", force, above=0.0)
-    return Filter(
-        f"press with more than {limit:g} N",
-        lambda candidates: [isinstance(c, View) or pressing_force(c) <= limit for c in candidates],
-    )
+
+    def keeps(candidate: Candidate) -> bool:
+        motion = motion_of(candidate)
+        return motion is None or pressing_force(motion) <= limit
+
+    return Filter(f"press with more than {limit:g} N", lambda candidates: [keeps(c) for c in candidates])
 
 
 def pressing_force(plan: Plan) -> float:
@@ -312,8 +308,9 @@ def within_reach(mounted: Mounted, *, seed: int = 0) -> Filter:
         groups: dict[int, list[int]] = {}
         paths: dict[int, Array] = {}
         for k, candidate in enumerate(candidates):
-            if isinstance(candidate, Plan):
-                paths[k] = _distinct(candidate.world_from_peg)
+            motion = motion_of(candidate)
+            if motion is not None:
+                paths[k] = _distinct(motion.world_from_peg)
                 groups.setdefault(len(paths[k]), []).append(k)
         for which in groups.values():
             along = torch.from_numpy(np.stack([paths[k] for k in which]))
@@ -326,10 +323,11 @@ def within_reach(mounted: Mounted, *, seed: int = 0) -> Filter:
             )
             kept[which] = np.isfinite(found).all(axis=(1, 2))
         for k, candidate in enumerate(candidates):
-            if isinstance(candidate, View) and candidate.camera.wrist_from_camera is not None:
+            placement = placement_of(candidate)
+            if placement is not None and placement.wrist_from_sensor is not None:
                 wrist = poses.compose(
-                    torch.as_tensor(candidate.camera.world_from_camera),
-                    poses.inverse(torch.as_tensor(candidate.camera.wrist_from_camera)),
+                    torch.as_tensor(placement.world_from_sensor),
+                    poses.inverse(torch.as_tensor(placement.wrist_from_sensor)),
                 )
                 path = poses.compose(base_from_world, wrist)[None, None].numpy()
                 kept[k] = bool(np.isfinite(joint_paths(mounted.robot, mounted.link, path, seed=seed)).all())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,6 @@ import torch
 from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
-from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.holes import Hole, hole_of
 from bcppl.geometry.parts import Part
@@ -29,21 +29,19 @@ from bcppl.inference.planning.touching import (
     touch,
 )
 from bcppl.robot.plan import Plan
-from bcppl.sensors import View
+from bcppl.sensors import sensor_named, sensors
+from bcppl.sensors.candidates import Candidate
+from bcppl.sensors.protocol import AroundPart
 
 Array = npt.NDArray[np.float64]
 
 # A search and an attempt that take two to three seconds.
 SHORT = Attempt(above=0.01, landing=0.03, longest=1.5, widest=0.006, press=0.004)
-CAMERA = Camera("camera", 160, 120, 160.0, 160.0, 79.5, 59.5, poses.identity().numpy(), near=0.1, far=2.0)
 _SHARES = (1.0, -1.0, 0.6, -0.6)  # of a slide's length that are tried, either way
 _ON = 0.0003  # m: a peg so near to the part slides on it
 _NEAR = 20  # places from among which the second touch of a pair is chosen
 _DOWNWARD = -0.5  # z of a normal that looks down
 _LOOKED_AT = 9  # places of a slide
-_DISTANCE = 0.45  # m from the part of a view's camera that no recording says
-_HEIGHTS = (50.0, 70.0, 35.0)  # degrees above the horizon, in turn
-_GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +56,7 @@ class Setup:
         hole: the one that is searched for, if it is at hand; None to have `hole_of` find it.
         touching: how touches and slides are made.
         attempt: how searches and attempts are made.
-        camera: views are taken with one like it, from other places.
+        like: by kind of sensor, an action that its candidates resemble.
         seed: of the places.
     """
 
@@ -69,7 +67,7 @@ class Setup:
     hole: Hole | None = None
     touching: Touching = field(default_factory=Touching)
     attempt: Attempt = SHORT
-    camera: Camera | None = None
+    like: Mapping[str, Any] = field(default_factory=dict)
     seed: int = 0
 
     @property
@@ -95,13 +93,13 @@ class Setup:
         return PegGap(self.part, self.held) if self.gap is None else self.gap
 
 
-def _touches(setup: Setup, most: int) -> Iterator[Plan | View]:
+def _touches(setup: Setup, most: int) -> Iterator[Plan]:
     for spot in spots_of(setup.part, most, setup.seed):
         name = f"touch #: {face_of(spot.normal)}"
         yield touch(setup.belief, setup.part, setup.held, spot, setup.touching, name)
 
 
-def _slides(setup: Setup, most: int) -> Iterator[Plan | View]:
+def _slides(setup: Setup, most: int) -> Iterator[Plan]:
     """Slides along a face that they do not leave, at the belief's mean."""
     generator = np.random.default_rng([setup.seed, 1])
     for spot in spots_of(setup.part, most, int(generator.integers(2**31))):
@@ -121,7 +119,7 @@ def _slides(setup: Setup, most: int) -> Iterator[Plan | View]:
             yield slide(setup.belief, setup.part, setup.held, spot, length * along, setup.touching, name)
 
 
-def _pairs(setup: Setup, most: int) -> Iterator[Plan | View]:
+def _pairs(setup: Setup, most: int) -> Iterator[Plan]:
     """Two touches of faces that stand across one another, near the edge or corner that they share."""
     generator = np.random.default_rng([setup.seed, 4])
     firsts = spots_of(setup.part, most, int(generator.integers(2**31)))
@@ -164,14 +162,14 @@ def _aims(setup: Setup, most: int) -> Iterator[Belief]:
         yield replace(setup.belief, world_from_part=poses.compose(aim, setup.belief.world_from_part))
 
 
-def _searches(setup: Setup, most: int) -> Iterator[Plan | View]:
+def _searches(setup: Setup, most: int) -> Iterator[Plan]:
     hole = hole_of(setup.part) if setup.hole is None else setup.hole
     for aimed in _aims(setup, most):
         plan = insertion_plan(aimed, setup.part, setup.held, hole, setup.attempt)
         yield _leaving(replace(plan.search, name="search #: spiral over the hole"))
 
 
-def _attempts(setup: Setup, most: int) -> Iterator[Plan | View]:
+def _attempts(setup: Setup, most: int) -> Iterator[Plan]:
     """Straight down the hole's axis, until something is felt: in the hole nothing is."""
     hole = hole_of(setup.part) if setup.hole is None else setup.hole
     for aimed in _aims(setup, most):
@@ -216,30 +214,24 @@ def _leaving(plan: Plan) -> Plan:
     )
 
 
-def _views(setup: Setup, most: int) -> Iterator[Plan | View]:
-    """Cameras that look at the part from all around, in turn from three heights."""
-    whole = poses.transform(setup.belief.mean, torch.from_numpy(setup.part.vertices)).numpy()
-    middle = 0.5 * (whole.min(axis=0) + whole.max(axis=0))
-    like, distance = setup.camera, _DISTANCE
-    if like is not None:
-        distance = float(np.linalg.norm(np.asarray(like.world_from_camera)[:3] - middle))
-    turn = float(np.random.default_rng([setup.seed, 3]).uniform(0.0, 2.0 * math.pi))
-    for k in range(most):
-        height, heading = math.radians(_HEIGHTS[k % len(_HEIGHTS)]), turn + k * _GOLDEN
-        flat = math.cos(height)
-        eye = middle + distance * np.array(
-            [flat * math.cos(heading), flat * math.sin(heading), math.sin(height)]
-        )
-        degrees = f"{round(math.degrees(heading)) % 360}°, {_HEIGHTS[k % len(_HEIGHTS)]:g}° up"
-        pose = looking_at(eye, middle)
-        yield View(replace(like or CAMERA, name=f"view #: from {degrees}", world_from_camera=pose))
-
-
-SOURCES: Mapping[str, Callable[[Setup, int], Iterator[Plan | View]]] = {
+SOURCES: Mapping[str, Callable[[Setup, int], Iterator[Plan]]] = {
     "touch": _touches,
     "slide": _slides,
     "pair": _pairs,
     "search": _searches,
     "attempt": _attempts,
-    "view": _views,
 }
+
+
+def kinds() -> tuple[str, ...]:
+    """The kinds of candidates: those of the planned motions, and the sensors that lay theirs out."""
+    return (*SOURCES, *(sensor.kind for sensor in sensors() if isinstance(sensor, AroundPart)))
+
+
+def source(kind: str, setup: Setup, most: int) -> Iterator[Candidate]:
+    """Candidates of a kind, at most so many."""
+    if kind in SOURCES:
+        return SOURCES[kind](setup, most)
+    sensor = sensor_named(kind)
+    assert isinstance(sensor, AroundPart)
+    return sensor.around(setup.belief.mean.numpy(), setup.part, setup.like.get(kind), most, setup.seed)

@@ -14,8 +14,8 @@ from bcppl.geometry.camera import Camera
 from bcppl.models.worlds.bench import BenchScene
 from bcppl.models.worlds.inserting import InsertionResult
 from bcppl.robot.insertion_plan import InsertionPlan
-from bcppl.robot.plan import Plan
-from bcppl.sensors import DepthImage, Measurement, View
+from bcppl.sensors import DepthImage, Measurement
+from bcppl.sensors.candidates import Candidate, motion_of
 
 Array = npt.NDArray[np.float64]
 
@@ -47,19 +47,15 @@ class BenchArm:
             off = poses.local(torch.from_numpy(camera.world_from_camera), torch.from_numpy(stands))
             self._off[camera.instrument] = off.numpy(), float(bias)
 
-    def carry_out(self, candidate: Plan | View) -> list[Measurement]:
+    def carry_out(self, candidate: Candidate) -> list[Measurement]:
         """What is measured: the windows of a plan, on a clock that goes on, or an image.
 
         Raises:
             InputError: it is asked for something else.
         """
-        if isinstance(candidate, View):
+        motion = motion_of(candidate)
+        if motion is None:
             return [Measurement(candidate, self._look(candidate.camera))]
-        if not isinstance(candidate, Plan):
-            raise InputError(
-                f"the arm is asked to carry out a {type(candidate).__name__}; give a Plan or a View, and "
-                "insertion plans to `insert`."
-            )
         began = candidate.times[0]
         plan = replace(candidate, times=candidate.times - began + self.clock)
         self.clock = float(plan.times[-1]) + _BETWEEN
