@@ -62,7 +62,9 @@ def about(scene: BenchScene, spread: float) -> Belief:
 def planned(seed: int) -> tuple[BenchScene, PegGap, Candidates]:
     scene = bench_scene(seed)
     gap = PegGap(scene.part, scene.peg)
-    found = candidates(about(scene, 0.001), scene.part, scene.peg, KINDS, gap=gap, camera=scene.cameras[0])
+    found = candidates(
+        about(scene, 0.001), scene.part, scene.peg, KINDS, gap=gap, like=[View(scene.cameras[0])]
+    )
     return scene, gap, found
 
 

@@ -174,7 +174,7 @@ def test_what_the_world_measured_is_to_be_what_was_asked_for_and_to_fit() -> Non
             next(probing_loop(model, look, BenchArm(scene), start=last, **given))  # type: ignore[arg-type]
         assert_one_sentence(str(caught.value))
     for what in (scene, insertion_plan(last.belief, scene.part, scene.peg)):
-        with pytest.raises(InputError, match=f"asked to carry out a {type(what).__name__}; give a Plan"):
+        with pytest.raises(InputError, match=f"{type(what).__name__} is no known kind of action"):
             BenchArm(scene).carry_out(what)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="asked to insert by a Plan"):
         BenchArm(scene).insert(plan)  # type: ignore[arg-type]
@@ -231,7 +231,9 @@ def test_a_view_may_be_chosen_and_is_taken_in() -> None:
     scene, look, last, _ = seen()
 
     def views(belief: Belief, number: int) -> list[Candidate]:
-        return list(candidates(belief, scene.part, None, {"view": 1}, camera=scene.cameras[0], seed=number))
+        return list(
+            candidates(belief, scene.part, None, {"view": 1}, like=[View(scene.cameras[0])], seed=number)
+        )
 
     (only,) = probing_loop(
         model,
@@ -263,7 +265,7 @@ def test_a_loop_without_candidates_or_world_says_so() -> None:
         ("measured nothing when it was asked for 'touch 1", Silent(), asked),
         ("gave a int when it was asked for 'touch 1", Junk(), lambda *now: (c for c in asked(*now))),
         ("candidates are given as a NoneType", BenchArm(scene), lambda belief, number: None),
-        ("a candidate is a str", BenchArm(scene), lambda belief, number: ["touch"]),
+        ("str is no known kind of action", BenchArm(scene), lambda belief, number: ["touch"]),
         ("no peg to carry out 'touch 1", BenchArm(scene), asked),
         ("world is a int", 1, asked),
     ):
