@@ -13,7 +13,7 @@ import torch
 from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
-from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.camera import Camera
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.holes import Hole, hole_of
 from bcppl.geometry.parts import Part
@@ -29,21 +29,17 @@ from bcppl.inference.planning.touching import (
     touch,
 )
 from bcppl.robot.plan import Plan
-from bcppl.sensors import View
+from bcppl.sensors.depth import DepthSensor, View
 
 Array = npt.NDArray[np.float64]
 
 # A search and an attempt that take two to three seconds.
 SHORT = Attempt(above=0.01, landing=0.03, longest=1.5, widest=0.006, press=0.004)
-CAMERA = Camera("camera", 160, 120, 160.0, 160.0, 79.5, 59.5, poses.identity().numpy(), near=0.1, far=2.0)
 _SHARES = (1.0, -1.0, 0.6, -0.6)  # of a slide's length that are tried, either way
 _ON = 0.0003  # m: a peg so near to the part slides on it
 _NEAR = 20  # places from among which the second touch of a pair is chosen
 _DOWNWARD = -0.5  # z of a normal that looks down
 _LOOKED_AT = 9  # places of a slide
-_DISTANCE = 0.45  # m from the part of a view's camera that no recording says
-_HEIGHTS = (50.0, 70.0, 35.0)  # degrees above the horizon, in turn
-_GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,22 +213,8 @@ def _leaving(plan: Plan) -> Plan:
 
 
 def _views(setup: Setup, most: int) -> Iterator[Plan | View]:
-    """Cameras that look at the part from all around, in turn from three heights."""
-    whole = poses.transform(setup.belief.mean, torch.from_numpy(setup.part.vertices)).numpy()
-    middle = 0.5 * (whole.min(axis=0) + whole.max(axis=0))
-    like, distance = setup.camera, _DISTANCE
-    if like is not None:
-        distance = float(np.linalg.norm(np.asarray(like.world_from_camera)[:3] - middle))
-    turn = float(np.random.default_rng([setup.seed, 3]).uniform(0.0, 2.0 * math.pi))
-    for k in range(most):
-        height, heading = math.radians(_HEIGHTS[k % len(_HEIGHTS)]), turn + k * _GOLDEN
-        flat = math.cos(height)
-        eye = middle + distance * np.array(
-            [flat * math.cos(heading), flat * math.sin(heading), math.sin(height)]
-        )
-        degrees = f"{round(math.degrees(heading)) % 360}°, {_HEIGHTS[k % len(_HEIGHTS)]:g}° up"
-        pose = looking_at(eye, middle)
-        yield View(replace(like or CAMERA, name=f"view #: from {degrees}", world_from_camera=pose))
+    like = None if setup.camera is None else View(setup.camera)
+    yield from DepthSensor().around(setup.belief.mean.numpy(), setup.part, like, most, setup.seed)
 
 
 SOURCES: Mapping[str, Callable[[Setup, int], Iterator[Plan | View]]] = {
