@@ -22,7 +22,7 @@ from bcppl.recordings.fingerprint import fingerprint
 from bcppl.robot.plan import Plan
 from bcppl.sensors import protocol, sensor_named, sensor_of, sensors
 from bcppl.sensors.candidates import action_of, duration_of, name_of
-from bcppl.sensors.protocol import AroundPart, Drawable, Plannable, Preparable, Timed
+from bcppl.sensors.protocol import AroundPart, Drawable, HasBlank, Plannable, Timed
 from tests.made_recordings import assert_identical, assert_one_sentence, camera, full
 
 ABOVE = np.array([0.0, 0.0, 0.3, 0.0, 1.0, 0.0, 0.0])
@@ -167,15 +167,15 @@ def test_a_candidate_of_a_new_kind_is_drawn(laser: Any) -> None:
 def test_capabilities_are_asked_for_by_protocol(laser: Any) -> None:
     found = {
         sensor.kind: [
-            p.__name__ for p in (AroundPart, Drawable, Plannable, Preparable, Timed) if isinstance(sensor, p)
+            p.__name__ for p in (AroundPart, Drawable, HasBlank, Plannable, Timed) if isinstance(sensor, p)
         ]
         for sensor in sensors()
     }
     assert found == {
-        "view": ["AroundPart", "Drawable", "Plannable", "Preparable"],
+        "view": ["AroundPart", "Drawable", "HasBlank", "Plannable"],
         "window": ["Drawable", "Plannable", "Timed"],
         "push": ["Timed"],
-        "laser": ["Drawable", "Plannable", "Preparable"],
+        "laser": ["Drawable", "HasBlank", "Plannable"],
     }
 
 

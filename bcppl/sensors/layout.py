@@ -212,7 +212,7 @@ class Layout(Generic[T]):
         return self._made(lambda key, kept: kept.parsed(tree[key]), set(tree), {})
 
     def stored(self, thing: T) -> dict[str, Any]:
-        """The values as a file holds them, by key: equal before and after an object was saved."""
+        """The values as a file holds them, by key: they are the same before and after an object was saved."""
         return {key: kept.stored(value) for key, kept, value in self._present(thing)}
 
     def version(self, thing: T) -> int:
