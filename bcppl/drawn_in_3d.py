@@ -1,4 +1,4 @@
-"""Parts, poses and axes drawn in space, millimetres: what the pictures of `bcppl.figures` are made of."""
+"""Parts, poses and axes drawn in space, in millimetres: the elements of the pictures of `bcppl.figures`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bcppl.geometry.parts import Part
 
 Array = npt.NDArray[np.float64]
 
-# Okabe and Ito's palette, told apart by people of every colour vision.
+# Of Okabe and Ito's palette, whose colours differ for every kind of colour vision.
 STRONG = "#D55E00"
 PARTICLE = "#7F7F7F"
 BODY = "#9DB4C8"
@@ -106,7 +106,7 @@ def frame(axes: Axes3D, low: Array, high: Array) -> None:
 
 
 def in_words(poses: Array, weights: Array, mean: Array, truth: Array | None) -> str:
-    """How wide the belief is, and how far its mean is from the truth."""
+    """The belief's spread, and the distance of its mean from the truth, in words."""
 
     def millimetres(center: Array) -> Array:
         return 1000.0 * np.linalg.norm(poses[:, :3] - center[:3], axis=1)

@@ -39,7 +39,7 @@ from bcppl.sensors.protocol import FAINT, Drawable, sensor_of
 
 Array = npt.NDArray[np.float64]
 
-# Okabe and Ito's palette, told apart by people of every colour vision.
+# Of Okabe and Ito's palette, whose colours differ for every kind of colour vision.
 TRUTH = "#00A6D6"
 
 HEAVIEST = 10

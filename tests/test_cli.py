@@ -78,7 +78,7 @@ BAD: dict[str, tuple[Callable[[], Recording], str]] = {
     ),
     "NaN in a wrench": (
         lambda: first_push(wrench=changed(touch_of(short()).wrench, (4, 1), np.nan)),
-        "measurement 0 has a wrench that is not finite at row 4",
+        "measurement 0's wrench has a number that is not finite at row 4",
     ),
     "no measurement": (lambda: short(0), "no measurement"),
     "unknown model in the file": (lambda: replace(short(), model="nobody"), "no model 'nobody': give one of"),
@@ -113,7 +113,7 @@ def test_check_lists_all_problems(bcppl: Callable[..., Ran], tmp_path: Path) -> 
     save(bad, tmp_path / "bad.h5")
     ran = bcppl("check", "bad.h5")
     assert ran.code == 2 and ran.out.count("wrong:") == 3
-    for says in ("open mesh", "the truth", "measurement 0 has a wrench"):
+    for says in ("open mesh", "the truth", "measurement 0's wrench"):
         assert says in ran.out
     assert bcppl("check", SHIPPED).code == 0
 

@@ -12,8 +12,10 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from bcppl.drawn_in_3d import MANY_FACES
 from bcppl.errors import InputError
-from bcppl.figures import add_over_time, belief_in_3d
+from bcppl.figures import action_in_3d, add_over_time, belief_in_3d
+from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
+from bcppl.sensors import Plan, Push, View
 
 HALF = np.sqrt(0.5)
 
@@ -106,3 +108,40 @@ def test_a_large_mesh_is_drawn_from_few_triangles() -> None:
     figure = belief_in_3d(ball, [("a", poses(3, 0.01), np.zeros(3)), ("b", poses(3, 0.001), np.zeros(3))])
     assert figure.axes[0].get_xlim() == figure.axes[1].get_xlim()
     rendered(figure)
+
+
+def placed_camera() -> Camera:
+    return Camera("c", 8, 6, 9.0, 9.5, 3.7, 2.4, np.array([0.1, 0.2, 0.6, 0.0, 1.0, 0.0, 0.0]), 0.06, 4.0)
+
+
+def test_a_plan_is_drawn_as_the_path_of_the_tip_and_coloured_by_manner() -> None:
+    down = np.array([0.5, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0])  # a half turn about x: the peg's z is downwards
+    knots = np.stack([down, down - [0.0, 0.0, 0.1, 0, 0, 0, 0], down])
+    plan = Plan("touch", np.arange(3.0), knots, ("guarded", "free"), 4.0, np.ones(6), np.ones(6))
+    peg = box().moved([0.0, 0.0, -0.02, 1.0, 0.0, 0.0, 0.0])  # from z = -35 mm to -5 mm: its tip
+    belief = "next", poses(9, 0.01), np.zeros(9)
+    figure = action_in_3d(box(), belief, plan, peg, [plan, plan])
+    (axes,) = figure.axes
+    drawn = {line.get_label(): np.transpose(line.get_data_3d()) for line in axes.get_lines()}
+    np.testing.assert_allclose(drawn["guarded"], [[500, 100, 335], [500, 100, 235]], atol=1e-9)
+    np.testing.assert_allclose(drawn["free"], [[500, 100, 235], [500, 100, 335]], atol=1e-9)
+    faint = [line for line in axes.get_lines() if line.get_linewidth() < 1.0]
+    assert len(faint) == 2 and all(len(line.get_data_3d()[0]) == 3 for line in faint)
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["guarded", "free", "particles (z axes)", "other candidates"]
+    assert "as if nothing were met" in axes.get_title()
+    without = action_in_3d(box(), belief, plan).axes[0].get_lines()[0]
+    np.testing.assert_allclose(without.get_data_3d()[2], [300.0, 200.0], atol=1e-9)
+    rendered(figure)
+
+
+def test_a_view_is_drawn_as_a_line_from_the_camera_to_the_mean() -> None:
+    belief = "next", poses(1, 0.0), np.zeros(1)
+    figure = action_in_3d(box(), belief, View(placed_camera()))
+    (axes,) = figure.axes
+    (line,) = axes.get_lines()
+    np.testing.assert_allclose(np.transpose(line.get_data_3d()), [[100, 200, 600], [500, 100, 20]], atol=1e-9)
+    assert axes.get_zlim()[1] >= 600.0 and axes.get_title().count("\n") == 1
+    path = np.arange(2.0), np.tile(placed_camera().world_from_camera, (2, 1))
+    with pytest.raises(InputError, match="a push cannot be drawn"):
+        action_in_3d(box(), belief, Push(*path))

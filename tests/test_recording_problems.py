@@ -81,6 +81,8 @@ WRONG: dict[str, tuple[Recording, str]] = {
     "empty mesh": (replace(full(), part=replace(full().part, faces=np.zeros((0, 3), int))), "empty mesh"),
     "mesh of quads": (replace(full(), part=replace(full().part, faces=np.zeros((2, 4), int))), "triangles"),
     "no measurement": (replace(full(), measurements=[]), "no measurement"),
+    "model in a file": (replace(full(), model="mine.py"), "names the file 'mine.py' as its model"),
+    "model in a folder": (replace(full(), model="mine/model"), "names the file 'mine/model' as its model"),
     "no peg": (replace(full(), peg=None), "measurement 1 is a probe window but the recording has no peg"),
     "negative width": (
         replace(full(), guess=replace(full().guess, translation=np.array([0.1, -0.1, 0]))),

@@ -125,7 +125,9 @@ def _tree(actions: Sequence[Candidate]) -> dict[str, Any]:
         "format": FORMAT,
         "schema_version": SCHEMA_VERSION,
         "about": " ".join(layout.about for layout in layouts if layout.about),
-        "units": {key: units for layout in layouts for key, units in layout.units.items()},
+        "units": {
+            lay.key(name): kept.units for lay in layouts for name, kept in lay.fields.items() if kept.units
+        },
         "actions": [
             {"kind": planner.candidate_kind, **planner.candidate.tree(action)}
             for planner, action in ((planner_of(action), action) for action in actions)

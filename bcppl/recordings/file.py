@@ -33,7 +33,7 @@ import numpy as np
 from bcppl.errors import InputError
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part, Piece
-from bcppl.sensors.layout import POSE_UNITS, Attribute, Layout, Numbers, SharedObjects, link, number
+from bcppl.sensors.layout import POSE_UNITS, TEXT, Layout, SharedObjects, link, number, numbers
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.protocol import sensor_named, sensor_of
 
@@ -44,24 +44,24 @@ ALWAYS = ("background", "cameras", "probes", "measurements")  # groups that a re
 PART = Layout(
     Part,
     {
-        "name": Attribute(),
-        "source": Attribute(),
-        "vertices": Numbers("m"),
-        "faces": Numbers("1", np.int64),
+        "name": TEXT,
+        "source": TEXT,
+        "vertices": numbers("m"),
+        "faces": numbers("1", np.int64),
     },
 )
-PIECE = Layout(Piece, {"kind": Attribute(), "size": Numbers("m"), "center": Numbers("m")})
+PIECE = Layout(Piece, {"kind": TEXT, "size": numbers("m"), "center": numbers("m")})
 GUESS = Layout(
     Guess,
     {
-        "world_from_part": Numbers(POSE_UNITS),
-        "translation": Numbers("m"),
+        "world_from_part": numbers(POSE_UNITS),
+        "translation": numbers("m"),
         **{name: number("rad") for name in ("tilt", "yaw", "angle")},
     },
     optional={"angle": 1},
 )
-POSE = Numbers(POSE_UNITS)
-DEPTH = Numbers("m", np.float32)
+POSE = numbers(POSE_UNITS)
+DEPTH = numbers("m", np.float32)
 
 
 def save(recording: Recording, path: str | os.PathLike[str]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 from bcppl.errors import InputError
 from bcppl.robot.plan import Plan
 from bcppl.sensors.measurements import Measurement, Recording
-from bcppl.sensors.protocol import Moving, Placed, Placement, Plannable, Preparable, sensor_of
+from bcppl.sensors.protocol import HasBlank, Moving, Placed, Placement, Plannable, sensor_of
 
 Candidate = Any  # of a type that a plannable sensor has registered: a Plan, a View
 
@@ -58,7 +58,7 @@ def with_candidates(recording: Recording, candidates: Sequence[Candidate]) -> Re
     for each in candidates:
         sensor: Any = planner_of(each)
         key = sensor.kind, sensor.name_of(each)
-        if isinstance(sensor, Preparable) and key not in known:
+        if isinstance(sensor, HasBlank) and key not in known:
             blanks.setdefault(key, Measurement(action_of(each), sensor.blank(each)))
     return replace(recording, measurements=[*recording.measurements, *blanks.values()])
 

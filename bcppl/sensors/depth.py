@@ -17,7 +17,7 @@ from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.distortion import coefficients
 from bcppl.geometry.parts import Part
 from bcppl.sensors import checks
-from bcppl.sensors.layout import POSE_UNITS, Attribute, Layout, Numbers, Reference, number
+from bcppl.sensors.layout import POSE_UNITS, TEXT, Layout, number, numbers, shared
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.protocol import FAINT, Indexed, Placement, register
 
@@ -49,22 +49,25 @@ class DepthImage:
 CAMERA = Layout(
     Camera,
     {
-        "world_from_camera": Numbers(POSE_UNITS),
+        "world_from_camera": numbers(POSE_UNITS),
         **{name: number("pixel", np.int64) for name in ("width", "height")},
         **{name: number("pixel") for name in ("fx", "fy", "cx", "cy")},
         **{name: number("m") for name in ("near", "far")},
-        "distortion": Numbers("1"),
-        "wrist_from_camera": Numbers(POSE_UNITS),
-        "device": Attribute(),
+        "distortion": numbers("1"),
+        "wrist_from_camera": numbers(POSE_UNITS),
+        "device": TEXT,
     },
     optional={"distortion": 2, "wrist_from_camera": 2, "device": 2},
 )
 
 
-def _refuse_camera(view: View) -> None:
-    view.camera.stated_pose()
-    if view.camera.wrist_from_camera is not None:
-        poses.as_pose(view.camera.wrist_from_camera, f"the wrist_from_camera of {view.camera.name!r}")
+def _stated_view(**fields: Any) -> View:
+    """The view of a camera that somebody wrote down, which is refused where it sees nothing."""
+    camera = Camera(**fields)
+    camera.stated_pose()
+    if camera.wrist_from_camera is not None:
+        poses.as_pose(camera.wrist_from_camera, f"the wrist_from_camera of {camera.name!r}")
+    return View(camera)
 
 
 class DepthSensor:
@@ -73,9 +76,9 @@ class DepthSensor:
     kind = "view"
     names = ("view", "views")
     contact = False
-    action = Layout(View, {"camera": Reference("cameras", CAMERA)})
+    action = Layout(View, {"camera": shared("cameras", CAMERA)})
     observation = Layout(
-        DepthImage, {"depth": Numbers("m", np.float32), "rgb": Numbers("1", np.uint8)}, optional={"rgb": 1}
+        DepthImage, {"depth": numbers("m", np.float32), "rgb": numbers("1", np.uint8)}, optional={"rgb": 1}
     )
 
     candidate_kind = "view"
@@ -83,10 +86,10 @@ class DepthSensor:
     caption = ""
     candidate = Layout(
         View,
-        {"name": Attribute(), **CAMERA.fields},
+        {"name": TEXT, **CAMERA.fields},
         optional=CAMERA.optional,
-        holder=(Camera, "camera"),
-        check=_refuse_camera,
+        make=_stated_view,
+        within="camera",
     )
 
     def problems(self, measurements: Indexed, recording: Recording) -> Iterator[tuple[int, str]]:

@@ -17,15 +17,16 @@ from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.robot.plan import Plan, probe_of
 from bcppl.sensors import checks, touches
 from bcppl.sensors.layout import (
+    COUNT,
     DAMPING_UNITS,
     POSE_UNITS,
     STIFFNESS_UNITS,
-    Attribute,
+    TEXT,
+    WORDS,
     Layout,
-    Numbers,
-    Reference,
-    Words,
     number,
+    numbers,
+    shared,
 )
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.protocol import FAINT, Indexed, register
@@ -40,11 +41,11 @@ COLOURS = {"free": "#56B4E9", "guarded": "#D55E00", "held": "#CC79A7", "searchin
 PROBE = Layout(
     Probe,
     {
-        "command_times": Numbers("s"),
-        "command": Numbers(POSE_UNITS),
-        "stiffness": Numbers(STIFFNESS_UNITS),
-        "damping": Numbers(DAMPING_UNITS),
-        "stamps": Numbers("s"),
+        "command_times": numbers("s"),
+        "command": numbers(POSE_UNITS),
+        "stiffness": numbers(STIFFNESS_UNITS),
+        "damping": numbers(DAMPING_UNITS),
+        "stamps": numbers("s"),
     },
     keys={"command": "command_world_from_peg"},
 )
@@ -58,7 +59,7 @@ class ProbeSensor:
     contact = True
     action = Layout(
         ProbeWindow,
-        {"probe": Reference("probes", PROBE), "first": Attribute(int), "last": Attribute(int)},
+        {"probe": shared("probes", PROBE), "first": COUNT, "last": COUNT},
     )
     observation = touches.TOUCH
 
@@ -68,13 +69,13 @@ class ProbeSensor:
     candidate = Layout(
         Plan,
         {
-            "name": Attribute(),
-            "manners": Words(),
-            "times": Numbers("s"),
-            "world_from_peg": Numbers(POSE_UNITS),
+            "name": TEXT,
+            "manners": WORDS,
+            "times": numbers("s"),
+            "world_from_peg": numbers(POSE_UNITS),
             "force": number("N"),
-            "stiffness": Numbers(STIFFNESS_UNITS),
-            "damping": Numbers(DAMPING_UNITS),
+            "stiffness": numbers(STIFFNESS_UNITS),
+            "damping": numbers(DAMPING_UNITS),
             "rate": number("1/s"),
             "sink": number("m"),
         },

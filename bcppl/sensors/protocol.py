@@ -1,10 +1,9 @@
-"""What a kind of measurement has to offer, and the registry of kinds.
+"""The protocol of a kind of measurement, its capabilities, and the registry of kinds.
 
-A sensor is an object that states how its actions and observations lie in files, what may be wrong with
-them, and how they are described. What else it can do (be planned, be drawn, be laid out around a part)
-are capabilities: protocols that a sensor may satisfy, asked for with `isinstance`. A new kind is one
-module that ends in `register(MySensor())`, named in `bcppl.sensors` or by an entry point of the group
-"bcppl.sensors".
+A sensor is an object that states how its actions and observations lie in files, checks them and describes
+them. Further capabilities (candidates, drawings, a default likelihood) are protocols that a sensor may
+satisfy, asked for with `isinstance`. A new kind is one module that ends in `register(MySensor())`, imported
+in `bcppl.sensors` or named by an entry point of the group "bcppl.sensors".
 """
 
 from __future__ import annotations
@@ -164,11 +163,19 @@ class Placed(Protocol):
 
 
 @runtime_checkable
-class Preparable(Protocol):
-    """A sensor of whose candidates a scene has to know before they are made."""
+class HasBlank(Protocol):
+    """A sensor whose candidates a scene has to know before they are carried out."""
 
     def blank(self, candidate: Any) -> Any:
         """An observation without content, so that a scene can be prepared for a candidate."""
+
+
+@runtime_checkable
+class HasLikelihood(Protocol):
+    """A sensor with a likelihood for models that state none for its kind."""
+
+    def prepare(self, recording: Recording) -> Any:
+        """The `bcppl.sensors.scene.Likelihood` of a recording's measurements of this kind."""
 
 
 _registered: dict[str, Sensor] = {}
@@ -226,7 +233,7 @@ def sensor_for(measurement: Measurement) -> Sensor:
     """The sensor of a measurement.
 
     Raises:
-        InputError: its action is of no known kind, or its observation is not what that kind observes.
+        InputError: its action is of no known kind, or its observation is not of that kind's type.
     """
     sensor = sensor_of(measurement.action)
     action, observation = sensor.action.type, sensor.observation.type

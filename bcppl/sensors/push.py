@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from bcppl.contact.touch import Touch
 from bcppl.sensors import checks, touches
-from bcppl.sensors.layout import POSE_UNITS, Layout, Numbers
+from bcppl.sensors.layout import POSE_UNITS, Layout, numbers
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.protocol import Indexed, register
 
@@ -36,7 +36,7 @@ class PushSensor:
     kind = "push"
     names = ("push", "pushes")
     contact = True
-    action = Layout(Push, {"times": Numbers("s"), "world_from_tip": Numbers(POSE_UNITS)})
+    action = Layout(Push, {"times": numbers("s"), "world_from_tip": numbers(POSE_UNITS)})
     observation = touches.TOUCH
 
     def problems(self, measurements: Indexed, recording: Recording) -> Iterator[tuple[int, str]]:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from bcppl.contact.touch import Touch
 from bcppl.sensors import checks
-from bcppl.sensors.layout import POSE_UNITS, WRENCH_UNITS, Layout, Numbers
+from bcppl.sensors.layout import POSE_UNITS, WRENCH_UNITS, Layout, numbers
 
 Array = npt.NDArray[np.float64]
 
@@ -17,7 +17,7 @@ MOST_FORCE = 1e4  # N or N m: beyond it a sensor would have been torn off, so th
 
 TOUCH = Layout(
     Touch,
-    {"times": Numbers("s"), "wrench": Numbers(WRENCH_UNITS), "world_from_peg": Numbers(POSE_UNITS)},
+    {"times": numbers("s"), "wrench": numbers(WRENCH_UNITS), "world_from_peg": numbers(POSE_UNITS)},
 )
 
 

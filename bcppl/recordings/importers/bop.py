@@ -61,9 +61,9 @@ def command(
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        details = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise InputError(
-            f"{scene} is not laid out as a BOP scene ({said}); compare its files with the format."
+            f"{scene} is not laid out as a BOP scene ({details}); compare its files with the format."
         ) from error
 
 

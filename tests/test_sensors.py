@@ -1,0 +1,199 @@
+"""Kinds of measurement: one that is registered here alone can be saved, checked, planned and drawn."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from bcppl.errors import InputError
+from bcppl.figures import action_in_3d
+from bcppl.recordings import Measurement, Push, Recording, View, describe, load, problems, save
+from bcppl.recordings.action_file import load_actions, save_actions
+from bcppl.recordings.fingerprint import fingerprint
+from bcppl.robot.plan import Plan
+from bcppl.sensors import protocol, sensor_named, sensor_of, sensors
+from bcppl.sensors.candidates import action_of, duration_of, name_of
+from bcppl.sensors.protocol import AroundPart, Drawable, HasBlank, Plannable, Timed
+from tests.made_recordings import assert_identical, assert_one_sentence, camera, full
+
+ABOVE = np.array([0.0, 0.0, 0.3, 0.0, 1.0, 0.0, 0.0])
+LASER = EntryPoint("laser", "tests.wrist_laser", protocol.GROUP)
+
+
+@pytest.fixture(autouse=True)
+def own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test registers, it registers for itself."""
+    monkeypatch.setattr(protocol, "_registered", dict(protocol._registered))
+    monkeypatch.setattr(protocol, "_by_type", dict(protocol._by_type))
+    monkeypatch.setattr(protocol, "_searched", False)
+
+
+@pytest.fixture
+def laser(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The kind `laser`, as an installed package offers it: nothing of bcppl imports it."""
+    monkeypatch.setattr(protocol, "entry_points", lambda group: [LASER] if group == LASER.group else [])
+    yield importlib.import_module("tests.wrist_laser")
+    del sys.modules["tests.wrist_laser"]
+
+
+def shone(module: Any, *metres: float, **changes: Any) -> Recording:
+    """`full()` with distances along one beam after its own measurements."""
+    beam = module.Beam(module.Laser("wrist", 0.05, 0.5), ABOVE)
+    distances = [Measurement(replace(beam, **changes), module.Distance(each)) for each in metres]
+    recording = full()
+    return replace(recording, measurements=[*recording.measurements, *distances])
+
+
+def test_a_recording_of_a_new_kind_comes_back(laser: Any, tmp_path: Path) -> None:
+    recording = shone(laser, 0.2, 0.3)
+    assert [m.kind for m in recording.measurements[-2:]] == ["laser", "laser"]
+    save(recording, tmp_path / "a.h5")
+    loaded = load(tmp_path / "a.h5")
+    assert_identical(recording, loaded)
+    first, second = (m.action for m in loaded.measurements[-2:])
+    assert first.laser is second.laser
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert file["lasers/wrist/far"][()] == 0.5 and file["lasers/wrist/far"].attrs["units"] == "m"
+        assert file.attrs["schema_version"] == 1
+
+
+def test_an_installed_package_is_searched_for_a_kind_that_is_not_known(
+    laser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(shone(laser, 0.2), tmp_path / "a.h5")
+    del protocol._registered["laser"], protocol._by_type[laser.Beam], sys.modules["tests.wrist_laser"]
+    assert load(tmp_path / "a.h5").measurements[-1].kind == "laser"
+
+
+def test_a_kind_that_nobody_offers_is_named(
+    laser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = shone(laser, 0.2)
+    save(recording, tmp_path / "a.h5")
+    del protocol._registered["laser"], protocol._by_type[laser.Beam], protocol._by_type[laser.Aim]
+    monkeypatch.setattr(protocol, "entry_points", lambda group: [])
+    with pytest.raises(
+        InputError, match=r"a\.h5.* unknown kind 'laser'; known are view, window, push"
+    ) as caught:
+        load(tmp_path / "a.h5")
+    assert_one_sentence(str(caught.value).replace(str(tmp_path), ""))
+    with pytest.raises(InputError, match="Beam is no known kind of action"):
+        save(recording, tmp_path / "b.h5")
+    (problem,) = problems(recording)
+    assert problem.startswith("measurement 7: Beam is no known kind of action")
+    assert_one_sentence(problem)
+    assert dict(describe(recording))["measurements"] == "3 views, 3 probe windows, 1 push"
+
+
+def test_a_package_that_cannot_be_loaded_is_named_and_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = EntryPoint("sniffer", "no_such_package.sniffer", protocol.GROUP)
+    monkeypatch.setattr(protocol, "entry_points", lambda group: [broken])
+    with pytest.warns(UserWarning, match="'sniffer' .*no_such_package"):
+        assert [sensor.kind for sensor in sensors()] == ["view", "window", "push"]
+
+
+def test_problems_of_a_new_kind_stand_where_its_measurements_do(laser: Any) -> None:
+    assert problems(shone(laser, 0.2)) == []
+    recording = shone(laser, 0.2, 0.9, 0.1)
+    dark = replace(full().measurements[0].observation, depth=np.full((6, 8), np.nan))
+    measurements = [*recording.measurements, Measurement(View(camera("left")), dark)]
+    other = Measurement(laser.Beam(laser.Laser("wrist", 0.05, 0.4), 2.0 * ABOVE), laser.Distance(0.2))
+    wrong = problems(replace(recording, measurements=[*measurements, other]))
+    starts = [
+        "measurement 8: a distance of 0.9 m",
+        "measurement 10: the depth",
+        "measurement 11: laser 'wrist'",
+    ]
+    for problem, start in zip(wrong, [*starts, "measurement 11's world_from_laser"], strict=True):
+        assert problem.startswith(start)
+        assert_one_sentence(problem)
+    touch = full().measurements[1].observation
+    mixed = replace(recording, measurements=[Measurement(recording.measurements[-1].action, touch)])
+    assert problems(mixed) == [
+        "measurement 0: a Beam is paired with a Touch; a laser distance pairs a Beam with a Distance."
+    ]
+
+
+def test_a_new_kind_is_described_and_counted(laser: Any) -> None:
+    rows = dict(describe(shone(laser, 0.2, 0.3)))
+    assert rows["measurements"] == "3 views, 3 probe windows, 1 push, 2 laser distances"
+    assert rows["laser wrist"] == "0.05 to 0.5 m"
+
+
+def test_fingerprints_see_a_new_kind(laser: Any, tmp_path: Path) -> None:
+    recordings = [
+        shone(laser, 0.2),
+        shone(laser, 0.21),
+        shone(laser, 0.2, world_from_laser=ABOVE + np.eye(7)[0]),
+        shone(laser, 0.2, laser=laser.Laser("wrist", 0.05, 0.6)),
+        shone(laser, 0.2, laser=laser.Laser("other", 0.05, 0.5)),
+    ]
+    assert len({fingerprint(each, 8) for each in recordings}) == len(recordings)
+    assert len({fingerprint(each, 7) for each in recordings}) == 1
+    save(recordings[0], tmp_path / "a.h5")
+    assert fingerprint(load(tmp_path / "a.h5"), 8) == fingerprint(recordings[0], 8)
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".json"])
+def test_candidates_of_a_new_kind_come_back_from_files(laser: Any, suffix: str, tmp_path: Path) -> None:
+    aim = laser.Aim("spot", 0.05, 0.5, ABOVE)
+    save_actions([aim, View(camera("left"))], tmp_path / f"next{suffix}")
+    back = load_actions(tmp_path / f"next{suffix}")
+    assert_identical(back[0], aim)
+    assert isinstance(back[1], View)
+
+
+def test_a_candidate_of_a_new_kind_is_drawn(laser: Any) -> None:
+    aim = laser.Aim("spot", 0.1, 0.4, ABOVE)
+    belief = "next", full().truth[None], np.zeros(1)  # type: ignore[index]
+    figure = action_in_3d(full().part, belief, aim, None, [aim, aim])
+    (axes,) = figure.axes
+    beams = [line for line in axes.get_lines() if line.get_label() == "beam"]
+    np.testing.assert_allclose(np.transpose(beams[0].get_data_3d()), [[0, 0, 200], [0, 0, -100]], atol=1e-9)
+    assert axes.get_zlim()[0] <= -100.0 and "the beam as far as" in axes.get_title()
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["beam", "particles (z axes)", "other candidates"]
+
+
+def test_capabilities_are_asked_for_by_protocol(laser: Any) -> None:
+    found = {
+        sensor.kind: [
+            p.__name__ for p in (AroundPart, Drawable, HasBlank, Plannable, Timed) if isinstance(sensor, p)
+        ]
+        for sensor in sensors()
+    }
+    assert found == {
+        "view": ["AroundPart", "Drawable", "HasBlank", "Plannable"],
+        "window": ["Drawable", "Plannable", "Timed"],
+        "push": ["Timed"],
+        "laser": ["Drawable", "HasBlank", "Plannable"],
+    }
+
+
+def test_candidates_of_every_kind_have_an_action_a_name_and_a_duration(laser: Any) -> None:
+    plan = Plan(
+        "down", np.array([1.0, 3.5]), np.stack([ABOVE, ABOVE]), ("free",), 4.0, np.ones(6), np.ones(6)
+    )
+    view, aim = View(replace(camera("left"), device="")), laser.Aim("spot", 0.05, 0.5, ABOVE)
+    assert [name_of(each) for each in (plan, view, aim)] == ["down", "left", "spot"]
+    assert [name_of(action_of(each)) for each in (plan, view, aim)] == ["down", "left", "spot"]
+    assert [duration_of(each) for each in (plan, view, aim)] == [2.5, 0.0, 1.5]
+    window = action_of(plan)
+    assert (window.first, window.last) == (0, 250) and sensor_of(window) is sensor_of(plan)
+    depth: Any = sensor_of(view)
+    again = depth.renamed(view, "left again")
+    assert again.camera.name == "left again" and again.camera.instrument == "left"
+    assert depth.blank(view).depth.shape == (6, 8) and np.isnan(depth.blank(view).depth).all()
+    push = full().measurements[3].action
+    assert isinstance(push, Push) and sensor_of(push) is sensor_named("push")
+    with pytest.raises(InputError, match="a push cannot be planned"):
+        action_of(push)
