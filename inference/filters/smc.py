@@ -1,6 +1,6 @@
-"""Sequential Monte Carlo over a recording: an iterator that can be stopped, looked into and gone on with.
+"""Sequential Monte Carlo over a recording: an iterator that can be paused, inspected and resumed.
 
-How one measurement is taken in is a step (`bcppl.inference.filters.step`), such as `tempered(...)`. A program
+One measurement is assimilated by a step (`bcppl.inference.filters.step`), such as `tempered(...)`. A program
 without a recording is run by `bcppl.inference.filters.step.steps`.
 """
 
@@ -29,31 +29,43 @@ from bcppl.traces import Model, Series, Trace, extend, generate
 
 
 class Info(NamedTuple):
-    """What happened while one measurement was taken in.
+    """What happened while one measurement was assimilated.
 
     Attributes:
-        label: the measurement's kind and number; time: seconds on the recording's clock, NaN if it has none.
-        effective_sample_size, log_evidence, distinct: of the population afterwards.
-        acceptance: the share of proposals accepted, NaN where nothing was moved.
-        exponents: the steps by which the likelihood was let in; the last is 1.
+        label: the measurement's kind and number.
+        time: seconds on the recording's clock, NaN if it has none.
+        log_evidence: of all measurements so far.
+        distinct: number of different poses among the particles with weight.
         truth_gap: log-likelihood of the true pose minus that of the best particle, all measurements so far;
             NaN where the truth is not known.
         seconds: wall time.
-        effort: by simulator's name, what it did for this measurement.
-        step: what else the step says about itself.
+        effort: by simulator's name, its cost for this measurement.
+        step: what the step itself reports.
     """
 
     label: str
     time: float
-    effective_sample_size: float
     log_evidence: float
     distinct: int
-    acceptance: float
-    exponents: tuple[float, ...]
     truth_gap: float
     seconds: float
     effort: Mapping[str, Any]
     step: StepInfo
+
+    @property
+    def acceptance(self) -> float:
+        """The share of proposals accepted, NaN where nothing was moved."""
+        return self.step.acceptance
+
+    @property
+    def exponents(self) -> tuple[float, ...]:
+        """The exponents of tempering; the last is 1."""
+        return self.step.exponents
+
+    @property
+    def effective_sample_size(self) -> float:
+        """Of the population afterwards."""
+        return self.step.effective_sample_size
 
 
 __all__ = ["Info", "Step", "smc", "tempered"]
@@ -79,14 +91,14 @@ def _own_state(box: list[Tensor], particles: int) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What `smc` yields: `for belief, info in smc(...)`, and the population to look into.
+    """What `smc` yields: `for belief, info in smc(...)`, and the population behind them.
 
     Attributes:
         belief: over the sought pose.
         info: what happened.
-        population: the particles.
-        random_state: of torch's generator; with the population it is all that a run goes on from.
-        taken: how many measurements were taken in.
+        population: the particles, and the approximation that guides the filter.
+        random_state: of torch's generator; with the population it is all that a run is resumed from.
+        taken: number of measurements assimilated.
     """
 
     belief: Belief
@@ -110,29 +122,28 @@ def smc(
     start: Step | None = None,
     progress: bool = False,
 ) -> Iterator[Step]:
-    """Run SMC over a recording: yields the prior's belief first, then one step for each measurement.
+    """Sequential Monte Carlo over a recording: the prior's belief first, then one step for each measurement.
 
     Args:
         model: what explains the recording.
         recording: a `bcppl.recordings.Recording`.
-        step: how one measurement is taken in, such as `tempered(...)`.
+        step: assimilates one measurement, such as `tempered(...)`.
         particles: N.
         seed: same seed, same beliefs, bit for bit; torch's own generator is left as it was.
         scene: `model.prepare(recording)` unless given.
-        start: go on from this one, with its particles and its random state: what is yielded are the steps
-            after it, the same to the bit as those of the run that it was taken from.
-        progress: show a bar, on a terminal or in a notebook, until the last step is taken. For a loop that
-            runs through: a bar would stay while you stop and look.
+        start: resume from this step, with its particles and its random state: the steps after it are yielded,
+            the same to the bit as those of the run that it was taken from.
+        progress: show a bar, on a terminal or in a notebook, until the last step is made.
 
     Raises:
         InferenceError: no particle is left with any weight; names the measurement.
         InputError: the particles or the seed are no whole number, the program samples no pose at
-            `model.pose`, or `start` has taken more measurements in than there are.
+            `model.pose`, or `start` has assimilated more measurements than there are.
 
     Warns:
-        RuntimeWarning: the recording has a problem (`bcppl.recordings.problems`, which is asked where no
-            scene is given): two cameras of one name, places in millimetres, times that go back. The run
-            goes on; `bcppl run` refuses such a recording.
+        RuntimeWarning: the recording has a problem (`bcppl.recordings.problems`, checked where no scene is
+            given): two cameras of one name, lengths in millimetres, times that decrease. The run continues;
+            `bcppl run` refuses such a recording.
     """
     whole_number("SMC is to run {} particles", particles)
     seed_number(seed)
@@ -168,7 +179,7 @@ def _steps(
             population = importance_sampling(model.program, (scene, []), {}, particles)
         if model.pose not in population.trace:
             raise InputError(
-                f"the model's pose is said to be at address {model.pose!r}, which its program never samples; "
+                f"the model's pose is at address {model.pose!r}, which its program never samples; "
                 f"it samples {', '.join(population.trace.choices) or 'nothing'} before any measurement."
             )
         start = _prior(model, population, state[0])
@@ -177,7 +188,7 @@ def _steps(
     else:
         if start.taken > len(recording.measurements):
             raise InputError(
-                f"a run is to go on after {start.taken} measurements, but the recording has "
+                f"a run is to be resumed after {start.taken} measurements, but the recording has "
                 f"{len(recording.measurements)}; give the recording that it was run on."
             )
         state, population, particles = [start.random_state], start.population, len(start.population)
@@ -197,46 +208,24 @@ def _steps(
         belief = population.belief(model.pose)
         spent = {name: after.since(before[name]) for name, after in _effort(scene).items()}
         elapsed = time.perf_counter() - begun
-        info = Info(
-            label,
-            _time(measurement),
-            belief.effective_sample_size,
-            population.log_evidence,
-            belief.distinct,
-            happened.acceptance,
-            happened.exponents,
-            truth.gap(observed, population),
-            elapsed,
-            spent,
-            happened,
-        )
+        gap = truth.gap(observed, population)
+        evidence, distinct = population.log_evidence, belief.distinct
+        info = Info(label, _time(measurement), evidence, distinct, gap, elapsed, spent, happened)
         yield Step(belief, info, population, state[0], count)
 
 
 def _prior(model: Model, population: Population, random_state: Tensor) -> Step:
     belief, nothing = population.belief(model.pose), float("nan")
-    size = belief.effective_sample_size
-    happened = StepInfo(exponents=(), effective_sample_size=size)
-    info = Info(
-        "prior",
-        nothing,
-        size,
-        population.log_evidence,
-        len(population),
-        nothing,
-        (),
-        nothing,
-        0.0,
-        {},
-        happened,
-    )
+    happened = StepInfo(exponents=(), effective_sample_size=belief.effective_sample_size)
+    evidence, count = population.log_evidence, len(population)
+    info = Info("prior", nothing, evidence, count, nothing, 0.0, {}, happened)
     return Step(belief, info, population, random_state)
 
 
 def _observed(model: Model, scene: Any, measurements: Sequence[Any], known: Mapping[str, Tensor]) -> Observed:
-    """What a step takes in so that the measurements are all taken in."""
+    """The arguments and the new observations by which all these measurements are assimilated."""
     if isinstance(model.program, Series):
-        # A step of a series is given what is new alone, under its own addresses.
+        # A step of a series is given the newest measurement alone, under its own addresses.
         measurements, known = measurements[-1:], {}
     observations = model.observe(scene, measurements)
     new = {a: v for a, v in observations.items() if a not in known}
@@ -248,7 +237,7 @@ class _Truth:
 
     def __init__(self, model: Model, scene: Any, recording: Any, population: Population, seed: int) -> None:
         self.trace: Trace | None = None
-        # It draws from a generator of its own: a belief does not depend on whether the truth is known.
+        # Its generator is its own: a belief does not depend on whether the truth is known.
         self.state = [torch.Generator().manual_seed(seed).get_state()]
         self.latent = {model.pose}
         # A series' pose moves: one true pose is not where it began.

@@ -63,12 +63,12 @@ def waste_free_moves(
                 current = put(current, mine, moved)
                 acceptances.append(accepted.to(torch.float64))
             whole = put(whole, torch.arange(chains) + state * chains, current)
-        kept = Population(
-            whole,
-            torch.zeros(count, dtype=torch.float64),
-            population.log_evidence,
-            population.founders[ancestors].repeat(count // chains),
-            population.log_pairs + log_pair(chains),
+        kept = replace(
+            population,
+            trace=whole,
+            log_weights=torch.zeros(count, dtype=torch.float64),
+            founders=population.founders[ancestors].repeat(count // chains),
+            log_pairs=population.log_pairs + log_pair(chains),
         )
         acceptance = float(torch.cat(acceptances).mean()) if acceptances else None
         return Rejuvenated(kept, ancestors.repeat(count // chains), acceptance)
