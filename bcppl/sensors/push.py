@@ -42,9 +42,8 @@ class PushSensor:
     def problems(self, measurements: Indexed, recording: Recording) -> Iterator[tuple[int, str]]:
         """Problems of finger paths and wrenches, and of paths and wrenches on different clocks."""
         for index, measurement in measurements:
-            where = f"measurement {index}"
-            for problem in _problems(where, measurement.action, measurement.observation):
-                yield index, problem
+            found = _problems(f"measurement {index}", measurement.action, measurement.observation)
+            yield from ((index, problem) for problem in found)
 
     def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:
         """How long was pushed, and at which rates."""
