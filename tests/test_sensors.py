@@ -33,7 +33,6 @@ from bcppl.sensors.protocol import (
     Moving,
     Placed,
     Plannable,
-    Timed,
 )
 from bcppl.traces import generate
 from tests.made_recordings import assert_identical, assert_one_sentence, camera, full
@@ -193,12 +192,12 @@ def test_a_model_explains_a_new_kind_by_its_own_likelihood(laser: Any) -> None:
 
 
 def test_capabilities_are_asked_for_by_protocol(laser: Any) -> None:
-    capabilities = (AroundPart, Drawable, HasBlank, HasLikelihood, Moving, Placed, Plannable, Timed)
+    capabilities = (AroundPart, Drawable, HasBlank, HasLikelihood, Moving, Placed, Plannable)
     found = {each.kind: [p.__name__ for p in capabilities if isinstance(each, p)] for each in sensors()}
     assert found == {
         "view": ["AroundPart", "Drawable", "HasBlank", "Placed", "Plannable"],
-        "window": ["Drawable", "Moving", "Plannable", "Timed"],
-        "push": ["Timed"],
+        "window": ["Drawable", "Moving", "Plannable"],
+        "push": [],
         "laser": ["Drawable", "HasBlank", "HasLikelihood", "Placed", "Plannable"],
     }
 

@@ -115,10 +115,6 @@ class ProbeSensor:
         ]
         return [*rows, ("touching", touches.length([m.observation for m in measurements]))]
 
-    def times(self, observation: Touch) -> Array:
-        """The wrench's times (T,), seconds."""
-        return observation.times
-
     # ---- candidates: plans
 
     def action_of(self, candidate: Plan) -> ProbeWindow:

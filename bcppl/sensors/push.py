@@ -51,10 +51,6 @@ class PushSensor:
         length = touches.length([m.observation for m in measurements])
         return [("pushing", f"{length}, finger path at {paths}")]
 
-    def times(self, observation: Touch) -> Array:
-        """The wrench's times (T,), seconds."""
-        return observation.times
-
 
 def _problems(where: str, push: Push, touch: Touch) -> Iterator[str]:
     yield from checks.times(f"{where}'s finger path", push.times)
