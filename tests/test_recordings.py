@@ -1,6 +1,8 @@
 """Recordings on disk: what comes back is what went in, and what is wrong is said in one sentence."""
 
 import dataclasses
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,8 @@ from bcppl.recordings import (
     save,
 )
 from tests.made_recordings import assert_identical, assert_one_sentence, camera, full, poses
+
+SHIPPED = Path(__file__).parents[1] / "models/recordings/peg_probe.h5"
 
 
 def test_everything_comes_back_to_the_last_bit(tmp_path: Path) -> None:
@@ -198,3 +202,14 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     assert "unknown kind" in edited(
         tmp_path, lambda file: file["measurements/000003"].attrs.__setitem__("kind", "sniff")
     )
+
+
+def test_checking_a_recording_imports_no_simulator() -> None:
+    heavy = ("mujoco", "pyro", "matplotlib", "scipy.signal")
+    check = (
+        "import sys; from bcppl.recordings import describe, load, notes, problems;"
+        f"recording = load({str(SHIPPED)!r}); describe(recording), notes(recording), problems(recording);"
+        f"print([name for name in {heavy} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

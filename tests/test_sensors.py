@@ -13,16 +13,28 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import torch
 
 from bcppl.errors import InputError
 from bcppl.figures import action_in_3d
+from bcppl.models.peg_in_hole import model
+from bcppl.poses import identity
 from bcppl.recordings import Measurement, Push, Recording, View, describe, load, problems, save
 from bcppl.recordings.action_file import load_actions, save_actions
 from bcppl.recordings.fingerprint import fingerprint
 from bcppl.robot.plan import Plan
 from bcppl.sensors import protocol, sensor_named, sensor_of, sensors
 from bcppl.sensors.candidates import action_of, duration_of, name_of
-from bcppl.sensors.protocol import AroundPart, Drawable, HasBlank, Plannable, Timed
+from bcppl.sensors.protocol import (
+    AroundPart,
+    Drawable,
+    HasBlank,
+    HasLikelihood,
+    Moving,
+    Placed,
+    Plannable,
+)
+from bcppl.traces import generate
 from tests.made_recordings import assert_identical, assert_one_sentence, camera, full
 
 ABOVE = np.array([0.0, 0.0, 0.3, 0.0, 1.0, 0.0, 0.0])
@@ -164,18 +176,29 @@ def test_a_candidate_of_a_new_kind_is_drawn(laser: Any) -> None:
     assert labels == ["beam", "particles (z axes)", "other candidates"]
 
 
+def test_a_model_explains_a_new_kind_by_its_own_likelihood(laser: Any) -> None:
+    whole = shone(laser, 0.2846, 0.3)
+    guess = replace(whole.guess, world_from_part=identity().numpy(), translation=np.full(3, 0.02))
+    recording = replace(whole, guess=guess, measurements=whole.measurements[-2:], peg=None)
+    scene = model.prepare(recording)
+    poses = identity(3)
+    poses[:, 2] = torch.tensor([0.0, 0.001, -0.0005])  # of a block whose top is 15 mm above its middle
+    actions = [m.action for m in recording.measurements]
+    observed = model.observe(scene, recording.measurements)
+    _, weight = generate(model.program, (scene, actions), observed, 3, choices={"hole": poses})
+    distance = torch.tensor([0.285, 0.284, 0.2855], dtype=torch.float64)
+    expected = -sum((distance - metres) ** 2 for metres in (0.2846, 0.3)) / (2 * 0.001**2)
+    torch.testing.assert_close(weight - weight[0], expected - expected[0], rtol=1e-3, atol=1e-3)
+
+
 def test_capabilities_are_asked_for_by_protocol(laser: Any) -> None:
-    found = {
-        sensor.kind: [
-            p.__name__ for p in (AroundPart, Drawable, HasBlank, Plannable, Timed) if isinstance(sensor, p)
-        ]
-        for sensor in sensors()
-    }
+    capabilities = (AroundPart, Drawable, HasBlank, HasLikelihood, Moving, Placed, Plannable)
+    found = {each.kind: [p.__name__ for p in capabilities if isinstance(each, p)] for each in sensors()}
     assert found == {
-        "view": ["AroundPart", "Drawable", "HasBlank", "Plannable"],
-        "window": ["Drawable", "Plannable", "Timed"],
-        "push": ["Timed"],
-        "laser": ["Drawable", "HasBlank", "Plannable"],
+        "view": ["AroundPart", "Drawable", "HasBlank", "Placed", "Plannable"],
+        "window": ["Drawable", "Moving", "Plannable"],
+        "push": [],
+        "laser": ["Drawable", "HasBlank", "HasLikelihood", "Placed", "Plannable"],
     }
 
 

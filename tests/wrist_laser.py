@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pyro
+import torch
+from pyro.distributions import Normal
+from torch import Tensor
 
 from bcppl.geometry.parts import Part
-from bcppl.poses import as_pose, rotation_matrix
+from bcppl.poses import as_pose, compose, inverse, rotation_matrix
 from bcppl.sensors import Measurement, Recording, checks, register
 from bcppl.sensors.layout import POSE_UNITS, TEXT, Layout, number, numbers, shared
-from bcppl.sensors.protocol import FAINT, Indexed
+from bcppl.sensors.protocol import FAINT, Indexed, Placement
+from bcppl.sensors.scene import Numbered
 
 Array = npt.NDArray[np.float64]
 
@@ -44,12 +49,34 @@ class Distance:
 
 @dataclass(frozen=True, eq=False)
 class Aim:
-    """Candidate: a beam that may be shone next."""
+    """Candidate: a beam, and its laser's name and range."""
 
     name: str
     near: float
     far: float
     world_from_laser: Array
+
+
+class BeamLikelihood:
+    """Distances to the part's surface at `laser_*`, with normal noise; a beam that misses reads its range."""
+
+    efforts: Mapping[str, Any] = {}
+
+    def __init__(self, recording: Recording) -> None:
+        self.mesh = recording.part.mesh
+
+    def observe(self, number: int, action: Beam, world_from_part: Tensor) -> None:
+        """Sample `laser_*`."""
+        part_from_laser = compose(inverse(world_from_part), as_pose(action.world_from_laser))
+        start, along = part_from_laser[:, :3].numpy(), rotation_matrix(part_from_laser)[:, :, 2].numpy()
+        met, rows, _ = self.mesh.ray.intersects_location(start, along, multiple_hits=False)
+        distance = torch.full((len(start),), action.laser.far, dtype=torch.float64)
+        distance[rows] = torch.from_numpy(np.linalg.norm(met - start[rows], axis=1))
+        pyro.sample(f"laser_{number}", Normal(distance, 0.001))
+
+    def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
+        """The distances, by address."""
+        return {f"laser_{n}": torch.tensor(m.observation.metres).double() for n, m in measurements}
 
 
 RANGE = {"near": number("m"), "far": number("m")}
@@ -64,6 +91,7 @@ class WristLaser:
     contact = False
     action = Layout(Beam, {"laser": shared("lasers", LASER), "world_from_laser": numbers(POSE_UNITS)})
     observation = Layout(Distance, {"metres": number("m")})
+    prepare = BeamLikelihood  # for models that state no likelihood of their own
 
     candidate_kind = "beam"
     candidate = Layout(Aim, {"name": TEXT, **RANGE, "world_from_laser": numbers(POSE_UNITS)})
@@ -79,13 +107,16 @@ class WristLaser:
             found += checks.pose(f"{where}'s world_from_laser", beam.world_from_laser)
             if not beam.laser.near <= metres <= beam.laser.far:
                 found.append(f"{where}: a distance of {metres:.4g} m is out of range; leave it out.")
-            for problem in found:
-                yield index, problem
+            yield from ((index, problem) for problem in found)
 
     def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:
         """The range of each laser."""
-        lasers = {m.action.laser.name: m.action.laser for m in measurements}
-        return [(f"laser {name}", f"{laser.near:g} to {laser.far:g} m") for name, laser in lasers.items()]
+        lasers = {m.action.laser.name: m.action.laser for m in measurements}.values()
+        return [(f"laser {each.name}", f"{each.near:g} to {each.far:g} m") for each in lasers]
+
+    def placement(self, candidate: Aim) -> Placement:
+        """The laser's pose."""
+        return Placement(candidate.world_from_laser, None)
 
     def action_of(self, candidate: Aim) -> Beam:
         """The beam."""
@@ -93,8 +124,7 @@ class WristLaser:
 
     def name_of(self, candidate_or_action: Aim | Beam) -> str:
         """The laser's name."""
-        laser: Any = getattr(candidate_or_action, "laser", candidate_or_action)
-        return str(laser.name)
+        return str(getattr(candidate_or_action, "laser", candidate_or_action).name)
 
     def renamed(self, candidate: Aim, name: str) -> Aim:
         """The same beam under another name."""

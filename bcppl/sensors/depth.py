@@ -107,8 +107,7 @@ class DepthSensor:
                 found.append(
                     f"{where}: the colour image is {image.rgb.shape}, its camera {_frame(camera)} pixels."
                 )
-            for problem in found:
-                yield index, problem
+            yield from ((index, problem) for problem in found)
 
     def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:
         """Each camera's size and range."""

@@ -104,8 +104,7 @@ class ProbeSensor:
             ends[name] = max(window.last, ends.get(name, 0))
             if recording.peg is None:
                 yield index, f"{where} is a probe window but the recording has no peg; add the held peg."
-            for problem in found:
-                yield index, problem
+            yield from ((index, problem) for problem in found)
 
     def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:
         """Each probe's length and rate, and those of all windows together."""
@@ -115,10 +114,6 @@ class ProbeSensor:
             for name, stamps in probes.items()
         ]
         return [*rows, ("touching", touches.length([m.observation for m in measurements]))]
-
-    def times(self, observation: Touch) -> Array:
-        """The wrench's times (T,), seconds."""
-        return observation.times
 
     # ---- candidates: plans
 

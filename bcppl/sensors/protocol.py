@@ -59,14 +59,6 @@ class Sensor(Protocol):
 
 
 @runtime_checkable
-class Timed(Protocol):
-    """A sensor whose observations have times."""
-
-    def times(self, observation: Any) -> Array:
-        """Times (T,) in seconds on the recording's clock."""
-
-
-@runtime_checkable
 class Plannable(Protocol):
     """A sensor whose measurements can be planned: a candidate is a measurement that may be made next.
 

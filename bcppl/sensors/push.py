@@ -42,19 +42,14 @@ class PushSensor:
     def problems(self, measurements: Indexed, recording: Recording) -> Iterator[tuple[int, str]]:
         """Problems of finger paths and wrenches, and of paths and wrenches on different clocks."""
         for index, measurement in measurements:
-            where = f"measurement {index}"
-            for problem in _problems(where, measurement.action, measurement.observation):
-                yield index, problem
+            found = _problems(f"measurement {index}", measurement.action, measurement.observation)
+            yield from ((index, problem) for problem in found)
 
     def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:
         """How long was pushed, and at which rates."""
         paths = touches.rate([m.action.times for m in measurements])
         length = touches.length([m.observation for m in measurements])
         return [("pushing", f"{length}, finger path at {paths}")]
-
-    def times(self, observation: Touch) -> Array:
-        """The wrench's times (T,), seconds."""
-        return observation.times
 
 
 def _problems(where: str, push: Push, touch: Touch) -> Iterator[str]:

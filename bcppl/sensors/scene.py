@@ -11,7 +11,7 @@ from torch import Tensor
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.sensors.measurements import Measurement, Recording
-from bcppl.sensors.protocol import sensor_named, sensor_of
+from bcppl.sensors.protocol import HasLikelihood, sensor_named, sensor_of
 
 
 class Numbered(NamedTuple):
@@ -115,7 +115,7 @@ def likelihoods_for(
     prepared = {kind: prepare(recording) for kind, prepare in chosen.items()}
     if not only:
         for kind in dict.fromkeys(sensor_of(m.action).kind for m in recording.measurements):
-            default = getattr(sensor_named(kind), "prepare", None)
-            if kind not in prepared and default is not None:
-                prepared[kind] = default(recording)
+            sensor = sensor_named(kind)
+            if kind not in prepared and isinstance(sensor, HasLikelihood):
+                prepared[kind] = sensor.prepare(recording)
     return {kind: each for kind, each in prepared.items() if each is not None}
