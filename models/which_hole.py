@@ -29,7 +29,7 @@ from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Scene
 from bcppl.traces import Model
 
-# Where the holes are in the frame of the first, metres: those of the plate that `invent` makes.
+# Where the holes are in the frame of the first, metres: those of the plate that `simulate_recording` makes.
 PITCH = 0.034
 HOLES = ((0.0, 0.0), (PITCH, 0.0), (0.0, PITCH), (PITCH, PITCH))
 

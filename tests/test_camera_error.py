@@ -41,7 +41,7 @@ def draws(recording: Recording, count: int) -> Trace:
     """Exact draws of part, biases and what the cameras see, before any image counts."""
     scene = camera_error.prepare(recording)
     arguments = scene, [m.action for m in recording.measurements]
-    observed = camera_error.observe(scene, recording.measurements)
+    observed = scene.observed(recording.measurements)
     return generate(camera_error.camera_error, arguments, observed, particles=count)[0]
 
 
@@ -74,9 +74,9 @@ def test_proposals_leave_the_target_invariant(recording: Recording, proposal: Ca
 
 def test_the_part_is_drawn_from_its_conditional(recording: Recording) -> None:
     trace = draws(recording, 2_000)
-    given = camera_error.given_seen(trace.args[0], camera_error.looks_of(trace))
+    given = camera_error.conditional(trace, trace.choices)
     drawn = trace.at({"part": given.sample()})
-    # Where the prior is flat, joint over conditional does not hang on the part.
+    # Where the prior is flat, joint over conditional does not depend on the part.
     inside = torch.isfinite(drawn.log_prob("part"))
     seen = [f"seen_by_{name}" for name in INSTRUMENTS]
     change = drawn.log_prob(*seen) - given.log_prob(drawn["part"])
@@ -89,21 +89,21 @@ def test_moving_the_part_alone_renders_nothing(recording: Recording) -> None:
     trace = draws(recording, 4)
     images = ["depth_0", "depth_1"]
     before = trace.log_prob(*images)
-    rendered = trace.args[0].renderer.effort.items
+    rendered = trace.args[0].likelihoods["view"].renderer.effort.items
     assert rendered > 0
     moved = trace.at({"part": poses.retract(trace["part"], torch.full((4, 6), 1e-3, dtype=torch.float64))})
     assert moved.known.keys() >= set(images)
     assert bool((moved.log_prob(*images) == before).all())
-    assert trace.args[0].renderer.effort.items == rendered
+    assert trace.args[0].likelihoods["view"].renderer.effort.items == rendered
 
 
 def test_what_makes_no_scene_is_refused_in_a_sentence(recording: Recording) -> None:
-    for settings, said in [
+    for settings, message in [
         ({"bias": 0.0}, "a site's spread must be positive and bias is 0.0"),
         ({"camera_shift": -0.002}, "camera_shift is -0.002"),
         ({"bins": 0}, "bins 0"),
     ]:
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             camera_error.prepare(recording, **settings)
     away = recording.guess.world_from_part + np.array([0.0, 5.0, 0, 0, 0, 0, 0])
     with pytest.raises(InputError, match=r"cannot see part .* beside its image"):
@@ -111,7 +111,7 @@ def test_what_makes_no_scene_is_refused_in_a_sentence(recording: Recording) -> N
 
 
 def test_several_views_share_one_error() -> None:
-    """A second view from the same place says nothing new of the error: the images are of one pose."""
+    """A second view from the same place does not inform the error: the images are of one pose."""
     trace = draws(record(1, World(views=2)), 3)
     assert [a for a in trace.choices if a.startswith("seen_by")] == ["seen_by_camera_0", "seen_by_camera_1"]
     first, second = trace.distributions["depth_0"], trace.distributions["depth_1"]

@@ -1,4 +1,4 @@
-"""A peg that sits off in the hand: what its recording says of it, and what turning the hand tells apart."""
+"""A peg that sits off in the hand: its touches, and the hand turned to discriminate peg from part."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ def recorded() -> Recording:
 
 
 @functools.cache
-def scene() -> grasped_peg.Scene:
+def scene() -> grasped_peg.GraspScene:
     return grasped_peg.prepare(recorded())
 
 
 def constrained(hole: Tensor, grip: Tensor) -> Trace:
-    """The program's trace for given poses (N, 7) of part and peg, all measurements taken in."""
+    """The program's trace for given poses (N, 7) of part and peg, given all measurements."""
     measurements = recorded().measurements
     empty, _ = generate(grasped_peg.grasped_peg, (scene(), []), {}, len(hole))
     moved = update(empty, {"hole": hole, "grip_from_peg": grip}).trace
-    values = grasped_peg.model.observe(scene(), measurements)
+    values = scene().observed(measurements)
     return extend(moved, (scene(), [m.action for m in measurements]), values)[0]
 
 
@@ -58,7 +58,7 @@ def test_the_truth_explains_the_touches_and_no_other_place_in_the_hand_does_bett
     assert float(trace.log_prob("depth_0").std()) == 0.0
 
 
-def test_only_touching_with_the_hand_turned_tells_the_peg_s_place_from_the_part_s() -> None:
+def test_only_touching_with_the_hand_turned_discriminates_the_peg_s_pose_from_the_part_s() -> None:
     """While the hand is not turned, 2 mm of the one are 2 mm of the other the other way."""
     truth, grip = torch.from_numpy(recorded().truth), world.grip_from_peg(0)
     hole, held = truth.expand(2, 7).clone(), grip.expand(2, 7).clone()
@@ -80,14 +80,14 @@ def test_a_peg_held_as_planned_is_that_of_peg_in_hole() -> None:
     plain_scene, measurements = peg_in_hole.prepare(recorded()), recorded().measurements
     empty, _ = generate(peg_in_hole.peg_in_hole, (plain_scene, []), {}, 2)
     moved = update(empty, {"hole": pose}).trace
-    values = peg_in_hole.observe(plain_scene, measurements)
+    values = plain_scene.observed(measurements)
     plain, _ = extend(moved, (plain_scene, [m.action for m in measurements]), values)
     for address in values:
         assert torch.equal(held.log_prob(address), plain.log_prob(address)), address
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "message"),
     [
         ({"grip_shift": 1.5}, "grip_shift is 1.5 m .* probably millimetres"),
         ({"grip_turn": 5.0}, "grip_turn is 5 rad, probably degrees"),
@@ -99,37 +99,37 @@ def test_a_peg_held_as_planned_is_that_of_peg_in_hole() -> None:
         ({"pose_every": 0}, "pose_every 0"),
     ],
 )
-def test_what_cannot_be_a_spread_is_refused_before_anything_is_built(settings: Any, said: str) -> None:
-    with pytest.raises(InputError, match=said) as caught:
+def test_what_cannot_be_a_spread_is_refused_before_anything_is_built(settings: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
         grasped_peg.prepare(recorded(), **settings)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("model", [part_in_view, peg_in_hole, grasped_peg])
-def test_a_model_takes_another_renderer(model: Any) -> None:
+def test_a_model_accepts_another_renderer(model: Any) -> None:
     """The same scene drawn in place of cast: the depth's density agrees to single precision."""
     views = [m for m in recorded().measurements if isinstance(m.action, View)]
     seen = replace(recorded(), measurements=views)
-    found = []
+    compared = []
     for options in ({}, {"renderer": renderer_for}):
         prepared = model.prepare(seen, **options)
         site = model.model.pose
         truth = torch.from_numpy(seen.truth).expand(2, 7).clone()
         empty, _ = generate(model.model.program, (prepared, []), {}, 2)
         trace = update(empty, {site: truth}).trace
-        values = model.model.observe(prepared, views)
+        values = prepared.observed(views)
         trace, _ = extend(trace, (prepared, [m.action for m in views]), values)
-        found.append((type(prepared.renderer), trace.log_prob(*values)))
-    (cast, rays), (drawn, triangles) = found
+        compared.append((type(prepared.likelihoods["view"].renderer), trace.log_prob(*values)))
+    (cast, rays), (drawn, triangles) = compared
     assert cast is DepthRenderer and issubclass(drawn, DepthRasteriser)
     torch.testing.assert_close(rays, triangles, rtol=0.0, atol=0.5)
 
 
-def test_it_is_offered_by_name_and_invents_what_it_explains() -> None:
+def test_it_is_offered_by_name_and_simulates_what_it_explains() -> None:
     assert loading.model("grasped_peg") is grasped_peg.model
     torch.manual_seed(0)
-    invented = simulate(
+    simulated = simulate(
         grasped_peg.grasped_peg, (scene(), [m.action for m in recorded().measurements[:4]]), 2
     )
-    assert invented["grip_from_peg"].shape == (2, 7) and invented["peg_3"].shape == (2, 80, 7)
+    assert simulated["grip_from_peg"].shape == (2, 7) and simulated["peg_3"].shape == (2, 80, 7)
     assert recorded().model == "grasped_peg"

@@ -1,11 +1,11 @@
-"""Guided SMC: exact where the programs are, unbiased where they are not, and the same again."""
+"""Guided SMC: exact where the approximation is, unbiased where it is not, and reproducible."""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -24,10 +24,11 @@ from bcppl.errors import InputError, NotANumberError
 from bcppl.geometry.guess import Guess
 from bcppl.inference.filters import tempered_smc
 from bcppl.inference.filters.guided_smc import guided, infer, kernel
-from bcppl.inference.filters.smc import smc
+from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair, smcp3
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.inference.population import Population
+from bcppl.inference.proposals import Program
 from bcppl.inference.resampling import never
 from bcppl.inference.targets import POSTERIOR
 from bcppl.models import look_and_touch
@@ -35,6 +36,7 @@ from bcppl.models.worlds.bench import bench_scene
 from bcppl.poses import Freedom
 from bcppl.sensors.measurements import Recording
 from bcppl.traces import Model, Trace, generate
+from tests.checked_pairs import run_checked
 from tests.made_recordings import assert_one_sentence
 
 # ---------------------------------------------------------------- a part that slides, seen with noise
@@ -52,21 +54,11 @@ def sliding(scene: Any, actions: Sequence[Any]) -> None:
         pyro.sample(f"seen_{k}", dist.Normal(part[:, :3], NOISE).to_event(1))
 
 
-def conditional(trace: Trace, count: int, wider: float) -> NormalPose:
-    """The part given the first so many measurements: exactly, or wider."""
-    precision = PRIOR**-2 + count / NOISE**2
-    total = sum((trace.observations[f"seen_{k}"] for k in range(count)), torch.zeros(3, dtype=torch.float64))
-    center = poses.identity()
-    center[:3] = total / NOISE**2 / precision
-    return NormalPose(center, torch.diag(wider**2 / precision), SLIDING)
+def observe(scene: Any, measurements: Sequence[Any]) -> dict[str, Tensor]:
+    return {f"seen_{m.number}": SEEN[m.number] for m in measurements}
 
 
-def there(trace: Trace, wider: float = 1.0) -> None:
-    pyro.sample("part", conditional(trace, len(trace.args[1]), wider))
-
-
-def back(trace: Trace, wider: float = 1.0) -> None:
-    pyro.sample("part", conditional(trace, len(trace.args[1]) - 1, wider))
+MODEL = Model(sliding, lambda recording: None, observe, "part")
 
 
 @dataclass(frozen=True)
@@ -82,11 +74,61 @@ class Sight:
 RECORDING: Any = SimpleNamespace(measurements=[Sight(k) for k in range(len(SEEN))], truth=None)
 
 
-def toy(forward: Any = there, backward: Any = back) -> Model:
-    def observe(scene: Any, measurements: Sequence[Any]) -> dict[str, Tensor]:
-        return {f"seen_{m.number}": SEEN[m.number] for m in measurements}
+@dataclass(frozen=True)
+class Exact:
+    """The posterior given the first so many measurements, whose sum is (3,)."""
 
-    return Model(sliding, lambda recording: None, observe, "part", arrival=(forward, backward))
+    count: int = 0
+    total: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
+
+    def including(self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]) -> Exact:
+        return Exact(self.count + 1, self.total + observations[f"seen_{number}"])
+
+    deferring = including
+
+    def updated(self) -> Exact:
+        return self
+
+    def posterior(self, wider: float) -> NormalPose:
+        precision, center = PRIOR**-2 + self.count / NOISE**2, poses.identity()
+        center[:3] = self.total / NOISE**2 / precision
+        return NormalPose(center, torch.diag(wider**2 / precision), SLIDING)
+
+
+def redrawn(proposed: NormalPose) -> Program:
+    def program(trace: Trace) -> None:
+        pyro.sample("part", proposed)
+
+    return program
+
+
+@dataclass(frozen=True)
+class Programs:
+    """Forward and backward kernels that draw from posteriors, so many times as wide."""
+
+    forward: float = 1.0
+    backward: float = 1.0
+
+    def pair(self, before: Exact, after: Exact, action: Any) -> Pair:
+        return Pair(redrawn(after.posterior(self.forward)), redrawn(before.posterior(self.backward)))
+
+    def proposals(self, approximation: Exact) -> Sequence[Program]:
+        return ()
+
+
+class NotBack(Programs):
+    """Mutant: a backward kernel that forgets nothing."""
+
+    def pair(self, before: Exact, after: Exact, action: Any) -> Pair:
+        return super().pair(after, after, action)
+
+
+WIDER, NOT_BACK = Programs(1.6, 1.4), NotBack(1.6, 1.4)
+
+
+def run(programs: Programs, particles: int, seed: int) -> Iterator[Step]:
+    step = guided(lambda scene: Exact(), programs, kernel("part", programs.proposals))
+    return smc(MODEL, RECORDING, step=step, particles=particles, seed=seed)
 
 
 def evidence(count: int = len(SEEN)) -> float:
@@ -100,7 +142,7 @@ def evidence(count: int = len(SEEN)) -> float:
 
 
 def test_with_exact_programs_every_weight_is_the_evidence() -> None:
-    steps = list(infer(toy(), RECORDING, particles=40, seed=1))
+    steps = list(run(Programs(), particles=40, seed=1))
     for step in steps[1:]:
         assert step.info.log_evidence == pytest.approx(evidence(step.taken), abs=1e-8)
     belief = steps[-1].belief
@@ -110,47 +152,55 @@ def test_with_exact_programs_every_weight_is_the_evidence() -> None:
     assert bool((off.abs() * precision.sqrt() < 5 / math.sqrt(40)).all())
 
 
-def ratios(model: Model, runs: int, particles: int = 30) -> np.ndarray:
+def ratios(programs: Programs, runs: int, particles: int = 30) -> np.ndarray:
     """Estimated over true evidence, by the pair alone."""
-    assert model.arrival is not None
-    found, step = [], smcp3(Pair(*model.arrival), resample=never)
+
+    def step(population: Population, observed: Any) -> Any:
+        before = Exact() if population.approximation is None else population.approximation
+        number = len(observed.args[1]) - 1
+        after = before.including(None, number, None, observed.observations)
+        pair = programs.pair(before, after, None)
+        return smcp3(pair, resample=never)(population.with_approximation(after), observed)
+
+    estimates = []
     for seed in range(runs):
-        *_, last = smc(model, RECORDING, step=step, particles=particles, seed=seed)
-        found.append(math.exp(last.info.log_evidence - evidence()))
-    return np.array(found)
+        *_, last = smc(MODEL, RECORDING, step=step, particles=particles, seed=seed)
+        estimates.append(math.exp(last.info.log_evidence - evidence()))
+    return np.array(estimates)
 
 
-WIDER = functools.partial(there, wider=1.6), functools.partial(back, wider=1.4)
-# Mutants: a way back that forgets nothing, and none at all.
-NOT_BACK = WIDER[0], functools.partial(there, wider=1.4)
-
-
-def test_evidence_is_unbiased_and_a_way_back_to_elsewhere_costs_it() -> None:
-    found = ratios(toy(*WIDER), 60)
-    assert abs(found.mean() - 1.0) < 4.0 * found.std(ddof=1) / math.sqrt(len(found))
-    assert 0.01 < found.std() < 1.0
-    wrong = ratios(toy(*NOT_BACK), 10)
-    assert np.median(wrong) < 0.5 or wrong.std() > 2.0 * found.std()
+def test_evidence_is_unbiased_and_a_wrong_backward_kernel_shows_in_it() -> None:
+    right = ratios(WIDER, 60)
+    assert abs(right.mean() - 1.0) < 4.0 * right.std(ddof=1) / math.sqrt(len(right))
+    assert 0.01 < right.std() < 1.0
+    wrong = ratios(NOT_BACK, 10)
+    assert np.median(wrong) < 0.5 or wrong.std() > 2.0 * right.std()
 
 
 def test_the_whole_step_agrees_with_tempering_and_with_the_truth() -> None:
-    runs = [list(infer(toy(*WIDER), RECORDING, particles=60, seed=s))[-1] for s in range(3)]
-    tempered = list(tempered_smc.infer(toy(), RECORDING, particles=40, seed=0))[-1]
+    runs = [list(run(WIDER, particles=60, seed=s))[-1] for s in range(3)]
+    tempered = list(tempered_smc.infer(MODEL, RECORDING, particles=40, seed=0))[-1]
     assert abs(np.mean([run.info.log_evidence for run in runs]) - evidence()) < 0.3
     assert tempered.info.log_evidence == pytest.approx(evidence(), abs=2.0)
     means = torch.stack([run.belief.mean[:3] for run in runs]).mean(dim=0)
     assert float((means - tempered.belief.mean[:3]).abs().max()) < 0.0015
 
 
-def test_programs_that_lead_nowhere_fall_back_on_tempering() -> None:
-    """A pair that goes where the posterior is not: the measurement is tempered in instead."""
+@dataclass(frozen=True)
+class Elsewhere(Programs):
+    """A forward kernel of its own, whatever the approximation."""
 
-    def astray(trace: Trace) -> None:
-        center = poses.identity()
-        center[:3] = 0.4
-        pyro.sample("part", NormalPose(center, torch.full((3,), 1e-3).double(), SLIDING))
+    proposed: Any = None
 
-    *_, last = infer(toy(astray, back), RECORDING, particles=100, seed=0)
+    def pair(self, before: Exact, after: Exact, action: Any) -> Pair:
+        return replace(super().pair(before, after, action), forward=redrawn(self.proposed))
+
+
+def test_where_a_forward_kernel_misses_the_posterior_the_likelihood_is_tempered() -> None:
+    center = poses.identity()
+    center[:3] = 0.4
+    astray = NormalPose(center, torch.full((3,), 1e-3).double(), SLIDING)
+    *_, last = run(Elsewhere(proposed=astray), particles=100, seed=0)
     assert len(last.info.exponents) >= 1
     precision = PRIOR**-2 + len(SEEN) / NOISE**2
     off = (last.belief.mean[:3] - SEEN.sum(dim=0) / NOISE**2 / precision) * precision.sqrt()
@@ -163,20 +213,18 @@ def test_a_density_that_is_not_a_number_stops_the_run_and_is_not_tempered_over()
         def log_prob(self, value: Tensor) -> Tensor:
             return super().log_prob(value) * math.nan
 
-    def broken(trace: Trace) -> None:
-        pyro.sample("part", Broken(poses.identity(), torch.diag(PRIOR**2), SLIDING))
-
+    broken = Broken(poses.identity(), torch.diag(PRIOR**2), SLIDING)
     with pytest.raises(NotANumberError, match=r"^sight 1: .* nan"):
-        list(infer(toy(broken, back), RECORDING, particles=20, seed=0))
+        list(run(Elsewhere(proposed=broken), particles=20, seed=0))
 
 
-def test_a_model_without_programs_is_refused_in_a_sentence() -> None:
-    with pytest.raises(InputError, match="give it an `arrival`") as caught:
-        infer(replace(toy(), arrival=None), RECORDING)
+def test_a_model_without_sensors_and_numbers_out_of_range_are_refused_in_a_sentence() -> None:
+    with pytest.raises(InputError, match="needs a scene with a prior and sensors") as caught:
+        list(infer(MODEL, RECORDING))
     assert_one_sentence(str(caught.value))
     for numbers in ({"particles": 0}, {"sweeps": 0}, {"share": 1.5}):
         with pytest.raises(InputError):
-            infer(toy(), RECORDING, **numbers)
+            infer(MODEL, RECORDING, **numbers)
 
 
 # ---------------------------------------------------------------- look_and_touch
@@ -207,27 +255,24 @@ def test_the_same_seed_gives_the_same_belief_to_the_bit() -> None:
     assert one.info.log_evidence == other.info.log_evidence
 
 
-def test_the_pair_leads_back_to_where_it_came_from() -> None:
-    """`check` inverts every move and refuses one that does not: two cameras, then touches."""
-    assert look_and_touch.model.arrival is not None
-    pair = Pair(*look_and_touch.model.arrival, check=True)
-    step = guided(pair, kernel("part", look_and_touch.model.proposals))
-    steps = list(smc(look_and_touch.model, some(VIEW, 1, 8, 13), step=step, particles=6, seed=0))
+def test_the_backward_kernel_leads_back_to_where_the_forward_kernel_came_from() -> None:
+    """Two cameras, then touches."""
+    steps = run_checked(look_and_touch.model, some(VIEW, 1, 8, 13), particles=6)
     assert len(steps) == 5 and all(math.isfinite(s.info.log_evidence) for s in steps)
 
 
-def test_a_second_camera_after_a_touch_is_taken_in() -> None:
+def test_a_second_camera_after_a_touch_is_assimilated() -> None:
     *_, last = infer(look_and_touch.model, some(VIEW, 8, 1), particles=6, seed=0)
     assert last.taken == 3
 
 
-def test_a_first_camera_after_touches_is_taken_in() -> None:
+def test_a_first_camera_after_touches_is_assimilated() -> None:
     *_, last = infer(look_and_touch.model, some(8, VIEW), particles=6, seed=0)
     assert last.taken == 2 and math.isfinite(last.info.log_evidence)
 
 
 def test_touches_alone_place_the_part() -> None:
-    """Contact-only recordings: the top, one side and the next, no image; what `bcppl check` says is told."""
+    """The top, one side and the next, no image; the problems that `bcppl check` reports are warned of."""
     with pytest.warns(RuntimeWarning, match="leaves out stamps 0 to 300"):
         *_, last = infer(look_and_touch.model, some(*TOUCHES), particles=20, seed=0)
     truth = torch.as_tensor(recording().truth)
@@ -241,7 +286,7 @@ def test_touches_alone_place_the_part() -> None:
 
 
 def test_free_windows_alone_keep_the_prior() -> None:
-    """Where the peg passed far above the part nothing is learnt, and the evidence is 1."""
+    """Where the peg passed far above the part they carry no information, and the evidence is 1."""
     *_, last = infer(look_and_touch.model, some(2, 3), particles=30, seed=0)
     assert last.info.log_evidence == pytest.approx(0.0, abs=0.1)
     assert last.belief.distinct == 30
@@ -253,17 +298,18 @@ def test_windows_and_no_peg_and_pushes_are_refused_in_a_sentence() -> None:
     assert_one_sentence(str(caught.value))
     with pytest.raises(InputError, match="gap_noise 0"):
         look_and_touch.prepare(some(8), gap_noise=0.0)
-    # Without windows the peg is not asked for.
-    assert look_and_touch.prepare(replace(some(VIEW), peg=None)).gap is None
+    # Without windows no peg is needed.
+    assert "window" not in look_and_touch.prepare(replace(some(VIEW), peg=None)).likelihoods
 
 
 def test_moves_leave_the_exact_posterior_as_it_is() -> None:
     torch.manual_seed(0)
     observed = {f"seen_{k}": SEEN[k] for k in range(3)}
     trace = generate(sliding, (None, [None] * 3), observed, 2000)[0]
-    drawn = conditional(trace, 3, 1.0).sample((2000,))
-    population = Population(trace.at({"part": drawn}), torch.zeros(2000, dtype=torch.float64))
-    move = kernel("part", [functools.partial(there, wider=1.5)])(population)
+    exact = Exact(3, SEEN.sum(dim=0))
+    drawn = exact.posterior(1.0).sample((2000,))
+    population = Population(trace.at({"part": drawn}), torch.zeros(2000).double(), approximation=exact)
+    move = kernel("part", lambda approximation: [redrawn(approximation.posterior(1.5))])(population)
     moved, _ = move(population.trace, POSTERIOR)
     for power in (1, 2):
         before, after = (t["part"][:, :3] ** power for t in (trace.at({"part": drawn}), moved))

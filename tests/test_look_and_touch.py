@@ -1,4 +1,4 @@
-"""What `look_and_touch` takes for known beforehand is as unsure as it should be."""
+"""The Gaussian approximation that guides `look_and_touch` is as wide as it should be."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from bcppl.distributions.pose_normals import transport
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models.look_and_touch import model
-from bcppl.models.look_and_touch_proposals import placed_by_images
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.sensors import View
 
@@ -31,9 +30,9 @@ def test_transport_carries_one_covariance_to_another_and_leaves_equals_alone() -
     assert torch.allclose(transport(second, first) @ carried, torch.eye(6).double(), atol=1e-8)
 
 
-def test_points_around_a_fit_keep_its_covariance_through_a_linear_map() -> None:
+def test_sigma_points_keep_the_covariance_of_a_fit_through_a_linear_map() -> None:
     fit, turn = FittedNormal(torch.arange(6.0).double(), covariance(2)), covariance(3)
-    mapped = fit.around() @ turn
+    mapped = fit.sigma_points() @ turn
     away = mapped[1:] - mapped[0]
     assert torch.allclose(mapped[0], fit.mean @ turn)
     assert torch.allclose(0.5 * away.T @ away, turn @ fit.covariance @ turn, rtol=1e-9)
@@ -44,13 +43,13 @@ def test_images_of_a_small_part_do_not_place_it_surer_than_they_can(seed: int) -
     """The yaw of a tray is seen to a few degrees. Taken for the cameras' half degree, d^2 was over 100."""
     scene = bench_scene(seed)
     *_, last = infer(model, scene.look(), particles=10, seed=0)
-    known = placed_by_images(last.population.trace.args[0], last.population.trace.args[1])
+    known = last.population.approximation.prior
     assert all(isinstance(action, View) for action in last.population.trace.args[1])
     off = poses.local(known.center[0], torch.as_tensor(scene.truth))
     assert float(off @ known.precision[0] @ off) < 22.5  # chi-square with six degrees of freedom, 0.1 %
     spread = torch.linalg.inv(known.precision[0]).diagonal().sqrt()
     assert 0.01 < float(spread[5]) < 0.2 and 0.0005 < float(spread[:3].max()) < 0.01
-    # Both sides of a tray are slid along, so touches do tell its yaw.
+    # Both sides of a tray are slid along, so touches do inform its yaw.
     plan = three_two_one(last.belief, scene.part, scene.peg)
     part_from_world = poses.inverse(last.belief.mean)
     tips = poses.compose(part_from_world.expand(len(plan.times), 7), torch.from_numpy(plan.world_from_peg))

@@ -1,4 +1,4 @@
-"""The paper's program and the bench that makes its recordings."""
+"""The paper's program and the bench that simulates its recordings."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from bcppl.inference.filters import bayes_contact, tempered_smc
 from bcppl.models import peg_in_hole
 from bcppl.models.worlds import peg_in_hole as world
 from bcppl.recordings import ProbeWindow, Recording
+from bcppl.sensors.scene import Scene
+from bcppl.sensors.simulated_probe import CONTACT
 from bcppl.traces import Trace, extend, generate, simulate, update
 
 
@@ -23,26 +25,26 @@ def recorded() -> Recording:
 
 
 @functools.cache
-def scene() -> peg_in_hole.Scene:
+def scene() -> Scene:
     return peg_in_hole.prepare(recorded())
 
 
 def constrained(poses: torch.Tensor, count: int = 14) -> Trace:
-    """The program's trace for given poses (N, 7), the first `count` measurements taken in."""
+    """The program's trace for given poses (N, 7), given the first `count` measurements."""
     measurements = recorded().measurements[:count]
-    values = peg_in_hole.observe(scene(), measurements)
+    values = scene().observed(measurements)
     empty, _ = generate(peg_in_hole.peg_in_hole, (scene(), []), {}, len(poses))
     moved = update(empty, {"hole": poses}).trace
     return extend(moved, (scene(), [m.action for m in measurements]), values)[0]
 
 
-def test_inference_is_not_told_what_the_world_is_like() -> None:
-    ours, theirs = peg_in_hole.CONTACT, world.CONTACT
+def test_inference_does_not_share_the_parameters_of_the_world() -> None:
+    ours, theirs = CONTACT, world.CONTACT
     assert peg_in_hole.__file__ != world.__file__
     for name in ("time_step", "friction", "time_constant"):
         assert getattr(ours, name) != getattr(theirs, name), name
     assert theirs.time_step == 0.0005
-    assert world.World().depth_noise != peg_in_hole.Settings().depth_scale
+    assert world.World().depth_noise != peg_in_hole.DepthSettings().depth_scale
 
 
 def test_the_shipped_recording_is_the_bench_s_first() -> None:
@@ -55,7 +57,7 @@ def test_the_shipped_recording_is_the_bench_s_first() -> None:
 
 
 def test_first_contact_comes_near_three_seconds_and_every_window_is_an_observation() -> None:
-    values = peg_in_hole.observe(scene(), recorded().measurements)
+    values = scene().observed(recorded().measurements)
     felt = {
         a: bool(torch.isfinite(v).all(dim=-1).any()) for a, v in values.items() if a.startswith("contacts")
     }
@@ -76,14 +78,14 @@ def test_the_truth_explains_the_probe_and_no_shifted_pose_does_better() -> None:
     assert (score[0] > score[1:] + 2.0).all(), score
 
 
-def test_the_program_invents_what_it_explains() -> None:
+def test_the_program_simulates_what_it_explains() -> None:
     torch.manual_seed(0)
     actions = [m.action for m in recorded().measurements[:10]]
-    invented = simulate(peg_in_hole.peg_in_hole, (scene(), actions), 2)
-    values = {a: invented[a][0] for a in invented.addresses if a != "hole"}
+    simulated = simulate(peg_in_hole.peg_in_hole, (scene(), actions), 2)
+    values = {a: simulated[a][0] for a in simulated.addresses if a != "hole"}
     assert values["depth_0"].shape == (120, 160)
     assert values["contacts_8"].shape == (50, 3) and values["peg_8"].shape == (50, 7)
-    poses = invented["hole"].clone()
+    poses = simulated["hole"].clone()
     poses[1] = poses[0]
     poses[1, 2] += 0.01
     empty, _ = generate(peg_in_hole.peg_in_hole, (scene(), []), {}, 2)
@@ -94,16 +96,15 @@ def test_the_program_invents_what_it_explains() -> None:
 def test_windows_of_one_probe_share_one_rollout_per_particle() -> None:
     guess = torch.from_numpy(recorded().guess.world_from_part).expand(3, 7).clone()
     guess[:, 0] += torch.tensor([0.0, 0.002, -0.003])
-    physics = scene().physics
-    assert physics is not None
-    begun = physics.effort.copy()
+    physics = scene().likelihoods["window"].efforts["physics"]
+    begun = physics.copy()
     whole = constrained(guess)
-    assert physics.effort.since(begun).items == 3
+    assert physics.since(begun).items == 3
     # Continued window by window and shuffled on the way, it is the same to the bit.
     pieces = constrained(guess, 9)[torch.tensor([2, 0, 1])]
     for count in range(10, 15):
         measurements = recorded().measurements[:count]
-        values = peg_in_hole.observe(scene(), measurements)
+        values = scene().observed(measurements)
         new = {a: v for a, v in values.items() if a not in pieces}
         pieces, _ = extend(pieces, (scene(), [m.action for m in measurements]), new)
     sites = [a for a in whole.addresses if a != "hole"]

@@ -1,4 +1,4 @@
-"""The point probe: what it invents it explains, what it learns, and real pushes."""
+"""The point probe: simulated pushes, learnt settings, and real pushes."""
 
 import math
 from dataclasses import replace
@@ -13,10 +13,11 @@ from bcppl import poses
 from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
-from bcppl.models.point_probe import Settings, felt, learn, model, prepare
+from bcppl.models.point_probe import learn, model, prepare
 from bcppl.models.worlds.point_probe import noise_seed
 from bcppl.recordings.importers.point_probe import command
 from bcppl.sensors import Measurement, Push, Recording
+from bcppl.sensors.point_finger import FingerSettings, contact_of
 from bcppl.traces import assess, generate
 
 LOGS = File(__file__).parents[2] / "shared/data/point_probe_pushes"
@@ -32,7 +33,7 @@ def t(*values: float) -> Tensor:
 def log_likelihood(recording: Recording, pose: Tensor, **settings: object) -> Tensor:
     """Log-likelihood (N,) of a recording's pushes at poses (N, 7)."""
     scene = prepare(recording, **settings)
-    observed = model.observe(scene, recording.measurements)
+    observed = scene.observed(recording.measurements)
     actions = [m.action for m in recording.measurements]
     choices = {**observed, "part": pose}
     return assess(model.program, (scene, actions), choices, len(pose)) - scene.prior.log_prob(pose)
@@ -70,7 +71,7 @@ def moved(recording: Recording, by: Tensor) -> Recording:
 
 
 @pytest.mark.parametrize("use_free_path", [False, True])
-def test_the_program_explains_what_it_invents(use_free_path: bool) -> None:
+def test_the_program_explains_what_it_simulates(use_free_path: bool) -> None:
     recording = model.simulate_recording(3, pushes=8, use_free_path=use_free_path)
     likelihood = log_likelihood(
         recording, around(torch.from_numpy(recording.truth), 0.002), use_free_path=use_free_path
@@ -78,20 +79,20 @@ def test_the_program_explains_what_it_invents(use_free_path: bool) -> None:
     assert float(likelihood[0]) > float(likelihood[1:].max()) + 5.0
 
 
-def test_what_is_invented_is_read_back() -> None:
+def test_a_simulated_recording_is_read_back() -> None:
     recording = model.simulate_recording(5, pushes=12)
     scene = prepare(recording)
     actions = [m.action for m in recording.measurements]
     torch.manual_seed(noise_seed(5))
     trace, _ = generate(model.program, (scene, actions), {"part": torch.from_numpy(recording.truth)[None]}, 1)
-    for address, value in model.observe(scene, recording.measurements).items():
+    for address, value in scene.observed(recording.measurements).items():
         # One row of force is 0.033 mm of travel; its noise turns the averaged force by a thousandth.
         tolerance = 1e-4 if address.startswith("onset") else 0.02
         assert torch.allclose(trace[address][0], value, atol=tolerance, equal_nan=True), address
 
 
 def test_settings_are_learnt_from_pushes_at_a_known_pose() -> None:
-    said = Settings(
+    given = FingerSettings(
         finger=(0.0010, -0.0005, 0.0),
         registration=(0.0003, -0.0002, 0.004),
         drift=(0.0, 0.0),
@@ -102,20 +103,20 @@ def test_settings_are_learnt_from_pushes_at_a_known_pose() -> None:
     )
     keys = ("finger", "registration", "drift", "offset", "spread", "friction", "outlier")
     recording = model.simulate_recording(
-        4, pushes=80, direction_outlier=0.0, **{k: getattr(said, k) for k in keys}
+        4, pushes=80, direction_outlier=0.0, **{k: getattr(given, k) for k in keys}
     )
     touching = [m for m in recording.measurements if np.abs(m.observation.wrench[-1, :2]).max() > 2.0]
     learnt = learn(replace(recording, measurements=touching))
-    assert learnt.finger == pytest.approx(said.finger, abs=2e-4)
+    assert learnt.finger == pytest.approx(given.finger, abs=2e-4)
     # Half of what one session shows is taken to last.
-    half = [0.5 * r for r in said.registration]
+    half = [0.5 * r for r in given.registration]
     assert learnt.registration[:2] == pytest.approx(half[:2], abs=1e-4)
     assert learnt.registration[2] == pytest.approx(half[2], abs=1e-3)  # some of the offset looks like a turn
-    assert learnt.offset == pytest.approx(said.offset, abs=1e-4)
+    assert learnt.offset == pytest.approx(given.offset, abs=1e-4)
     # What the finger alone leaves: the registration is in it.
-    assert 0.65 * said.spread < learnt.spread < math.hypot(said.spread, *said.registration[:2])
-    assert learnt.friction == pytest.approx(said.friction, abs=0.03)
-    assert learnt.direction_spread == pytest.approx(said.direction_spread, rel=0.3)
+    assert 0.65 * given.spread < learnt.spread < math.hypot(given.spread, *given.registration[:2])
+    assert learnt.friction == pytest.approx(given.friction, abs=0.03)
+    assert learnt.direction_spread == pytest.approx(given.direction_spread, rel=0.3)
 
 
 def test_a_push_that_misses_is_evidence() -> None:
@@ -134,7 +135,7 @@ def test_a_push_that_misses_is_evidence() -> None:
 
 
 @pytest.mark.parametrize("use_free_path", [False, True])
-def test_likelihood_does_not_hang_on_the_world(use_free_path: bool) -> None:
+def test_the_likelihood_does_not_depend_on_the_world_frame(use_free_path: bool) -> None:
     recording = model.simulate_recording(2, pushes=5)
     by = t(0.3, -0.2, 0.1, math.cos(0.4), 0.0, 0.0, math.sin(0.4))
     at = around(torch.from_numpy(recording.truth), 0.0004)
@@ -148,10 +149,10 @@ def test_bad_pushes_are_refused() -> None:
     push, touch = recording.measurements[0].action, recording.measurements[0].observation
     short = Touch(touch.times[:8], touch.wrench[:8], touch.world_from_peg)
     with pytest.raises(InputError, match="too few to tare"):
-        felt(push, short, Settings())
+        contact_of(push, short, FingerSettings())
     late = Touch(touch.times + 100.0, touch.wrench, touch.world_from_peg)
     with pytest.raises(InputError, match="outside its path's times"):
-        felt(push, late, Settings())
+        contact_of(push, late, FingerSettings())
     with pytest.raises(InputError, match="no setting 'ofset'"):
         prepare(recording, ofset=1.0)
 
@@ -167,7 +168,7 @@ def log(name: str) -> Recording:
 
 
 def test_defaults_are_learnt_from_one_log() -> None:
-    learnt, settings = learn(log("10_130")), Settings()
+    learnt, settings = learn(log("10_130")), FingerSettings()
     for name in ("finger", "registration", "drift"):
         assert getattr(learnt, name) == pytest.approx(getattr(settings, name), abs=1e-5)
     for name in ("offset", "spread", "tolerance", "free_spread"):
@@ -180,9 +181,11 @@ def test_the_finger_of_one_log_explains_the_other() -> None:
     recording = log("10_90")
     truth, distance = torch.from_numpy(recording.truth), SignedDistance(recording.part)
     depths = {}
-    for finger in ((0.0, 0.0, 0.0), Settings().finger):
-        settings = Settings(finger=finger)
-        tips = torch.stack([felt(m.action, m.observation, settings).onset for m in recording.measurements])
+    for finger in ((0.0, 0.0, 0.0), FingerSettings().finger):
+        settings = FingerSettings(finger=finger)
+        tips = torch.stack(
+            [contact_of(m.action, m.observation, settings).onset for m in recording.measurements]
+        )
         depths[finger] = -1e3 * distance(poses.transform(poses.inverse(truth), tips)).distance
     raw, mended = depths.values()
     assert float(raw.mean()) == pytest.approx(
@@ -195,8 +198,9 @@ def test_the_finger_of_one_log_explains_the_other() -> None:
 
 def test_forces_lie_in_the_cone_and_point_inwards() -> None:
     recording = log("10_90")
-    truth, distance, settings = torch.from_numpy(recording.truth), SignedDistance(recording.part), Settings()
-    seen = [felt(m.action, m.observation, settings) for m in recording.measurements]
+    truth, distance = torch.from_numpy(recording.truth), SignedDistance(recording.part)
+    settings = FingerSettings()
+    seen = [contact_of(m.action, m.observation, settings) for m in recording.measurements]
     near = distance(poses.transform(poses.inverse(truth), torch.stack([s.onset for s in seen])))
     inward = -(near.normal @ poses.rotation_matrix(truth).T)
     lean = torch.stack([s.direction for s in seen]) - torch.atan2(inward[:, 1], inward[:, 0])

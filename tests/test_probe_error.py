@@ -1,4 +1,4 @@
-"""How near made-up probes bring the belief: minutes of simulation, so not in every run of the tests."""
+"""The error of beliefs given simulated probes: minutes of simulation, so not in every run of the tests."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bcppl.models.peg_in_hole import model
 
 @pytest.mark.long
 def test_six_probes_end_within_three_millimetres_in_the_median() -> None:
-    """A world that inference is not told of: friction, stiffness, steps and cameras differ."""
+    """The world has its own friction, stiffness, time steps and camera noise."""
     errors, gaps = [], []
     for seed in range(100, 106):
         recording = model.simulate_recording(seed)

@@ -1,9 +1,10 @@
-"""A touch that either of two ridges explains: both are found, and believed in as they are likely."""
+"""A touch that either of two ridges explains: the belief has both modes, weighted by their evidence."""
 
 from __future__ import annotations
 
 import functools
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,20 +15,22 @@ from torch.distributions import MultivariateNormal
 
 from bcppl import poses
 from bcppl.contact.touch import Touch
-from bcppl.distributions.manifold_fit import Normal, Told, Window, told_by
-from bcppl.distributions.pose_normals import Modes, matched, widened, widened_modes
+from bcppl.distributions.pose_normals import GaussianMixture, matched, widened, widened_mixture
+from bcppl.distributions.poses import UniformPose
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
 from bcppl.geometry.shapes import box_peg
-from bcppl.inference.filters.guided_smc import guided, infer, kernel
-from bcppl.inference.filters.smc import smc
-from bcppl.inference.filters.smcp3 import Pair
+from bcppl.inference.approximation import GaussianApproximation
+from bcppl.inference.filters.guided_smc import infer
+from bcppl.inference.laplace import Normal, QuadraticApproximation, quadratic_approximation
+from bcppl.inference.proposals.approximated import component_transitions
 from bcppl.models import look_and_touch
-from bcppl.models.look_and_touch_proposals import met_anew, passing, unsure
-from bcppl.models.look_and_touch_scene import touch_of
 from bcppl.recordings import problems
 from bcppl.robot.motion import Probe, ProbeWindow
+from bcppl.sensors.capabilities import Approximated
 from bcppl.sensors.measurements import Measurement, Recording
+from bcppl.sensors.scene import Scene
+from tests.checked_pairs import run_checked
 
 APART, THICK, HIGH, WIDE = 0.012, 0.004, 0.01, 0.004  # m: of the ridges, and of the peg
 LENGTH, DEEP = 0.05, 0.006  # m: the peg, and how far below the ridges' tops its tip is
@@ -72,39 +75,42 @@ def shares(world_from_part: Tensor, weights: Tensor) -> tuple[float, float]:
     return float(weights[near[0]].sum()), float(weights[near[1]].sum())
 
 
-def explained(everywhere: bool, before: Tensor | None = None) -> tuple[Normal, Told]:
-    recording = touched()
+def window_of(recording: Recording) -> tuple[Any, Approximated]:
+    """The likelihood of touches, and the window with its observed value."""
     scene = look_and_touch.prepare(recording)
-    value = look_and_touch.observe(scene, recording.measurements)["touch_0"]
+    value = scene.observed(recording.measurements)["touch_0"]
+    return scene.likelihoods["window"], Approximated(0, recording.measurements[0].action, value)
+
+
+def approximated(everywhere: bool, before: Tensor | None = None) -> tuple[Normal, QuadraticApproximation]:
+    recording = touched()
+    sensor, window = window_of(recording)
     spread = torch.tensor([0.006, 0.002, 1e-4, 0.001, 0.001, 0.005], dtype=torch.float64)
     center = torch.from_numpy(recording.guess.world_from_part)[None]
-    known = Normal(center, torch.diag(spread**-2)[None])
-    window = Window(value, partial(touch_of, scene, recording.measurements[0].action))
-    assert scene.gap is not None
-    return known, told_by(scene.gap, [window], known, before, everywhere)
+    prior = Normal(center, torch.diag(spread**-2)[None])
+    sites, heading = partial(sensor.sites, [window]), sensor.heading([window])
+    return prior, quadratic_approximation(sites, prior, before, heading, everywhere)
 
 
 def test_the_world_is_sound_and_both_places_explain_the_touch_alike() -> None:
-    recording = touched()
-    assert not [p for p in problems(recording) if "tared" not in p]
-    scene = look_and_touch.prepare(recording)
-    value = look_and_touch.observe(scene, recording.measurements)["touch_0"]
+    assert not [p for p in problems(touched()) if "tared" not in p]
+    sensor, (_, action, value) = window_of(touched())
     assert set(value[:, 7][~torch.isnan(value[:, 7])].tolist()) == {0.0, 1.0}
-    there = poses.identity(4)
-    there[:, 0] = torch.tensor([INNER, OUTER, 0.5 * (INNER + OUTER), OUTER + 0.002])
-    said = touch_of(scene, recording.measurements[0].action, there).log_prob(value)
-    assert float(said[0]) == pytest.approx(float(said[1]), abs=1e-4)
-    assert float(said[:2].min() - said[2:].max()) > 20.0
+    part = poses.identity(4)
+    part[:, 0] = torch.tensor([INNER, OUTER, 0.5 * (INNER + OUTER), OUTER + 0.002])
+    log_prob = sensor.site(action, part).log_prob(value)
+    assert float(log_prob[0]) == pytest.approx(float(log_prob[1]), abs=1e-4)
+    assert float(log_prob[:2].min() - log_prob[2:].max()) > 20.0
 
 
-def test_everywhere_finds_both_with_the_same_weight_and_what_was_found_is_kept() -> None:
-    known, one = explained(False)
+def test_a_search_everywhere_reaches_both_modes_with_equal_weights_and_keeps_them() -> None:
+    prior, one = approximated(False)
     assert len(one.around) == 1, "errors of millimetres lead all starts to one of them"
-    _, both = explained(True)
-    modes = both.given(known.center[0], known.precision[0])
+    _, both = approximated(True)
+    modes = both.posterior(prior.center[0], prior.precision[0])
     assert sorted(round(1e3 * float(x), 1) for x in modes.centers[:, 0]) == [1e3 * INNER, 1e3 * OUTER]
     assert float((modes.log_weights[0] - modes.log_weights[1]).abs()) < 0.1
-    _, again = explained(False, both.around)
+    _, again = approximated(False, both.around)
     assert len(again.around) == 2
 
 
@@ -115,17 +121,18 @@ def test_a_mode_weighs_what_a_normal_observation_is_worth() -> None:
     off = torch.cat([0.2 * torch.randn(3), torch.zeros(3)]).double()
     seen = torch.randn(9, dtype=torch.float64)
     information, zero = rows.T @ rows / noise**2, torch.zeros(9, dtype=torch.float64)
-    said = MultivariateNormal(zero, noise**2 * torch.eye(9).double()).log_prob(seen)
-    told = Told(poses.identity(1), -(rows.T @ seen / noise**2)[None], information[None], said[None])
-    found = told.given(poses.retract(poses.identity(1), off)[0], torch.diag(spread**-2))
+    log_prob = MultivariateNormal(zero, noise**2 * torch.eye(9).double()).log_prob(seen)
+    gradient = -(rows.T @ seen / noise**2)
+    quadratic = QuadraticApproximation(poses.identity(1), gradient[None], information[None], log_prob[None])
+    posterior = quadratic.posterior(poses.retract(poses.identity(1), off)[0], torch.diag(spread**-2))
     whole = noise**2 * torch.eye(9).double() + rows @ torch.diag(spread**2) @ rows.T
-    assert float(found.log_weights) == pytest.approx(
+    assert float(posterior.log_weights) == pytest.approx(
         float(MultivariateNormal(rows @ off, whole).log_prob(seen)), rel=1e-6
     )
     precision = torch.diag(spread**-2) + information
     expected = torch.linalg.solve(precision, off / spread**2 + rows.T @ seen / noise**2)
-    torch.testing.assert_close(poses.local(poses.identity(1), found.centers)[0], expected)
-    torch.testing.assert_close(found.covariances[0], torch.linalg.inv(precision))
+    torch.testing.assert_close(poses.local(poses.identity(1), posterior.centers)[0], expected)
+    torch.testing.assert_close(posterior.covariances[0], torch.linalg.inv(precision))
 
 
 def test_modes_widen_as_one_does_and_match_their_mean_and_covariance() -> None:
@@ -133,20 +140,20 @@ def test_modes_widen_as_one_does_and_match_their_mean_and_covariance() -> None:
     center = poses.retract(poses.identity(3), 0.1 * torch.randn(3, 6, dtype=torch.float64))
     root = torch.randn(6, 6, dtype=torch.float64)
     covariance = 1e-4 * (root @ root.T + torch.eye(6)).expand(3, 6, 6)
-    twice = Modes(
+    twice = GaussianMixture(
         torch.stack([center, center], 1), torch.stack([covariance] * 2, 1), torch.tensor([1.0, -2.0]).double()
     )
     at = poses.retract(center, 0.01 * torch.randn(3, 6, dtype=torch.float64))
-    one, other = widened(center, covariance), widened_modes(twice)
+    one, other = widened(center, covariance), widened_mixture(twice)
     torch.testing.assert_close(one.log_prob(at), other.log_prob(at))
     torch.testing.assert_close(matched(one).covariance, matched(other).covariance)
     away = torch.tensor([0.01, 0, 0, 0, 0, 0], dtype=torch.float64)
-    apart = Modes(
+    apart = GaussianMixture(
         torch.stack([center, poses.retract(center, away)], 1),
         twice.covariances,
         torch.tensor([0.0, 0.0]).double(),
     )
-    middle = matched(widened_modes(apart))
+    middle = matched(widened_mixture(apart))
     torch.testing.assert_close(poses.local(center, middle.center), (0.5 * away).expand(3, 6))
     spread = middle.covariance - matched(one).covariance
     torch.testing.assert_close(spread, 0.25 * torch.outer(away, away).expand(3, 6, 6))
@@ -156,22 +163,24 @@ def test_particles_mostly_stay_in_their_mode_and_may_go_to_any() -> None:
     centers = poses.identity(2)
     centers[1, 0] = 0.01
     spread = 1e-7 * torch.eye(6, dtype=torch.float64).expand(2, 6, 6)
-    modes = Modes(centers, spread, torch.tensor([0.9, 0.1]).double().log())
-    stay = passing(modes, modes).exp()
+    modes = GaussianMixture(centers, spread, torch.tensor([0.9, 0.1]).double().log())
+    stay = component_transitions(modes, modes).exp()
     torch.testing.assert_close(stay, torch.tensor([[0.98, 0.02], [0.18, 0.82]]).double())
-    wide = Modes(centers[:1], 1e-4 * torch.eye(6).double()[None], torch.zeros(1).double())
-    torch.testing.assert_close(passing(wide, modes).exp(), torch.tensor([[0.9, 0.1]]).double())
-    torch.testing.assert_close(passing(modes, wide).exp(), torch.ones(2, 1).double())
-    assert modes.own(centers).tolist() == [0, 1]
+    wide = GaussianMixture(centers[:1], 1e-4 * torch.eye(6).double()[None], torch.zeros(1).double())
+    torch.testing.assert_close(component_transitions(wide, modes).exp(), torch.tensor([[0.9, 0.1]]).double())
+    torch.testing.assert_close(component_transitions(modes, wide).exp(), torch.ones(2, 1).double())
+    assert modes.component(centers).tolist() == [0, 1]
 
 
-def test_the_peg_meets_the_part_where_it_did_not_touch_before() -> None:
-    def window(flags: str) -> Window:
+def test_a_contact_is_new_where_the_peg_did_not_touch_before() -> None:
+    sensor, (_, action, _) = window_of(touched())
+
+    def window(flags: str) -> Approximated:
         value = torch.zeros(len(flags), 8, dtype=torch.float64)
         value[:, 7] = torch.tensor([{"#": 1.0, ".": 0.0, "?": torch.nan}[each] for each in flags])
-        return Window(value, partial(pytest.fail, "not asked"))
+        return Approximated(0, action, value)
 
-    for newest, windows, met in (
+    for newest, windows, new in (
         (True, ["..?##"], True),
         (True, ["..###", "#####"], False),
         (False, ["..###", "#####"], True),
@@ -180,10 +189,13 @@ def test_the_peg_meets_the_part_where_it_did_not_touch_before() -> None:
         (False, ["....", "??"], False),
         (True, [], False),
     ):
-        assert met_anew([window(each) for each in windows], newest) is met, (newest, windows)
-    known = Normal(poses.identity(1), torch.diag(torch.tensor([0.0004] * 3 + [0.1] * 3) ** -2).double()[None])
-    assert not unsure(known, None)
-    assert unsure(Normal(known.center, known.precision / 4.0), None)
+        assert sensor.new_contact([window(each) for each in windows], newest) is new, (newest, windows)
+
+
+def test_the_contact_may_be_elsewhere_where_the_part_is_not_known_to_half_a_millimetre() -> None:
+    for deviation, unsure in ((0.0004, False), (0.0008, True)):
+        prior = UniformPose(poses.identity(), deviation / 0.6, 0.1)
+        assert GaussianApproximation("part", Scene(prior, {}, "toy"))._is_unsure() is unsure
 
 
 def test_the_belief_holds_both_alike() -> None:
@@ -197,9 +209,6 @@ def test_the_belief_holds_both_alike() -> None:
     assert 0.35 < float(np.mean(inner / (inner + outer))) < 0.65, held
 
 
-def test_the_pair_leads_back_from_both() -> None:
-    assert look_and_touch.model.arrival is not None
-    pair = Pair(*look_and_touch.model.arrival, check=True)
-    step = guided(pair, kernel("part", look_and_touch.model.proposals))
-    *_, last = smc(look_and_touch.model, touched(), step=step, particles=20, seed=0)
+def test_the_backward_kernel_leads_back_from_both() -> None:
+    *_, last = run_checked(look_and_touch.model, touched(), particles=20)
     assert np.isfinite(last.info.log_evidence)

@@ -1,4 +1,4 @@
-"""A plate with equal holes: the camera does not tell which is seen, touching beside it does."""
+"""A plate with equal holes: the camera does not inform which is seen, touching beside it does."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_vision_leaves_it_open_and_each_touch_settles_one_half(seed: int) -> Non
     empty, _ = generate(which_hole.which_hole, (scene, []), {}, 4)
     truth = torch.from_numpy(recording.truth).expand(4, 7).clone()
     trace = update(empty, {"which": torch.arange(4), "hole": truth}).trace
-    values = which_hole.model.observe(scene, recording.measurements)
+    values = scene.observed(recording.measurements)
     trace, _ = extend(trace, (scene, [m.action for m in recording.measurements]), values)
     assert float(trace.log_prob("depth_0").std()) < 0.01
     right = trace.log_prob(*[f"{kind}_{k}" for kind in ("contacts", "peg") for k in (1, 2)])
@@ -60,11 +60,11 @@ def test_it_is_offered_by_name_and_refuses_what_cannot_be_chosen_from() -> None:
     with pytest.raises(InputError, match="two or more"):
         which_hole.prepare(world.record(0), holes=[(0.0, 0.0)])
     recording = world.record(0)
-    for holes, said in [
+    for holes, message in [
         ([(0, 0), (34, 0)], r"hole 1 is at \[34.0, 0.0\], beside part .* give metres"),
         ([(0, 0), (float("nan"), 0)], "hole 1 is at .nan"),
         ([(0, 0), (0.034,)], "two or more"),
         ([(0, 0), (0.034, 0), (0.034, 0)], "twice"),
     ]:
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             which_hole.prepare(recording, holes=holes)

@@ -1,4 +1,4 @@
-"""Made-up recordings give nothing away: their truth is not what inference draws first from the same seed."""
+"""The truth of a simulated recording is not what inference draws first from the same seed."""
 
 from __future__ import annotations
 
