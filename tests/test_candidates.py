@@ -38,8 +38,8 @@ from bcppl.inference.planning.touching import Spot, Touching, face_of, middles_o
 from bcppl.models.robots import load_robot
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.recordings.action_file import load_actions, save_actions
+from bcppl.robot.inverse_kinematics import joint_paths
 from bcppl.robot.plan import Plan
-from bcppl.robot.reach import joint_paths
 from bcppl.sensors import View
 from bcppl.sensors.candidates import name_of
 from tests.made_recordings import assert_one_sentence

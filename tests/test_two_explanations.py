@@ -16,9 +16,9 @@ from bcppl import poses
 from bcppl.contact.touch import Touch
 from bcppl.distributions.manifold_fit import Normal, Told, Window, told_by
 from bcppl.distributions.pose_normals import Modes, matched, widened, widened_modes
+from bcppl.geometry.extrusion import box_peg
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
-from bcppl.geometry.shapes import box_peg
 from bcppl.inference.filters.guided_smc import guided, infer, kernel
 from bcppl.inference.filters.smc import smc
 from bcppl.inference.filters.smcp3 import Pair
