@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, replace
 
 
 @dataclass
@@ -41,13 +41,8 @@ class Effort:
 
     def copy(self) -> Effort:
         """A copy of the cost so far."""
-        return Effort(self.calls, self.items, self.amount, self.seconds)
+        return replace(self)
 
     def since(self, earlier: Effort) -> Effort:
         """The cost since an earlier `copy`."""
-        return Effort(
-            self.calls - earlier.calls,
-            self.items - earlier.items,
-            self.amount - earlier.amount,
-            self.seconds - earlier.seconds,
-        )
+        return Effort(*(now - then for now, then in zip(astuple(self), astuple(earlier), strict=True)))

@@ -324,7 +324,7 @@ def test_files_of_actions_that_make_no_sense_are_refused_in_a_sentence(tmp_path:
         ("width", "160", "'160' pixels wide"),
         ("height", -1, "-1 pixels high"),
         ("fx", "a", "focal length fx 'a'"),
-        ("far", 0.05, "sees from 0.1 m to 0.05 m"),
+        ("far", 0.05, "has a range from 0.1 m to 0.05 m"),
         ("wrist_from_camera", [1, 2], "wrist_from_camera"),
         ("world_from_camera", [0.0] * 7, "world_from_camera"),
     ):

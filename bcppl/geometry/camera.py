@@ -125,11 +125,7 @@ class Camera:
                 pixel has no unique ray.
         """
         self._check_optics()
-        if self.is_distorted:
-            return undistorted_rays(*self.optics).copy()
-        u, v = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
-        x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
-        return np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+        return undistorted_rays(*self.optics).copy()
 
     def project(self, points: npt.ArrayLike) -> Array:
         """Projections (..., 2) of points (..., 3) in the optical frame (metres): pixels, u then v.

@@ -48,10 +48,9 @@ def distance_grid(part: Part, signed: SignedDistance, margin: float) -> Distance
 
 
 @compiled
-def interpolated(
-    x: float, y: float, z: float, low: Array, spacing: float, distance: npt.NDArray[np.float32]
-) -> float:
+def interpolated(x: float, y: float, z: float, grid: DistanceGrid) -> float:
     """The interpolated distance at a point; outside the grid its boundary's plus the L1 distance to it."""
+    low, spacing, distance = grid
     count_x, count_y, count_z = distance.shape
     u, v, w = (x - low[0]) / spacing, (y - low[1]) / spacing, (z - low[2]) / spacing
     inside_u = min(max(u, 0.0), count_x - 1.000001)
@@ -71,10 +70,9 @@ def interpolated(
 
 
 @compiled
-def plane_gradient(
-    point: Array, low: Array, spacing: float, distance: npt.NDArray[np.float32], gradient: Array
-) -> bool:
+def plane_gradient(point: Array, grid: DistanceGrid, gradient: Array) -> bool:
     """Whether a single plane is closest around a point; `gradient` (3,) is set to the unit gradient there."""
+    low, spacing, distance = grid
     cell, share = np.empty(3, np.int64), np.empty(3)
     for axis in range(3):
         at = min(max((point[axis] - low[axis]) / spacing, 0.0), distance.shape[axis] - 1.000001)

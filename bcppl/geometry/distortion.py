@@ -118,9 +118,7 @@ def undistorted_rays(
         InputError: the number of coefficients is wrong, or they fold the image over.
     """
     fx, fy, cx, cy = intrinsics
-    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    seen = np.stack([(u - cx) / fx, (v - cy) / fy], axis=-1).reshape(-1, 2)
-    plane, sound = undistorted(seen, distortion)
+    plane, sound = undistorted((_pixels(width, height) - [cx, cy]) / [fx, fy], distortion)
     if not sound.all():
         first = int(np.argmin(sound))
         raise InputError(
@@ -147,9 +145,11 @@ def pinhole_shifts(
     """
     fx, fy, cx, cy = intrinsics
     rays = undistorted_rays(width, height, intrinsics, distortion)
-    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    shifts = np.stack(
-        [fx * rays[:, 0] + cx - u.reshape(-1), fy * rays[:, 1] + cy - v.reshape(-1)], axis=-1
-    ).reshape(height, width, 2)
+    shifts = (rays[:, :2] * [fx, fy] + [cx, cy] - _pixels(width, height)).reshape(height, width, 2)
     shifts.setflags(write=False)
     return shifts
+
+
+def _pixels(width: int, height: int) -> Array:
+    """The centres (height * width, 2) of an image's pixels, u then v."""
+    return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(float)

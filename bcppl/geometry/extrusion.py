@@ -46,7 +46,7 @@ def extruded(
             or the top is not above the bottom.
     """
     check_outline(outline, name)
-    if not (np.isfinite([bottom, top]).all() and top > bottom):
+    if not bottom < top:
         raise InputError(
             f"part {name!r} would extend from z = {bottom:g} to {top:g} m; give a top above its bottom."
         )

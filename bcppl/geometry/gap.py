@@ -19,9 +19,10 @@ from bcppl.compiled import compiled
 from bcppl.effort import Effort
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.distance_grid import DistanceGrid, distance_grid, interpolated, plane_gradient
-from bcppl.geometry.hausdorff import solid_of
+from bcppl.geometry.hausdorff import planes_of, solid_of
 from bcppl.geometry.parts import Part
 from bcppl.geometry.sharp_edges import (
+    SharpEdges,
     dot,
     is_separated,
     may_be_nearer,
@@ -29,14 +30,14 @@ from bcppl.geometry.sharp_edges import (
     sharp_edges,
     to_peg_frame,
 )
-from bcppl.threads import shared, thread_count
+from bcppl.threads import parallel_sum, thread_count
 
 Array = npt.NDArray[np.float64]
 Numbers = npt.NDArray[np.int64]
 
 _NEAR = 0.002  # m: below this gap edges are evaluated, and distances exactly where the grid is inexact
 _MARGIN = 0.012  # m around the part that the grid covers
-_SHARE = 8  # particles of a chunk of work, at least
+_CHUNK = 8  # particles of a chunk of work, at least
 _PAIRS = 256  # pairs of poses of a chunk, at least
 
 
@@ -99,10 +100,8 @@ class PegGap:
         self.effort = Effort()
         self._signed = SignedDistance(part)
         self._grid: DistanceGrid | None = None
-        self._corners = _corners(peg)
         self._edges = sharp_edges(part)
-        self._planes, self._ends = _planes(peg)
-        self._box = np.stack([peg.vertices.min(axis=0), peg.vertices.max(axis=0)])
+        self._solids = _solids(peg)
 
     def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gap:
         """Gaps (N, T) at poses (N, 7) of the part and (T, 7) of the peg, or (N, T, 7), one per particle."""
@@ -116,36 +115,16 @@ class PegGap:
         with self.effort.measure(items=particles * stamps):
             if self._grid is None:
                 self._grid = distance_grid(self.part, self._signed, _MARGIN)
-            grid, edges = self._grid, self._edges
-            distance = np.empty((particles, stamps))
+            given = (part, peg, self._grid, self._edges, self._solids)
+            distance, rounded = np.empty((particles, stamps)), np.empty((particles, stamps), dtype=np.bool_)
             witness, normal = np.empty((particles, stamps, 3)), np.empty((particles, stamps, 3))
-            rounded = np.empty((particles, stamps), dtype=np.bool_)
+            result = (distance, witness, normal, rounded)
 
             def work(first: int, last: int) -> int:
-                _measure(
-                    first,
-                    last,
-                    *part,
-                    *peg,
-                    self._corners,
-                    grid.low,
-                    grid.spacing,
-                    grid.distance,
-                    edges.ends,
-                    edges.spheres,
-                    edges.groups,
-                    edges.stops,
-                    self._planes,
-                    self._ends,
-                    self._box,
-                    distance,
-                    witness,
-                    normal,
-                    rounded,
-                )
+                _evaluate(first, last, *given, *result)
                 return 0
 
-            shared(work, 0, particles, max(_SHARE, _PAIRS // max(1, stamps)), thread_count())
+            parallel_sum(work, 0, particles, max(_CHUNK, _PAIRS // max(1, stamps)), thread_count())
             if rounded.any():
                 exact = self._signed(torch.from_numpy(witness[rounded]))
                 distance[rounded] = exact.distance.numpy()
@@ -153,93 +132,91 @@ class PegGap:
         return distance, witness, normal
 
 
-def _corners(peg: Part) -> Array:
-    """The peg's distinct vertices (V, 3)."""
-    return np.unique(np.round(peg.vertices, 9), axis=0)
+class _Solids(NamedTuple):
+    """A peg as convex solids.
+
+    Attributes:
+        corners: (V, 3) its distinct vertices, metres.
+        planes: (P, 4) outward unit normals and offsets of all solids.
+        ends: (S,) index after each solid's last plane.
+        box: (2, 3) the bounding box.
+    """
+
+    corners: Array
+    planes: Array
+    ends: Numbers
+    box: Array
 
 
-def _planes(peg: Part) -> tuple[Array, Numbers]:
-    """Planes (P, 4) of the peg's convex solids, outward normal and offset, and the end of each solid's."""
-    solids = [peg.mesh.convex_hull] if peg.mesh.is_convex or not peg.pieces else map(solid_of, peg.pieces)
-    planes = []
-    for solid in solids:
-        normals = np.asarray(solid.face_normals)
-        offsets = np.einsum("fi,fi->f", normals, np.asarray(solid.triangles)[:, 0])
-        whole = np.round(np.column_stack([normals, offsets]), 9)
-        planes.append(np.unique(whole, axis=0))
-    return np.concatenate(planes), np.cumsum([len(each) for each in planes])
+def _solids(peg: Part) -> _Solids:
+    meshes = [peg.mesh.convex_hull] if peg.mesh.is_convex or not peg.pieces else map(solid_of, peg.pieces)
+    planes = [np.unique(np.round(planes_of(mesh), 9), axis=0) for mesh in meshes]
+    return _Solids(
+        corners=np.unique(np.round(peg.vertices, 9), axis=0),
+        planes=np.concatenate(planes),
+        ends=np.cumsum([len(each) for each in planes]),
+        box=np.stack([peg.vertices.min(axis=0), peg.vertices.max(axis=0)]),
+    )
 
 
 @compiled
-def _measure(
+def _evaluate(
     first: int,
     last: int,
-    part_rotation: Array,
-    part_translation: Array,
-    peg_rotation: Array,
-    peg_translation: Array,
-    corners: Array,
-    low: Array,
-    spacing: float,
-    grid: npt.NDArray[np.float32],
-    edges: Array,
-    spheres: Array,
-    groups: Array,
-    stops: Numbers,
-    planes: Array,
-    ends: Numbers,
-    box: Array,
+    part: Frames,
+    peg: Frames,
+    grid: DistanceGrid,
+    edges: SharpEdges,
+    solids: _Solids,
     distance: Array,
     witness: Array,
     normal: Array,
     rounded: npt.NDArray[np.bool_],
 ) -> None:
-    stamps = peg_rotation.shape[1]
+    corners, planes, box = solids.corners, solids.planes, solids.box
     gradient, start, stop, middle = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for n in range(first, last):
-        own = n if len(peg_rotation) > 1 else 0
-        for t in range(stamps):
+        own = n if len(peg.rotation) > 1 else 0
+        for t in range(peg.rotation.shape[1]):
             # part_from_peg
-            turn = part_rotation[n].T @ peg_rotation[own, t]
-            shift = part_rotation[n].T @ (peg_translation[own, t] - part_translation[n])
+            turn = part.rotation[n].T @ peg.rotation[own, t]
+            shift = part.rotation[n].T @ (peg.translation[own, t] - part.translation[n])
             least, which = np.inf, 0
             for c in range(len(corners)):
                 p = corners[c]
                 x = turn[0, 0] * p[0] + turn[0, 1] * p[1] + turn[0, 2] * p[2] + shift[0]
                 y = turn[1, 0] * p[0] + turn[1, 1] * p[1] + turn[1, 2] * p[2] + shift[1]
                 z = turn[2, 0] * p[0] + turn[2, 1] * p[1] + turn[2, 2] * p[2] + shift[2]
-                here = interpolated(x, y, z, low, spacing, grid)
+                here = interpolated(x, y, z, grid)
                 if here < least:
                     least, which = here, c
             witness[n, t] = turn @ corners[which] + shift
-            rounded[n, t] = (
-                not plane_gradient(witness[n, t], low, spacing, grid, gradient) and abs(least) < _NEAR
-            )
+            rounded[n, t] = not plane_gradient(witness[n, t], grid, gradient) and abs(least) < _NEAR
             normal[n, t] = gradient
             # A farther edge cannot be in contact.
             nearer = min(least, _NEAR)
             next_edge = 0
-            for g in range(len(groups)):
-                first_edge, next_edge = next_edge, stops[g]
-                if not may_be_nearer(groups[g], turn, shift, box, nearer):
+            for g in range(len(edges.groups)):
+                first_edge, next_edge = next_edge, edges.stops[g]
+                if not may_be_nearer(edges.groups[g], turn, shift, box, nearer):
                     continue
                 for e in range(first_edge, next_edge):
-                    if not may_be_nearer(spheres[e], turn, shift, box, nearer):
+                    if not may_be_nearer(edges.spheres[e], turn, shift, box, nearer):
                         continue
-                    to_peg_frame(turn, shift, spheres[e], middle)
-                    to_peg_frame(turn, shift, edges[e, 0], start)
-                    to_peg_frame(turn, shift, edges[e, 1], stop)
+                    to_peg_frame(turn, shift, edges.spheres[e], middle)
+                    to_peg_frame(turn, shift, edges.ends[e, 0], start)
+                    to_peg_frame(turn, shift, edges.ends[e, 1], stop)
                     begin = 0
-                    for s in range(len(ends)):
-                        solid = planes[begin : ends[s]]
-                        begin = ends[s]
-                        if is_separated(middle, solid, spheres[e, 3] + nearer):
+                    for s in range(len(solids.ends)):
+                        solid = planes[begin : solids.ends[s]]
+                        begin = solids.ends[s]
+                        if is_separated(middle, solid, edges.spheres[e, 3] + nearer):
                             continue
                         inside, share = segment_distance(start, stop, solid, nearer, gradient)
                         if inside < nearer:
                             nearer = least = inside
                             rounded[n, t] = False
-                            witness[n, t] = edges[e, 0] + share * (edges[e, 1] - edges[e, 0])
+                            witness[n, t] = edges.ends[e, 0] + share * (edges.ends[e, 1] - edges.ends[e, 0])
                             for axis in range(3):
                                 normal[n, t, axis] = -dot(turn[axis], gradient)
             distance[n, t] = least

@@ -87,6 +87,12 @@ def solid_of(piece: Piece) -> trimesh.Trimesh:
     return solid
 
 
+def planes_of(solid: trimesh.Trimesh) -> Array:
+    """The planes (F, 4) of a mesh's faces: outward unit normal and offset."""
+    normals = np.asarray(solid.face_normals)
+    return np.column_stack([normals, np.sum(normals * solid.triangles[:, 0], axis=1)])
+
+
 def _outside(points: Array, solids: list[trimesh.Trimesh]) -> Array:
     """Distances (P,) of points (P, 3) to the union of convex solids; 0 inside."""
     beyond = np.full(len(points), np.inf)
@@ -112,7 +118,6 @@ def _beyond_box(points: Array, solid: trimesh.Trimesh) -> Array:
 
 def _beyond_planes(points: Array, solid: trimesh.Trimesh) -> Array:
     """Lower bounds (P,) on the distances of points (P, 3) to a convex solid, from its planes; 0 inside."""
-    normals, levels = solid.face_normals, np.sum(solid.face_normals * solid.triangles[:, 0], axis=1)
-    starts = range(0, len(points), _BATCH)
-    farthest = [(points[k : k + _BATCH] @ normals.T - levels).max(axis=1) for k in starts]
+    planes, starts = planes_of(solid), range(0, len(points), _BATCH)
+    farthest = [(points[k : k + _BATCH] @ planes[:, :3].T - planes[:, 3]).max(axis=1) for k in starts]
     return np.maximum(np.concatenate(farthest), 0.0) if farthest else np.empty(0)

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.geometry.parts import LARGEST_EXTENT
 
@@ -182,8 +183,7 @@ def check_fit(hole: shapely.Polygon, peg: shapely.Polygon) -> float:
 def positive(what: str, **lengths: float) -> None:
     """Refuse lengths that are not positive, by the names they are given under."""
     for name, value in lengths.items():
-        if not (math.isfinite(value) and value > 0):
-            raise InputError(f"{what} has {name.replace('_', ' ')} {value!r}; give metres greater than 0.")
+        number_within(f"{what} has {name.replace('_', ' ')} {{}} m", value, above=0.0)
 
 
 def _arc(

@@ -63,15 +63,13 @@ def check_offsets(robot: str, joints: Sequence[Joint], offsets: Tensor) -> None:
             )
 
 
-def held_values(robot: str, moving: Mapping[str, Joint], held: object) -> dict[str, float]:
+def held_values(robot: str, moving: Mapping[str, Joint], held: Mapping[str, float]) -> dict[str, float]:
     """The values of fixed joints by name, radians or metres.
 
     Raises:
-        InputError: they are no mapping, a joint is not a moving one of the robot's, or a value is no finite
-            number, or far outside the limits.
+        InputError: a joint is not a moving one of the robot's, or a value is no finite number or far outside
+            the limits.
     """
-    if not isinstance(held, Mapping):
-        raise InputError(f"held joints of {robot} are given as {held!r}; give {{name: value}}.")
     values = {}
     for name, value in held.items():
         if name not in moving:

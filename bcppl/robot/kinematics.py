@@ -81,13 +81,12 @@ class Robot:
             j for j in moving.values() if j.name in chain and j.mimics is None and j.name not in held
         )
         self._chain = chain_of(self._description)
-        self._frames = [self._chain.frame_to_idx[link] for link in self.links]
         self._coupling, self._constant = self._couplings(moving, held)
 
     # ---- poses
 
     def base_from_links(
-        self, angles: Angles, offsets: Angles | None = None, links: Sequence[str] | None = None
+        self, angles: Angles, offsets: Angles | None = None, links: Sequence[str] = ()
     ) -> Tensor:
         """Poses of links.
 
@@ -95,7 +94,7 @@ class Robot:
             angles: (..., J) measured joint angles.
             offsets: (N, J) joint offsets per particle, added to all of `angles` in one batch; (N, ..., J)
                 where they vary over the stamps.
-            links: names of K links; by default `self.links`.
+            links: names of K links; by default all, `self.links`.
 
         Returns:
             (..., K, 7), or (N, ..., K, 7) with offsets: `base_from_link` of each link, differentiable in
@@ -105,9 +104,7 @@ class Robot:
             InputError: the angles or offsets have another number of joints, are not finite or so large that
                 they are in degrees or millimetres, or a link is unknown.
         """
-        frames = (
-            self._frames if links is None else [self._chain.frame_to_idx[self._known(link)] for link in links]
-        )
+        frames = [self._chain.frame_to_idx[self._known(link)] for link in (links or self.links)]
         values = self._values(angles, offsets)
         all_values = values @ self._coupling.T + self._constant
         matrices = self._chain.forward_kinematics_tensor(all_values.reshape(-1, all_values.shape[-1]))[frames]
@@ -163,35 +160,21 @@ class Robot:
             differentiable in all arguments.
 
         Raises:
-            InputError: as `base_from_links`, or the point or the errors have another shape.
+            InputError: as `base_from_links`.
         """
         number = {joint.name: k for k, joint in enumerate(self.joints)}
-        offsets, point, errors = (
-            None if given is None else _numbers(f"the {name} of {self.name}", given)
-            for name, given in (("offsets", offsets), ("point", point), ("errors", errors))
-        )
-        per_particle = [len(x) for x in (offsets, errors) if x is not None]
-        per_particle += [len(point)] if point is not None and point.ndim == 2 else []
-        if len(set(per_particle)) > 1:
-            raise InputError(
-                f"offsets, point and errors are of {per_particle} particles; give all for the same number."
-            )
-        if errors is not None and errors.shape[1:] != (len(self.joints), 6):
-            raise InputError(
-                f"the errors of {self.name} have shape {tuple(errors.shape)}; "
-                f"give (N, {len(self.joints)}, 6), a tangent for each joint."
-            )
-        if point is not None and point.shape[-1] != 3:
-            raise InputError(f"the point on {link} has shape {tuple(point.shape)}; give x y z in metres.")
+        position = _float64([0.0, 0.0, 0.0] if point is None else point)
+        errors = None if errors is None else _float64(errors)
         values = self._values(angles, offsets)
-        if per_particle and offsets is None:
-            values = values.expand(per_particle[0], *values.shape)
+        others = [x for x in (errors, position if position.ndim == 2 else None) if x is not None]
+        if others and offsets is None:
+            values = values.expand(len(others[0]), *values.shape)
         shape = values.shape[:-1]
         # One axis of particles and one of stamps: each joint is one batched matrix product.
         flat = (values @ self._coupling.T + self._constant).reshape(
-            shape[0] if per_particle else 1, -1, len(self._constant)
+            1 if offsets is None and not others else shape[0], -1, len(self._constant)
         )
-        position = values.new_zeros(1, 1, 3) if point is None else point.reshape(-1, 1, 3)
+        position = position.reshape(-1, 1, 3)
         names = self._chain.get_joint_parameter_names()
         for joint in reversed(self._chain_to(link)):
             if joint.kind in MOVING:
@@ -219,7 +202,7 @@ class Robot:
             if any(s.link == link for s in shapes)
         )
 
-    def placed(self, angles: Angles, offsets: Angles | None = None) -> Tensor:
+    def base_from_parts(self, angles: Angles, offsets: Angles | None = None) -> Tensor:
         """Poses of `parts`, (..., K, 7) or (N, ..., K, 7), for a renderer of several parts.
 
         Raises:
@@ -227,7 +210,7 @@ class Robot:
         """
         return self.base_from_links(angles, offsets, [part.name for part in self.parts])
 
-    def drawn(self, angles: Angles) -> Part:
+    def as_part(self, angles: Angles) -> Part:
         """The whole arm at angles (J,) as one rigid part in the base's frame.
 
         One part renders faster than eight, as long as the arm is stationary.
@@ -241,7 +224,7 @@ class Robot:
                 f"no link of {self.name} has a {self._geometry} shape to draw; "
                 f'give geometry="{other}", or a URDF file with shapes.'
             )
-        base_from_parts = self.placed(self._values(angles, None).reshape(len(self.joints)))
+        base_from_parts = self.base_from_parts(self._values(angles, None).reshape(len(self.joints)))
         vertices = [
             poses.transform(pose, torch.from_numpy(part.vertices)).numpy()
             for pose, part in zip(base_from_parts, self.parts, strict=True)
@@ -294,13 +277,13 @@ class Robot:
     def _values(self, angles: Angles, offsets: Angles | None) -> Tensor:
         """Angles with offsets, (..., J) or (N, ..., J), checked."""
         count = len(self.joints)
-        values = _numbers(f"joint angles of {self.name}", angles)
+        values = _float64(angles)
         if values.ndim == 0 or values.shape[-1] != count:
             raise self._shape_error("angles", values, f"(..., {count})")
         check_angles(self.name, self.joints, values)
         if offsets is None:
             return values
-        offsets = _numbers(f"joint offsets of {self.name}", offsets)
+        offsets = _float64(offsets)
         if offsets.shape[1:] not in (values.shape, values.shape[-1:]):
             raise self._shape_error("offsets", offsets, f"(N, {count}) or (N, *angles.shape)")
         check_offsets(self.name, self.joints, offsets)
@@ -316,12 +299,8 @@ class Robot:
         )
 
 
-def _numbers(name: str, given: Angles) -> Tensor:
-    """A float64 tensor that carries the gradients of what is given."""
-    try:
-        return torch.as_tensor(given, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"{name} are no table of numbers ({error}); give one row for each stamp.") from error
+def _float64(given: Angles) -> Tensor:
+    return torch.as_tensor(given, dtype=torch.float64)
 
 
 def _pose(matrix: npt.NDArray[np.float64]) -> Tensor:
