@@ -1,4 +1,4 @@
-"""Loops over many particles, compiled with numba."""
+"""Compilation with numba of loops over particles."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(function: F) -> F:
-    """Compile on first use, to run without Python's lock; the code is kept where a folder can be written."""
+    """The function compiled on first use, without Python's lock; cached where a folder is writable."""
     # In numpy's error model a division by zero is infinite.
     try:
         return cast(F, njit(cache=True, nogil=True, error_model="numpy")(function))
-    except RuntimeError:  # no such folder
+    except RuntimeError:  # no writable folder
         return cast(F, njit(nogil=True, error_model="numpy")(function))

@@ -1,22 +1,22 @@
-"""What a simulator has cost so far: how often it was asked, how much it made, and how long that took."""
+"""The cost of a simulator: calls, outputs, and wall time."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, replace
 
 
 @dataclass
 class Effort:
-    """The work of one simulator, added up; every simulator owns one as `.effort`.
+    """The accumulated cost of one simulator; every simulator has one as `.effort`.
 
     Attributes:
-        calls: how often the simulator was asked.
+        calls: number of calls.
         items: images rendered, or rollouts run.
         amount: rays traced, or seconds simulated over all rollouts.
-        seconds: wall time spent.
+        seconds: wall time.
     """
 
     calls: int = 0
@@ -28,7 +28,7 @@ class Effort:
     def measure(self, items: int = 0, amount: float = 0.0) -> Iterator[Effort]:
         """Add one call, its wall time, and `items` and `amount`, also where the body raises.
 
-        What is known only at the end is added in the body: `with effort.measure(75) as e: e.amount += rays`.
+        The body may add more: `with effort.measure(75) as effort: effort.amount += rays`.
         """
         start = time.perf_counter()
         try:
@@ -40,14 +40,9 @@ class Effort:
             self.seconds += time.perf_counter() - start
 
     def copy(self) -> Effort:
-        """The work so far, as it stands now."""
-        return Effort(self.calls, self.items, self.amount, self.seconds)
+        """A copy of the cost so far."""
+        return replace(self)
 
     def since(self, earlier: Effort) -> Effort:
-        """The work done since an earlier `copy`."""
-        return Effort(
-            self.calls - earlier.calls,
-            self.items - earlier.items,
-            self.amount - earlier.amount,
-            self.seconds - earlier.seconds,
-        )
+        """The cost since an earlier `copy`."""
+        return Effort(*(now - then for now, then in zip(astuple(self), astuple(earlier), strict=True)))

@@ -197,7 +197,7 @@ def by_nearest_points() -> list[Row]:
     robot, truth = Robot(XARM / "xarm7_plain.urdf"), reference()
     parts, clouds = [], []
     for k in range(5):
-        parts.append(robot.drawn(np.load(XARM / f"joint_state_{k}.npy")).mesh)
+        parts.append(robot.as_part(np.load(XARM / f"joint_state_{k}.npy")).mesh)
         depth = 1e-3 * np.asarray(Image.open(XARM / f"depth_{k}.png")).astype(np.float64)
         shown = (np.asarray(Image.open(XARM / f"mask_{k}.png")) > 0) & (depth > 0.0)
         clouds.append((camera().rays() * depth.reshape(-1, 1))[shown.reshape(-1)])

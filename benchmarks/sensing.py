@@ -16,8 +16,8 @@ from bcppl.contact.sensing.candidates import CORNER, EDGE, FACE
 from bcppl.contact.sensing.intrinsic import IntrinsicSensing
 from bcppl.contact.sensing.noise import WrenchNoise, filtered_share
 from bcppl.contact.wrench import Sensing
+from bcppl.geometry.extrusion import box_peg, round_peg
 from bcppl.geometry.parts import Part
-from bcppl.geometry.shapes import box_peg, round_peg
 
 Array = npt.NDArray[np.float64]
 

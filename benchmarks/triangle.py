@@ -118,7 +118,7 @@ def told(arguments: Callable[[Any], tuple[Any, ...]], push: Push, trace: Trace) 
     felt_at = torch.where(torch.isnan(onset), part[:, :3], onset)
     place = poses.transform(poses.inverse(part), felt_at[:, None])
     near = scene.distance(place[:, 0])
-    slope = Gap(near.distance[:, None], place, near.normal[:, None]).slope(part)
+    slope = Gap(near.distance[:, None], place, near.normal[:, None]).gradient(part)
     slope = torch.where(torch.isnan(onset).any(dim=1)[:, None, None], 0.0, slope) / scene.settings.spread
     return slope.transpose(-1, -2) @ slope
 

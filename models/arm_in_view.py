@@ -180,7 +180,7 @@ def prepare(
     small = still.binned(chosen.bins)
     binned = _binned(images, still, chosen.bins)
     backgrounds = [still_behind(binned, view) for view in range(len(binned))]
-    drawn = [robot.drawn(q) for q in angles]
+    drawn = [robot.as_part(q) for q in angles]
     if masks is None:
         # Where no mask says where the arm ends, depth has to, and smears it.
         renderers = [DepthRenderer(widened(part, chosen.widening)) for part in drawn]

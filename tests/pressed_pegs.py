@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from bcppl.contact.sensing.load import ToolLoad
 from bcppl.contact.sensing.noise import WrenchNoise
+from bcppl.geometry.extrusion import box_peg
 from bcppl.geometry.parts import Part
-from bcppl.geometry.shapes import box_peg
 
 LOGS = Path(__file__).parents[2] / "shared/data/point_probe_pushes"
 PEG = box_peg(0.016, 0.05)

@@ -38,8 +38,8 @@ from bcppl.inference.planning.touching import Spot, Touching, face_of, middles_o
 from bcppl.models.robots import load_robot
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.recordings.action_file import load_actions, save_actions
+from bcppl.robot.inverse_kinematics import joint_paths
 from bcppl.robot.plan import Plan
-from bcppl.robot.reach import joint_paths
 from bcppl.sensors import View
 from bcppl.sensors.candidates import name_of
 from tests.made_recordings import assert_one_sentence
@@ -324,7 +324,7 @@ def test_files_of_actions_that_make_no_sense_are_refused_in_a_sentence(tmp_path:
         ("width", "160", "'160' pixels wide"),
         ("height", -1, "-1 pixels high"),
         ("fx", "a", "focal length fx 'a'"),
-        ("far", 0.05, "sees from 0.1 m to 0.05 m"),
+        ("far", 0.05, "has a range from 0.1 m to 0.05 m"),
         ("wrist_from_camera", [1, 2], "wrist_from_camera"),
         ("world_from_camera", [0.0] * 7, "world_from_camera"),
     ):

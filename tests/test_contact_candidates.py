@@ -19,8 +19,8 @@ from bcppl.contact.sensing.noise import WrenchNoise, filtered_share, noise_at_re
 from bcppl.contact.track import ContactTrack
 from bcppl.contact.wrench import Sensing
 from bcppl.errors import InputError
+from bcppl.geometry.extrusion import block, round_peg
 from bcppl.geometry.parts import Part, Piece
-from bcppl.geometry.shapes import block, round_peg
 from bcppl.robot.motion import Probe
 from tests.pressed_pegs import COVARIANCE, PEG, fork, noisy, pressed, wrench
 

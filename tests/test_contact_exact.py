@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 from bcppl.contact.peg_model import ContactParameters
 from bcppl.contact.physics import PegPhysics, Rollout
 from bcppl.contact.wrench import Sensing
+from bcppl.geometry.extrusion import block, block_with_hole, box_peg, cylinder_peg, peg_for
 from bcppl.geometry.layers import hole_outline
-from bcppl.geometry.outlines import block_with_hole, cylinder_peg, named_outline, peg_for
+from bcppl.geometry.outlines import named_outline
 from bcppl.geometry.parts import Part, Piece
-from bcppl.geometry.shapes import block, box_peg
 from bcppl.models.parts import insert_peg, insert_tray
 from bcppl.robot.motion import Probe
 

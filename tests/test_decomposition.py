@@ -16,9 +16,9 @@ import trimesh
 from bcppl.errors import InputError
 from bcppl.geometry import decomposition
 from bcppl.geometry.decomposition import decomposed
-from bcppl.geometry.fidelity import geometric_error
+from bcppl.geometry.extrusion import block
+from bcppl.geometry.hausdorff import hausdorff_error
 from bcppl.geometry.parts import Part, Piece
-from bcppl.geometry.shapes import block
 
 
 def angle(tall: float = 0.01) -> Part:
@@ -37,14 +37,14 @@ def test_the_error_of_pieces_is_exact_on_both_sides() -> None:
     half = np.array([0.03, 0.02, 0.01])
     solid = block((0.06, 0.04, 0.02))
     moved = replace(solid, pieces=[Piece("box", half, np.array([0.0003, 0.0, -0.01]))])
-    error = geometric_error(moved, count=500)
+    error = hausdorff_error(moved, count=500)
     assert error.added == pytest.approx(0.0003, abs=1e-9) and error.lost == pytest.approx(0.0003, abs=1e-9)
     smaller = replace(solid, pieces=[Piece("box", half - 0.001, np.array([0.0, 0.0, -0.01]))])
-    error = geometric_error(smaller, count=500)
+    error = hausdorff_error(smaller, count=500)
     # A corner is off along the diagonal, and is a point that is always looked at.
     assert error.added == 0.0 and error.lost == pytest.approx(0.001 * np.sqrt(3.0), rel=1e-6)
     halves = [Piece("box", half * [0.5, 1, 1], np.array([x, 0.0, -0.01])) for x in (-0.015, 0.015)]
-    assert geometric_error(replace(solid, pieces=halves), count=500).largest < 1e-12
+    assert hausdorff_error(replace(solid, pieces=halves), count=500).largest < 1e-12
 
 
 def test_a_convex_part_needs_no_coacd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_pieces_are_kept_by_content_and_damage_is_told(
 ) -> None:
     pytest.importorskip("coacd")
     made = decomposed(angle(), clearance=0.0002, cache=tmp_path)
-    assert made.error == geometric_error(made.part) and made.error.largest <= 0.00004
+    assert made.error == hausdorff_error(made.part) and made.error.largest <= 0.00004
     assert sum(trimesh.convex.convex_hull(p.size).volume for p in made.part.pieces) == pytest.approx(
         angle().mesh.volume, rel=0.01
     )
@@ -124,7 +124,7 @@ def test_a_rounded_hole_is_refused_after_the_first_threshold_and_bodies_stay(
     tried: list[float] = []
     real = decomposition._coacd
     monkeypatch.setattr(decomposition, "_coacd", lambda *given: tried.append(given[1]) or real(*given))
-    with pytest.raises(InputError, match=r"would still be by about .* all the same\.") as told:
+    with pytest.raises(InputError, match=r"would still have about .* all the same\.") as told:
         decomposed(ring(), 0.0001, thresholds=(0.1, 0.05), cache=tmp_path, progress=True)
     assert tried == [0.1] and "\n" not in str(told.value)
     assert "CoACD at threshold 0.1" in capsys.readouterr().err
@@ -136,9 +136,9 @@ def test_a_rounded_hole_is_refused_after_the_first_threshold_and_bodies_stay(
     # Halves of the first box: their common face lies deep in the solid, next to the other box's surface.
     halves = [Piece("box", np.array([0.005, 0.005, 0.005]), np.array([x, 0.0, 0.0])) for x in (-0.005, 0.005)]
     second = Piece("box", np.array([0.01, 0.005, 0.005]), np.array([0.005, 0.005, 0.002]))
-    assert geometric_error(replace(made.part, pieces=(*halves, second)), count=5000).largest < 1e-9
+    assert hausdorff_error(replace(made.part, pieces=(*halves, second)), count=5000).largest < 1e-9
     with pytest.raises(InputError, match="no convex pieces"):
-        geometric_error(angle())
+        hausdorff_error(angle())
 
 
 def test_a_cache_that_cannot_be_written_is_told_and_does_not_stop(
@@ -146,7 +146,7 @@ def test_a_cache_that_cannot_be_written_is_told_and_does_not_stop(
 ) -> None:
     pytest.importorskip("coacd")
     (tmp_path / "file").write_text("in the way")
-    with pytest.warns(RuntimeWarning, match="cannot be kept"):
+    with pytest.warns(RuntimeWarning, match="cannot be cached"):
         made = decomposed(angle(), clearance=0.001, cache=tmp_path / "file")
     assert made.error.largest < 0.0002
 

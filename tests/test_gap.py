@@ -15,10 +15,10 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.contact.peg_model import ContactParameters, build_model
 from bcppl.errors import InputError
+from bcppl.geometry.extrusion import block, block_with_hole, box_peg, peg_for
 from bcppl.geometry.gap import PegGap
-from bcppl.geometry.outlines import block_with_hole, peg_for, round_outline
+from bcppl.geometry.outlines import round_outline
 from bcppl.geometry.parts import Part
-from bcppl.geometry.shapes import block, box_peg
 from bcppl.models.worlds.bench_parts import bench_part
 
 SIZE = np.array([0.06, 0.06, 0.025])  # of the block, m; its top is z = 0
@@ -114,7 +114,7 @@ def test_over_a_plane_it_is_the_height_of_the_lowest_corner(tilt: float) -> None
         # 2 mm and more in, the grid's single precision is all there is.
         np.testing.assert_allclose(gap.distance[0].numpy(), heights, atol=2e-9)
         np.testing.assert_allclose(gap.normal[0, 1:4].numpy(), [[0.0, 0.0, 1.0]] * 3, atol=1e-6)
-        np.testing.assert_allclose(gap.place[0, :, 2].numpy(), heights, atol=1e-9)
+        np.testing.assert_allclose(gap.witness[0, :, 2].numpy(), heights, atol=1e-9)
 
 
 def test_corners_and_crossing_edges_are_those_of_brute_force() -> None:
@@ -122,7 +122,7 @@ def test_corners_and_crossing_edges_are_those_of_brute_force() -> None:
     gap = measured()(poses.identity(1), peg)
     exact = np.array([by_hand(p) for p in peg])
     touching, found = exact < 0.0, gap.distance[0].numpy()
-    crossing = (np.abs(gap.place[0, :, :2].numpy()) - 0.5 * SIZE[:2]).max(axis=-1) > -1e-9
+    crossing = (np.abs(gap.witness[0, :, :2].numpy()) - 0.5 * SIZE[:2]).max(axis=-1) > -1e-9
     assert 10 < touching.sum() < 30 and (crossing & touching).sum() >= 5
     # The grid rounds off the block's edges, so that once in fifty poses it takes another corner.
     off = np.abs(found - exact)[~crossing]
@@ -200,9 +200,9 @@ def off_slopes(pegs: Tensor) -> tuple[np.ndarray, np.ndarray]:
         ],
         dim=-1,
     ) / (2 * step)
-    places = poses.transform(poses.inverse(pegs), gap.place[0][:, None])[:, 0].numpy()
+    places = poses.transform(poses.inverse(pegs), gap.witness[0][:, None])[:, 0].numpy()
     at_corner = np.abs(box_distance(places, LOW, HIGH)) < 1e-9
-    return (gap.slope(part)[0] - numeric).abs().amax(dim=-1).numpy(), at_corner
+    return (gap.gradient(part)[0] - numeric).abs().amax(dim=-1).numpy(), at_corner
 
 
 def test_slopes_are_finite_differences() -> None:
@@ -229,7 +229,7 @@ def test_moving_part_and_peg_together_changes_nothing() -> None:
     for motion in anyhow(3, 7):
         there = gap(poses.compose(motion, part), poses.compose(motion, peg))
         torch.testing.assert_close(there.distance, here.distance, atol=1e-9, rtol=0.0)
-        torch.testing.assert_close(there.place, here.place, atol=1e-8, rtol=0.0)
+        torch.testing.assert_close(there.witness, here.witness, atol=1e-8, rtol=0.0)
     # One particle, one stamp at a time gives the same.
     each = torch.stack([torch.cat([gap(a[None], b[None]).distance[0] for b in peg]) for a in part])
     assert torch.equal(each, here.distance)
@@ -255,8 +255,8 @@ def test_a_peg_deep_inside_and_none_at_all() -> None:
     assert np.abs(measured()(part, inside).distance[0].numpy() - exact).max() < 0.0009
     for n, t in ((0, 3), (2, 0), (0, 0)):
         none = measured()(poses.identity(n), poses.identity(t))
-        assert none.distance.shape == (n, t) and none.place.shape == none.normal.shape == (n, t, 3)
-        assert none.slope(poses.identity(n)).shape == (n, t, 6)
+        assert none.distance.shape == (n, t) and none.witness.shape == none.normal.shape == (n, t, 3)
+        assert none.gradient(poses.identity(n)).shape == (n, t, 6)
 
 
 def test_an_open_part_is_refused() -> None:

@@ -17,9 +17,9 @@ from bcppl.contact.peg_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
 from bcppl.distributions.manifold import ContactManifold
 from bcppl.errors import InputError
+from bcppl.geometry.extrusion import block, block_with_hole, box_peg, peg_for
 from bcppl.geometry.gap import PegGap
-from bcppl.geometry.outlines import block_with_hole, peg_for, round_outline
-from bcppl.geometry.shapes import block, box_peg
+from bcppl.geometry.outlines import round_outline
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.robot.plan import Plan, probe_of

@@ -15,11 +15,10 @@ from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.contact.physics import PegPhysics
 from bcppl.errors import InputError
-from bcppl.geometry.extrusion import extruded
-from bcppl.geometry.holes import Hole, clearance_in, hole_from_peg, hole_of
+from bcppl.geometry.extrusion import block, extruded
+from bcppl.geometry.holes import Hole, fit_in, hole_of
 from bcppl.geometry.outlines import rectangular_outline
 from bcppl.geometry.parts import Part
-from bcppl.geometry.shapes import block
 from bcppl.inference.planning.chance import chance_of_success
 from bcppl.inference.planning.insertion import Attempt, insertion_plan
 from bcppl.inference.schemes import systematic
@@ -63,7 +62,7 @@ def plan_of(part: str = "square 8 mm") -> InsertionPlan:
 def test_the_hole_of_a_mesh_is_the_one_that_was_drawn(name: str) -> None:
     kind = bench_part(name)
     hole = hole_of(kind.part)
-    stands = hole_from_peg(hole, kind.peg(0.0001))
+    stands = fit_in(hole, kind.peg(0.0001)).hole_from_peg
     # Where the peg stands in the part is what counts; the two frames of a D differ in where its middle is.
     place = poses.compose(torch.from_numpy(hole.part_from_hole), torch.from_numpy(stands))
     drawn = kind.part_from_hole.copy()
@@ -72,7 +71,7 @@ def test_the_hole_of_a_mesh_is_the_one_that_was_drawn(name: str) -> None:
     assert hole.depth == pytest.approx(kind.depth, abs=1e-6)
     tray = "tray" in name
     assert hole.chamfer == pytest.approx(0.001 if tray else 0.0, abs=1e-6) and hole.through == (not tray)
-    assert clearance_in(hole, kind.peg(0.0002)) == pytest.approx(0.0002, abs=1e-5)
+    assert fit_in(hole, kind.peg(0.0002)).clearance == pytest.approx(0.0002, abs=1e-5)
 
 
 def test_a_peg_that_is_held_turned_and_aside_is_turned_into_the_hole() -> None:
@@ -80,9 +79,9 @@ def test_a_peg_that_is_held_turned_and_aside_is_turned_into_the_hole() -> None:
     hole, peg = hole_of(kind.part), kind.peg(0.0002)
     yaw = np.radians(77.3)
     held = np.array([0.003, -0.002, 0.0, np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw)])
-    stands = torch.from_numpy(hole_from_peg(hole, peg.moved(held)))
+    stands = torch.from_numpy(fit_in(hole, peg.moved(held)).hole_from_peg)
     back = poses.local(
-        torch.from_numpy(hole_from_peg(hole, peg)), poses.compose(stands, torch.from_numpy(held))
+        torch.from_numpy(fit_in(hole, peg).hole_from_peg), poses.compose(stands, torch.from_numpy(held))
     )
     assert float(back[:3].norm()) < 1e-5 and float(back[3:].norm()) < np.radians(0.1)
 
@@ -193,7 +192,7 @@ def test_what_cannot_be_inserted_is_refused_in_one_sentence() -> None:
     with pytest.raises(InputError, match="no hole around"):
         hole_of(_two_holes(), inside=(0.0, 0.0))
     with pytest.raises(InputError, match="does not fit the hole"):
-        hole_from_peg(hole, bench_part("round 16 mm").peg(0.0001))
+        fit_in(hole, bench_part("round 16 mm").peg(0.0001))
     with pytest.raises(InputError, match="the insertion has press 0"):
         insertion_plan(touched(), scene.part, scene.peg, attempt=Attempt(press=0.0))
     with pytest.raises(InputError, match=r"search_stiffness .*; give six numbers"):

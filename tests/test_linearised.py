@@ -16,8 +16,8 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.manifold import ContactManifold, Quadratic
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
+from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.gap import PegGap
-from bcppl.geometry.shapes import block, box_peg
 from bcppl.inference.design import linearised_information_gain, mode_entropy
 from bcppl.inference.design.gaussians import Gaussians, right_jacobian
 from bcppl.inference.population import Population

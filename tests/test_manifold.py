@@ -15,8 +15,8 @@ from torch.special import log_ndtr
 from bcppl import poses
 from bcppl.distributions.manifold import FARTHEST, ContactManifold
 from bcppl.errors import InputError
+from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.gap import Gap, PegGap
-from bcppl.geometry.shapes import block, box_peg
 
 NOISE, SHARED, SINK, OUTLIER = 8e-5, 3e-5, 2e-5, 1e-3
 LENGTH = 0.05
@@ -30,8 +30,8 @@ class Ledge(NamedTuple):
     normal: Tensor
     place: Tensor
 
-    def slope(self, world_from_part: Tensor) -> Tensor:
-        return Gap(self.distance, self.place, self.normal).slope(world_from_part)
+    def gradient(self, world_from_part: Tensor) -> Tensor:
+        return Gap(self.distance, self.place, self.normal).gradient(world_from_part)
 
 
 def ledge(world_from_part: Tensor, world_from_peg: Tensor) -> Ledge:

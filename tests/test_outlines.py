@@ -20,22 +20,12 @@ from bcppl.contact.physics import PegPhysics
 from bcppl.contact.unknowns import Unknowns
 from bcppl.errors import InputError
 from bcppl.geometry import extrusion
-from bcppl.geometry.extrusion import extruded
-from bcppl.geometry.fidelity import geometric_error, solid_of
+from bcppl.geometry.extrusion import block, block_with_hole, box_peg, cylinder_peg, extruded, peg_for
+from bcppl.geometry.hausdorff import hausdorff_error, solid_of
 from bcppl.geometry.layers import hole_outline, prismatic
 from bcppl.geometry.meshes import load_mesh
-from bcppl.geometry.outlines import (
-    NAMED,
-    block_with_hole,
-    check_fit,
-    cylinder_peg,
-    named_outline,
-    peg_for,
-    round_outline,
-    roundness_error,
-)
+from bcppl.geometry.outlines import NAMED, check_fit, named_outline, round_outline, roundness_error
 from bcppl.geometry.parts import Part
-from bcppl.geometry.shapes import block, box_peg
 from bcppl.models.parts import SHAPES, insert_peg, insert_tray
 from bcppl.robot.motion import Probe
 
@@ -55,7 +45,7 @@ def test_a_block_and_its_peg_are_exactly_their_outlines(name: str) -> None:
     part = block_with_hole(hole, offset=(0.006, -0.004), turn=0.3)
     peg = peg_for(hole, 0.0001, 0.05)
     for drawn, volume in ((part, (0.06**2 - hole.area) * 0.025), (peg, peg.mesh.volume)):
-        error = geometric_error(drawn, count=4000)
+        error = hausdorff_error(drawn, count=4000)
         assert error.added < 1e-9 and error.lost < 1e-9
         assert volume_of_union(drawn) == pytest.approx(volume, rel=1e-6)
     section = shapely.Polygon(np.asarray(peg.mesh.section([0, 0, 1], [0, 0, -0.025]).discrete[0])[:, :2])
@@ -95,7 +85,7 @@ def test_a_peg_that_slides_over_the_top_feels_no_seam(monkeypatch: pytest.Monkey
         force, where = slide(block_with_hole(named_outline(name, 0.0161)), peg)
         assert abs(where - smooth)[:, :2].max() < 6e-6 and abs(where - smooth)[:, 2].max() < 15e-6
         assert np.median(force[:, 2]) == pytest.approx(7.5, rel=0.02)
-    monkeypatch.setattr(extrusion, "RAMP", 0.0)  # prisms that end in steps hold the peg back
+    monkeypatch.setattr(extrusion, "BEVEL", 0.0)  # prisms that end in steps hold the peg back
     _, caught = slide(block_with_hole(named_outline("hexagon", 0.0161)), peg)
     assert abs(caught - smooth)[:, :2].max() > 15e-6
 
@@ -118,7 +108,7 @@ def test_a_stepped_part_with_a_chamfered_bore_is_its_layers_along_any_axis() -> 
     turn = np.roll(np.eye(3), 1, axis=0)  # its z to the part's x
     part = Part("stepped", np.asarray(solid.vertices) @ turn.T, np.asarray(solid.faces))
     made = prismatic(part, axis="x", tolerance=1e-7)
-    error = geometric_error(made, count=5000)
+    error = hausdorff_error(made, count=5000)
     assert error.added < 1e-6 and error.lost < 1e-6
     assert volume_of_union(made) == pytest.approx(solid.volume, rel=1e-5)
     with pytest.raises(InputError, match="walls along y"):
@@ -128,7 +118,7 @@ def test_a_stepped_part_with_a_chamfered_bore_is_its_layers_along_any_axis() -> 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_the_shipped_trays_and_pegs_are_within_5_um_of_their_meshes(shape: str) -> None:
     for part in (insert_tray(shape), insert_peg(shape)):
-        error = geometric_error(part, count=1000)
+        error = hausdorff_error(part, count=1000)
         assert error.added <= 5.1e-6 and error.lost <= 5.1e-6
         assert "BSD-3" in part.source
         if NIST.is_dir():
@@ -180,6 +170,8 @@ def test_outlines_that_cannot_be_drawn_are_refused_in_a_sentence() -> None:
         "empty": lambda: extruded("none", shapely.Polygon(), 0, 1),
         "top above": lambda: extruded("flat", square, 0.0, 0.0),
         "does not lie inside": lambda: block_with_hole(square, offset=(0.025, 0.0)),
+        "turn nan": lambda: block_with_hole(square, turn=math.nan),
+        "offset along y nan": lambda: block_with_hole(square, offset=(0.0, math.nan)),
         "no peg": lambda: peg_for(square, 0.017, 0.05),
         "clearance": lambda: peg_for(square, -0.001, 0.05),
         "touches its border at": lambda: extruded(
@@ -197,8 +189,6 @@ def test_outlines_that_cannot_be_drawn_are_refused_in_a_sentence() -> None:
             0,
             0.1,
         ),
-        "turn nan": lambda: block_with_hole(square, turn=math.nan),
-        "offset nan along y": lambda: block_with_hole(square, offset=(0.0, math.nan)),
         "tolerance nan": lambda: prismatic(block((0.06, 0.06, 0.025)), tolerance=math.nan),
         "stands up to 0.95 mm": lambda: check_fit(square, translate(named_outline("square", 0.0159), 0.001)),
         "no clearance": lambda: check_fit(square, square),
@@ -220,7 +210,7 @@ def test_a_moved_part_is_the_same_solid_in_another_frame() -> None:
     quarter = [0.0, 0.0, -0.05, math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
     for part, pose in ((hole, askew), (pegs[0], askew), (pegs[0], quarter), (pegs[1], quarter)):
         moved = part.moved(pose)
-        before, after = geometric_error(part, count=500).largest, geometric_error(moved, count=500).largest
+        before, after = hausdorff_error(part, count=500).largest, hausdorff_error(moved, count=500).largest
         assert after == pytest.approx(before, abs=1e-9)
         expected = Rotation.from_quat(np.array(pose)[[4, 5, 6, 3]]).apply(part.vertices) + pose[:3]
         np.testing.assert_allclose(moved.vertices, expected, atol=1e-12)

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from bcppl.contact.peg_model import ContactParameters, commands
 from bcppl.contact.physics import PegPhysics, Rollout
 from bcppl.errors import InputError
+from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, round_peg
 from bcppl.geometry.parts import Part, Piece
-from bcppl.geometry.shapes import block, block_with_square_hole, box_peg, round_peg
 from bcppl.robot.motion import Probe
 
 STIFFNESS = np.array([1500.0, 1000.0, 2000.0, 60.0, 50.0, 40.0])

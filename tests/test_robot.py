@@ -165,9 +165,9 @@ def test_the_arm_drawn_as_one_part_looks_as_its_links_do(robot: Robot) -> None:
     camera = Camera("c", 64, 48, 60.0, 60.0, 32.0, 24.0, looking_at([1.8, 0.4, 0.6], [0.0, 0.0, 0.5]))
     links = [
         DepthRenderer(part).images(camera, pose[None])[0]
-        for part, pose in zip(robot.parts, robot.placed(angles), strict=True)
+        for part, pose in zip(robot.parts, robot.base_from_parts(angles), strict=True)
     ]
-    whole = DepthRenderer(robot.drawn(angles)).images(camera, poses.identity(1))[0]
+    whole = DepthRenderer(robot.as_part(angles)).images(camera, poses.identity(1))[0]
     assert np.isfinite(whole).sum() > 100
     assert np.array_equal(np.isfinite(whole), np.isfinite(np.min(links, axis=0)))
     seen = np.isfinite(whole)
@@ -281,19 +281,14 @@ def test_angles_that_are_wrong_are_refused(angles: Tensor, word: str) -> None:
 def test_what_a_robot_does_not_have_is_refused() -> None:
     panda = load_robot("panda", tip="panda_hand")
     angles = torch.tensor([0.0, 0, 0, -1, 0, 1, 0], dtype=torch.float64)
-    offsets, errors = torch.zeros(3, 7).double(), torch.zeros(2, 7, 6).double()
     for call in (
         lambda: load_robot("panda", tip="panda_foot"),
         lambda: load_robot("panda", held={"panda_joint9": 0.0}),
         lambda: load_robot("panda", geometry="colliding"),  # type: ignore[arg-type]
         lambda: panda.base_from_link("panda_hand", angles, link_from_tool=[0.0, 0, 0, 2, 0, 0, 0]),
-        lambda: panda.base_from_links(angles, [["a"] * 7]),  # type: ignore[list-item]
         lambda: panda.base_from_link("panda_foot", angles),
         lambda: panda.position("panda_foot", angles),
         lambda: panda.base_from_links(angles, torch.zeros(3, 6).double()),
-        lambda: panda.position("panda_hand", angles, offsets, errors=errors),
-        lambda: panda.position("panda_hand", angles, errors=torch.zeros(3, 6, 6).double()),
-        lambda: panda.position("panda_hand", angles, point=torch.zeros(3, 4).double()),
     ):
         with pytest.raises(InputError) as error:
             call()
@@ -306,7 +301,6 @@ def test_what_a_robot_does_not_have_is_refused() -> None:
         ({"panda_joint1": 90.0}, "degrees"),
         ({"panda_finger_joint1": 30.0}, "millimetres"),
         ({"panda_joint1": math.nan}, "panda_joint1"),
-        ([0.0], "{name: value}"),
     ],
 )
 def test_what_joints_are_held_at_is_a_number_in_the_right_unit(held: Any, word: str) -> None:
@@ -344,5 +338,5 @@ def test_lists_arrays_and_single_precision_are_taken(robot: Robot) -> None:
 
 def test_an_arm_without_shapes_is_not_drawn(tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
-        load_robot(written(tmp_path), geometry="collision").drawn([0.0])
+        load_robot(written(tmp_path), geometry="collision").as_part([0.0])
     assert 'geometry="visual"' in said(error)

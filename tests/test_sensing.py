@@ -21,7 +21,7 @@ from bcppl.contact.track import ContactTrack
 from bcppl.contact.wrench import Sensing
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
-from bcppl.geometry.shapes import block
+from bcppl.geometry.extrusion import block
 from bcppl.recordings.importers.point_probe import LoggedPush, force_on_object, prism, read_log
 from bcppl.robot.motion import Probe
 from tests.pressed_pegs import LOAD, LOGS, PEG, noisy, orientations

@@ -14,7 +14,7 @@ from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.silhouette import Silhouette, binned_mask
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
-from bcppl.geometry.shapes import block, block_with_square_hole
+from bcppl.geometry.extrusion import block, block_with_square_hole
 from bcppl.rendering.renderer import DepthRenderer
 
 PART = block_with_square_hole((0.1, 0.08, 0.03), 0.02, (0.01, 0.005))

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
-from bcppl.geometry.shapes import block_with_square_hole
+from bcppl.geometry.extrusion import block_with_square_hole
 from bcppl.rendering.region import region_of
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.rendering.stated_cameras import apparent_covariance, line_of_sight, seen_elsewhere

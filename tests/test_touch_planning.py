@@ -15,8 +15,8 @@ from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.contact.sensing.felt import Felt
 from bcppl.errors import InputError
+from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, round_peg
 from bcppl.geometry.gap import PegGap
-from bcppl.geometry.shapes import block, block_with_square_hole, box_peg, round_peg
 from bcppl.inference.planning.faces import section, sides, spots_on_top
 from bcppl.inference.planning.metrology import Pace, three_two_one
 from bcppl.models.parts import insert_peg, insert_tray
@@ -117,7 +117,7 @@ def plan_of(**changed: Any) -> Plan:
         ({"times": ["a", "b", "c"]}, "times that are no array of numbers"),
         ({"world_from_peg": [[0.0], [0.0, 1.0], []]}, "world_from_peg that are no array"),
         ({"times": np.array([0.0, 900.0, 2000.0])}, "lasts 2000 s: .* milliseconds"),
-        ({"world_from_peg": poses.identity(3).numpy() + 10.0 * np.eye(3, 7)}, "leads 10 m .* millimetres"),
+        ({"world_from_peg": poses.identity(3).numpy() + 10.0 * np.eye(3, 7)}, "spans 10 m .* millimetres"),
         ({"world_from_peg": poses.identity(3).numpy() + 506.0 * np.eye(1, 7)}, "to 506 m .* millimetres"),
     ],
 )

@@ -19,7 +19,7 @@ from bcppl.distributions.pose_normals import GaussianMixture, matched, widened, 
 from bcppl.distributions.poses import UniformPose
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
-from bcppl.geometry.shapes import box_peg
+from bcppl.geometry.extrusion import box_peg
 from bcppl.inference.approximation import GaussianApproximation
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.laplace import Normal, QuadraticApproximation, quadratic_approximation

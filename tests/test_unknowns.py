@@ -18,8 +18,8 @@ from bcppl.contact.unknowns import Unknowns
 from bcppl.contact.wrench import Sensing
 from bcppl.distributions.contact import ChamferContacts
 from bcppl.errors import InputError
+from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg
 from bcppl.geometry.parts import Part, Piece
-from bcppl.geometry.shapes import block, block_with_square_hole, box_peg
 from bcppl.robot.motion import Probe
 
 STIFFNESS = np.array([1500.0, 1000.0, 2000.0, 60.0, 50.0, 40.0])

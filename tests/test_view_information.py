@@ -11,7 +11,7 @@ import torch
 
 from bcppl import poses
 from bcppl.geometry.camera import Camera, looking_at
-from bcppl.geometry.shapes import block
+from bcppl.geometry.extrusion import block
 from bcppl.inference.design.rules import by_information
 from bcppl.inference.population import Population
 from bcppl.models.look_and_touch import model

@@ -9,7 +9,7 @@ from bcppl import poses
 from bcppl.cli import loading
 from bcppl.contact.physics import PegPhysics
 from bcppl.errors import InputError
-from bcppl.geometry.shapes import box_peg
+from bcppl.geometry.extrusion import box_peg
 from bcppl.models import which_hole
 from bcppl.models.worlds import which_hole as world
 from bcppl.recordings import ProbeWindow

@@ -18,7 +18,7 @@ from bcppl.contact.track import ContactTrack
 from bcppl.contact.wrench import Sensing
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose
 from bcppl.errors import InputError
-from bcppl.geometry.shapes import block, block_with_square_hole, box_peg, round_peg
+from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, round_peg
 from bcppl.robot.motion import Probe
 
 PEG = box_peg(0.016, 0.05)

@@ -15,7 +15,7 @@ from bcppl.contact.track import ContactTrack
 from bcppl.contact.wrench import Sensing
 from bcppl.distributions.wrench import Wrench
 from bcppl.errors import InputError
-from bcppl.geometry.shapes import block, box_peg
+from bcppl.geometry.extrusion import block, box_peg
 from bcppl.robot.motion import Probe
 
 PEG = box_peg(0.016, 0.05)

@@ -212,7 +212,7 @@ class _Motion:
         """Where pegs (M,) get to on the way to a command (M, 7), and how far from the part they are then."""
         rules, count = self.rules, len(chosen)
         on = chosen.numpy()
-        part = Frames(self.part.rotation[on], self.part.place[on])
+        part = Frames(self.part.rotation[on], self.part.translation[on])
         turn = frames_of(goal).rotation
         place, target = self.place[chosen].numpy().copy(), goal[:, :3].numpy()
         normals, offsets = np.zeros((count, _PLANES, 3)), np.zeros((count, _PLANES))
@@ -221,7 +221,7 @@ class _Motion:
         moving = np.arange(count)
         for rounds in range(_ROUNDS):
             peg = Frames(turn[moving, None], place[moving, None])
-            found, _, normal = rules.gap.measured(Frames(*(each[moving] for each in part)), peg)
+            found, _, normal = rules.gap.evaluate(Frames(*(each[moving] for each in part)), peg)
             distance[moving] = found[:, 0]
             stays = np.zeros(len(moving), dtype=np.bool_)
             _stepped(

@@ -27,7 +27,7 @@ class Gaps(Protocol):
     def distance(self) -> Tensor:
         """(N, T) metres."""
 
-    def slope(self, world_from_part: Tensor) -> Tensor:
+    def gradient(self, world_from_part: Tensor) -> Tensor:
         """(N, T, 6) its derivatives in the tangent space at the part's poses."""
 
 
@@ -120,7 +120,7 @@ class ContactManifold(LazyDistribution):
         count = len(self.pose)
         if gaps is None:
             return Quadratic(self.pose.new_zeros(count, 6), self.pose.new_zeros(count, 6, 6))
-        slope, touching = gaps.slope(self.pose), (felt == 1.0).to(torch.float64)
+        slope, touching = gaps.gradient(self.pose), (felt == 1.0).to(torch.float64)
         # The common error takes the mean of a window's contacts part of its weight.
         variance, common = self.noise**2, self.shared**2
         share = (common / (variance + touching.sum(dim=1) * common))[:, None, None]
@@ -222,7 +222,7 @@ class ContactManifold(LazyDistribution):
         sound = torch.isfinite(rows).all(dim=2).all(dim=1)
         shift = torch.full_like(noise, torch.nan)
         pose, drawn = self.pose[sound], rows[sound]
-        normal = -self.gap(pose, drawn[..., :7]).slope(pose)[..., :3]
+        normal = -self.gap(pose, drawn[..., :7]).gradient(pose)[..., :3]
         touching = (drawn[..., 7:] == 1.0).to(torch.float64)
         shift[sound] = noise[sound] + touching * normal * (shared[sound] - self.sink)
         return torch.cat([rows[..., :3] + shift, rows[..., 3:]], dim=-1)

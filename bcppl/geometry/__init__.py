@@ -1,1 +1,1 @@
-"""Geometry: parts, cameras, outlines, convex pieces and distances; nothing here is simulated."""
+"""Geometry: parts, cameras, outlines, convex decompositions and signed distances, without simulation."""

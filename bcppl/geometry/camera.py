@@ -1,4 +1,4 @@
-"""A camera: a pinhole with Brown's lens distortion, and where it stands."""
+"""A pinhole camera with Brown's lens distortion, and its pose."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A camera in its optical frame: x right, y down, z forward; depth is along z, metres.
+    """A camera with its optical frame: x right, y down, z forward; depth is along z, metres.
 
-    A camera on a wrist is one camera for each place it looks from: see `on`.
+    A camera on a wrist is one camera for each viewpoint: see `on`.
 
     Attributes:
-        name: cameras are told apart by name; two views from two places are two cameras.
+        name: identifies the camera; views from two viewpoints are two cameras.
         width, height: the image's size in pixels.
         fx, fy, cx, cy: focal lengths and principal point in pixels; pixel (u, v) is centred at the
-            integers, so without distortion it sees along ((u - cx) / fx, (v - cy) / fy, 1).
-        world_from_camera: (7,) pose of the optical frame.
+            integers, so without distortion its ray is ((u - cx) / fx, (v - cy) / fy, 1).
+        world_from_camera: (7,) pose of the optical frame (the extrinsics).
         near, far: the sensor's range in metres: a depth outside it is missing, not far away.
-        distortion: k1 k2 p1 p2 (k3) of Brown's model, as OpenCV has them; empty for none. Depth images are
+        distortion: k1 k2 p1 p2 (k3) of Brown's model, in OpenCV's order; empty for none. Depth images are
             often rectified already, and then have none: see the driver's camera information.
-        wrist_from_camera: (7,) where the camera sits on a robot's wrist; None for one that stands still.
-        device: which instrument it is, where one instrument looks from several places; "" where `name` says.
+        wrist_from_camera: (7,) hand-eye calibration of a wrist camera; None for a stationary camera.
+        device: identifies the instrument where one has several viewpoints; "" where it is `name`.
     """
 
     name: str
@@ -58,43 +58,42 @@ class Camera:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether a coefficient of its distortion is not zero."""
+        """Whether a distortion coefficient is not zero."""
         return any(k != 0.0 for k in self.distortion)
 
     @property
     def optics(self) -> tuple[int, int, tuple[float, float, float, float], tuple[float, ...]]:
-        """Width, height, (fx, fy, cx, cy) and distortion: all that the rays hang on."""
+        """Width, height, (fx, fy, cx, cy) and distortion: all that the rays depend on."""
         intrinsics = (float(self.fx), float(self.fy), float(self.cx), float(self.cy))
         return self.width, self.height, intrinsics, tuple(self.distortion)
 
     def stated_pose(self) -> Tensor:
-        """Its `world_from_camera` (7,) once its pose and optics have been looked at, quaternion normalised.
+        """The checked `world_from_camera` (7,), its quaternion normalised.
 
-        A camera may be made with any numbers, so that a recording that holds a wrong one can be read and
-        reported; whoever looks through it asks here.
+        The constructor accepts any numbers, so that a recording with wrong ones can be read and reported;
+        renderers check here.
 
         Raises:
-            InputError: the pose is none or has no unit quaternion; there are no pixels; a focal length is not
-                positive, the principal point is not finite, or near is not below far.
+            InputError: the pose is not valid; there are no pixels; a focal length is not positive, the
+                principal point is not finite, or near is not below far.
         """
-        self._refuse_optics()
+        self._check_optics()
         pose = poses.as_pose(
             np.asarray(self.world_from_camera, dtype=np.float64), f"the world_from_camera of {self.name!r}"
         )
         if pose.ndim != 1:
             raise InputError(
-                f"the world_from_camera of {self.name!r} has shape {tuple(pose.shape)}; a camera stands at "
-                "one pose (7,): make one camera for each place it looks from."
+                f"the world_from_camera of {self.name!r} has shape {tuple(pose.shape)}; a camera has one "
+                "pose (7,): give one camera for each viewpoint."
             )
         return pose
 
-    def _refuse_optics(self) -> None:
+    def _check_optics(self) -> None:
         for size, value in (("wide", self.width), ("high", self.height)):
             whole_number(f"camera {self.name!r} is {{}} pixels {size}", value)
         for name in ("fx", "fy"):
             number_within(
-                f"camera {self.name!r} has a focal length {name} {{}} pixels (turn a mirrored image back "
-                "before)",
+                f"camera {self.name!r} has a focal length {name} {{}} pixels (flip mirrored images)",
                 getattr(self, name),
                 above=0.0,
             )
@@ -102,42 +101,37 @@ class Camera:
             number_within(
                 f"camera {self.name!r} has its principal point at {name} {{}} pixels", getattr(self, name)
             )
-        near = number_within(f"camera {self.name!r} sees from {{}} m on", self.near, least=0.0)
+        near = number_within(f"camera {self.name!r} has a range from {{}} m", self.near, least=0.0)
         try:
-            beyond = float(self.far) > near
+            ordered = float(self.far) > near
         except (TypeError, ValueError):
-            beyond = False
-        if not beyond:
+            ordered = False
+        if not ordered:
             raise InputError(
-                f"camera {self.name!r} sees from {self.near} m to {self.far!r} m; give near below far, in "
-                "metres."
+                f"camera {self.name!r} has a range from {self.near} m to {self.far!r} m; give near below "
+                "far, in metres."
             )
 
     @property
     def instrument(self) -> str:
-        """What it shares its errors with: its device, or its name where no device is stated."""
+        """Identifies the instrument, whose cameras share calibration errors: the device, else the name."""
         return self.device or self.name
 
     def rays(self) -> Array:
-        """Directions (height * width, 3) of the pixels in the optical frame, z = 1 (lengths are depths).
+        """Directions (height * width, 3) of the pixels' rays in the optical frame, z = 1: lengths are depths.
 
         Raises:
-            InputError: there are no pixels, a focal length is not positive, the principal point is not
-                finite, near is not below far, or the distortion folds the image over, so that a pixel sees
-                along no ray or several.
+            InputError: as `stated_pose` for the optics, or the distortion folds the image over, so that a
+                pixel has no unique ray.
         """
-        self._refuse_optics()
-        if self.is_distorted:
-            return undistorted_rays(*self.optics).copy()
-        u, v = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
-        x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
-        return np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+        self._check_optics()
+        return undistorted_rays(*self.optics).copy()
 
     def project(self, points: npt.ArrayLike) -> Array:
-        """Pixels (..., 2), u then v, at which points (..., 3) in the optical frame (metres) are seen.
+        """Projections (..., 2) of points (..., 3) in the optical frame (metres): pixels, u then v.
 
-        They may lie outside the image. NaN where a point is not in front of the camera, or so far to the
-        side that the distortion would fold it back into the image.
+        They may lie outside the image. NaN where a point is not in front of the camera, or so far off axis
+        that the distortion would fold it back into the image.
         """
         places = np.asarray(points, dtype=np.float64)
         depth = places[..., 2]
@@ -155,13 +149,17 @@ class Camera:
         It keeps its name: crop every image of a camera, and its background, alike.
 
         Raises:
-            InputError: the region is not of whole pixels, is empty or reaches out of the image.
+            InputError: the region is not of whole pixels, is empty or extends beyond the image.
         """
-        of = f"a region of camera {self.name!r} is given"
-        left = whole_number(f"{of} left {{}}", left, least=0)
-        top = whole_number(f"{of} top {{}}", top, least=0)
-        width = whole_number(f"{of} width {{}}", width)
-        height = whole_number(f"{of} height {{}}", height)
+        left, top, width, height = (
+            whole_number(f"a region of camera {self.name!r} is given {side} {{}}", value, least=least)
+            for side, value, least in (
+                ("left", left, 0),
+                ("top", top, 0),
+                ("width", width, 1),
+                ("height", height, 1),
+            )
+        )
         if left + width > self.width or top + height > self.height:
             raise InputError(
                 f"a region of {width}×{height} pixels from column {left}, row {top} does not lie within "
@@ -172,12 +170,12 @@ class Camera:
     def binned(self, k: int) -> Camera:
         """The camera whose pixels are blocks of k × k of this one's; see `bin_depth` for its images.
 
-        Columns and rows that fill no block are left out at the right and below. It keeps its name.
+        Incomplete blocks at the right and below are dropped. It keeps its name.
 
         Raises:
             InputError: no block fits into the image.
         """
-        _refuse_block(k, self.width, self.height)
+        _check_block(k, self.width, self.height)
         middle = 0.5 * (k - 1)
         return replace(
             self,
@@ -190,20 +188,19 @@ class Camera:
         )
 
     def on(self, world_from_wrist: npt.ArrayLike, name: str | None = None) -> Camera:
-        """The camera where the arm holds it at one view.
+        """The wrist camera at one viewpoint.
 
         Args:
-            world_from_wrist: (7,) the wrist's pose at that view, from the arm's joints.
-            name: of the camera at this place; give each view its own, for two places are two cameras. They
-                stay one `device`.
+            world_from_wrist: (7,) the wrist's pose, from the arm's forward kinematics.
+            name: of the camera at this viewpoint; give each its own. They stay one `device`.
 
         Raises:
-            InputError: the camera states no `wrist_from_camera`, or a pose is none.
+            InputError: the camera has no `wrist_from_camera`, or a pose is not valid.
         """
         if self.wrist_from_camera is None:
             raise InputError(
-                f"camera {self.name!r} states no wrist_from_camera, so the wrist's pose does not say where "
-                "it is; give it the pose of the optical frame on the wrist (the hand-eye calibration)."
+                f"camera {self.name!r} has no wrist_from_camera; give the pose of the optical frame on the "
+                "wrist (the hand-eye calibration)."
             )
         there = poses.compose(
             poses.as_pose(torch.as_tensor(np.asarray(world_from_wrist)), "world_from_wrist"),
@@ -217,18 +214,17 @@ class Camera:
 def bin_depth(
     depth: npt.ArrayLike, k: int, edge: float = 0.01, near: float = 0.0, far: float = np.inf
 ) -> Array:
-    """A depth image (H, W) in blocks of k × k pixels, (H // k, W // k) metres, NaN where all are missing.
+    """The median depth (H // k, W // k) of blocks of k × k pixels, metres, NaN where all are missing.
 
-    A block's depth is the median of its valid readings. Of an even number the two in the middle are averaged
-    only where they lie within `edge` of each other; otherwise the nearer is taken: a mean over an edge is a
-    depth at which nothing stands.
+    Of an even number of valid readings the two middle ones are averaged only where they differ by at most
+    `edge`; otherwise the nearer is the result: a mean across a depth edge lies on no surface.
 
     Args:
-        depth: (H, W) metres; 0, NaN and what is out of range are missing.
-        k: pixels of a block's side.
-        edge: metres.
-        near: the sensor's range begins here, metres.
-        far: the sensor's range ends here, metres.
+        depth: (H, W) metres; 0, NaN and values out of range are missing.
+        k: side length of a block, pixels.
+        edge: smallest depth discontinuity, metres.
+        near: lower end of the sensor's range, metres.
+        far: upper end of the sensor's range, metres.
 
     Raises:
         InputError: the image has no two dimensions, or no block fits into it.
@@ -237,7 +233,7 @@ def bin_depth(
     if image.ndim != 2:
         raise InputError(f"a depth image of shape {image.shape} cannot be binned; give one (H, W).")
     height, width = image.shape
-    _refuse_block(k, width, height)
+    _check_block(k, width, height)
     rows, columns = height // k, width // k
     blocks: Array = (
         image[: rows * k, : columns * k]
@@ -254,7 +250,7 @@ def bin_depth(
     return np.asarray(np.where(upper - lower <= edge, 0.5 * (lower + upper), lower))
 
 
-def _refuse_block(k: int, width: int, height: int) -> None:
+def _check_block(k: int, width: int, height: int) -> None:
     if not (isinstance(k, int | np.integer) and 1 <= k <= min(width, height)):
         raise InputError(
             f"an image of {width}×{height} pixels cannot be binned by {k}; give a whole number from 1 to "
@@ -263,12 +259,12 @@ def _refuse_block(k: int, width: int, height: int) -> None:
 
 
 def looking_at(eye: npt.ArrayLike, point: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """The pose (7,) `world_from_camera` of an optical frame at `eye` that sees `point` in its middle.
+    """The pose (7,) `world_from_camera` of an optical frame at `eye` with its optical axis through `point`.
 
     Args:
-        eye: (3,) where the camera stands, metres in the world.
-        point: (3,) what it looks at.
-        up: (3,) the direction that is upwards in the image.
+        eye: (3,) position of the camera in the world, metres.
+        point: (3,) in the world, metres.
+        up: (3,) direction in the world that is upwards in the image.
 
     Raises:
         InputError: the camera would look at itself, or straight along `up`.

@@ -1,7 +1,7 @@
-"""Plane regions with holes as convex polygons: few that tile the region, each grown into its neighbours.
+"""Convex covers of polygonal regions: a convex partition, each cell expanded into its neighbours.
 
-Convex pieces that only meet have faces inside the solid, on which a body that slides across can catch. Pieces
-that are grown into one another along the region's own edges leave no such face on its walls.
+Convex pieces that share only their boundaries have faces inside the solid on which a sliding body can catch.
+Pieces that overlap along the region's own edges have no such face on the walls.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import shapely
 
 Array = npt.NDArray[np.float64]
 
-_TIGHT = 1e-11  # m: what growing may add to a region; MuJoCo keeps corners in single precision, 1e-9 m
-_STRAIGHT = 1e-9  # sine of the turn below which a corner is none
-_ROUNDED = 8  # corners from which on a hole is boxed in
+_TIGHT = 1e-11  # m by which expansion may exceed a region; MuJoCo's single precision resolves 1e-9 m
+_STRAIGHT = 1e-9  # sine of the turning angle below which a vertex counts as collinear
+_ROUNDED = 8  # vertices from which on a hole is enclosed in a box
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Cell:
     """One convex polygon of a cover.
 
     Attributes:
-        core: (C, 2) its corners, counter-clockwise; the cores of a cover tile the region.
+        core: (C, 2) its vertices, counter-clockwise; the cores of a cover partition the region.
         grown: (G, 2) a convex polygon within the region that contains the core.
     """
 
@@ -33,27 +33,25 @@ class Cell:
 
 
 def convex_cells(region: shapely.Polygon | shapely.MultiPolygon, reach: float) -> list[Cell]:
-    """Convex cells that tile a region and are grown into one another where the region allows it.
+    """Convex cells whose cores partition a region, expanded into one another where the region allows it.
 
-    The tiles are a constrained Delaunay triangulation whose diagonals are removed, longest first, as long as
-    cells stay convex: at most four times as many as the fewest (Hertel and Mehlhorn 1983). A hole of many
-    corners is boxed in first, so that the small cells at its sides stay near it.
+    The partition is a constrained Delaunay triangulation whose diagonals are removed, longest first, while
+    cells stay convex: at most four times as many cells as the minimum (Hertel and Mehlhorn 1983). A hole with
+    many vertices is enclosed in a box first, so that the small cells along its sides stay near it.
 
     Args:
         region: in metres, valid.
-        reach: metres by which a cell grows beyond a diagonal, at most.
+        reach: largest expansion of a cell across a diagonal, metres.
     """
-    cells = []
+    cells: list[Cell] = []
     for polygon in polygons_of(region):
-        cores = [core for part in _boxed(polygon) for core in _tiles(part)]
-        cells += [
-            Cell(core, grown) for core, grown in zip(cores, grown_in(polygon, cores, reach), strict=True)
-        ]
+        cores = [core for part in _boxed(polygon) for core in _partition(part)]
+        cells += map(Cell, cores, grown_in(polygon, cores, reach))
     return cells
 
 
 def grown_in(region: shapely.Polygon | shapely.MultiPolygon, cores: list[Array], reach: float) -> list[Array]:
-    """Each of some convex polygons within a region, its inner sides moved out by up to a reach."""
+    """Convex polygons (G, 2) within a region: cores (C, 2) whose inner sides are offset by up to `reach`."""
     shapely.prepare(allowed := region.buffer(_TIGHT, join_style="mitre"))
     shapely.prepare(boundary := region.boundary)
     convex: dict[tuple[float, float], list[Array]] = {}
@@ -63,13 +61,13 @@ def grown_in(region: shapely.Polygon | shapely.MultiPolygon, cores: list[Array],
 
 
 def polygons_of(region: shapely.Geometry) -> list[shapely.Polygon]:
-    """The polygons of a region with area, wound counter-clockwise."""
-    found = [p for p in shapely.get_parts(region) if isinstance(p, shapely.Polygon) and p.area > 0]
-    return [shapely.orient_polygons(polygon) for polygon in found]
+    """The polygons of a region with positive area, wound counter-clockwise."""
+    polygons = [p for p in shapely.get_parts(region) if isinstance(p, shapely.Polygon) and p.area > 0]
+    return [shapely.orient_polygons(polygon) for polygon in polygons]
 
 
 def _boxed(polygon: shapely.Polygon) -> list[shapely.Polygon]:
-    """The polygon cut along boxes around its round holes, where there is room for them."""
+    """The polygon cut along boxes around its rounded holes where such boxes fit."""
     outline, rest = shapely.Polygon(polygon.exterior), polygon
     cut: list[shapely.Polygon] = []
     for ring in polygon.interiors:
@@ -88,14 +86,14 @@ def _boxed(polygon: shapely.Polygon) -> list[shapely.Polygon]:
     return [p for part in (rest, *rings) for p in polygons_of(part)]
 
 
-def _tiles(polygon: shapely.Polygon) -> list[Array]:
-    """Convex corners (C, 2), counter-clockwise, that tile a polygon."""
+def _partition(polygon: shapely.Polygon) -> list[Array]:
+    """Vertices (C, 2), counter-clockwise, of the cells of a convex partition."""
     triangles = [
         np.asarray(t.exterior.coords)[:-1]
         for t in polygons_of(shapely.constrained_delaunay_triangles(polygon))
     ]
     points, index = np.unique(np.concatenate(triangles), axis=0, return_inverse=True)
-    tiles = {k: corners for k, corners in enumerate(index.reshape(-1, 3).tolist())}
+    tiles = dict(enumerate(index.reshape(-1, 3).tolist()))
     sides = {(c[j], c[(j + 1) % 3]): k for k, c in tiles.items() for j in range(3)}
     diagonals = sorted(
         (s for s in sides if s[0] < s[1] and s[::-1] in sides),
@@ -115,7 +113,7 @@ def _tiles(polygon: shapely.Polygon) -> list[Array]:
 
 
 def _joined(first: list[int], second: list[int], a: int, b: int) -> list[int]:
-    """Two counter-clockwise cells as one, across the side from `a` to `b` of the first."""
+    """Vertices of the union of two counter-clockwise cells across the side from `a` to `b` of the first."""
     i, j = first.index(a), second.index(b)
     return [*first[i + 1 :], *first[: i + 1], *(second[j + 1 :] + second[:j])[1:]]
 
@@ -127,12 +125,12 @@ def _convex_at(points: Array, corners: list[int], corner: int) -> bool:
 
 
 def _turn(a: Array, b: Array) -> float:
-    """The sine of the angle from one direction to another."""
+    """The sine of the angle between two directions, positive counter-clockwise."""
     return float((a[0] * b[1] - a[1] * b[0]) / (np.linalg.norm(a) * np.linalg.norm(b)))
 
 
 def straightened(corners: Array) -> Array:
-    """A polygon's corners (C, 2) without those on a straight side."""
+    """A polygon's vertices (C, 2) without those collinear with their neighbours."""
     kept = corners[np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1) > 0]
     before, after = kept - np.roll(kept, 1, axis=0), np.roll(kept, -1, axis=0) - kept
     sharp = [abs(_turn(a, b)) > _STRAIGHT for a, b in zip(before, after, strict=True)]
@@ -140,23 +138,23 @@ def straightened(corners: Array) -> Array:
 
 
 def _outward(corners: Array) -> Array:
-    """The unit normals (C, 2) to the right of a ring's sides: outward where it is counter-clockwise."""
+    """Unit normals (C, 2) to the right of a ring's sides: outward where it is counter-clockwise."""
     side = np.roll(corners, -1, axis=0) - corners
     normal = np.stack([side[:, 1], -side[:, 0]], axis=1)
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
 def _corner_normals(polygon: shapely.Polygon) -> dict[tuple[float, float], list[Array]]:
-    """The outward normals of the two sides at each of a polygon's convex corners."""
-    found = {}
+    """Outward normals of the two sides at each convex vertex of a polygon."""
+    normals = {}
     for ring in (polygon.exterior, *polygon.interiors):
         corners = np.asarray(ring.coords)[:-1]
         corners = corners[np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1) > 0]
         normal = _outward(corners)
         for corner, before, after in zip(corners, np.roll(normal, 1, axis=0), normal, strict=True):
             if _turn(before, after) > 0:
-                found[tuple(corner.tolist())] = [before, after]
-    return found
+                normals[tuple(corner.tolist())] = [before, after]
+    return normals
 
 
 def _grown(
@@ -166,21 +164,21 @@ def _grown(
     reach: float,
     convex: dict[tuple[float, float], list[Array]],
 ) -> Array:
-    """A convex polygon around a core: its inner sides moved out as far as is allowed."""
+    """A convex polygon around a core: its inner sides offset as far as the region allows."""
     if len(straightened(core)) < 3:  # a chamfer may end in an edge
         return core
     normal = _outward(core)
     level = np.sum(normal * core, axis=1)
     middle = shapely.points(0.5 * (core + np.roll(core, -1, axis=0)))
     inner = np.flatnonzero(shapely.distance(middle, boundary) > 1e-9)
-    # Where a diagonal ends at a convex corner of the region, the corner's two sides bound the cell, too.
+    # Where a diagonal ends at a convex vertex of the region, the vertex's two sides bound the cell, too.
     for corner in core:
         for n in convex.get(tuple(corner.tolist()), []):
             if (core @ n).max() <= corner @ n + 1e-12:
                 normal, level = np.vstack([normal, n]), np.append(level, corner @ n)
     frame, center = 4.0 * (np.ptp(core, axis=0).max() + reach), core.mean(axis=0)
     start = level.copy()
-    for moved in (inner, *inner[:, None]):  # all at once, then each that may go farther alone
+    for moved in (inner, *inner[:, None]):  # all at once, then each that can be offset farther alone
         for distance in reach * 0.5 ** np.arange(6):
             wider = level.copy()
             wider[moved] = np.maximum(level[moved], start[moved] + distance)
@@ -191,7 +189,7 @@ def _grown(
 
 
 def _cut(center: Array, frame: float, normal: Array, level: Array) -> Array:
-    """What a square of half width `frame` about a centre has in all half planes normal . x <= level."""
+    """The intersection of a square of half width `frame` about a centre with half planes n . x <= level."""
     corners = center + frame * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     for n, d in zip(normal, level, strict=True):
         height = corners @ n - d

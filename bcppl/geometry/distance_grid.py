@@ -1,4 +1,4 @@
-"""The signed distance to a part on a grid, to be looked up where exact distances would take too long."""
+"""The signed distance to a part sampled on a grid and interpolated, where exact distances are too slow."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from bcppl.geometry.parts import Part
 Array = npt.NDArray[np.float64]
 
 SPACING = 0.001  # m
-_MOST = 2_000_000  # points of a grid
+_MOST = 2_000_000  # nodes of a grid
 
 
 class DistanceGrid(NamedTuple):
-    """Signed distances at the corners of a grid in the part's frame.
+    """Signed distances at the nodes of a grid in the part's frame.
 
     Attributes:
-        low: (3,) the first corner, metres.
-        spacing: between corners, metres.
+        low: (3,) the first node, metres.
+        spacing: between nodes, metres.
         distance: (X, Y, Z) metres, positive outside.
     """
 
@@ -33,25 +33,24 @@ class DistanceGrid(NamedTuple):
 
 
 def distance_grid(part: Part, signed: SignedDistance, margin: float) -> DistanceGrid:
-    """The grid of a part and `margin` metres around it.
+    """The grid over a part's bounding box and `margin` metres around it.
 
-    Between corners distances are interpolated: exactly where one plane is nearest, and within 0.9 spacings
-    elsewhere, for no distance changes faster than its argument. A large part has a wider spacing than 1 mm.
+    Trilinear interpolation is exact where one plane is closest, and within 0.9 spacings elsewhere, since the
+    distance has Lipschitz constant 1. A large part has a wider spacing than 1 mm.
     """
     low, high = part.vertices.min(axis=0) - margin, part.vertices.max(axis=0) + margin
     spacing = max(SPACING, float((np.prod(high - low) / _MOST) ** (1.0 / 3.0)))
     counts = np.ceil((high - low) / spacing).astype(int) + 1
     axes = [low[axis] + spacing * np.arange(counts[axis]) for axis in range(3)]
-    corners = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    distance = signed(torch.from_numpy(corners.reshape(-1, 3))).distance.numpy()
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    distance = signed(torch.from_numpy(nodes.reshape(-1, 3))).distance.numpy()
     return DistanceGrid(low, spacing, distance.reshape(*counts).astype(np.float32))
 
 
 @compiled
-def looked_up(
-    x: float, y: float, z: float, low: Array, spacing: float, distance: npt.NDArray[np.float32]
-) -> float:
-    """The interpolated distance at a point; beyond the grid that of its border, and the way to there."""
+def interpolated(x: float, y: float, z: float, grid: DistanceGrid) -> float:
+    """The interpolated distance at a point; outside the grid its boundary's plus the L1 distance to it."""
+    low, spacing, distance = grid
     count_x, count_y, count_z = distance.shape
     u, v, w = (x - low[0]) / spacing, (y - low[1]) / spacing, (z - low[2]) / spacing
     inside_u = min(max(u, 0.0), count_x - 1.000001)
@@ -71,32 +70,33 @@ def looked_up(
 
 
 @compiled
-def sloped(point: Array, low: Array, spacing: float, distance: npt.NDArray[np.float32], slope: Array) -> bool:
-    """Whether one plane alone is nearest around a point; `slope` (3,) becomes the gradient there."""
+def plane_gradient(point: Array, grid: DistanceGrid, gradient: Array) -> bool:
+    """Whether a single plane is closest around a point; `gradient` (3,) is set to the unit gradient there."""
+    low, spacing, distance = grid
     cell, share = np.empty(3, np.int64), np.empty(3)
     for axis in range(3):
         at = min(max((point[axis] - low[axis]) / spacing, 0.0), distance.shape[axis] - 1.000001)
         cell[axis] = int(at)
         share[axis] = at - cell[axis]
     i, j, k = cell
-    slope[:] = 0.0
+    gradient[:] = 0.0
     for corner in range(8):
         a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
         here = distance[i + a, j + b, k + c]
         wa = share[0] if a else 1.0 - share[0]
         wb = share[1] if b else 1.0 - share[1]
         wc = share[2] if c else 1.0 - share[2]
-        slope[0] += (2 * a - 1) * wb * wc * here
-        slope[1] += (2 * b - 1) * wa * wc * here
-        slope[2] += (2 * c - 1) * wa * wb * here
+        gradient[0] += (2 * a - 1) * wb * wc * here
+        gradient[1] += (2 * b - 1) * wa * wc * here
+        gradient[2] += (2 * c - 1) * wa * wb * here
     plane = True
     first = distance[i, j, k]
     for corner in range(8):
         a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
-        expected = first + a * slope[0] + b * slope[1] + c * slope[2]
+        expected = first + a * gradient[0] + b * gradient[1] + c * gradient[2]
         plane = plane and abs(distance[i + a, j + b, k + c] - expected) < 1e-6
-    length = np.sqrt((slope * slope).sum())
+    length = np.sqrt((gradient * gradient).sum())
     plane = plane and abs(length / spacing - 1.0) < 1e-3
     if length > 0.0:
-        slope /= length
+        gradient /= length
     return plane

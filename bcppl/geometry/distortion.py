@@ -1,8 +1,8 @@
-"""Brown's lens distortion, there and back, on the image plane z = 1.
+"""Brown's lens distortion and its inverse on the normalised image plane z = 1.
 
-A point (x, y) at radius r is seen at x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), and
+A point (x, y) at radius r is imaged at x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), and
 likewise in y with p1 and p2 exchanged: Brown, Decentering distortion of lenses, 1966, in the order of
-OpenCV's calibration: k1 k2 p1 p2 k3. The way back has no closed form and is found by Newton's method.
+OpenCV's calibration: k1 k2 p1 p2 k3. The inverse has no closed form and is computed by Newton's method.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from bcppl.errors import InputError
 
 Array = npt.NDArray[np.float64]
 
-LARGEST = 1e3  # on the plane z = 1: beyond it nothing is seen, and sixth powers stay finite
-MOST_STEPS = 50
-EXACT = 1e-12  # on the plane z = 1: a millionth of a millionth of the distance
-ALONG = 16  # points between the optical axis and a pixel at which a fold is looked for
+LARGEST = 1e3  # largest coordinate on the plane z = 1 that is imaged; sixth powers stay finite
+MOST_STEPS = 50  # of Newton's method
+EXACT = 1e-12  # residual on the plane z = 1
+ALONG = 16  # points between the optical axis and a pixel at which the Jacobian is checked for a fold
 
 
 def coefficients(distortion: tuple[float, ...]) -> tuple[float, float, float, float, float]:
-    """The five coefficients k1 k2 p1 p2 k3, those that are not given 0.
+    """The five coefficients k1 k2 p1 p2 k3, zero where not given.
 
     Raises:
-        InputError: there are neither none nor four nor five, or one is not finite.
+        InputError: there are not 0, 4 or 5 of them, or one is not finite.
     """
     if len(distortion) not in (0, 4, 5) or not np.isfinite(distortion).all():
         raise InputError(
@@ -38,7 +38,7 @@ def coefficients(distortion: tuple[float, ...]) -> tuple[float, float, float, fl
 
 
 def distorted(plane: Array, distortion: tuple[float, ...]) -> Array:
-    """Where points (..., 2) of the plane z = 1 appear on it, (..., 2)."""
+    """The distorted positions (..., 2) of points (..., 2) of the plane z = 1."""
     k1, k2, p1, p2, k3 = coefficients(distortion)
     x, y = plane[..., 0], plane[..., 1]
     square = x * x + y * y
@@ -52,8 +52,8 @@ def distorted(plane: Array, distortion: tuple[float, ...]) -> Array:
     )
 
 
-def _slopes(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array, Array]:
-    """Derivatives of `distorted`: of x by x, of x by y (and y by x: they are equal), of y by y."""
+def _jacobian(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array, Array]:
+    """The entries xx, xy = yx and yy of the Jacobian of `distorted`, which is symmetric."""
     k1, k2, p1, p2, k3 = coefficients(distortion)
     x, y = plane[..., 0], plane[..., 1]
     square = x * x + y * y
@@ -67,36 +67,36 @@ def _slopes(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array, 
 
 
 def unfolded(plane: Array, distortion: tuple[float, ...]) -> npt.NDArray[np.bool_]:
-    """Whether the image is not folded over anywhere between the optical axis and points (..., 2), (...,)."""
+    """Whether (...,) the distortion is injective from the optical axis to points (..., 2)."""
     within = np.abs(plane).max(axis=-1) <= LARGEST
     k1, k2, p1, p2, k3 = coefficients(distortion)
     if p1 == p2 == 0.0:
-        # The radius r (1 + k1 r^2 + ...) turns back where its derivative first vanishes.
+        # The distorted radius r (1 + k1 r^2 + ...) increases up to the first root of its derivative.
         roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
         turns = roots[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)].real
         return np.asarray(within & ((plane**2).sum(axis=-1) < min(turns, default=np.inf)))
-    # With tangential terms the lines to the points are walked, all points together.
+    # With tangential terms the Jacobian must stay positive definite along the lines to the points.
     for share in np.arange(1, ALONG + 1) / ALONG:
-        xx, xy, yy = _slopes(np.clip(plane, -LARGEST, LARGEST) * share, distortion)
+        xx, xy, yy = _jacobian(np.clip(plane, -LARGEST, LARGEST) * share, distortion)
         within = within & (xx * yy - xy * xy > 0.0) & (xx + yy > 0.0)
     return np.asarray(within)
 
 
 def undistorted(seen: Array, distortion: tuple[float, ...]) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """The points (..., 2) that appear at `seen` (..., 2), and where (...,) there is exactly one."""
+    """The points (..., 2) whose distorted positions are `seen` (..., 2); whether (...,) they are unique."""
     plane = seen.copy()
     for _ in range(MOST_STEPS):
         error = distorted(plane, distortion) - seen
         if float(np.abs(error).max(initial=0.0)) <= EXACT:
             break
-        xx, xy, yy = _slopes(plane, distortion)
+        xx, xy, yy = _jacobian(plane, distortion)
         determinant = xx * yy - xy * xy
         determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
         step_x = (yy * error[..., 0] - xy * error[..., 1]) / determinant
         step_y = (xx * error[..., 1] - xy * error[..., 0]) / determinant
         plane = np.clip(plane - np.stack([step_x, step_y], axis=-1), -LARGEST, LARGEST)
-    found = np.abs(distorted(plane, distortion) - seen).max(axis=-1) <= 1e3 * EXACT
-    return plane, found & unfolded(plane, distortion)
+    converged = np.abs(distorted(plane, distortion) - seen).max(axis=-1) <= 1e3 * EXACT
+    return plane, converged & unfolded(plane, distortion)
 
 
 @lru_cache(maxsize=16)
@@ -106,7 +106,7 @@ def undistorted_rays(
     intrinsics: tuple[float, float, float, float],
     distortion: tuple[float, ...],
 ) -> Array:
-    """Directions (height * width, 3) of the pixels, z = 1; worked out once for each set of numbers.
+    """Directions (height * width, 3) of the pixels' rays, z = 1, cached.
 
     Args:
         width: of the image, pixels.
@@ -115,19 +115,17 @@ def undistorted_rays(
         distortion: k1 k2 p1 p2 (k3).
 
     Raises:
-        InputError: the coefficients are none, or they fold the image over.
+        InputError: the number of coefficients is wrong, or they fold the image over.
     """
     fx, fy, cx, cy = intrinsics
-    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    seen = np.stack([(u - cx) / fx, (v - cy) / fy], axis=-1).reshape(-1, 2)
-    plane, sound = undistorted(seen, distortion)
+    plane, sound = undistorted((_pixels(width, height) - [cx, cy]) / [fx, fy], distortion)
     if not sound.all():
         first = int(np.argmin(sound))
         raise InputError(
             f"the distortion {[float(f'{k:.4g}') for k in distortion]} folds the image over: "
             f"{int((~sound).sum())} of {sound.size} pixels (column {first % width}, row {first // width} is "
-            "the first) see along no single ray; check the order k1 k2 p1 p2 k3, or calibrate with views "
-            "that reach the corners."
+            "the first) have no unique ray; check the order k1 k2 p1 p2 k3, or calibrate with views that "
+            "reach the corners."
         )
     rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
     rays.setflags(write=False)
@@ -141,15 +139,17 @@ def pinhole_shifts(
     intrinsics: tuple[float, float, float, float],
     distortion: tuple[float, ...],
 ) -> Array:
-    """How far (height, width, 2) a pinhole camera without distortion would see each pixel's ray away from it.
+    """Displacements (height, width, 2) from each pixel to its ray's projection without distortion, pixels.
 
-    In pixels, u then v, with the arguments of `undistorted_rays`; a renderer bounds a part's outline by it.
+    u then v, with the arguments of `undistorted_rays`; a renderer bounds a part's outline by them.
     """
     fx, fy, cx, cy = intrinsics
     rays = undistorted_rays(width, height, intrinsics, distortion)
-    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    shifts = np.stack(
-        [fx * rays[:, 0] + cx - u.reshape(-1), fy * rays[:, 1] + cy - v.reshape(-1)], axis=-1
-    ).reshape(height, width, 2)
+    shifts = (rays[:, :2] * [fx, fy] + [cx, cy] - _pixels(width, height)).reshape(height, width, 2)
     shifts.setflags(write=False)
     return shifts
+
+
+def _pixels(width: int, height: int) -> Array:
+    """The centres (height * width, 2) of an image's pixels, u then v."""
+    return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(float)

@@ -1,4 +1,4 @@
-"""What is known of a part's pose before anything is measured."""
+"""The support of the prior over a part's pose."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """What is known of the part's pose beforehand.
+    """A prior's support: poses of the part within bounds of a guessed pose.
 
     Attributes:
-        world_from_part: (7,) the pose about which the prior is centred.
-        translation: (3,) half widths of the box, metres, along the world's axes; 0 holds an axis fixed.
-        tilt: the largest angle between the part's z axis and its guess, radians; 0 holds it fixed.
-        yaw: the largest turn about the part's z axis, radians; 0 holds it fixed.
+        world_from_part: (7,) the guessed pose, the centre of the prior.
+        translation: (3,) half widths of a box along the world's axes, metres; 0 fixes an axis.
+        tilt: largest angle between the part's z axis and its guess, radians; 0 fixes it.
+        yaw: largest rotation about the part's z axis, radians; 0 fixes it.
         angle: if not None, the rotation is uniform within this angle (radians) of the guess, and
             `tilt` and `yaw` are not used.
     """

@@ -1,9 +1,10 @@
-"""Where a part has a hole along its z axis, and how a peg stands in it."""
+"""Holes along a part's z axis, the insertion pose of a peg in one, and its clearance."""
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,16 +15,17 @@ from shapely.affinity import rotate, translate
 
 from bcppl import poses
 from bcppl.errors import InputError
+from bcppl.geometry.layers import cross_section
 from bcppl.geometry.outlines import check_fit
 from bcppl.geometry.parts import Part
 
 Array = npt.NDArray[np.float64]
 
-_LEVEL = 1e-5  # m: corners nearer in height than this are of one level
-_LEAST = 0.0005  # m across: what is smaller is no hole for a peg
-_WIDER = 1e-5  # m by which a section is wider where a chamfer is
-_TURNS = 720  # yaws that are tried
-_OUT = 2e-6  # m by which a peg as wide as its hole stands out of it by rounding
+_LEVEL = 1e-5  # m: vertices closer in height than this lie on one level
+_LEAST = 0.0005  # m: smallest extent of a hole for a peg
+_WIDER = 1e-5  # m by which a chamfered section is wider, at least
+_TURNS = 720  # yaws of the grid search
+_OUT = 2e-6  # m by which a peg as wide as its hole protrudes by rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +33,12 @@ class Hole:
     """A hole in a part's top.
 
     Attributes:
-        part_from_hole: (7,) its frame: origin at the middle of its outline in the plane of the part's top, z
-            out of the material, x and y the part's.
-        outline: where it is narrowest, in its frame, metres.
+        part_from_hole: (7,) its frame: origin at the centroid of its outline in the plane of the part's top,
+            z out of the material, x and y the part's.
+        outline: its narrowest cross section, in its frame, metres.
         depth: below the top, metres.
-        chamfer: how far below the top it is wider than that, metres.
-        through: whether it has no bottom.
+        chamfer: depth of the part of it that is wider than its outline, metres.
+        through: whether it is a through hole.
     """
 
     part_from_hole: Array
@@ -47,24 +49,24 @@ class Hole:
 
 
 def hole_of(part: Part, inside: tuple[float, float] | None = None) -> Hole:
-    """The hole in a part's top, from sections of its mesh between the levels at which it has corners.
+    """The hole in a part's top, from cross sections of its mesh between the levels of its vertices.
 
     Args:
-        part: its z axis points out of its top; the walls of its hole are parallel to it, but for a chamfer.
-        inside: (x, y) in the part's frame of a point in the hole; needed where there are several.
+        part: its z axis points out of its top; the walls of its hole are parallel to z, except in a chamfer.
+        inside: (x, y) of a point in the hole, in the part's frame; needed where there are several holes.
 
     Raises:
         InputError: there is no hole in the top, none around the point, or there are several and no point is
             given.
     """
     levels = _levels(part)
-    found = [_rings(part, 0.5 * (a + b)) for a, b in itertools.pairwise(levels)]
-    if not found or not found[0]:
+    sections = [_rings(part, 0.5 * (a + b)) for a, b in itertools.pairwise(levels)]
+    if not sections or not sections[0]:
         raise InputError(
             f"part {part.name!r} has no hole in its top; give a part with a hole along its z axis, or turn "
             "it with `Part.moved` until the hole points up."
         )
-    first = found[0]
+    first = sections[0]
     if inside is not None:
         first = [ring for ring in first if ring.contains(shapely.Point(inside))]
         if not first:
@@ -72,11 +74,11 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None) -> Hole:
     if len(first) > 1:
         places = ", ".join(f"({p.centroid.x:.4f}, {p.centroid.y:.4f})" for p in first)
         raise InputError(
-            f"part {part.name!r} has {len(first)} holes in its top, at {places} m; say which with `inside`."
+            f"part {part.name!r} has {len(first)} holes in its top, at {places} m; choose one with `inside`."
         )
     middle, rings = first[0].centroid, []
-    for each in found:
-        around = [ring for ring in each if ring.contains(middle)]
+    for section in sections:
+        around = [ring for ring in section if ring.contains(middle)]
         if not around:
             break
         rings.append(around[0])
@@ -89,111 +91,95 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None) -> Hole:
         translate(ring, -centre[0], -centre[1]),
         top - levels[len(rings)],
         top - levels[narrowest],
-        len(rings) == len(found),
+        len(rings) == len(sections),
     )
 
 
-def hole_from_peg(hole: Hole, peg: Part) -> Array:
-    """How a peg stands in a hole, its tip in the plane of the part's top: (7,).
+class Fit(NamedTuple):
+    """How a peg fits a hole.
 
-    Where it fits in several ways the one that turns it least.
+    Attributes:
+        hole_from_peg: (7,) the insertion pose, the peg's tip in the plane of the part's top.
+        clearance: metres, of the diameter or between opposite flats.
+    """
+
+    hole_from_peg: Array
+    clearance: float
+
+
+def fit_in(hole: Hole, peg: Part) -> Fit:
+    """The insertion pose of a peg and its clearance; of several yaws that fit, the smallest.
 
     Raises:
-        InputError: the peg fits in no way.
+        InputError: the peg fits at no yaw.
     """
     low = float(peg.vertices[:, 2].min())
     outline = _cut(peg, low + 0.1 * float(peg.extent[2]))[0]
     held = np.array([outline.centroid.x, outline.centroid.y])
     centred = translate(outline, *-held)
 
-    # As wide as the peg, so that it fits in the middle of its play and nowhere else.
-    gap = max((hole.outline.area - centred.area) / hole.outline.length, 0.0)
-    narrowed = hole.outline.buffer(-gap, join_style="mitre", mitre_limit=100.0)
+    # Offset inwards to the peg's width, so that only the pose in the middle of the play fits.
+    play = max((hole.outline.area - centred.area) / hole.outline.length, 0.0)
+    narrowed = hole.outline.buffer(-play, join_style="mitre", mitre_limit=100.0)
+
+    def turned(yaw: float) -> shapely.Polygon:
+        return rotate(centred, yaw, origin=(0.0, 0.0), use_radians=True)
 
     def beyond(yaw: float) -> float:
-        """The area (m^2) that stands out."""
-        return float(rotate(centred, yaw, origin=(0.0, 0.0), use_radians=True).difference(narrowed).area)
+        """The area (m^2) of the peg outside the hole."""
+        return float(turned(yaw).difference(narrowed).area)
 
     yaw, nothing = 0.0, _OUT * float(centred.length)
     if beyond(0.0) > nothing:
         step = 2.0 * np.pi / _TURNS
-        tried = sorted((k * step for k in range(-_TURNS // 2, _TURNS // 2)), key=abs)
-        areas = np.array([beyond(yaw) for yaw in tried])
-        yaw = tried[int(np.flatnonzero(areas <= 1.5 * areas.min() + nothing)[0])]
+        yaws = sorted((k * step for k in range(-_TURNS // 2, _TURNS // 2)), key=abs)
+        areas = np.array([beyond(yaw) for yaw in yaws])
+        yaw = yaws[int(np.flatnonzero(areas <= 1.5 * areas.min() + nothing)[0])]
         yaw = float(minimize_scalar(beyond, bounds=(yaw - step, yaw + step), method="bounded").x)
-    turned = rotate(centred, yaw, origin=(0.0, 0.0), use_radians=True)
     try:
-        check_fit(hole.outline, turned)
+        clearance = check_fit(hole.outline, turned(yaw))
     except InputError as error:
         raise InputError(f"peg {peg.name!r} does not fit the hole: {error}") from None
-    turn = np.array([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw)])
+    rotation = np.array([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw)])
     shift = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ held
-    return np.concatenate([-shift, [-low], turn])
-
-
-def clearance_in(hole: Hole, peg: Part) -> float:
-    """The clearance (m) that a peg has in a hole, of the diameter or of opposite flats.
-
-    Raises:
-        InputError: the peg does not fit.
-    """
-    pose = hole_from_peg(hole, peg)
-    outline = _cut(peg, float(peg.vertices[:, 2].min()) + 0.1 * float(peg.extent[2]))[0]
-    yaw = 2.0 * np.arctan2(pose[6], pose[3])
-    turned = rotate(outline, yaw, origin=(0.0, 0.0), use_radians=True)
-    return check_fit(hole.outline, translate(turned, *pose[:2]))
+    return Fit(np.concatenate([-shift, [-low], rotation]), clearance)
 
 
 def depth_reached(hole: Hole, peg: Part, part_from_peg: Array) -> Array:
-    """How deep (...) the lowest end of a peg is below the plane of the part's top, metres.
-
-    Args:
-        hole: in the part.
-        peg: what is held.
-        part_from_peg: (..., 7).
-    """
+    """The depth (...) of a peg's tip below the plane of the part's top at poses (..., 7), metres."""
     tip = torch.tensor([[0.0, 0.0, float(peg.vertices[:, 2].min())]], dtype=torch.float64)
     there = poses.transform(torch.as_tensor(part_from_peg), tip)[..., 0, :]
     return np.asarray(hole.part_from_hole[2] - there[..., 2].numpy())
 
 
-def aside_of(hole: Hole, peg: Part, part_from_peg: Array) -> Array:
-    """How far (...) a peg's tip is from the hole's axis, beyond what its clearance leaves it, metres.
+def lateral_error(hole: Hole, peg: Part, part_from_peg: Array) -> Array:
+    """The distance (...) of a peg's tip from the hole's axis beyond the clearance, at poses (..., 7), metres.
 
-    It is 0 for a peg in its hole, but for what a tilt adds; depth alone does not tell a peg in a hole from
-    one beside the part.
-
-    Args:
-        hole: in the part.
-        peg: what is held.
-        part_from_peg: (..., 7).
+    It is 0 for an upright peg in its hole; depth alone does not distinguish a peg in the hole from one beside
+    the part.
 
     Raises:
         InputError: the peg does not fit.
     """
-    stands = torch.from_numpy(hole_from_peg(hole, peg))
-    tip = poses.inverse(stands)[None, :3]
+    fit = fit_in(hole, peg)
+    tip = poses.inverse(torch.from_numpy(fit.hole_from_peg))[None, :3]
     there = poses.transform(torch.as_tensor(part_from_peg), tip)[..., 0, :2].numpy()
     off = np.linalg.norm(there - hole.part_from_hole[:2], axis=-1)
-    return np.asarray(np.maximum(off - clearance_in(hole, peg), 0.0))
+    return np.asarray(np.maximum(off - fit.clearance, 0.0))
 
 
 def _levels(part: Part) -> Array:
-    """The heights at which a mesh has corners, the highest first, metres."""
+    """The heights of a mesh's vertices, the highest first, metres."""
     heights = np.sort(part.vertices[:, 2])[::-1]
     return heights[np.concatenate([[True], np.diff(heights) < -_LEVEL])]
 
 
 def _rings(part: Part, height: float) -> list[shapely.Polygon]:
-    """The holes of a section, in the part's x-y plane."""
+    """The holes of a cross section, in the part's x-y plane."""
     rings = [shapely.Polygon(ring) for cut in _cut(part, height) for ring in cut.interiors]
     return [ring for ring in rings if min(np.ptp(shapely.get_coordinates(ring), axis=0)) > _LEAST]
 
 
 def _cut(part: Part, height: float) -> list[shapely.Polygon]:
-    """A section of the mesh at a height, the largest polygon first, in the part's x-y plane."""
-    path = part.mesh.section(plane_origin=[0.0, 0.0, height], plane_normal=[0.0, 0.0, 1.0])
-    if path is None:
-        return []
-    planar, _ = path.to_2D(to_2D=np.eye(4))
-    return sorted((p.buffer(0.0) for p in planar.polygons_full), key=lambda p: -p.area)
+    """The polygons of a cross section, the largest first."""
+    return sorted(cross_section(part.mesh, height), key=lambda p: -p.area)

@@ -1,4 +1,4 @@
-"""Meshes of walls along one axis, faces across it, and chamfers, as exact convex prisms."""
+"""Convex prisms from the cross sections of a mesh: walls along one axis, faces across it, and chamfers."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from scipy.spatial import cKDTree
 from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.geometry.cover import Cell, convex_cells, grown_in, polygons_of, straightened
-from bcppl.geometry.extrusion import RAMP, REACH
-from bcppl.geometry.fidelity import geometric_error
+from bcppl.geometry.extrusion import BEVEL, OVERLAP
+from bcppl.geometry.hausdorff import hausdorff_error
 from bcppl.geometry.parts import Part, Piece
 
 Array = npt.NDArray[np.float64]
 
-_LEVEL = 2e-6  # m: corners nearer in height than this are of one level; files round to 1e-6
-_FLAT = 2e-3  # radians within which two faces are one plane, or a face is a wall: rounding again
-_MANY = 256  # corners from which on a convex part, too, is drawn anew from its sections
+_LEVEL = 2e-6  # m: vertices closer in height than this lie on one level; files round to 1e-6
+_FLAT = 2e-3  # radians: faces that differ by less are coplanar, or vertical: rounding again
+_MANY = 256  # vertices from which on a convex part, too, is rebuilt from its sections
 _ROTATIONS = {"x": np.roll(np.eye(3), 2, axis=0), "y": np.roll(np.eye(3), 1, axis=0), "z": np.eye(3)}
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """What a solid is between two levels: upright, or tapering evenly from one section to another.
+    """A slab of a solid between two levels: a prism, or tapered linearly from one section to another.
 
     Attributes:
         bottom: height of the lower level, metres.
         top: height of the upper level, metres.
         low: the section at the bottom.
-        high: the section at the top, corner by corner where the one at the bottom goes; upright: the same.
+        high: the section at the top, vertex by vertex that of the bottom moved; a prism: the same object.
     """
 
     bottom: float
@@ -49,24 +49,24 @@ class Layer:
 
 
 def prismatic(part: Part, axis: str = "z", tolerance: float = 5e-6) -> Part:
-    """The same part with convex prisms as its pieces, from the cross sections of its mesh.
+    """The part with convex prisms as its pieces, constructed from the cross sections of its mesh.
 
-    Between two levels the mesh's walls are parallel to the axis, or taper evenly as a chamfer does. Corners
-    of an outline that lie within the tolerance of a straight line are dropped. Prisms reach through other
-    levels as far as those are solid there too, so that a wall that goes on has no seam.
+    Between two levels the mesh's walls are parallel to the axis, or taper linearly as a chamfer does.
+    Vertices of an outline within the tolerance of a straight line are dropped. Prisms extend through other
+    levels as far as the solid does, so that a continuous wall has no seam.
 
     Args:
         part: with a closed mesh.
         axis: of the prisms, "x", "y" or "z".
-        tolerance: metres by which an outline may be off the mesh's. At 5 um a bore of 9 mm has 72 sides.
+        tolerance: largest deviation of an outline, metres. At 5 um a bore of 9 mm has 72 sides.
 
     Raises:
         InputError: the mesh is empty, open, inside out, in millimetres, or has faces that are neither
-            walls, levels nor chamfers, so that pieces are off by more than twice the tolerance; or the
-            tolerance is not above 0.
+            walls, levels nor chamfers, so that the Hausdorff error of the pieces exceeds twice the tolerance;
+            or the tolerance is not above 0.
     """
     part.check()
-    number_within(f"part {part.name!r} is to be made of prisms with tolerance {{}}", tolerance, above=0.0)
+    number_within(f"part {part.name!r} is decomposed into prisms with tolerance {{}}", tolerance, above=0.0)
     if axis not in _ROTATIONS:
         raise InputError(f"the axis of part {part.name!r} is {axis!r}; give 'x', 'y' or 'z'.")
     rotation = _ROTATIONS[axis]
@@ -78,12 +78,12 @@ def prismatic(part: Part, axis: str = "z", tolerance: float = 5e-6) -> Part:
     else:
         pieces = _pieces(_layers(mesh, tolerance), tolerance)
     made = replace(part, pieces=tuple(replace(p, size=p.size @ rotation) for p in pieces))
-    error = geometric_error(made, count=5000) if pieces else None
+    error = hausdorff_error(made, count=5000) if pieces else None
     if error is None or error.largest > 2 * tolerance + _LEVEL:
-        off = "nothing is left" if error is None else f"they are off by {1000 * error.largest:.2g} mm"
+        off = "none remain" if error is None else f"their error is {1000 * error.largest:.2g} mm"
         raise InputError(
-            f"part {part.name!r} is not made of walls along {axis}, faces across it and chamfers (as prisms "
-            f"{off}); give another axis, or take it apart with `decomposed`."
+            f"part {part.name!r} does not consist of walls along {axis}, faces across it and chamfers (of "
+            f"its prisms {off}); give another axis, or decompose it with `decomposed`."
         )
     return made
 
@@ -91,13 +91,13 @@ def prismatic(part: Part, axis: str = "z", tolerance: float = 5e-6) -> Part:
 def hole_outline(
     part: Part, height: float, inside: tuple[float, float] = (0.0, 0.0), tolerance: float = 5e-6
 ) -> shapely.Polygon:
-    """The outline of the hole around a point in a cross section, in the part's x-y plane, metres.
+    """The outline of a hole in a cross section, in the part's x-y plane, metres.
 
     Args:
         part: with a closed mesh.
         height: z of the section, metres.
         inside: a point in the hole.
-        tolerance: metres within which corners that lie on a straight line are dropped, as by `prismatic`.
+        tolerance: vertices within this distance of a straight line are dropped, metres, as by `prismatic`.
 
     Raises:
         InputError: there is no hole around the point.
@@ -113,7 +113,7 @@ def hole_outline(
 
 
 def _levels(mesh: trimesh.Trimesh) -> list[float]:
-    """The heights of the horizontal edges where the surface bends: between them all faces go on evenly."""
+    """Heights of the horizontal edges at which the surface bends; between them all faces are planar."""
     bent = mesh.face_adjacency_angles > _FLAT
     ends = mesh.vertices[mesh.face_adjacency_edges[bent], 2]
     sloped = np.abs(mesh.face_normals[mesh.face_adjacency[bent], 2]).max(axis=1) > _FLAT
@@ -124,7 +124,7 @@ def _levels(mesh: trimesh.Trimesh) -> list[float]:
 
 
 def _layers(mesh: trimesh.Trimesh, tolerance: float) -> list[Layer]:
-    """The solid from level to level; sections that are the same are the same object."""
+    """The slabs of a solid, bottom to top; sections that agree are one object."""
     layers: list[Layer] = []
     for bottom, top in itertools.pairwise(_levels(mesh)):
         inset = 0.01 * (top - bottom)
@@ -138,36 +138,38 @@ def _layers(mesh: trimesh.Trimesh, tolerance: float) -> list[Layer]:
     return layers
 
 
+def cross_section(mesh: trimesh.Trimesh, height: float) -> list[shapely.Polygon]:
+    """The polygons in which a mesh meets the plane z = height (m), in its x-y plane."""
+    path = mesh.section(plane_normal=[0.0, 0.0, 1.0], plane_origin=[0.0, 0.0, height])
+    return [] if path is None else [p.buffer(0.0) for p in path.to_2D(to_2D=np.eye(4))[0].polygons_full]
+
+
 def _section(mesh: trimesh.Trimesh, height: float) -> shapely.MultiPolygon:
-    cut = mesh.section(plane_normal=[0.0, 0.0, 1.0], plane_origin=[0.0, 0.0, height])
-    if cut is None:
-        return shapely.MultiPolygon()
-    flat, _ = cut.to_2D(to_2D=np.eye(4))
-    return shapely.MultiPolygon(polygons_of(shapely.union_all([p.buffer(0) for p in flat.polygons_full])))
+    return shapely.MultiPolygon(polygons_of(shapely.union_all(cross_section(mesh, height))))
 
 
 def _known(layers: list[Layer], section: shapely.MultiPolygon, tolerance: float) -> shapely.MultiPolygon:
-    """The section of a layer below if it is the same, else this one without the corners that are none."""
+    """The section of a layer below that agrees with this one, else this one without collinear vertices."""
     simple = shapely.simplify(section, tolerance)
     if isinstance(simple, shapely.Polygon):
         simple = shapely.MultiPolygon([simple])
-    alike = (k.high for k in reversed(layers) if _same(k.high, simple, tolerance + _LEVEL))
-    return next(alike, simple)
+    equal = (k.high for k in reversed(layers) if _same(k.high, simple, tolerance + _LEVEL))
+    return next(equal, simple)
 
 
 def _same(a: shapely.Geometry, b: shapely.Geometry, tolerance: float) -> bool:
-    """Whether two sections are the same but for a strip no wider than the tolerance on either side."""
+    """Whether the Hausdorff distance between two sections is at most the tolerance."""
     return bool(a.buffer(tolerance).covers(b) and b.buffer(tolerance).covers(a))
 
 
 def _corners_at(mesh: trimesh.Trimesh, height: float, section: shapely.Geometry, reach: float) -> Array:
-    """The mesh's corners (K, 2) at a height that lie within a reach of a section's outline."""
+    """The mesh's vertices (K, 2) at a height within a distance `reach` of a section's outline."""
     level = mesh.vertices[np.abs(mesh.vertices[:, 2] - height) < _LEVEL][:, :2]
     return np.asarray(level[shapely.distance(shapely.points(level), section.boundary) <= reach])
 
 
 def _moved(section: shapely.MultiPolygon, far: shapely.MultiPolygon, corners: Array) -> shapely.MultiPolygon:
-    """A section with its corners at the nearest of some others; those on the far outline stay."""
+    """A section with each vertex moved to the nearest of some corners, unless it is on the far outline."""
     if len(corners) == 0:
         return shapely.transform(section, np.copy)
     tree = cKDTree(corners)
@@ -180,8 +182,8 @@ def _moved(section: shapely.MultiPolygon, far: shapely.MultiPolygon, corners: Ar
 
 
 def _pieces(layers: list[Layer], tolerance: float) -> list[Piece]:
-    """Convex pieces: upright layers with the chamfers that cut them back, then the other chamfers."""
-    found, used = [], set()
+    """Convex pieces: upright layers with the chamfers that cap them, then the other chamfers."""
+    pieces, used = [], set()
     for k, layer in enumerate(layers):
         if not layer.upright or layer.low.is_empty:
             continue
@@ -192,19 +194,19 @@ def _pieces(layers: list[Layer], tolerance: float) -> list[Piece]:
             caps[1] = (layers[k + 1].top, layers[k + 1].high)
         caps = {d: c for d, c in caps.items() if layer.low.buffer(_LEVEL).covers(c[1])}
         used |= {k + d for d in caps}
-        found += _columns(k, layers, caps, tolerance)
+        pieces += _columns(k, layers, caps, tolerance)
     for k, layer in enumerate(layers):
         if k not in used and not layer.upright and not layer.low.is_empty:
             alone = [Layer(layer.bottom, layer.bottom, layer.low, layer.low)]
-            found += _columns(0, alone, {1: (layer.top, layer.high)}, tolerance)
-    return found
+            pieces += _columns(0, alone, {1: (layer.top, layer.high)}, tolerance)
+    return pieces
 
 
 def _columns(
     k: int, layers: list[Layer], caps: dict[int, tuple[float, shapely.MultiPolygon]], tolerance: float
 ) -> list[Piece]:
-    """The pieces of layer `k` with its caps (-1 below, 1 above: where they end, and their section there)."""
-    drawn, cells = layers[k].low, convex_cells(layers[k].low, REACH)
+    """The pieces of layer `k` with its caps: end height and end section, by direction (-1 below, 1 above)."""
+    drawn, cells = layers[k].low, convex_cells(layers[k].low, OVERLAP)
     shapely.prepare(drawn)
     hulls: list[list[Array]] = [[] for _ in cells]
     for direction in (-1, 1):
@@ -219,7 +221,7 @@ def _columns(
 
 
 def _upright_end(cell: Cell, layers: list[Layer], k: int, direction: int) -> list[Array]:
-    """Corners (C, 3) of one end of a cell that goes on through upright layers as far as they are solid."""
+    """Vertices (C, 3) of one end of a cell, extended through upright layers as far as they are solid."""
     grown = shapely.Polygon(cell.grown)
     while 0 <= k + direction < len(layers):
         beyond = layers[k + direction]
@@ -227,8 +229,8 @@ def _upright_end(cell: Cell, layers: list[Layer], k: int, direction: int) -> lis
             break
         k += direction
     end = layers[k].bottom if direction < 0 else layers[k].top
-    ramp = min(RAMP, 0.25 * (layers[k].top - layers[k].bottom))
-    return [np.insert(cell.core, 2, end, axis=1), np.insert(cell.grown, 2, end - direction * ramp, axis=1)]
+    bevel = min(BEVEL, 0.25 * (layers[k].top - layers[k].bottom))
+    return [np.insert(cell.core, 2, end, axis=1), np.insert(cell.grown, 2, end - direction * bevel, axis=1)]
 
 
 def _capped(
@@ -240,22 +242,22 @@ def _capped(
     direction: int,
     tolerance: float,
 ) -> list[list[Array]]:
-    """For each cell the corners (C, 3) of an end that a chamfer cuts back, from `rest` to `end`."""
+    """For each cell the vertices (C, 3) of an end capped by a chamfer, from height `rest` to `end`."""
     pairs = zip(shapely.get_coordinates(drawn).tolist(), shapely.get_coordinates(section), strict=True)
     goes = {tuple(a): b for a, b in pairs}
     halfway = shapely.transform(
         drawn, lambda points: np.array([0.5 * (p + goes[tuple(p.tolist())]) for p in points])
     )
     shapely.prepare(allowed := halfway.buffer(0.2 * tolerance))
-    found = []
+    capped = []
     cores = [np.array([goes.get(tuple(p.tolist()), p) for p in cell.core]) for cell in cells]
-    wide = grown_in(section, [straightened(core) for core in cores], REACH)
+    wide = grown_in(section, [straightened(core) for core in cores], OVERLAP)
     wide = [wider if len(wider) > 2 else core for wider, core in zip(wide, cores, strict=True)]
     for cell, core, wider in zip(cells, cores, wide, strict=True):
         corners = [np.insert(cell.core, 2, rest, axis=1), np.insert(core, 2, end, axis=1)]
         both = 0.5 * (cell.grown[:, None] + wider[None]).reshape(-1, 2)
         if allowed.covers(shapely.MultiPoint(both).convex_hull):
             corners += [np.insert(cell.grown, 2, rest, axis=1)]
-            corners += [np.insert(wider, 2, end - direction * min(RAMP, 0.25 * abs(end - rest)), axis=1)]
-        found.append(corners)
-    return found
+            corners += [np.insert(wider, 2, end - direction * min(BEVEL, 0.25 * abs(end - rest)), axis=1)]
+        capped.append(corners)
+    return capped

@@ -12,24 +12,24 @@ from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 
-LARGEST_UNSCALED = 1.0  # m: what is longer is a mesh in millimetres unless a scale says otherwise
+LARGEST_UNSCALED = 1.0  # m: a larger mesh without a stated scale is in millimetres
 
 
 def load_mesh(
     path: str | Path, name: str | None = None, scale: float | None = None, source: str = ""
 ) -> Part:
-    """A part from an OBJ, STL, PLY or other mesh file that trimesh reads, checked, without pieces yet.
+    """A part from an OBJ, STL, PLY or other mesh file that trimesh reads, checked, without convex pieces.
 
-    Vertices that a file holds several times, for their normals or texture or because STL has it so, are
-    merged: without it most closed meshes look open. All bodies of a file become one part. A mesh that is
-    inside out is turned right side out, with a warning. A peg's frame must have its origin at the wrench
-    sensor, above the tip: where the file has it elsewhere, use `Part.moved`.
+    Duplicate vertices, as of STL files and of seams of normals or textures, are merged: otherwise most closed
+    meshes look open. All bodies of a file become one part. A mesh that is inside out is inverted, with a
+    warning. A peg's frame must have its origin at the wrench sensor, above the tip: where the file has it
+    elsewhere, use `Part.moved`.
 
     Args:
         path: the file; its coordinates are the part's frame.
         name: the part's name; None for the file's.
-        scale: metres for one unit of the file: 0.001 for millimetres. None takes metres, and refuses what is
-            longer than 1 m then: a small part in millimetres would be a large one in metres.
+        scale: metres per unit of the file: 0.001 for millimetres. None assumes metres, and refuses a part
+            longer than 1 m: a small part in millimetres would be a large one in metres.
         source: attribution and licence.
 
     Raises:
@@ -41,7 +41,7 @@ def load_mesh(
         raise InputError(f"there is no mesh file {path}; give the path of an OBJ, STL or PLY file.")
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:  # every format has a reader of its own, with errors of its own
+    except Exception as error:  # every format has its own reader with its own errors
         raise InputError(
             f"mesh file {path} cannot be read ({error}); export it again as OBJ or STL."
         ) from error
@@ -52,7 +52,7 @@ def load_mesh(
     if len(mesh.faces) and mesh.is_watertight and mesh.volume < 0:
         mesh.invert()
         warnings.warn(
-            f"mesh file {path} is inside out; its faces are turned round.", RuntimeWarning, stacklevel=2
+            f"mesh file {path} is inside out; its faces are inverted.", RuntimeWarning, stacklevel=2
         )
     vertices = factor * np.asarray(mesh.vertices, dtype=np.float64)
     part = Part(name or path.stem, vertices, np.asarray(mesh.faces, dtype=np.int64), (), source)

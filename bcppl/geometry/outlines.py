@@ -1,25 +1,25 @@
-"""Outlines of holes by name, blocks with such a hole, and the pegs that go in with a stated clearance."""
+"""Outlines of holes and pegs: plane polygons by name, checked, and the clearance of one in another."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
 import numpy.typing as npt
 import shapely
-from shapely.affinity import rotate, translate
 
 from bcppl.arguments import number_within
 from bcppl.errors import InputError
-from bcppl.geometry.extrusion import check_outline, extruded
-from bcppl.geometry.parts import Part, Piece
+from bcppl.geometry.parts import LARGEST_EXTENT
 
-SIDES = 64  # of a round outline: at a diameter of 16 mm it is off the circle by 5 um either way
+SIDES = 64  # of a round outline: at a diameter of 16 mm it deviates from the circle by 5 um either way
+_TOUCHING = 1e-9  # m: a wall thinner than this has no thickness in MuJoCo's single precision
 
 
 def round_outline(diameter: float, sides: int = SIDES) -> shapely.Polygon:
-    """A circle as a regular polygon, as much outside the circle at its corners as inside at its sides.
+    """A circle as a regular polygon, as far outside the circle at its corners as inside at its sides.
 
     Either error is radius * tan(pi / (2 * sides))^2: with 64 sides 5 um at a diameter of 16 mm, 48 sides
     9 um, 32 sides 19 um. A corner lies on the x axis.
@@ -31,26 +31,26 @@ def round_outline(diameter: float, sides: int = SIDES) -> shapely.Polygon:
     Raises:
         InputError: the diameter is not positive or there are fewer than three sides.
     """
-    _positive("a round outline", diameter=diameter)
+    positive("a round outline", diameter=diameter)
     if sides < 3:
         raise InputError(f"a round outline has {sides} sides; give at least three.")
     return shapely.Polygon(_arc(diameter, 0.0, 2.0 * math.pi, sides, closed=True))
 
 
 def roundness_error(diameter: float, sides: int = SIDES) -> float:
-    """How far `round_outline` is from its circle, either way, metres."""
+    """The largest distance between `round_outline` and its circle, inwards and outwards, metres."""
     return 0.5 * diameter * math.tan(math.pi / (2 * sides)) ** 2
 
 
 def rectangular_outline(width: float, breadth: float) -> shapely.Polygon:
     """A rectangle, `width` along x and `breadth` along y, metres, centred at the origin."""
-    _positive("a rectangular outline", width=width, breadth=breadth)
+    positive("a rectangular outline", width=width, breadth=breadth)
     return shapely.box(-0.5 * width, -0.5 * breadth, 0.5 * width, 0.5 * breadth)
 
 
 def hexagonal_outline(across_flats: float) -> shapely.Polygon:
-    """A regular hexagon, `across_flats` metres from side to side, a corner on the x axis."""
-    _positive("a hexagonal outline", across_flats=across_flats)
+    """A regular hexagon, `across_flats` metres between opposite sides, a corner on the x axis."""
+    positive("a hexagonal outline", across_flats=across_flats)
     angles = math.pi / 3.0 * np.arange(6)
     return shapely.Polygon(across_flats / math.sqrt(3.0) * np.stack([np.cos(angles), np.sin(angles)], axis=1))
 
@@ -60,13 +60,13 @@ def d_outline(diameter: float, flat: float, sides: int = SIDES) -> shapely.Polyg
 
     Args:
         diameter: of the circle, metres.
-        flat: from the flat, which faces +x, to the far side of the circle, metres.
+        flat: from the flat, which faces +x, to the opposite side of the circle, metres.
         sides: of the polygon that a full circle would be.
 
     Raises:
         InputError: the flat does not cut the circle.
     """
-    _positive("a D-shaped outline", diameter=diameter, flat=flat)
+    positive("a D-shaped outline", diameter=diameter, flat=flat)
     if flat >= diameter:
         raise InputError(
             f"the flat of a D-shaped outline is {flat:g} m from the far side of a circle of {diameter:g} m; "
@@ -79,7 +79,7 @@ def d_outline(diameter: float, flat: float, sides: int = SIDES) -> shapely.Polyg
 def keyed_outline(
     diameter: float, key_width: float, key_height: float, sides: int = SIDES
 ) -> shapely.Polygon:
-    """A circle with a key that stands out of it towards +x: a keyway in a hole, a feather on a peg.
+    """A circle with a key towards +x: a keyway in a hole, a feather on a peg.
 
     Args:
         diameter: of the circle, metres.
@@ -90,7 +90,7 @@ def keyed_outline(
     Raises:
         InputError: the key is as wide as the circle or wider.
     """
-    _positive("a keyed outline", diameter=diameter, key_width=key_width, key_height=key_height)
+    positive("a keyed outline", diameter=diameter, key_width=key_width, key_height=key_height)
     if key_width >= diameter:
         raise InputError(
             f"the key is {key_width:g} m wide on a circle of {diameter:g} m; make it narrower than that."
@@ -101,7 +101,7 @@ def keyed_outline(
     return shapely.Polygon(np.concatenate([arc, [[top, -side], [top, side]]]))
 
 
-# Outlines of one size, metres: what it measures across.
+# Outlines of one size: the diameter or the distance across flats, metres.
 NAMED: Mapping[str, Callable[[float], shapely.Polygon]] = {
     "round": round_outline,
     "square": lambda size: rectangular_outline(size, size),
@@ -115,7 +115,7 @@ NAMED: Mapping[str, Callable[[float], shapely.Polygon]] = {
 def named_outline(name: str, size: float = 0.016) -> shapely.Polygon:
     """The outline of a name in `NAMED`: round, square, rectangle, hexagon, D or keyway.
 
-    A rectangle is 10 mm broad for 16 mm of size, a D is 14 mm to its flat, a key is 5 mm wide and 3 mm high.
+    At a size of 16 mm a rectangle is 10 mm broad, a D is 14 mm to its flat, a key is 5 mm wide and 3 mm high.
 
     Raises:
         InputError: there is no such name.
@@ -125,74 +125,42 @@ def named_outline(name: str, size: float = 0.016) -> shapely.Polygon:
     return NAMED[name](size)
 
 
-def block_with_hole(
-    hole: shapely.Polygon,
-    size: tuple[float, float, float] = (0.06, 0.06, 0.025),
-    offset: tuple[float, float] = (0.0, 0.0),
-    turn: float = 0.0,
-    name: str = "block with a hole",
-) -> Part:
-    """A rectangular block with a hole of any outline through it.
-
-    The part's frame is that of `shapes.block_with_square_hole`: origin at the centre of the outer block's top
-    face, x and y along its sides, z up, out of the material.
-
-    Args:
-        hole: the hole's outline in its own frame, metres, without holes of its own.
-        size: outer side lengths along x, y and z, metres.
-        offset: where the origin of the hole's outline lies in the part's frame, metres.
-        turn: of the hole about z, radians.
-        name: the part's name.
+def check_outline(outline: shapely.Polygon, name: str) -> None:
+    """Refuse an outline that cannot be extruded.
 
     Raises:
-        InputError: the outline is not valid, a number is not finite, or the hole does not lie inside the
-            block.
+        InputError: it is empty, crosses itself, has a hole that touches its border or another hole, is in
+            several pieces, or is probably in millimetres.
     """
-    _positive(name, size_x=size[0], size_y=size[1], size_z=size[2])
-    check_outline(hole, f"hole of {name}")
-    number_within(f"the hole of {name!r} has turn {{}}", turn)
-    if len(offset) != 2:
-        raise InputError(f"the hole of {name!r} has offset {offset!r}; give its x and y in metres.")
-    for axis, value in zip("xy", offset, strict=True):
-        number_within(f"the hole of {name!r} has offset {{}} along {axis}", value)
-    placed = translate(rotate(hole, turn, origin=(0.0, 0.0), use_radians=True), *offset)
-    outer = rectangular_outline(size[0], size[1])
-    if not outer.contains_properly(placed):
-        low, high = np.reshape(placed.bounds, (2, 2))
+    if not isinstance(outline, shapely.Polygon):
+        kind = getattr(outline, "geom_type", type(outline).__name__)
         raise InputError(
-            f"the hole of {name!r} spans {low.tolist()} to {high.tolist()} m and does not lie inside a block "
-            f"of {size[0]:g} m by {size[1]:g} m; make it smaller or move it."
+            f"the outline of {name!r} is a {kind}; give one shapely.Polygon, a part for each piece."
         )
-    return extruded(name, shapely.Polygon(outer.exterior, [placed.exterior]), -size[2], 0.0)
-
-
-def peg_for(hole: shapely.Polygon, clearance: float, length: float, name: str = "peg") -> Part:
-    """The peg that goes into a hole with a stated clearance: half of it to each side.
-
-    The peg's frame is that of `shapes.box_peg`: origin at the wrench sensor, above the origin of the hole's
-    outline once the peg is in, its axes parallel to the outline's; the tip is at z = -length.
-
-    Args:
-        hole: the hole's outline, metres.
-        clearance: of the diameter, or of opposite flats, metres.
-        length: from the sensor to the tip, metres.
-        name: the part's name.
-
-    Raises:
-        InputError: the outline is not valid, the clearance is not positive, or it leaves no peg in one piece.
-    """
-    check_outline(hole, f"hole for {name}")
-    _positive(name, clearance=clearance, length=length)
-    outline = hole.buffer(-0.5 * clearance, join_style="mitre", mitre_limit=100.0)
-    if outline.is_empty or not isinstance(outline, shapely.Polygon):
+    if outline.is_empty or not outline.is_valid:
         raise InputError(
-            f"a clearance of {clearance:g} m leaves no peg in one piece for {name!r}; make it smaller."
+            f"the outline of {name!r} is empty or no simple polygon ({shapely.is_valid_reason(outline)}); "
+            "draw sides that do not cross and holes that lie inside."
         )
-    return extruded(name, outline, -length, 0.0)
+    border = outline.exterior
+    for a, b in itertools.combinations([border, *outline.interiors], 2):
+        if shapely.distance(a, b) < _TOUCHING:
+            x, y = shapely.get_coordinates(shapely.shortest_line(a, b))[0]
+            beside = "its border" if a is border else "another"
+            raise InputError(
+                f"the outline of {name!r} has a hole that touches {beside} at ({x:.6g}, {y:.6g}) m; move the "
+                "hole, or cut the wall open there."
+            )
+    low, high = np.reshape(outline.bounds, (2, 2))
+    if (high - low).max() > LARGEST_EXTENT:
+        raise InputError(
+            f"the outline of {name!r} is {(high - low).max():.0f} m long: it is probably in millimetres; "
+            "scale it by 0.001 to metres."
+        )
 
 
 def check_fit(hole: shapely.Polygon, peg: shapely.Polygon) -> float:
-    """The clearance (m) that a peg's outline has in a hole's, both in one frame: twice the narrowest gap.
+    """The clearance (m) of a peg's outline in a hole's, both in one frame: twice their minimum distance.
 
     Raises:
         InputError: the peg does not fit, or an outline is not valid.
@@ -212,19 +180,10 @@ def check_fit(hole: shapely.Polygon, peg: shapely.Polygon) -> float:
     return 2.0 * float(shapely.distance(peg, hole.boundary))
 
 
-def cylinder_peg(diameter: float, length: float, name: str = "cylindrical peg") -> Part:
-    """A round peg that is touched as an exact cylinder; its frame is that of `shapes.box_peg`.
-
-    Pressed flat on a plane its centre of pressure is less exact than a prism's, `shapes.round_peg`.
-
-    Args:
-        diameter: metres.
-        length: from the sensor to the tip, metres.
-        name: the part's name.
-    """
-    drawn = extruded(name, round_outline(diameter), -length, 0.0)
-    piece = Piece("cylinder", np.array([0.5 * diameter, 0.5 * length]), np.array([0.0, 0.0, -0.5 * length]))
-    return Part(name, drawn.vertices, drawn.faces, [piece], drawn.source)
+def positive(what: str, **lengths: float) -> None:
+    """Refuse lengths that are not positive, by the names they are given under."""
+    for name, value in lengths.items():
+        number_within(f"{what} has {name.replace('_', ' ')} {{}} m", value, above=0.0)
 
 
 def _arc(
@@ -238,9 +197,3 @@ def _arc(
     if not closed:  # a flat or a key begins where the circle itself does
         radius[[0, -1]] = 0.5 * diameter
     return np.asarray(radius[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1))
-
-
-def _positive(what: str, **lengths: float) -> None:
-    for name, value in lengths.items():
-        if not (math.isfinite(value) and value > 0):
-            raise InputError(f"{what} has {name.replace('_', ' ')} {value!r}; give metres greater than 0.")

@@ -1,4 +1,4 @@
-"""Parts: the rigid bodies that are looked for, touched, and held."""
+"""Parts: rigid bodies as closed meshes, with convex pieces for contact."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bcppl.errors import InputError
 
 Array = npt.NDArray[np.float64]
 
-LARGEST_EXTENT = 5.0  # m: a part larger than this is a mesh in millimetres
+LARGEST_EXTENT = 5.0  # m: a larger mesh is in millimetres
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Piece:
         kind: "box", "cylinder" (its axis along z) or "hull".
         size: half extents (3,) of a box, radius and half length (2,) of a cylinder, both in metres;
             vertices (V, 3) of a hull in the part's frame.
-        center: (3,) where a box or cylinder is centred, in the part's frame (its axes are the part's).
+        center: (3,) centre of a box or cylinder in the part's frame (its axes are the part's), metres.
     """
 
     kind: str
@@ -36,14 +36,14 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A rigid part: a closed triangle mesh and, where it is touched, exact convex pieces.
+    """A rigid part: a closed triangle mesh and, for contact, convex pieces.
 
     Attributes:
-        name: what people call it.
+        name: for people.
         vertices: (V, 3) in metres, in the part's frame.
         faces: (F, 3) indices of vertices, counter-clockwise seen from outside.
-        pieces: convex pieces whose union is the solid; empty where the part is never touched in simulation.
-        source: where the mesh comes from: attribution and licence.
+        pieces: convex pieces whose union is the solid; empty where contact is never simulated.
+        source: attribution and licence of the mesh.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Part:
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
-        """The mesh as trimesh has it, vertices as given."""
+        """The trimesh mesh, its vertices unmerged."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
     @property
@@ -64,22 +64,22 @@ class Part:
 
     @cached_property
     def diameter(self) -> float:
-        """The largest distance between two vertices, metres (as the BOP benchmark has it)."""
+        """The largest distance between two vertices, metres (the diameter of the BOP benchmark)."""
         from scipy.spatial.distance import pdist
 
         hull = self.vertices if len(self.vertices) <= 4 else self.mesh.convex_hull.vertices
         return float(pdist(hull).max())
 
     def surface_points(self, count: int = 1000, seed: int = 0) -> Array:
-        """Points (count, 3) spread evenly over the surface by area, in the part's frame; ADD is over them."""
+        """Points (count, 3) sampled uniformly by area on the surface, in the part's frame, as for ADD."""
         points, _ = trimesh.sample.sample_surface(self.mesh, count, seed=seed)
         return np.ascontiguousarray(points, dtype=np.float64)
 
     def moved(self, new_from_old: object, name: str | None = None) -> Part:
-        """The same solid seen from another frame: what stood at p in the old one stands at new_from_old p.
+        """The same solid in another frame: a point p of the old frame becomes new_from_old p.
 
-        A peg whose mesh begins at its lower end gets its frame at the wrench sensor, 50 mm above the tip,
-        with `peg.moved([0, 0, -0.05, 1, 0, 0, 0])`. A box that ends up askew becomes the hull of its corners.
+        A peg whose mesh has its origin at the tip gets its frame at the wrench sensor, 50 mm above, with
+        `peg.moved([0, 0, -0.05, 1, 0, 0, 0])`. A box whose axes are not the new frame's becomes a hull.
 
         Args:
             new_from_old: (7,) pose of the old frame in the new one.
@@ -88,11 +88,7 @@ class Part:
         Raises:
             InputError: it is no pose, or tilts a cylinder, which must stay along z.
         """
-        pose = poses.as_pose(new_from_old, f"the new frame of part {self.name!r}").detach().cpu()
-        if pose.shape != (7,):
-            raise InputError(
-                f"the new frame of part {self.name!r} has shape {tuple(pose.shape)}; give one pose (7,)."
-            )
+        pose = poses.as_pose(new_from_old, f"the new frame of part {self.name!r}").detach().cpu().reshape(7)
         rotation, shift = poses.rotation_matrix(pose).numpy(), pose[:3].numpy()
         return replace(
             self,
@@ -102,7 +98,7 @@ class Part:
         )
 
     def check(self, closed: bool = True) -> None:
-        """Refuse a mesh that cannot be rendered or touched.
+        """Refuse a mesh that cannot be rendered or used in contact.
 
         Raises:
             InputError: the mesh is empty, not finite, larger than 5 m, or (with `closed`) open or inside out.
@@ -113,7 +109,7 @@ class Part:
             raise InputError(f"part {self.name!r} has a vertex that is not finite; export its mesh again.")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
             raise InputError(
-                f"part {self.name!r} has a face that points at no vertex; export its mesh again."
+                f"part {self.name!r} has a face with an index of no vertex; export its mesh again."
             )
         if self.extent.max() > LARGEST_EXTENT:
             raise InputError(
@@ -124,7 +120,7 @@ class Part:
             edges = int(trimesh.grouping.group_rows(self.mesh.edges_sorted, require_count=1).shape[0])
             raise InputError(
                 f"part {self.name!r} has an open mesh ({edges} open edges); close its holes, "
-                "or merge vertices that are doubled at seams."
+                "or merge duplicate vertices at seams."
             )
         if closed and self.mesh.volume < -1e-9 * self.extent.max() ** 3:
             raise InputError(
@@ -134,7 +130,7 @@ class Part:
 
 
 def _moved(piece: Piece, rotation: Array, shift: Array, name: str) -> Piece:
-    """A piece in another frame, exactly."""
+    """A piece in another frame."""
     if piece.kind == "hull":
         return replace(piece, size=piece.size @ rotation.T + shift)
     center = rotation @ piece.center + shift
@@ -142,11 +138,11 @@ def _moved(piece: Piece, rotation: Array, shift: Array, name: str) -> Piece:
         if abs(rotation[2, 2]) < 1.0 - 1e-14:
             raise InputError(
                 f"part {name!r} has a cylinder among its pieces, which must stay along z; turn it about z "
-                "only, or draw the part with `extruded`."
+                "only, or construct the part with `extruded`."
             )
         return replace(piece, center=center)
     steps = np.abs(rotation)
-    if np.allclose(steps, np.rint(steps), rtol=0.0, atol=1e-14):  # the axes change places
+    if np.allclose(steps, np.rint(steps), rtol=0.0, atol=1e-14):  # a permutation of the axes
         return replace(piece, size=np.rint(steps) @ piece.size, center=center)
     signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
     return Piece("hull", (signs * piece.size + piece.center) @ rotation.T + shift)

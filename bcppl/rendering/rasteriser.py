@@ -24,7 +24,7 @@ from bcppl.rendering.drawing import collect, draw_images, draw_regions
 from bcppl.rendering.placement import Grid, Placed
 from bcppl.rendering.renderer import Hits, counted_pixels
 from bcppl.rendering.scan_conversion import bound
-from bcppl.threads import shared, thread_count
+from bcppl.threads import parallel_sum, thread_count
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -199,7 +199,7 @@ class DepthRasteriser:
         return filled
 
     def _shared(self, work: Callable[[int, int], int], begin: int, end: int) -> int:
-        return shared(work, begin, end, SHARE, self.threads)
+        return parallel_sum(work, begin, end, SHARE, self.threads)
 
 
 class _Found:

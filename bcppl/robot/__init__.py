@@ -1,1 +1,1 @@
-"""Robots: kinematics, reach, and the motions that an arm is commanded to make."""
+"""Robots: forward and inverse kinematics, and plans of compliant motions."""

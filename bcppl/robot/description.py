@@ -1,4 +1,4 @@
-"""A robot as its URDF file describes it: links, joints, limits, and where its meshes lie.
+"""Robot descriptions from URDF files: links, joints, limits and meshes.
 
 The format is that of ROS, wiki.ros.org/urdf/XML; the parser is the one that comes with pytorch-kinematics.
 """
@@ -38,10 +38,10 @@ class Joint:
         name: as in the URDF file.
         kind: "revolute", "continuous", "prismatic" or "fixed".
         parent, child: names of the links it joins.
-        parent_from_child: (4, 4) transformation at the joint's zero.
+        parent_from_child: (4, 4) transformation at joint value zero.
         axis: (3,) of unit length, in the child's frame.
-        lower, upper: limits in radians (metres where prismatic); infinite where there are none.
-        mimics: the joint that it follows, with multiplier and offset; None for a joint of its own.
+        lower, upper: joint limits in radians (metres where prismatic); infinite where there are none.
+        mimics: the joint that it mimics, with multiplier and offset; None for an independent joint.
     """
 
     name: str
@@ -57,10 +57,10 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """What a link looks like, or one piece of it.
+    """The visual or collision geometry of a link, or one element of it.
 
     Attributes:
-        link: the link that carries it.
+        link: the name of its link.
         link_from_shape: (4, 4) transformation.
         geometry: a mesh, box, cylinder or sphere, as parsed.
     """
@@ -72,13 +72,13 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """What a URDF file says.
+    """The content of a URDF file.
 
     Attributes:
         name: of the robot.
-        file: where it was read from.
+        file: path of the URDF file.
         links: names of all links, the base first, each after its parent.
-        joints: each after the joint that carries it.
+        joints: each after its parent joint.
         visual, collision: the links' shapes.
     """
 
@@ -91,7 +91,7 @@ class Description:
 
 
 def read(file: str | Path) -> Description:
-    """Read a URDF file.
+    """The description in a URDF file.
 
     Raises:
         InputError: the file is missing or no URDF, its links do not form one tree, or a joint is of a kind
@@ -100,13 +100,13 @@ def read(file: str | Path) -> Description:
     file = Path(file)
     if not file.is_file():
         raise InputError(f"{file} is missing; give a robot's URDF file.")
-    said = io.StringIO()
+    ignored = io.StringIO()
     try:
-        # The parser prints what it does not know (transmissions, xacro) to standard error.
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+        # The parser prints unknown elements (transmissions, xacro) to standard error.
+        with contextlib.redirect_stderr(ignored), contextlib.redirect_stdout(ignored):
             robot = urdf.URDF.from_xml_string(file.read_bytes())
-        for what, named in (("joint", robot.joints), ("link", robot.links)):
-            _refuse_twins(file, what, [each.name for each in named])
+        for kind, named in (("joint", robot.joints), ("link", robot.links)):
+            _check_unique(file, kind, [each.name for each in named])
         links = {link.name: link for link in robot.links}
         joints = {j.child: _joint(j) for j in robot.joints}
     except InputError:
@@ -129,14 +129,14 @@ def read(file: str | Path) -> Description:
     )
 
 
-def _refuse_twins(file: Path, what: str, names: Sequence[str]) -> None:
+def _check_unique(file: Path, kind: str, names: Sequence[str]) -> None:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(f"{file} has two {what}s of the name {twice[0]!r}; give each a name of its own.")
+        raise InputError(f"{file} has two {kind}s of the name {twice[0]!r}; give each a name of its own.")
 
 
 def _ordered(file: Path, links: Sequence[str], joints: Mapping[str, Joint], count: int) -> list[str]:
-    """The links from the base outwards."""
+    """The links, each after its parent, the base first."""
     roots = [name for name in links if name not in joints]
     unknown = {j.parent for j in joints.values()} | set(joints)
     unknown -= set(links)
@@ -166,21 +166,21 @@ def _joint(parsed: Any) -> Joint:
     if parsed.type == "fixed":
         axis, length = np.array([0.0, 0.0, 1.0]), 1.0
     if not 0.0 < length < math.inf:
-        raise InputError(f"joint {parsed.name!r} turns about the axis {axis.tolist()}; give it a direction.")
+        raise InputError(f"joint {parsed.name!r} has the axis {axis.tolist()}; give it a direction.")
     bounded = parsed.type in ("revolute", "prismatic") and parsed.limit is not None
-    mimic = parsed.mimic
-    follows = None
-    if mimic is not None:
-        follows = (
-            str(mimic.joint),
-            1.0 if mimic.multiplier is None else float(mimic.multiplier),
-            0.0 if mimic.offset is None else float(mimic.offset),
+    mimics = None
+    if parsed.mimic is not None:
+        multiplier, offset = parsed.mimic.multiplier, parsed.mimic.offset
+        mimics = (
+            str(parsed.mimic.joint),
+            1.0 if multiplier is None else float(multiplier),
+            0.0 if offset is None else float(offset),
         )
     lower = float(parsed.limit.lower) if bounded else -math.inf
     upper = float(parsed.limit.upper) if bounded else math.inf
-    if not lower <= upper or any(math.isnan(number) for number in (follows or ())[1:]):
+    if not lower <= upper or any(math.isnan(number) for number in (mimics or ())[1:]):
         raise InputError(
-            f"joint {parsed.name!r} has limits {lower:g} to {upper:g} and mimics {follows}; "
+            f"joint {parsed.name!r} has limits {lower:g} to {upper:g} and mimics {mimics}; "
             "give limits in ascending order, and numbers."
         )
     return Joint(
@@ -192,7 +192,7 @@ def _joint(parsed: Any) -> Joint:
         axis=axis / length,
         lower=lower,
         upper=upper,
-        mimics=follows,
+        mimics=mimics,
     )
 
 
@@ -201,13 +201,13 @@ def _transformation(whose: str, origin: Any) -> Array:
     if origin is not None:
         matrix[:3, 3] = [0.0, 0.0, 0.0] if origin.xyz is None else origin.xyz
         # Roll, pitch and yaw are about the parent's fixed axes.
-        turn = [0.0, 0.0, 0.0] if origin.rpy is None else origin.rpy
-        if not (np.isfinite(matrix[:3, 3]).all() and np.isfinite(turn).all()):
+        angles = [0.0, 0.0, 0.0] if origin.rpy is None else origin.rpy
+        if not (np.isfinite(matrix[:3, 3]).all() and np.isfinite(angles).all()):
             raise InputError(
-                f"the origin of {whose} has xyz {matrix[:3, 3].tolist()} and rpy {list(turn)}; "
+                f"the origin of {whose} has xyz {matrix[:3, 3].tolist()} and rpy {list(angles)}; "
                 "give finite numbers, metres and radians."
             )
-        matrix[:3, :3] = Rotation.from_euler("xyz", turn).as_matrix()
+        matrix[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
     return matrix
 
 
@@ -216,7 +216,7 @@ def _shape(link: str, parsed: Any) -> Shape:
 
 
 def chain_of(description: Description) -> Any:
-    """The chain as pytorch-kinematics has it, in float64; its own reader rounds to single precision."""
+    """The kinematic chain of pytorch-kinematics in float64; its own reader rounds to single precision."""
     frames = {link: frame.Frame(link, link=frame.Link(link)) for link in description.links}
     frames[description.links[0]].joint = frame.Joint()
     for joint in description.joints:
@@ -274,29 +274,29 @@ def _mesh(description: Description, shape: Shape, folders: Sequence[Path]) -> An
         )
     tried = list(_candidates(description, geometry.filename, folders))
     file = next((path for path in tried if path.is_file()), None)
-    alike = [] if file is not None else list(dict.fromkeys(_alike(tried)))
-    # A scale tells the unit of the file that is named, and another format may well be in another unit.
-    if len(alike) == 1 and (geometry.scale is None or np.allclose(geometry.scale, 1.0)):
-        file = alike[0]
+    others = [] if file is not None else list(dict.fromkeys(_other_formats(tried)))
+    # A scale states the unit of the named file, and another format may be in another unit.
+    if len(others) == 1 and (geometry.scale is None or np.allclose(geometry.scale, 1.0)):
+        file = others[0]
     if file is None:
-        looked = ", ".join(dict.fromkeys(str(path.parent) for path in tried))
+        searched = ", ".join(dict.fromkeys(str(path.parent) for path in tried))
         advice = "put it there, or name its folder with mesh_folders"
-        if alike:
+        if others:
             advice = (
-                f"there lies {', '.join(map(str, alike))}: name that in the URDF file, with the scale that "
-                "makes it metres"
+                f"there is {', '.join(map(str, others))}: name that in the URDF file, with the scale that "
+                "converts it to metres"
             )
         raise InputError(
             f"link {shape.link!r} of {description.file} needs the mesh {geometry.filename}, "
-            f"which is in none of {looked}; {advice}."
+            f"which is in none of {searched}; {advice}."
         )
     try:
         # "mesh" also places the nodes of a scene (DAE) and converts its stated unit.
         mesh: Any = trimesh.load(file, force="mesh")
     except Exception as error:  # every format has its own loader and its own errors
-        said = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
-            f"{file} cannot be read as a mesh ({said}); give an STL, OBJ or DAE file."
+            f"{file} cannot be read as a mesh ({reason}); give an STL, OBJ or DAE file."
         ) from error
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     if geometry.scale is not None:
@@ -304,26 +304,22 @@ def _mesh(description: Description, shape: Shape, folders: Sequence[Path]) -> An
     return mesh
 
 
-def _alike(tried: Sequence[Path]) -> Iterator[Path]:
-    """Meshes that differ from those looked for in nothing but the extension."""
+def _other_formats(tried: Sequence[Path]) -> Iterator[Path]:
+    """Mesh files that differ from the ones tried only in the extension."""
     for path in tried:
         if path.parent.is_dir():
-            yield from sorted(
-                other
-                for other in path.parent.iterdir()
-                if other.stem == path.stem and other.suffix.lower() in MESHES and other.is_file()
-            )
+            files = sorted(file for file in path.parent.iterdir() if file.is_file())
+            yield from (f for f in files if f.stem == path.stem and f.suffix.lower() in MESHES)
 
 
 def _candidates(description: Description, name: str, folders: Sequence[Path]) -> Iterator[Path]:
-    """Where a mesh may lie, the likeliest first."""
+    """Paths at which a mesh may be, the likeliest first."""
     here = description.file.parent
     if name.startswith("package://"):
         inside = Path(name.removeprefix("package://"))
-        without = Path(*inside.parts[1:]) if len(inside.parts) > 1 else inside
         for folder in (*folders, here):
             yield folder / inside
-            yield folder / without
+            yield folder / Path(*(inside.parts[1:] or inside.parts))
         return
     plain = Path(name.removeprefix("file://"))
     yield here / plain

@@ -1,4 +1,4 @@
-"""What an arm is asked to do to put a peg into a hole: search until it yields, then push where it stands."""
+"""Plans of an insertion: a search for the hole, then a push from the pose at which the search ends."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class InsertionPlan:
-    """A search for a hole, and a push into it that begins where the search has ended.
+    """A search for a hole, and a push into it from the pose at which the search ends.
 
-    The two have their own stiffness: a search is led firmly across and pressed on softly along the axis; a
-    push leaves the peg free to turn with the hole. A controller is told to change between them, as a robot's
-    owner would, and the command is set to where the peg then stands, which unloads its springs.
+    The two have their own stiffness: a search is stiff laterally and compliant along the axis; a push leaves
+    the peg compliant in rotation. Between them the controller's stiffness is changed and its command set to
+    the peg's pose, which unloads the springs.
 
     Attributes:
-        search: ends where its last motion does or, before, where a "searching" motion finds the hole.
-        push: its first pose is where the peg is thought to stand then; see `push_from`.
-        world_from_hole: (7,) where the hole is thought to be: its origin in the plane of the part's top, z
-            out of the material.
+        search: ends with its last motion or, earlier, where a "searching" motion detects the hole.
+        push: its first pose is the peg's expected pose at the end of the search; see `push_from`.
+        world_from_hole: (7,) estimated pose of the hole: its origin in the plane of the part's top, z out of
+            the material.
         depth: of the hole, metres.
-        chamfer: how far below the top the hole is wider, metres.
+        chamfer: depth below the top down to which the hole is wider, metres.
 
     Raises:
-        InputError: the search does not search, the depth is not positive, or the pose is not (7,).
+        InputError: the search has no searching motion, or the depth is not positive.
     """
 
     search: Plan
@@ -48,32 +48,28 @@ class InsertionPlan:
             )
         if not self.depth > 0.0:
             raise InputError(f"an insertion is planned {self.depth:g} m deep; give a positive depth.")
-        if np.shape(self.world_from_hole) != (7,):
-            raise InputError(
-                f"an insertion's world_from_hole has shape {np.shape(self.world_from_hole)}; give (7,)."
-            )
 
     @property
     def deep_enough(self) -> float:
-        """From how deep below the top (m) the peg is in: 0.8 of the depth, or 10 mm beyond the chamfer."""
+        """The least depth (m) of an inserted peg: 0.8 of the hole's, or 10 mm past the chamfer."""
         return min(0.8 * self.depth, self.chamfer + 0.01)
 
     def push_from(self, world_from_peg: Array, sunk: float | None = None) -> Plan:
-        """The push, moved as a whole so that it begins at a pose (7,) and ends as deep as planned.
+        """The push, transformed as a whole to begin at a pose (7,) and shortened to end at the planned depth.
 
-        The peg turns with the hole that it is in, so the way is along its own axes.
+        The peg has rotated with the hole that it is in, so the path is along its own axes.
 
         Args:
-            world_from_peg: where the peg stands.
-            sunk: how far (m) it is then below the top, where that was felt; None to take it from where the
-                hole is thought to be.
+            world_from_peg: the peg's pose.
+            sunk: its depth (m) below the top, where contact located it; None for the depth relative to the
+                push's first pose.
         """
         start = torch.from_numpy(self.push.world_from_peg[0])
-        stands = torch.as_tensor(world_from_peg)
-        way = poses.compose(poses.inverse(start), torch.from_numpy(self.push.world_from_peg))
+        pose = torch.as_tensor(world_from_peg)
+        path = poses.compose(poses.inverse(start), torch.from_numpy(self.push.world_from_peg))
         if sunk is None:
-            sunk = -float(poses.transform(poses.inverse(start), stands[None, :3])[0, 2])
-        length = float(way[:, 2].abs().max())
+            sunk = -float(poses.transform(poses.inverse(start), pose[None, :3])[0, 2])
+        length = float(path[:, 2].abs().max())
         if length > 0.0:
-            way[:, :3] *= max(length - sunk, 0.0) / length
-        return replace(self.push, world_from_peg=poses.compose(stands, way).numpy())
+            path[:, :3] *= max(length - sunk, 0.0) / length
+        return replace(self.push, world_from_peg=poses.compose(pose, path).numpy())

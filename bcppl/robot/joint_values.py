@@ -1,7 +1,6 @@
-"""Checks of joint angles, of what their readings lack, and of the values of joints that do not move.
+"""Checks of joint angles, joint offsets and fixed joint values against the joint limits.
 
-Degrees in place of radians and millimetres in place of metres are what people get wrong, and both show by
-their size.
+Degrees in place of radians and millimetres in place of metres are the common mistakes, and their size shows.
 """
 
 from __future__ import annotations
@@ -16,109 +15,101 @@ from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.robot.description import Joint
 
-FAR = 1.0  # rad beyond a limit: no encoder is that wrong, so the angles are something else
-WOUND = 4.0 * math.pi  # rad: two turns, and nobody holds a joint without limits beyond them
+FAR = 1.0  # rad beyond a joint limit: no encoder error is as large
+WOUND = 4.0 * math.pi  # rad: two revolutions, the largest value of a joint without limits
 
 
-def refuse_not_finite(robot: str, joints: Sequence[Joint], what: str, values: Tensor) -> None:
-    """Refuse joint values (..., J) that hold a number that is not finite.
-
-    Args:
-        robot: its name.
-        joints: the J joints.
-        what: "angles", which come with stamps, or "offsets".
-        values: of them.
+def check_angles(robot: str, joints: Sequence[Joint], values: Tensor) -> None:
+    """Refuse joint angles (..., J) that are not finite, or so far outside the limits that the unit is wrong.
 
     Raises:
-        InputError: they do; names the joint.
+        InputError: names the joint.
     """
-    finite = torch.isfinite(values.detach()).reshape(-1, len(joints)).all(dim=0)
-    if not bool(finite.all()):
-        joint = joints[int(torch.nonzero(~finite)[0])]
-        advice = "leave such stamps out" if what == "angles" else "give 0 where nothing is lacking"
-        raise InputError(
-            f"joint {what} of {robot} hold a number that is not finite, at {joint.name}; {advice}."
-        )
-
-
-def refuse_far_angles(robot: str, joints: Sequence[Joint], values: Tensor) -> None:
-    """Refuse angles (..., J) that lie so far outside the limits that they are no radians (or metres).
-
-    Raises:
-        InputError: they do; names the joint.
-    """
+    _check_finite(robot, joints, values, "angles", "leave such stamps out")
+    if values.numel() == 0:
+        return
     detached = values.detach().reshape(-1, len(joints))
-    names = ", ".join(joint.name for joint in joints)
-    for k, joint in enumerate(joints):
-        if len(detached) == 0 or not math.isfinite(joint.upper - joint.lower):
-            continue
-        low, high = float(detached[:, k].min()), float(detached[:, k].max())
-        beyond = FAR if joint.kind != "prismatic" else _travel(joint)
-        if low < joint.lower - beyond or high > joint.upper + beyond:
-            worst = low if joint.lower - low > high - joint.upper else high
+    low, high = detached.amin(dim=0).tolist(), detached.amax(dim=0).tolist()
+    for joint, least, most in zip(joints, low, high, strict=True):
+        if _limited(joint) and (least < joint.lower - _margin(joint) or most > joint.upper + _margin(joint)):
+            worst = least if joint.lower - least > most - joint.upper else most
             wrong, unit, units = _units(joint)
             raise InputError(
                 f"joint {joint.name} of {robot} reads {worst:.4g} {unit} and its limits are "
                 f"{joint.lower:.4g} to {joint.upper:.4g}: the angles are probably in {wrong} or in "
-                f"another order; give {units} in the order {names}."
+                f"another order; give {units} in the order {', '.join(each.name for each in joints)}."
             )
 
 
-def refuse_far_offsets(robot: str, joints: Sequence[Joint], offsets: Tensor) -> None:
-    """Refuse offsets (N, ..., J) most of which are larger than any encoder's: half a turn, a whole travel.
+def check_offsets(robot: str, joints: Sequence[Joint], offsets: Tensor) -> None:
+    """Refuse offsets (N, ..., J) that are not finite, or with a median above half a revolution or the travel.
 
-    One particle may be anywhere, and so may all on the way of a leapfrog, whose offsets carry gradients.
+    A few particles may be anywhere, and so may all within a leapfrog trajectory, whose offsets carry
+    gradients.
 
     Raises:
-        InputError: they are; names the joint.
+        InputError: names the joint.
     """
+    _check_finite(robot, joints, offsets, "offsets", "give 0 for a joint without an error")
     if offsets.requires_grad or offsets.numel() == 0:
         return
-    usual = offsets.abs().reshape(-1, len(joints)).median(dim=0).values.tolist()
-    for joint, size in zip(joints, usual, strict=True):
-        if size > (math.pi if joint.kind != "prismatic" else _travel(joint)):
+    sizes = offsets.abs().reshape(-1, len(joints)).median(dim=0).values.tolist()
+    for joint, size in zip(joints, sizes, strict=True):
+        if size > (_margin(joint) if joint.kind == "prismatic" else math.pi):
             wrong, unit, units = _units(joint)
             raise InputError(
-                f"the offsets of joint {joint.name} of {robot} are of a size of {size:.4g} {unit}: "
+                f"the offsets of joint {joint.name} of {robot} have a median size of {size:.4g} {unit}: "
                 f"they are probably in {wrong}; give {units}."
             )
 
 
-def held_values(robot: str, moving: Mapping[str, Joint], held: object) -> dict[str, float]:
-    """The values of joints that do not move, radians or metres, by name.
+def held_values(robot: str, moving: Mapping[str, Joint], held: Mapping[str, float]) -> dict[str, float]:
+    """The values of fixed joints by name, radians or metres.
 
     Raises:
-        InputError: they are no mapping, a joint is none of the robot's that move, or a value is no finite
-            number, or far outside the limits.
+        InputError: a joint is not a moving one of the robot's, or a value is no finite number or far outside
+            the limits.
     """
-    if not isinstance(held, Mapping):
-        raise InputError(f"held joints of {robot} are given as {held!r}; give {{name: value}}.")
-    found = {}
+    values = {}
     for name, value in held.items():
         if name not in moving:
             raise InputError(f"{robot} has no joint {name!r} to hold; its joints are {', '.join(moving)}.")
         joint = moving[name]
         wrong, unit, units = _units(joint)
-        number = number_within(f"joint {name} of {robot} is to be held at {{}} {unit}", value)
-        limited = math.isfinite(joint.upper - joint.lower)
-        beyond = FAR if joint.kind != "prismatic" else _travel(joint)
-        low, high = (joint.lower - beyond, joint.upper + beyond) if limited else (-WOUND, WOUND)
-        if not low <= number <= high:
-            within = f", outside its limits {joint.lower:.4g} to {joint.upper:.4g}" if limited else ""
+        values[name] = number_within(f"joint {name} of {robot} is to be held at {{}} {unit}", value)
+        low, high, within = -WOUND, WOUND, ""
+        if _limited(joint):
+            low, high = joint.lower - _margin(joint), joint.upper + _margin(joint)
+            within = f", outside its limits {joint.lower:.4g} to {joint.upper:.4g}"
+        if not low <= values[name] <= high:
             raise InputError(
-                f"joint {name} of {robot} is to be held at {number:.4g} {unit}{within}: the value is "
+                f"joint {name} of {robot} is to be held at {values[name]:.4g} {unit}{within}: the value is "
                 f"probably in {wrong}; give {units}."
             )
-        found[name] = number
-    return found
+    return values
 
 
-def _travel(joint: Joint) -> float:
-    """How far a prismatic joint moves, metres; without limits the arm's own size is not known either."""
+def _check_finite(robot: str, joints: Sequence[Joint], values: Tensor, kind: str, advice: str) -> None:
+    finite = torch.isfinite(values.detach()).reshape(-1, len(joints)).all(dim=0)
+    if not bool(finite.all()):
+        joint = joints[int(torch.nonzero(~finite)[0])]
+        raise InputError(
+            f"joint {kind} of {robot} hold a number that is not finite, at {joint.name}; {advice}."
+        )
+
+
+def _limited(joint: Joint) -> bool:
+    return math.isfinite(joint.upper - joint.lower)
+
+
+def _margin(joint: Joint) -> float:
+    """How far beyond its limits a value may be: of a prismatic joint its travel, where that is known."""
     travel = joint.upper - joint.lower
+    if joint.kind != "prismatic":
+        return FAR
     return travel if 0.0 < travel < math.inf else WOUND
 
 
 def _units(joint: Joint) -> tuple[str, str, str]:
-    """What a value is probably in, and what it is read as."""
+    """The probable wrong unit of a value, the symbol of the right one, and its name."""
     return ("millimetres", "m", "metres") if joint.kind == "prismatic" else ("degrees", "rad", "radians")

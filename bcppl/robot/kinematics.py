@@ -1,8 +1,8 @@
-"""A robot arm: link poses from joint angles, for all particles and stamps in one batch.
+"""Forward kinematics of a robot arm, for all particles and stamps in one batch.
 
-Poses come from pytorch-kinematics (Zhong et al., PyTorch Kinematics, 2024, zenodo 7700587), in float64 and
-with gradients. Joint angles are radians, metres where a joint is prismatic; frames are named after the links,
-the base's is the root link's of the URDF file.
+Poses are computed by pytorch-kinematics (Zhong et al., PyTorch Kinematics, 2024, zenodo 7700587), in float64
+and with gradients. Joint angles are radians, metres where a joint is prismatic; frames are named after the
+links, and the base is the root link of the URDF file.
 """
 
 from __future__ import annotations
@@ -21,23 +21,18 @@ from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 from bcppl.robot.description import MOVING, Joint, chain_of, part_of, read
-from bcppl.robot.joint_values import (
-    held_values,
-    refuse_far_angles,
-    refuse_far_offsets,
-    refuse_not_finite,
-)
+from bcppl.robot.joint_values import check_angles, check_offsets, held_values
 
 Angles = Tensor | npt.NDArray[np.float64] | Sequence[float]
 
 
 class Robot:
-    """A robot arm as its URDF file describes it.
+    """A robot arm described by a URDF file.
 
     Attributes:
         name: of the robot.
-        joints: the J joints whose angles are given, from the base outwards. A joint that mimics another
-            follows it, and a joint that is not on the way to `tip` is held.
+        joints: the J independent joints, from the base outwards. Joints that mimic another are not among
+            them, nor are fixed ones: those outside the chain from the base to `tip`, and those in `held`.
         links: names of all links, the base first.
     """
 
@@ -49,28 +44,26 @@ class Robot:
         geometry: Literal["visual", "collision"] = "visual",
         mesh_folders: str | Path | Sequence[str | Path] = (),
     ) -> None:
-        """Read a URDF file; its meshes are read when they are first asked for.
+        """Read a URDF file; its meshes are read on first use.
 
         Args:
             file: the URDF file. Shipped ones: `bcppl.models.robots`.
-            tip: a link; only the joints between it and the base are then given, the others are held.
-            held: values (radians, metres) of joints that do not move; where nothing is said, the value within
-                the limits that is nearest to zero.
+            tip: a link; joints outside the chain from the base to it are fixed.
+            held: values (radians, metres) of fixed joints; by default the value within the limits that is
+                closest to zero.
             geometry: which of the links' shapes are drawn.
-            mesh_folders: where meshes are looked for beside the URDF file's own folder; `package://NAME/...`
-                is looked for in each, with NAME and without.
+            mesh_folders: folders of meshes beside the URDF file's own; `package://NAME/...` is searched in
+                each, with NAME and without.
 
         Raises:
             InputError: the file is missing or no URDF, a link or joint is unknown, or a joint is held at no
                 number or far outside its limits.
         """
         if geometry not in ("visual", "collision"):
-            raise InputError(
-                f'a robot is to be drawn by its geometry {geometry!r}; give "visual" or "collision".'
-            )
+            raise InputError(f'a robot has no geometry {geometry!r}; give "visual" or "collision".')
         self._description = read(file)
         self._geometry = geometry
-        # One folder alone would be read letter by letter.
+        # A single path would be iterated by letters.
         folders = [mesh_folders] if isinstance(mesh_folders, str | Path) else mesh_folders
         self._mesh_folders = [Path(folder) for folder in folders]
         self.name = self._description.name
@@ -81,63 +74,60 @@ class Robot:
             if joint.mimics is not None and joint.mimics[0] not in moving:
                 raise InputError(
                     f"joint {joint.name!r} of {self.name} mimics {joint.mimics[0]!r}, which does not move; "
-                    "name a joint of the URDF file."
+                    "name a movable joint of the URDF file."
                 )
-        on_the_way = {j.name for j in (self._description.joints if tip is None else self._way(tip))}
+        chain = {j.name for j in (self._description.joints if tip is None else self._chain_to(tip))}
         self.joints: tuple[Joint, ...] = tuple(
-            j for j in moving.values() if j.name in on_the_way and j.mimics is None and j.name not in held
+            j for j in moving.values() if j.name in chain and j.mimics is None and j.name not in held
         )
         self._chain = chain_of(self._description)
-        self._frames = [self._chain.frame_to_idx[link] for link in self.links]
-        self._spread, self._rest = self._held(moving, held)
+        self._coupling, self._constant = self._couplings(moving, held)
 
     # ---- poses
 
     def base_from_links(
-        self, angles: Angles, offsets: Angles | None = None, links: Sequence[str] | None = None
+        self, angles: Angles, offsets: Angles | None = None, links: Sequence[str] = ()
     ) -> Tensor:
         """Poses of links.
 
         Args:
-            angles: (..., J) joint angles as read from the robot.
-            offsets: (N, J) what the readings lack, each particle's added to all of `angles` in one batch;
-                (N, ..., J) where it changes with the stamps.
-            links: which; all, in the order of `self.links`, where none are named.
+            angles: (..., J) measured joint angles.
+            offsets: (N, J) joint offsets per particle, added to all of `angles` in one batch; (N, ..., J)
+                where they vary over the stamps.
+            links: names of K links; by default all, `self.links`.
 
         Returns:
-            (..., K, 7), or (N, ..., K, 7) with offsets: `base_from_link` of K links. Gradients pass to angles
-            and offsets.
+            (..., K, 7), or (N, ..., K, 7) with offsets: `base_from_link` of each link, differentiable in
+            angles and offsets.
 
         Raises:
             InputError: the angles or offsets have another number of joints, are not finite or so large that
                 they are in degrees or millimetres, or a link is unknown.
         """
-        frames = (
-            self._frames if links is None else [self._chain.frame_to_idx[self._known(link)] for link in links]
-        )
+        frames = [self._chain.frame_to_idx[self._known(link)] for link in (links or self.links)]
         values = self._values(angles, offsets)
-        all_values = values @ self._spread.T + self._rest
+        all_values = values @ self._coupling.T + self._constant
         matrices = self._chain.forward_kinematics_tensor(all_values.reshape(-1, all_values.shape[-1]))[frames]
-        found = poses.from_rotation_matrix(matrices[..., :3, 3], matrices[..., :3, :3])
-        return found.movedim(0, -2).reshape(*values.shape[:-1], len(frames), 7)
+        pose = poses.from_rotation_matrix(matrices[..., :3, 3], matrices[..., :3, :3])
+        return pose.movedim(0, -2).reshape(*values.shape[:-1], len(frames), 7)
 
     def base_from_link(
         self, link: str, angles: Angles, offsets: Angles | None = None, link_from_tool: Angles | None = None
     ) -> Tensor:
-        """Poses of one link, or of what is mounted on it, such as a peg or a camera.
+        """Poses of one link, or of a tool mounted on it, such as a peg or a camera.
 
         Args:
             link: its name.
             angles: as in `base_from_links`.
             offsets: as in `base_from_links`.
             link_from_tool: (7,) the tool's pose in the link's frame, or (N, 1, ..., 7) that broadcasts;
-                by default the link itself.
+                by default the identity.
 
         Returns:
             (..., 7), or (N, ..., 7) with offsets.
 
         Raises:
-            InputError: as `base_from_links`, or the tool's pose is none.
+            InputError: as `base_from_links`, or the tool's pose is not valid.
         """
         pose = self.base_from_links(angles, offsets, [link])[..., 0, :]
         if link_from_tool is None:
@@ -152,68 +142,55 @@ class Robot:
         point: Angles | None = None,
         errors: Angles | None = None,
     ) -> Tensor:
-        """Where a point of a link is, in the base's frame, also for an arm that is not built as drawn.
+        """Positions of a point of a link in the base's frame, with kinematic errors of the arm.
 
-        The point is carried from joint to joint towards the base, which is a tenth of the work of poses.
+        The point is transformed from joint to joint towards the base, at a tenth of the cost of link poses.
 
         Args:
             link: its name.
             angles: as in `base_from_links`.
             offsets: as in `base_from_links`.
-            point: (3,) or (N, 3) in the link's frame, metres; its origin by default.
-            errors: (N, J, 6) tangents by which the joints' origins differ from the URDF file's: metres along
-                the parent link's axes, then a rotation vector in the child link's frame at the joint's zero.
+            point: (3,) or (N, 3) in the link's frame, metres; by default its origin.
+            errors: (N, J, 6) tangents from the joints' origins in the URDF file to the true ones: metres
+                along the parent link's axes, then a rotation vector in the child link's frame at joint value
+                zero.
 
         Returns:
-            (..., 3), or (N, ..., 3) where anything but the angles is given per particle; metres. Gradients
-            pass to all arguments.
+            (..., 3), or (N, ..., 3) where an argument other than the angles is per particle; metres,
+            differentiable in all arguments.
 
         Raises:
-            InputError: as `base_from_links`, or the point or the errors have another shape.
+            InputError: as `base_from_links`.
         """
         number = {joint.name: k for k, joint in enumerate(self.joints)}
-        offsets, point, errors = (
-            None if given is None else _numbers(f"the {what} of {self.name}", given)
-            for what, given in (("offsets", offsets), ("point", point), ("errors", errors))
-        )
-        per_particle = [len(x) for x in (offsets, errors) if x is not None]
-        per_particle += [len(point)] if point is not None and point.ndim == 2 else []
-        if len(set(per_particle)) > 1:
-            raise InputError(
-                f"offsets, point and errors are given for {per_particle} particles; give them for one number."
-            )
-        if errors is not None and errors.shape[1:] != (len(self.joints), 6):
-            raise InputError(
-                f"the errors of {self.name} have shape {tuple(errors.shape)}; "
-                f"give (N, {len(self.joints)}, 6), a tangent for each joint."
-            )
-        if point is not None and point.shape[-1] != 3:
-            raise InputError(f"the point on {link} has shape {tuple(point.shape)}; give x y z in metres.")
+        position = _float64([0.0, 0.0, 0.0] if point is None else point)
+        errors = None if errors is None else _float64(errors)
         values = self._values(angles, offsets)
-        if per_particle and offsets is None:
-            values = values.expand(per_particle[0], *values.shape)
+        others = [x for x in (errors, position if position.ndim == 2 else None) if x is not None]
+        if others and offsets is None:
+            values = values.expand(len(others[0]), *values.shape)
         shape = values.shape[:-1]
-        # One particle axis and one of stamps: then each joint is one batched product of matrices.
-        flat = (values @ self._spread.T + self._rest).reshape(
-            shape[0] if per_particle else 1, -1, len(self._rest)
+        # One axis of particles and one of stamps: each joint is one batched matrix product.
+        flat = (values @ self._coupling.T + self._constant).reshape(
+            1 if offsets is None and not others else shape[0], -1, len(self._constant)
         )
-        place = values.new_zeros(1, 1, 3) if point is None else point.reshape(-1, 1, 3)
+        position = position.reshape(-1, 1, 3)
         names = self._chain.get_joint_parameter_names()
-        for joint in reversed(self._way(link)):
+        for joint in reversed(self._chain_to(link)):
             if joint.kind in MOVING:
-                place = _moved(joint, flat[..., names.index(joint.name)], place)
+                position = _moved(joint, flat[..., names.index(joint.name)], position)
             parent_from_child = _pose(joint.parent_from_child)[None]
             if errors is not None and joint.name in number:
                 parent_from_child = poses.retract(parent_from_child, errors[:, number[joint.name]])
-            turn = poses.rotation_matrix(parent_from_child)
-            place = place @ turn.transpose(-1, -2) + parent_from_child[:, None, :3]
-        return place.expand(*flat.shape[:2], 3).reshape(*shape, 3)
+            rotation = poses.rotation_matrix(parent_from_child)
+            position = position @ rotation.transpose(-1, -2) + parent_from_child[:, None, :3]
+        return position.expand(*flat.shape[:2], 3).reshape(*shape, 3)
 
     # ---- meshes
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
-        """The links that have a shape, each as a part in its link's frame, named after the link.
+        """The links with a shape, each as a part in its link's frame, named after the link.
 
         Raises:
             InputError: a mesh is missing or unreadable.
@@ -225,18 +202,18 @@ class Robot:
             if any(s.link == link for s in shapes)
         )
 
-    def placed(self, angles: Angles, offsets: Angles | None = None) -> Tensor:
-        """Poses of `parts`, (..., K, 7) or (N, ..., K, 7): what a renderer of several parts takes.
+    def base_from_parts(self, angles: Angles, offsets: Angles | None = None) -> Tensor:
+        """Poses of `parts`, (..., K, 7) or (N, ..., K, 7), for a renderer of several parts.
 
         Raises:
             InputError: as `base_from_links`, or a mesh is missing.
         """
         return self.base_from_links(angles, offsets, [part.name for part in self.parts])
 
-    def drawn(self, angles: Angles) -> Part:
-        """The whole arm at one set of angles (J,) as one rigid part in the base's frame.
+    def as_part(self, angles: Angles) -> Part:
+        """The whole arm at angles (J,) as one rigid part in the base's frame.
 
-        While the arm stands still it is one part, and one part renders faster than eight.
+        One part renders faster than eight, as long as the arm is stationary.
 
         Raises:
             InputError: as `base_from_links`, a mesh is missing, or no link has a shape.
@@ -247,13 +224,13 @@ class Robot:
                 f"no link of {self.name} has a {self._geometry} shape to draw; "
                 f'give geometry="{other}", or a URDF file with shapes.'
             )
-        base_from_parts = self.placed(self._values(angles, None).reshape(len(self.joints)))
+        base_from_parts = self.base_from_parts(self._values(angles, None).reshape(len(self.joints)))
         vertices = [
             poses.transform(pose, torch.from_numpy(part.vertices)).numpy()
             for pose, part in zip(base_from_parts, self.parts, strict=True)
         ]
-        first = np.cumsum([0, *[len(v) for v in vertices]])
-        faces = [part.faces + k for part, k in zip(self.parts, first, strict=False)]
+        starts = np.cumsum([0, *map(len, vertices)])
+        faces = [part.faces + start for part, start in zip(self.parts, starts, strict=False)]
         return Part(self.name, np.concatenate(vertices), np.concatenate(faces), source=self.parts[0].source)
 
     # ---- checks and layout
@@ -263,73 +240,67 @@ class Robot:
             raise InputError(f"{self.name} has no link {link!r}; its links are {', '.join(self.links)}.")
         return link
 
-    def _way(self, link: str) -> list[Joint]:
+    def _chain_to(self, link: str) -> list[Joint]:
         """The joints from the base to a link, the fixed ones included."""
         link = self._known(link)
-        carried = {joint.child: joint for joint in self._description.joints}
-        way: list[Joint] = []
-        while link in carried:
-            way.insert(0, carried[link])
-            link = carried[link].parent
-        return way
+        joint_of = {joint.child: joint for joint in self._description.joints}
+        chain: list[Joint] = []
+        while link in joint_of:
+            chain.insert(0, joint_of[link])
+            link = joint_of[link].parent
+        return chain
 
-    def _held(self, moving: Mapping[str, Joint], held: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-        """Matrix (F, J) and vector (F,) that give the values of all F joints of the chain."""
+    def _couplings(self, moving: Mapping[str, Joint], held: Mapping[str, float]) -> tuple[Tensor, Tensor]:
+        """Matrix (F, J) and vector (F,) of the affine map from the J angles to all F joint values."""
         names = self._chain.get_joint_parameter_names()
         given = {joint.name: k for k, joint in enumerate(self.joints)}
-        spread = torch.zeros(len(names), len(self.joints), dtype=torch.float64)
-        rest = torch.zeros(len(names), dtype=torch.float64)
+        matrix = torch.zeros(len(names), len(self.joints), dtype=torch.float64)
+        vector = torch.zeros(len(names), dtype=torch.float64)
         for row, name in enumerate(names):
             joint, factor, constant, seen = moving[name], 1.0, 0.0, {name}
             while joint.mimics is not None and joint.name not in held:
-                follows, multiplier, offset = joint.mimics
-                if follows in seen:
-                    raise InputError(f"joint {name!r} of {self.name} mimics itself; let one joint be free.")
-                seen.add(follows)
-                joint, factor, constant = moving[follows], factor * multiplier, constant + factor * offset
+                mimicked, multiplier, offset = joint.mimics
+                if mimicked in seen:
+                    raise InputError(
+                        f"joint {name!r} of {self.name} mimics itself; make one joint independent."
+                    )
+                seen.add(mimicked)
+                joint, factor, constant = moving[mimicked], factor * multiplier, constant + factor * offset
             if joint.name in given:
-                spread[row, given[joint.name]] = factor
-                rest[row] = constant
+                matrix[row, given[joint.name]] = factor
+                vector[row] = constant
             else:
-                still = held.get(joint.name, min(max(0.0, joint.lower), joint.upper))
-                rest[row] = factor * still + constant
-        return spread, rest
+                value = held.get(joint.name, min(max(0.0, joint.lower), joint.upper))
+                vector[row] = factor * value + constant
+        return matrix, vector
 
     def _values(self, angles: Angles, offsets: Angles | None) -> Tensor:
         """Angles with offsets, (..., J) or (N, ..., J), checked."""
         count = len(self.joints)
-        values = _numbers(f"joint angles of {self.name}", angles)
-        offsets = None if offsets is None else _numbers(f"joint offsets of {self.name}", offsets)
-        names = ", ".join(joint.name for joint in self.joints)
-        for what, given in (("angles", values), ("offsets", offsets)):
-            if given is None:
-                continue
-            fits = given.ndim > 0 and given.shape[-1] == count
-            if what == "offsets":
-                fits = fits and (given.ndim == 2 or given.shape[1:] == values.shape)
-            if not fits:
-                shape = f"(..., {count})" if what == "angles" else f"(N, {count}) or (N, *angles.shape)"
-                raise InputError(
-                    f"joint {what} of {self.name} have shape {tuple(given.shape)}; "
-                    f"give {shape}, in the order {names}, or name a tip."
-                )
-        refuse_not_finite(self.name, self.joints, "angles", values)
-        refuse_far_angles(self.name, self.joints, values)
+        values = _float64(angles)
+        if values.ndim == 0 or values.shape[-1] != count:
+            raise self._shape_error("angles", values, f"(..., {count})")
+        check_angles(self.name, self.joints, values)
         if offsets is None:
             return values
-        refuse_not_finite(self.name, self.joints, "offsets", offsets)
-        refuse_far_offsets(self.name, self.joints, offsets)
+        offsets = _float64(offsets)
+        if offsets.shape[1:] not in (values.shape, values.shape[-1:]):
+            raise self._shape_error("offsets", offsets, f"(N, {count}) or (N, *angles.shape)")
+        check_offsets(self.name, self.joints, offsets)
         if offsets.ndim == 2 and values.ndim > 1:
             offsets = offsets.reshape(len(offsets), *[1] * (values.ndim - 1), count)
         return values + offsets
 
+    def _shape_error(self, kind: str, values: Tensor, shape: str) -> InputError:
+        names = ", ".join(joint.name for joint in self.joints)
+        return InputError(
+            f"joint {kind} of {self.name} have shape {tuple(values.shape)}; "
+            f"give {shape}, in the order {names}, or name a tip."
+        )
 
-def _numbers(what: str, given: Angles) -> Tensor:
-    """Numbers as a tensor of float64, with the gradients they carry."""
-    try:
-        return torch.as_tensor(given, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"{what} are no table of numbers ({error}); give one row for each stamp.") from error
+
+def _float64(given: Angles) -> Tensor:
+    return torch.as_tensor(given, dtype=torch.float64)
 
 
 def _pose(matrix: npt.NDArray[np.float64]) -> Tensor:
@@ -338,7 +309,7 @@ def _pose(matrix: npt.NDArray[np.float64]) -> Tensor:
 
 
 def _moved(joint: Joint, value: Tensor, point: Tensor) -> Tensor:
-    """Points (..., 3) carried by a joint at values (...); Rodrigues' formula."""
+    """Points (..., 3) transformed by a joint at values (...), by Rodrigues' formula."""
     axis = torch.from_numpy(joint.axis)
     if joint.kind == "prismatic":
         return point + value[..., None] * axis

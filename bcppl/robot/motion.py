@@ -1,4 +1,4 @@
-"""A compliant motion as an arm was commanded to make it, and when it was read."""
+"""Compliant motions: commanded trajectories with the stamps of their measurements."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A compliant motion: the peg, held by a Cartesian spring-damper, follows a commanded trajectory.
+    """A compliant motion: the peg follows a commanded trajectory under Cartesian impedance control.
 
     Attributes:
-        name: windows of the same probe carry the same name and share one simulation.
+        name: windows of one probe have the same name and share one simulation.
         command_times: (C,) seconds, increasing; the command is interpolated between them
             (translations linearly, rotations along the geodesic).
         command: (C, 7) commanded `world_from_peg`.
         stiffness: (6,) N/m along, then N m/rad about, the commanded peg's axes.
         damping: (6,) N s/m, then N m s/rad.
-        stamps: (T,) seconds at which wrench and peg pose are read, over the whole probe.
+        stamps: (T,) times at which wrench and peg pose are measured, over the whole probe, seconds.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Probe:
 
 @dataclass(frozen=True, eq=False)
 class ProbeWindow:
-    """Action: a stretch of a probe, stamps `first` to `last` (exclusive) of `probe.stamps`."""
+    """Action: a window of a probe, stamps `first` to `last` (exclusive) of `probe.stamps`."""
 
     probe: Probe
     first: int

@@ -1,7 +1,7 @@
-"""What an arm is asked to do: straight motions, some of which end where something is felt.
+"""Plans of straight motions, some of them guarded.
 
-A `Probe` is a command as it was carried out, or would be. A plan is what comes before it: whoever carries it
-out (a robot, or a world that plays one) decides from the wrench where guarded motions end.
+A `Probe` is an executed command. A plan precedes it: the executor (a robot, or a simulated world) decides
+from the wrench where guarded motions end.
 """
 
 from __future__ import annotations
@@ -20,42 +20,39 @@ Array = npt.NDArray[np.float64]
 Manner = Literal["free", "guarded", "held", "searching"]
 MANNERS: tuple[Manner, ...] = ("free", "guarded", "held", "searching")
 
-QUICKEST = 1e5  # samples a second: beyond it a rate is no sensor's
-STIFFEST = (
-    1e7  # N/m, and in the units of the others: no arm is so stiff, and no step of a simulation so short
-)
-LONGEST = 600.0  # s: a plan that lasts longer is in milliseconds
-WIDEST = 5.0  # m between its knots, and
-FARTHEST = 100.0  # m from the world's origin: beyond either it is in millimetres
+QUICKEST = 1e5  # samples per second, more than any sensor's rate
+STIFFEST = 1e7  # N/m and the other units: beyond any arm, and unstable at any time step
+LONGEST = 600.0  # s: a longer plan is in milliseconds
+WIDEST = 5.0  # m between knots, and
+FARTHEST = 100.0  # m from the world's origin: beyond either the poses are in millimetres
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Straight motions of a held peg from knot to knot.
+    """Straight motions of a held peg between knots.
 
     Between knots translations are interpolated linearly and rotations along the geodesic. A "guarded" motion
-    stops where the force felt exceeds `force`; the way that was left then stays undone: "held" motions after
-    it are made as planned but for that way, so a slide goes on along the surface that was met. A "free"
-    motion leads to its knot as planned. "Searching" motions are held ones, made while the peg is pressed
-    on by a command that lies below a surface: once the peg has sunk by `sink` below where a guarded
-    motion was last stopped, along the commanded z, or if none was, it has found a hole; the motion stops, and
-    the searching motions right after it stay undone.
+    stops where the contact force exceeds `force`; "held" motions after it are displaced by the remainder of
+    its path, so a slide continues along the surface in contact. A "free" motion ends at its knot as planned.
+    "Searching" motions are held ones with a command below a surface: once the peg has sunk by `sink` along
+    the commanded z, measured from the stop of the last guarded motion if there was one, it is in a hole; the
+    motion stops, and the searching motions directly after it are skipped.
 
     Attributes:
-        name: of the probe that comes of it.
+        name: of the resulting probe.
         times: (K,) seconds, increasing.
-        world_from_peg: (K, 7) where the peg is commanded to be at the knots.
+        world_from_peg: (K, 7) commanded poses at the knots.
         manners: (K - 1,) one of "free", "guarded", "held" and "searching" for each motion.
-        force: newtons at which a guarded motion stops.
+        force: contact force at which a guarded motion stops, newtons.
         stiffness: (6,) N/m along, then N m/rad about, the commanded peg's axes.
         damping: (6,) N s/m, then N m s/rad.
-        rate: samples per second of what is measured.
-        sink: metres; how far below the surface it met a peg is in a hole that is searched for.
+        rate: measurements per second.
+        sink: depth below the surface at which a searching peg is in a hole, metres.
 
     Raises:
         InputError: shapes do not fit, times do not increase, a manner is unknown, the force is not positive,
-            times or places are so large that they are in milliseconds or millimetres, or a motion searches
-            and nothing says what it finds.
+            times or positions are so large that they are in milliseconds or millimetres, or a motion searches
+            and no sink is given.
     """
 
     name: str
@@ -74,8 +71,8 @@ class Plan:
                 numbers = np.asarray(getattr(self, name), dtype=np.float64)
             except (TypeError, ValueError):
                 raise InputError(
-                    f"plan {self.name!r} has {name} that are no array of numbers; give numbers in SI units, "
-                    "as many in each row."
+                    f"plan {self.name!r} has {name} that are no array of numbers; give rows of equal length, "
+                    "in SI units."
                 ) from None
             object.__setattr__(self, name, numbers)
         knots = self.times.size if self.times.ndim == 1 else 0
@@ -86,8 +83,12 @@ class Plan:
             )
         if not (np.isfinite(self.times).all() and (np.diff(self.times) > 0).all()):
             raise InputError(f"plan {self.name!r} has times that do not increase; sort them, in seconds.")
-        if not np.isfinite(self.world_from_peg).all():
-            raise InputError(f"plan {self.name!r} has a pose that is not finite; give poses in metres.")
+        lengths = np.linalg.norm(self.world_from_peg[:, 3:], axis=1)
+        if not (np.isfinite(self.world_from_peg).all() and (np.abs(lengths - 1.0) < 1e-3).all()):
+            raise InputError(
+                f"plan {self.name!r} has a pose that is not finite or has no quaternion of unit length; "
+                "give x y z (m) qw qx qy qz."
+            )
         for manner in self.manners:
             if manner not in MANNERS:
                 raise InputError(
@@ -100,13 +101,7 @@ class Plan:
             least=1.0 / lasts,
             most=QUICKEST,
         )
-        lengths = np.linalg.norm(self.world_from_peg[:, 3:], axis=1)
-        if not (np.abs(lengths - 1.0) < 1e-3).all():
-            raise InputError(
-                f"plan {self.name!r} has a pose whose quaternion is not of unit length; "
-                "give x y z (m) qw qx qy qz."
-            )
-        self._refuse_units()
+        self._check_units()
         for name, given in (("stiffness", self.stiffness), ("damping", self.damping)):
             if given.shape != (6,) or not ((given >= 0.0) & (given <= STIFFEST)).all():
                 raise InputError(
@@ -118,26 +113,26 @@ class Plan:
         if "searching" in self.manners and not self.sink > 0.0:
             raise InputError(
                 f"plan {self.name!r} searches until the peg has sunk by {self.sink:g} m; give a positive "
-                "`sink`, less than how far the command lies below the surface."
+                "`sink`, less than the depth of the command below the surface."
             )
 
-    def _refuse_units(self) -> None:
-        lasts, places = float(self.times[-1] - self.times[0]), self.world_from_peg[:, :3]
+    def _check_units(self) -> None:
+        lasts, positions = float(self.times[-1] - self.times[0]), self.world_from_peg[:, :3]
         if lasts > LONGEST:
             raise InputError(
                 f"plan {self.name!r} lasts {lasts:.0f} s: its times are probably in milliseconds; "
                 "scale them by 0.001 to seconds."
             )
-        way, away = float(np.ptp(places, axis=0).max()), float(np.abs(places).max())
-        if way > WIDEST or away > FARTHEST:
+        extent, away = float(np.ptp(positions, axis=0).max()), float(np.abs(positions).max())
+        if extent > WIDEST or away > FARTHEST:
             raise InputError(
-                f"plan {self.name!r} leads {way:.4g} m far, to {away:.4g} m from the world's origin: its "
+                f"plan {self.name!r} spans {extent:.4g} m, to {away:.4g} m from the world's origin: its "
                 "poses are probably in millimetres; scale x, y and z by 0.001 to metres."
             )
 
 
 def probe_of(plan: Plan) -> Probe:
-    """The command of a plan of which nothing is stopped, with stamps up to but without its last knot."""
+    """The command of a plan that nothing stops, with stamps up to but without its last knot."""
     count = max(1, round(float(plan.times[-1] - plan.times[0]) * plan.rate))
     stamps = plan.times[0] + np.arange(count) / plan.rate
     return Probe(plan.name, plan.times, plan.world_from_peg, plan.stiffness, plan.damping, stamps)

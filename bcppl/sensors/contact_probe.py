@@ -159,7 +159,7 @@ class ContactProbe:
     ) -> Iterator[tuple[ContactManifold, Tensor]]:
         """Each window's likelihood at poses (S, 7), all distances computed in one batch, and its value."""
         gaps = self.gap(part, torch.cat([value[:, :7] for _, _, value in measurements]))
-        gradients, begin = gaps.slope(part), 0
+        gradients, begin = gaps.gradient(part), 0
         for _, action, value in measurements:
             used = begin + torch.nonzero(~torch.isnan(value[:, 7]))[:, 0]
             begin += len(value)
@@ -191,7 +191,7 @@ class _Measured(NamedTuple):
     distance: Tensor
     gradients: Tensor
 
-    def slope(self, world_from_part: Tensor) -> Tensor:
+    def gradient(self, world_from_part: Tensor) -> Tensor:
         return self.gradients
 
     def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gaps:

@@ -15,7 +15,7 @@ from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief
 from bcppl.contact.physics import PegPhysics, Rollout
 from bcppl.errors import InputError
-from bcppl.geometry.holes import Hole, aside_of, depth_reached, hole_of
+from bcppl.geometry.holes import Hole, depth_reached, hole_of, lateral_error
 from bcppl.geometry.parts import Part
 from bcppl.inference.schemes import systematic
 from bcppl.robot.insertion_plan import InsertionPlan
@@ -138,7 +138,7 @@ def _search(
         rows, first_sunk = np.flatnonzero(yields), near[yields].argmax(axis=1)
         stands[left[yields]] = seen[rows, first_sunk]
         # Beside the part, or in another pocket of it, a peg sinks too, and the search ends there.
-        found[left[yields]] = aside_of(hole, physics.peg, part_from_peg[rows, first_sunk]) < _BESIDE
+        found[left[yields]] = lateral_error(hole, physics.peg, part_from_peg[rows, first_sunk]) < _BESIDE
         if yields.all():
             break
         left, rollout = left[~yields], rollout[~yields]
@@ -165,7 +165,7 @@ def _push(
     there = torch.from_numpy(rollout.world_from_peg[np.arange(len(pegs)), ends])
     part_from_peg = poses.compose(poses.inverse(moved), there).numpy()
     deep = depth_reached(hole, physics.peg, part_from_peg) >= plan.deep_enough
-    return np.asarray(deep & (aside_of(hole, physics.peg, part_from_peg) < _BESIDE))
+    return np.asarray(deep & (lateral_error(hole, physics.peg, part_from_peg) < _BESIDE))
 
 
 def _stopped(rollout: Rollout, force: float) -> npt.NDArray[np.int64]:

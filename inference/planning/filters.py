@@ -22,9 +22,9 @@ from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.touching import middles_of_strokes
+from bcppl.robot.inverse_kinematics import joint_paths
 from bcppl.robot.kinematics import Robot
 from bcppl.robot.plan import Plan
-from bcppl.robot.reach import joint_paths
 from bcppl.sensors.candidates import Candidate, duration_of, motion_of, placement_of
 
 Array = npt.NDArray[np.float64]
@@ -299,7 +299,7 @@ def pressing_force(plan: Plan) -> float:
 def within_reach(mounted: Mounted, *, seed: int = 0) -> Filter:
     """Keeps plans along which the arm's joints get the peg, and views for which they get a camera on a wrist.
 
-    Cameras that do not stand on the wrist are kept. See `bcppl.robot.reach.joint_paths`.
+    Cameras that do not stand on the wrist are kept. See `bcppl.robot.inverse_kinematics.joint_paths`.
     """
     base_from_world = poses.inverse(torch.as_tensor(mounted.world_from_base))
 

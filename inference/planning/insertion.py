@@ -19,7 +19,7 @@ from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
-from bcppl.geometry.holes import Hole, clearance_in, hole_from_peg, hole_of
+from bcppl.geometry.holes import Hole, fit_in, hole_of
 from bcppl.geometry.parts import Part
 from bcppl.robot.insertion_plan import InsertionPlan
 from bcppl.robot.plan import Manner, Plan
@@ -94,7 +94,8 @@ def insertion_plan(
     """
     attempt = _checked(Attempt() if attempt is None else attempt)
     hole = hole_of(part) if hole is None else hole
-    stands, clearance = torch.from_numpy(hole_from_peg(hole, peg)), clearance_in(hole, peg)
+    fit = fit_in(hole, peg)
+    stands, clearance = torch.from_numpy(fit.hole_from_peg), fit.clearance
     place = torch.from_numpy(hole.part_from_hole)
     world_from_hole = poses.compose(belief.mean, place)
     doubt = _doubt(belief, world_from_hole, place)

@@ -16,8 +16,8 @@ SHAPES = ("round", "rectangular")
 def insert_tray(shape: str) -> Part:
     """The insert tray for an 8 mm peg, "round" or "rectangular".
 
-    The part's frame: z up, the tray stands on z = 0, its bore is around the z axis, blind from z = 3 mm,
-    chamfered from 27 to 28 mm. The bore is 9 mm wide, the rectangular one 9 mm by 8 mm.
+    The part's frame: z up, the bottom at z = 0, the blind bore around the z axis from z = 3 mm up, chamfered
+    from 27 to 28 mm. The round bore is 9 mm across, the rectangular one 9 mm by 8 mm.
 
     Raises:
         InputError: there is no such tray.
@@ -26,7 +26,7 @@ def insert_tray(shape: str) -> Part:
 
 
 def insert_peg(shape: str) -> Part:
-    """The peg, 50 mm long, for the tray of that shape: its frame is that of `shapes.box_peg`.
+    """The 50 mm peg for the tray of that shape; its frame is that of `extrusion.box_peg`.
 
     The round one is 7.98 mm across, the rectangular one 7.96 mm by 6.92 mm.
 

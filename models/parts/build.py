@@ -1,4 +1,4 @@
-"""Makes `insert_trays.h5` from the published meshes: python -m bcppl.models.parts.build FOLDER."""
+"""Generates `insert_trays.h5` from the published meshes: python -m bcppl.models.parts.build FOLDER."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SOURCE = (
 
 
 def build(folder: Path, path: Path) -> None:
-    """Write the parts whose published OBJ files lie in a folder."""
+    """Write the parts whose published OBJ files are in a folder."""
     with h5py.File(path, "w") as file:
         file.attrs["source"] = SOURCE
         for shape in SHAPES:

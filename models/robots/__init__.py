@@ -1,4 +1,4 @@
-"""Robots that come with bcppl: the Franka Emika Panda with its hand, and the KUKA LBR iiwa 14."""
+"""Shipped robots: the Franka Emika Panda with its hand, and the KUKA LBR iiwa 14."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ def load_robot(
     geometry: Literal["visual", "collision"] = "visual",
     mesh_folders: str | Path | Sequence[str | Path] = (),
 ) -> Robot:
-    """A shipped robot by its name, or any other by its URDF file.
+    """A shipped robot by name, or any other by its URDF file.
 
     Args:
         name: "panda" (7 joints and the gripper's; tip "panda_hand_tcp" for the 7) or "iiwa" (7 joints; its
             flange is "lbr_iiwa_flange"), or the path of a URDF file.
-        tip: a link; the joints that do not lead to it are held.
-        held: values of joints that do not move.
+        tip: a link; joints outside the chain from the base to it are fixed.
+        held: values of fixed joints.
         geometry: which of the links' shapes are drawn.
-        mesh_folders: where meshes are looked for; all four as in `bcppl.robot.kinematics.Robot`.
+        mesh_folders: folders of meshes; all four as in `bcppl.robot.kinematics.Robot`.
 
     Raises:
-        InputError: there is neither a shipped robot nor a file of that name; or as `Robot` says.
+        InputError: there is neither a shipped robot nor a file of that name, or as for `Robot`.
     """
     if name in SHIPPED:
         with importlib.resources.as_file(importlib.resources.files(__name__).joinpath(str(name))) as folder:

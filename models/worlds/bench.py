@@ -21,9 +21,9 @@ from bcppl.contact.peg_model import ContactParameters
 from bcppl.contact.touch import Touch
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.extrusion import block
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
-from bcppl.geometry.shapes import block
 from bcppl.models.worlds.bench_parts import PARTS, BenchPart, bench_part
 from bcppl.models.worlds.bench_sensors import SensorErrors
 from bcppl.models.worlds.guarded_motion import CarriedOut, carry_out, stamps_of

@@ -11,13 +11,8 @@ import numpy.typing as npt
 import shapely
 
 from bcppl.errors import InputError
-from bcppl.geometry.outlines import (
-    block_with_hole,
-    named_outline,
-    peg_for,
-    rectangular_outline,
-    round_outline,
-)
+from bcppl.geometry.extrusion import block_with_hole, peg_for
+from bcppl.geometry.outlines import named_outline, rectangular_outline, round_outline
 from bcppl.geometry.parts import Part
 from bcppl.models.parts import insert_tray
 

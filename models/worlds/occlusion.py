@@ -11,8 +11,8 @@ import torch
 from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
+from bcppl.geometry.extrusion import block
 from bcppl.geometry.parts import Part
-from bcppl.geometry.shapes import block
 from bcppl.rendering.renderer import DepthRenderer
 
 Array = npt.NDArray[np.float64]

@@ -21,9 +21,9 @@ from bcppl.contact.physics import PegPhysics
 from bcppl.contact.touch import Touch
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.camera import Camera
+from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
-from bcppl.geometry.shapes import block, block_with_square_hole, box_peg
 from bcppl.rendering.renderer import DepthRenderer
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors import DepthImage, Measurement, Recording, View

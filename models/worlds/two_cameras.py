@@ -14,8 +14,8 @@ import torch
 
 from bcppl import poses
 from bcppl.distributions.poses import SwingTwistPose
+from bcppl.geometry.extrusion import block_with_square_hole
 from bcppl.geometry.guess import Guess
-from bcppl.geometry.shapes import block_with_square_hole
 from bcppl.models.worlds.peg_in_hole import GUESS, cameras, shifted, table
 from bcppl.rendering.depth_noise import DepthNoise
 from bcppl.rendering.scene import SceneRenderer

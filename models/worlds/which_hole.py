@@ -19,9 +19,9 @@ from bcppl.contact.physics import PegPhysics
 from bcppl.contact.touch import Touch
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.extrusion import box_peg
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part, Piece
-from bcppl.geometry.shapes import box_peg
 from bcppl.models.which_hole import HOLES, PITCH
 from bcppl.models.worlds import peg_in_hole as bench
 from bcppl.rendering.renderer import DepthRenderer

@@ -15,7 +15,7 @@ from bcppl.contact.track import ContactTrack
 from bcppl.contact.wrench import Sensing
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime
 from bcppl.distributions.poses import UniformPose
-from bcppl.geometry.shapes import block, box_peg
+from bcppl.geometry.extrusion import block, box_peg
 from bcppl.inference.filters.tempered_smc import kernel as shipped
 from bcppl.robot.motion import Probe
 from bcppl.traces import carried

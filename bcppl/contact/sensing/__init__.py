@@ -11,7 +11,7 @@ against the peg's side, 30 mm from its root, with 6 N:
     >>> from bcppl.contact.sensing.load import ToolLoad, identify_load
     >>> from bcppl.contact.sensing.noise import noise_at_rest
     >>> from bcppl.contact.sensing.onset import OnsetDetector
-    >>> from bcppl.geometry.shapes import box_peg
+    >>> from bcppl.geometry.extrusion import box_peg
     >>> from bcppl.contact.wrench import Sensing
     >>> rng = np.random.default_rng(1)
     >>> def read(wrench):

@@ -1,4 +1,4 @@
-"""How far a part's convex pieces are from its mesh, on both sides."""
+"""Hausdorff distances between a part's mesh and the union of its convex pieces, in both directions."""
 
 from __future__ import annotations
 
@@ -10,23 +10,22 @@ import numpy.typing as npt
 import torch
 import trimesh
 
-from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.parts import Part, Piece
 
 Array = npt.NDArray[np.float64]
 
-_BATCH = 4096  # points whose distances to all pieces are held at once
+_BATCH = 4096  # points whose distances to all planes are in memory at once
 
 
 @dataclass(frozen=True)
-class GeometricError:
-    """The largest distances found between a mesh and the convex pieces that stand in for it, metres.
+class HausdorffError:
+    """Directed Hausdorff distances between a solid and the union of its convex pieces, metres.
 
     Attributes:
-        added: of points on the pieces' surfaces that lie outside the mesh: material that is not there.
-        lost: of points on the mesh that lie outside all pieces: material that is missing.
+        added: from the pieces to the solid: the farthest that a piece extends outside the mesh.
+        lost: from the solid to the pieces: the farthest that the mesh extends outside all pieces.
     """
 
     added: float
@@ -34,27 +33,26 @@ class GeometricError:
 
     @property
     def largest(self) -> float:
-        """The larger of the two, metres."""
+        """The Hausdorff distance, the larger of the two, metres."""
         return max(self.added, self.lost)
 
 
-def geometric_error(part: Part, count: int = 20000, seed: int = 0) -> GeometricError:
-    """The error of a part's pieces, over points spread evenly over both surfaces, and all corners.
+def hausdorff_error(part: Part, count: int = 20000, seed: int = 0) -> HausdorffError:
+    """The Hausdorff error of a part's pieces, over vertices and uniform samples of both surfaces.
 
     Args:
         part: with a closed mesh and pieces.
-        count: of points on either surface.
-        seed: of the points.
+        count: of samples on either surface.
+        seed: of the samples.
 
     Raises:
-        InputError: the mesh is empty, open or not finite, there are no pieces, or the count is none.
+        InputError: the mesh is empty, open or not finite, or there are no pieces.
     """
     if not part.pieces:
         raise InputError(
-            f"part {part.name!r} has no convex pieces whose error could be measured; make them with "
+            f"part {part.name!r} has no convex pieces whose error could be measured; construct them with "
             "`extruded`, `prismatic` or `decomposed`."
         )
-    whole_number("geometric_error is asked for {} points", count)
     solids = [solid_of(piece) for piece in part.pieces]
     corners = np.concatenate([solid.vertices for solid in solids])
     whole = trimesh.util.concatenate(solids)
@@ -67,18 +65,18 @@ def geometric_error(part: Part, count: int = 20000, seed: int = 0) -> GeometricE
         beyond = torch.minimum(beyond, SignedDistance(single)(on_pieces).distance)
     added = float(beyond.max())
     on_mesh = np.concatenate([part.vertices, part.surface_points(count, seed)])
-    return GeometricError(max(0.0, added), float(_outside(on_mesh, solids).max()))
+    return HausdorffError(max(0.0, added), float(_outside(on_mesh, solids).max()))
 
 
 def bodies_of(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
-    """A mesh's bodies, which may overlap; the whole mesh where one is open or a cavity."""
+    """The connected components of a mesh, which may overlap; the whole mesh where one is open or a cavity."""
     bodies = list(mesh.split(only_watertight=False))
     sound = len(bodies) > 1 and all(body.is_watertight and body.volume > 0 for body in bodies)
     return bodies if sound else [mesh]
 
 
 def solid_of(piece: Piece) -> trimesh.Trimesh:
-    """A convex piece as a closed mesh in the part's frame; a cylinder has 256 sides."""
+    """A closed mesh of a convex piece in the part's frame; a cylinder has 256 sides."""
     if piece.kind == "hull":
         return trimesh.convex.convex_hull(piece.size)
     if piece.kind == "box":
@@ -89,13 +87,19 @@ def solid_of(piece: Piece) -> trimesh.Trimesh:
     return solid
 
 
+def planes_of(solid: trimesh.Trimesh) -> Array:
+    """The planes (F, 4) of a mesh's faces: outward unit normal and offset."""
+    normals = np.asarray(solid.face_normals)
+    return np.column_stack([normals, np.sum(normals * solid.triangles[:, 0], axis=1)])
+
+
 def _outside(points: Array, solids: list[trimesh.Trimesh]) -> Array:
-    """How far points (P, 3) lie outside all of some convex solids; 0 inside any of them."""
+    """Distances (P,) of points (P, 3) to the union of convex solids; 0 inside."""
     beyond = np.full(len(points), np.inf)
     for solid in solids:
         close = np.flatnonzero(_beyond_box(points, solid) < beyond)
         beyond[close] = np.minimum(beyond[close], _beyond_planes(points[close], solid))
-    # The farthest plane tells inside from outside; how far is outside, near an edge, the surface tells.
+    # The farthest plane decides between inside and outside, and bounds the distance to the surface below.
     distance = np.where(beyond > 1e-9, np.inf, 0.0)
     for solid in solids:
         close = np.flatnonzero(_beyond_box(points, solid) < np.minimum(distance, beyond + 1e-4))
@@ -108,12 +112,12 @@ def _outside(points: Array, solids: list[trimesh.Trimesh]) -> Array:
 
 
 def _beyond_box(points: Array, solid: trimesh.Trimesh) -> Array:
-    """How far points (P, 3) are outside a solid's bounding box, at least."""
+    """Lower bounds (P,) on the distances of points (P, 3) to a solid, from its bounding box."""
     return np.asarray(np.maximum(solid.bounds[0] - points, points - solid.bounds[1]).max(axis=1))
 
 
 def _beyond_planes(points: Array, solid: trimesh.Trimesh) -> Array:
-    """How far points (P, 3) are outside a convex solid, at least; 0 inside."""
-    normals, levels = solid.face_normals, np.sum(solid.face_normals * solid.triangles[:, 0], axis=1)
-    found = [(points[k : k + _BATCH] @ normals.T - levels).max(axis=1) for k in range(0, len(points), _BATCH)]
-    return np.maximum(np.concatenate(found), 0.0) if found else np.empty(0)
+    """Lower bounds (P,) on the distances of points (P, 3) to a convex solid, from its planes; 0 inside."""
+    planes, starts = planes_of(solid), range(0, len(points), _BATCH)
+    farthest = [(points[k : k + _BATCH] @ planes[:, :3].T - planes[:, 3]).max(axis=1) for k in starts]
+    return np.maximum(np.concatenate(farthest), 0.0) if farthest else np.empty(0)

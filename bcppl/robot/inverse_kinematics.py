@@ -1,0 +1,120 @@
+"""Inverse kinematics along paths of tool poses, within the joint limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.arguments import seed_number, whole_number
+from bcppl.errors import InputError
+from bcppl.robot.kinematics import Robot
+
+Array = npt.NDArray[np.float64]
+
+NEAR = (0.0005, math.radians(0.5))  # m and rad: tolerance at which a pose is reached
+_LEVER = 0.3  # m per radian in the norm of the error
+_DAMPING = 1e-4
+_FARTHEST = 0.4  # rad or m, largest change of a joint in one step
+_FIRST, _NEXT = 50, 25  # steps, at most, to the first pose of a path and from one pose to the next
+
+
+def joint_paths(
+    robot: Robot,
+    link: str,
+    base_from_tool: Array,
+    link_from_tool: Array | None = None,
+    *,
+    tries: int = 8,
+    seed: int = 0,
+) -> Array:
+    """Joint angles along paths of poses, within the joint limits.
+
+    Damped least squares (Wampler, Manipulator inverse kinematic solutions based on vector formulations and
+    damped least-squares methods, IEEE SMC 16, 1986) from several starts in one batch; each pose of a path is
+    solved from the solution of the one before, so that the arm does not change its configuration in between.
+    Collisions of the links are not checked.
+
+    Args:
+        robot: constructed with a tip, so that all joints move the link.
+        link: to which the tool is mounted.
+        base_from_tool: (P, K, 7) P paths of K poses in the robot's base frame.
+        link_from_tool: (7,) the tool's pose on the link; None for the link's frame.
+        tries: starts for each path.
+        seed: of the starts.
+
+    Returns:
+        (P, K, J) radians, metres where a joint is prismatic; NaN for paths that are not reached.
+
+    Raises:
+        InputError: a pose is not valid, the robot has no link of that name, or no joint moves.
+    """
+    tries, seed = whole_number("a path is tried from {} starts", tries), seed_number(seed)
+    goal = poses.as_pose(torch.as_tensor(base_from_tool), "a path of the tool")
+    if not robot.joints:
+        raise InputError(f"{robot.name} has no joint that moves {link!r}; name another link.")
+    count, length = goal.shape[:2]
+    low, high = (
+        torch.tensor([_within(getattr(j, of)) for j in robot.joints], dtype=torch.float64)
+        for of in ("lower", "upper")
+    )
+    generator = torch.Generator().manual_seed(seed)
+    share = torch.rand(tries, len(robot.joints), generator=generator, dtype=torch.float64)
+    share[0] = 0.5
+    angles = (low + share * (high - low)).repeat(count, 1)
+    mounted = None if link_from_tool is None else torch.as_tensor(link_from_tool)
+    reached = torch.ones(count * tries, dtype=torch.bool)
+    path = []
+    for k in range(length):
+        target = goal[:, k].repeat_interleave(tries, dim=0)
+        for _ in range(_NEXT if k else _FIRST):
+            error, jacobian = _error(robot, link, angles, target, mounted)
+            near = _is_near(error)
+            # One solution for a path's first pose suffices; afterwards all that have reached theirs go on.
+            if bool(near[reached].all() if k else near.reshape(count, tries).any(dim=1).all()):
+                break
+            angles = (angles + _step(error, jacobian)).clamp(low, high)
+        error, _ = _error(robot, link, angles, target, mounted)
+        reached = reached & _is_near(error)
+        path.append(angles)
+        if not bool(reached.any()):
+            return np.full((count, length, len(robot.joints)), np.nan)
+    paths = torch.stack(path, dim=1).reshape(count, tries, length, -1)
+    good = reached.reshape(count, tries)
+    chosen = paths[torch.arange(count), good.to(torch.int8).argmax(dim=1)]
+    chosen[~good.any(dim=1)] = torch.nan
+    return np.asarray(chosen.numpy())
+
+
+def _within(limit: float) -> float:
+    """A joint limit; without one, a revolution in either direction."""
+    return float(np.clip(limit, -2.0 * math.pi, 2.0 * math.pi))
+
+
+def _error(
+    robot: Robot, link: str, angles: Tensor, goal: Tensor, mounted: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Pose errors (B, 6), metres and radians, and their Jacobian (B, 6, J) with respect to the angles."""
+    angles = angles.detach().requires_grad_()
+    error = poses.local(goal, robot.base_from_link(link, angles, link_from_tool=mounted))
+    rows = [torch.autograd.grad(error[:, k].sum(), angles, retain_graph=k < 5)[0] for k in range(6)]
+    return error.detach(), torch.stack(rows, dim=1)
+
+
+def _step(error: Tensor, jacobian: Tensor) -> Tensor:
+    """The damped least-squares step (B, J) of the angles."""
+    scale = torch.tensor([1.0] * 3 + [_LEVER] * 3, dtype=torch.float64)
+    error, jacobian = error * scale, jacobian * scale[:, None]
+    square = jacobian @ jacobian.transpose(-1, -2) + _DAMPING * torch.eye(6, dtype=torch.float64)
+    step = -(jacobian.transpose(-1, -2) @ torch.linalg.solve(square, error[..., None]))[..., 0]
+    largest = step.abs().amax(dim=-1, keepdim=True).clamp_min(1e-12)
+    return step * (_FARTHEST / largest).clamp_max(1.0)
+
+
+def _is_near(error: Tensor) -> Tensor:
+    shift, turn = error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1)
+    return (shift < NEAR[0]) & (turn < NEAR[1])
