@@ -39,7 +39,7 @@ class Counted(LazyDistribution):
 
     def __init__(self, x: Tensor, log_likelihood: Callable[[Tensor], Tensor]) -> None:
         self.x, self.log_likelihood = x, log_likelihood
-        super().__init__(len(x), (), (x,))
+        super().__init__(len(x), ())
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Of the data, which the function holds."""

@@ -66,7 +66,7 @@ class Feeling:
                 pyro.sample(f"depth_{k}", depth)
                 continue
             begin = partial(ContactTrack.start, scene.physics, scene.sensing, hole, action.probe)
-            window = (carried(f"probe {action.probe.name}", hole, begin), action.first, action.last)
+            window = (carried(f"probe {action.probe.name}", begin), action.first, action.last)
             if self.contacts:
                 felt = ChamferContacts(*window, settings.contact_scale, settings.one_empty)
                 pyro.sample(f"contacts_{k}", felt)

@@ -22,7 +22,8 @@ class Felt(LazyDistribution):
     """Anything that is felt at x; what its log-probability is, is said by those that inherit from it."""
 
     def __init__(self, x: Tensor) -> None:
-        super().__init__(len(x), (), (x,))
+        self.x = x
+        super().__init__(len(x), ())
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         return torch.zeros(self.batch_shape)

@@ -48,12 +48,12 @@ def carrying(log: list[str]) -> Callable[[int], Any]:
             log.append(f"started {len(x)}")
             return Counter(x.clone(), torch.zeros(len(x), dtype=torch.int64), log)
 
-        state = carried("counter", x, start)
+        state = carried("counter", start)
 
         class Window(LazyDistribution):
             def __init__(self, k: int) -> None:
                 self.k = k
-                super().__init__(len(x), (), (x,))
+                super().__init__(len(x), ())
 
             def log_prob(self, value: Tensor) -> Tensor:
                 assert torch.equal(state.start, x), "the state belongs to other particles"
@@ -117,8 +117,8 @@ def test_two_windows_of_one_run_share_the_state_that_the_first_began() -> None:
         return State()
 
     def twice() -> None:
-        x = pyro.sample("x", dist.Normal(torch.tensor(0.0, dtype=torch.float64), 1.0))
-        assert carried("state", x, start) is carried("state", x, start)
+        pyro.sample("x", dist.Normal(torch.tensor(0.0, dtype=torch.float64), 1.0))
+        assert carried("state", start) is carried("state", start)
 
     simulate(twice, (), 5)
     assert len(started) == 1

@@ -51,7 +51,7 @@ def test_one_more_particle_runs_no_simulator_and_draws_nothing() -> None:
         cost = 2
 
         def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
-            sampled.append(len(self.inputs[0]))
+            sampled.append(len(self.x))
             return super().sample(sample_shape)
 
     def program(data: Tensor) -> None:

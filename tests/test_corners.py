@@ -35,7 +35,7 @@ def number(value: float) -> Tensor:
 class Lazy(LazyDistribution):
     def __init__(self, loc: Tensor) -> None:
         self.loc = loc
-        super().__init__(len(loc), (), (loc,))
+        super().__init__(len(loc), ())
 
     def log_prob(self, value: Tensor) -> Tensor:
         return torch.distributions.Normal(self.loc, 1.0).log_prob(value)

@@ -44,7 +44,7 @@ class Seen(LazyDistribution):
 
     def __init__(self, name: str, value: Tensor, cost: int) -> None:
         self.name, self.value, self.cost = name, value, cost
-        super().__init__(len(value), (), (value,))
+        super().__init__(len(value), ())
 
     @property
     def log_prob_bound(self) -> float:

@@ -127,7 +127,6 @@ def test_no_error_and_no_bias_change_nothing(kind: Kind) -> None:
     torch.testing.assert_close(
         still, kind(RENDERER, CAMERA, POSE, SCALE).log_prob(seen), rtol=1e-6, atol=1e-3
     )
-    assert kind(RENDERER, CAMERA, POSE, SCALE, camera_error=ERROR, bias=BIAS).inputs == (POSE, ERROR, BIAS)
 
 
 def density(site: DepthDistribution, readings: Array) -> Array:

@@ -161,7 +161,7 @@ class SeenPoints(LazyDistribution):
 
     def __init__(self, pose: Tensor, model: Tensor, noise: float) -> None:
         self.pose, self.model, self.noise = pose, model, noise
-        super().__init__(len(pose), tuple(model.shape), (pose,))
+        super().__init__(len(pose), tuple(model.shape))
 
     def log_prob(self, value: Tensor) -> Tensor:
         moved = poses.transform(self.pose, self.model)

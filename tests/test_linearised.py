@@ -34,7 +34,7 @@ class Read(LazyDistribution):
     def __init__(self, pose: Tensor, row: Tensor, noise: float) -> None:
         self.told, self.row, self.noise = poses.local(CENTER, pose) @ row, row, noise
         self.pose = pose
-        super().__init__(len(pose), (), (pose,))
+        super().__init__(len(pose), ())
 
     def log_prob(self, value: Tensor) -> Tensor:
         return -0.5 * ((value - self.told) / self.noise) ** 2 - math.log(self.noise * math.sqrt(2 * math.pi))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -43,7 +44,7 @@ class Counted(LazyDistribution):
 
     def __init__(self, track: Any, noise: float) -> None:
         self.track, self.noise = track, noise
-        super().__init__(len(track), (), track.inputs)
+        super().__init__(len(track), ())
 
     def log_prob(self, value: Tensor) -> Tensor:
         return dist.Normal(self.track.run(), self.noise).log_prob(value)
@@ -81,8 +82,7 @@ def pushed(gains: list[Tensor]) -> None:
     """Each push is felt twice; a gain is one number for all, or one for each particle."""
     x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
     for k, gain in enumerate(gains):
-        inputs = (x, gain.expand(x.shape))
-        track = carried(f"push {k}", inputs, lambda inputs=inputs: Track(*inputs))
+        track = carried(f"push {k}", partial(Track, x, gain.expand(x.shape)))
         first = pyro.sample(f"felt_{k}", Counted(track, 0.3))
         pyro.sample(f"again_{k}", Counted(track, 0.5))
         with pyro.plate(f"echoes_{k}", 2):
@@ -211,7 +211,8 @@ class Off(LazyDistribution):
     """A reading that is off by what was read before."""
 
     def __init__(self, x: Tensor, before: Tensor) -> None:
-        super().__init__(len(x), (), (x, before))
+        self.inputs = x, before
+        super().__init__(len(x), ())
 
     def log_prob(self, value: Tensor) -> Tensor:
         x, before = self.inputs
@@ -242,11 +243,12 @@ class Unforeseen(LazyDistribution):
     """A likelihood of what was measured that cannot say what will be."""
 
     def __init__(self, x: Tensor) -> None:
-        super().__init__(len(x), (2,), (x,))
+        self.x = x
+        super().__init__(len(x), (2,))
 
     def log_prob(self, value: Tensor) -> Tensor:
         assert value.shape == (2,)
-        return -0.5 * ((value - self.inputs[0][:, None]) / 0.2).square().sum(-1)
+        return -0.5 * ((value - self.x[:, None]) / 0.2).square().sum(-1)
 
 
 def unforeseen(touches: int) -> None:
@@ -320,11 +322,11 @@ def test_a_series_is_run_on_by_a_step() -> None:
 def test_hypotheses_whose_simulation_failed_are_left_out_and_counted() -> None:
     class Fragile(Unforeseen):
         def log_prob(self, value: Tensor) -> Tensor:
-            return torch.where(self.inputs[0] > 1.0, -torch.inf, super().log_prob(value))
+            return torch.where(self.x > 1.0, -torch.inf, super().log_prob(value))
 
         def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
-            drawn = self.inputs[0][:, None] + 0.2 * torch.randn(len(self.inputs[0]), 2, dtype=torch.float64)
-            return torch.where((self.inputs[0] > self.limit)[:, None], torch.nan, drawn)
+            drawn = self.x[:, None] + 0.2 * torch.randn(len(self.x), 2, dtype=torch.float64)
+            return torch.where((self.x > self.limit)[:, None], torch.nan, drawn)
 
         limit = 1.0
 

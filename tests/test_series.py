@@ -216,7 +216,7 @@ def test_a_carried_simulator_goes_on_from_step_to_step() -> None:
             started.append(len(pose))
             return Counter(pose)
 
-        assert torch.equal(carried("probe", pose, start).owner, pose)
+        assert torch.equal(carried("probe", start).owner, pose)
         pyro.sample("force", dist.Normal(pose, 1.0))
         return pose
 

@@ -30,7 +30,7 @@ class Counting(LazyDistribution):
     asked: list[int] = []  # noqa: RUF012
 
     def __init__(self, mean: Tensor) -> None:
-        super().__init__(len(mean), (), (mean,))
+        super().__init__(len(mean), ())
         self.center = mean
 
     def log_prob(self, value: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ class Dear(LazyDistribution):
 
     def __init__(self, value: Tensor, bound: float) -> None:
         self.value, self.bound = value, bound
-        super().__init__(len(value), (), (value,))
+        super().__init__(len(value), ())
 
     @property
     def log_prob_bound(self) -> float:

@@ -28,7 +28,7 @@ class Counted(LazyDistribution):
 
     def __init__(self, calls: list[str], name: str, x: Tensor) -> None:
         self.calls, self.name, self.x = calls, name, x
-        super().__init__(len(x), (), (x,))
+        super().__init__(len(x), ())
 
     def log_prob(self, value: Tensor) -> Tensor:
         self.calls.append(self.name)

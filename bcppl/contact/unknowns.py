@@ -26,7 +26,7 @@ class Unknowns:
         friction = pyro.sample("friction", LogNormal(log(0.3), 0.3))
         unknowns = Unknowns(friction=friction)
         begin = partial(ContactTrack.start, physics, sensing, hole, probe, unknowns)
-        track = carried("probe", (hole, *unknowns.tensors), begin)
+        track = carried("probe", begin)
 
     Frames. The grip is the frame that the robot believes the peg's to be: its origin is the wrench sensor,
     its axes are those of a peg that is held as planned. What is commanded, measured by the robot's joints and

@@ -19,10 +19,6 @@ class Track(Protocol):
     """A probe as N particles feel it: `bcppl.contact.track.ContactTrack`, or what answers alike."""
 
     @property
-    def inputs(self) -> tuple[Tensor, ...]:
-        """The tensors that the track hangs on, particle axis first."""
-
-    @property
     def diverged(self) -> Tensor:
         """(N,) particles whose simulation failed, as far as it was run."""
 
@@ -113,7 +109,7 @@ class ChamferContacts(LazyDistribution):
             )
         self.track, self.first, self.last = track, first, last
         self.scale, self.one_empty, self.noise = scale, one_empty, noise
-        super().__init__(len(track), (last - first, 3), track.inputs)
+        super().__init__(len(track), (last - first, 3))
 
     @property
     def log_prob_bound(self) -> float:
@@ -190,7 +186,7 @@ class ContactsInTime(LazyDistribution):
         self.track, self.first, self.last = track, first, last
         self.scale, self.missed, self.invented, self.outlier = scale, missed, invented, outlier
         self.reach, self.every = reach, every
-        super().__init__(len(track), (last - first, 3), track.inputs)
+        super().__init__(len(track), (last - first, 3))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-probability (N,) of locations (T, 3), or (N, T, 3).
@@ -274,7 +270,7 @@ class PegPose(LazyDistribution):
         _check_positive("PegPose", translation_scale=translation_scale, rotation_scale=rotation_scale)
         self.track, self.first, self.last = track, first, last
         self.translation_scale, self.rotation_scale, self.every = translation_scale, rotation_scale, every
-        super().__init__(len(track), (last - first, 7), track.inputs)
+        super().__init__(len(track), (last - first, 7))
 
     @property
     def log_prob_bound(self) -> float:

@@ -17,13 +17,13 @@ class LazyDistribution(TorchDistribution):
     """A distribution over one observation for each of N particles, evaluated only on demand.
 
     Subclasses run their simulator in `log_prob` and `sample`, never in `__init__`, so that a program
-    can be traced for the price of its Python.
+    can be traced for the price of its Python. A log-probability is evaluated again when an attribute, or
+    anything that an attribute holds, has changed (`bcppl.traces.dependence`). Attributes that only cache what
+    the others determine are therefore cached properties, or are named in `__caches__`.
 
     Attributes:
-        inputs: the tensors, particle axis first, that the distribution hangs on. While they stay the same,
-            a log-probability that is known already is not computed again.
-        cost: what a log-probability takes: 0 arithmetic, 1 rendering, 2 physics. Kernels ask the cheap ones
-            first and move particles less often where they are dear.
+        cost: of a log-probability: 0 arithmetic, 1 rendering, 2 physics. Kernels evaluate the cheap sites
+            first and move particles less often where they are expensive.
         broadcasts: whether `log_prob` takes H observations at once, (H, 1, *event_shape), and gives (H, N).
     """
 
@@ -33,8 +33,7 @@ class LazyDistribution(TorchDistribution):
     arg_constraints: dict[str, Any] = {}
     support = constraints.real
 
-    def __init__(self, particles: int, event_shape: tuple[int, ...], inputs: tuple[Tensor, ...]) -> None:
-        self.inputs = inputs
+    def __init__(self, particles: int, event_shape: tuple[int, ...]) -> None:
         super().__init__(torch.Size([particles]), torch.Size(event_shape), validate_args=False)
 
     def expand(self, batch_shape: Any, _instance: Any = None) -> LazyDistribution:
@@ -56,9 +55,9 @@ class LazyDistribution(TorchDistribution):
 
     @property
     def log_prob_bound(self) -> float:
-        """What no log-probability exceeds, whatever the value and the inputs; +inf where that is not known.
+        """Upper bound of the log-probability at any value and any parameters; +inf where none is known.
 
-        It lets a kernel reject a particle before its dear sites are evaluated.
+        It lets a kernel reject a particle before its expensive sites are evaluated.
         """
         return math.inf
 

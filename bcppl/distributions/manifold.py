@@ -103,7 +103,7 @@ class ContactManifold(LazyDistribution):
         number_within("a contact manifold is given outlier {}", outlier, above=0.0, below=1.0)
         self.gap, self.pose, self.motion = gap, pose, motion
         self.noise, self.shared, self.sink, self.outlier = noise, shared, sink, outlier
-        super().__init__(len(pose), (stamps, 8), (pose,))
+        super().__init__(len(pose), (stamps, 8))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-likelihood (N,) of one window (T, 8), or of one for each particle (N, T, 8)."""

@@ -36,6 +36,8 @@ class Path:
         InputError: fewer than two different points, or one that is not finite.
     """
 
+    __caches__ = ("_last",)
+
     def __init__(self, points: Tensor) -> None:
         if not bool(torch.isfinite(points).all()):
             raise InputError("a finger's path holds a point that is not finite; leave those rows out.")

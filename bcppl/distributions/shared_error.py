@@ -9,8 +9,6 @@ about zero. Then the thresholds of all touches are jointly normal, and each is c
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -33,6 +31,8 @@ class SharedError:
         shift, turn: standard deviations of the shared error: metres along each axis of the plane, radians.
         offset, spread: of one touch by itself, as `OnsetLocation` has them, metres.
     """
+
+    __caches__ = ("_known",)
 
     def __init__(
         self, placed: Placed, center: Tensor, shift: float, turn: float, offset: float, spread: float
@@ -124,18 +124,15 @@ class SharedOnset(OnsetLocation):
         outlier: probability of an onset that has nothing to do with the part.
     """
 
+    __caches__ = ("shared",)
+
     def __init__(self, shared: SharedError, outlier: float) -> None:
         self.shared, self.which = shared, len(shared.paths) - 1
+        # What it shares with later touches does not change it.
+        self.given = shared.center, shared.scale, tuple(shared.paths), tuple(shared.places)
         placed, path = shared.placed, shared.paths[-1]
         super().__init__(placed, placed.pose, path, shared.offset, shared.spread, outlier)
-        self.inputs = (placed.pose, *[place for place in shared.places if place.ndim > 1])
 
-    def log_prob(self, value: Tensor) -> Tensor:
-        """Log-density (N,) of one location (3,), or of one for each particle (N, 3)."""
-        self.offset, self.spread = self.shared.threshold(self.which)
-        return super().log_prob(value)
-
-    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
-        """Where contact is first felt, (N, 3); NaN for never."""
-        self.offset, self.spread = self.shared.threshold(self.which)
-        return super().sample(sample_shape)
+    def threshold(self) -> tuple[Tensor, Tensor]:
+        """Offset and spread (N,) of this touch, given where those before it were felt, metres."""
+        return self.shared.threshold(self.which)

@@ -87,7 +87,7 @@ class Silhouette(LazyDistribution):
                 f"the rim of a silhouette has shape {tuple(rim.shape)}; "
                 f"give ({len(pose)},), pixels, one per particle."
             )
-        super().__init__(len(pose), shape, (pose, rim) if isinstance(rim, Tensor) else (pose,))
+        super().__init__(len(pose), shape)
         self.camera, self.pose, self.rim, self.region = camera, pose, rim, region
         self._hits = HitsOfPoses(partial(renderer.hits, camera, pose.detach()), None)
         self._hits.keep_all()
@@ -103,8 +103,6 @@ class Silhouette(LazyDistribution):
             others: `rim`, `temperature`, `region`.
         """
         made = cls(depth.renderer, depth.camera, depth.seen_pose, width, wrong, **others)
-        # A bias or a scale of the depth changes no outline.
-        made.inputs = tuple(x for x in (depth.pose, depth.camera_error, made.rim) if isinstance(x, Tensor))
         made._hits = depth.all_hits()
         return made
 

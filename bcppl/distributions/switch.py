@@ -77,11 +77,7 @@ class Switch(LazyDistribution):
             )
         self.cost = costs[0] if cost is None else cost
         self.support, self.freedom = _common_support(self.groups), _common_freedom(built)
-        inputs = tuple(tensor for each in built for tensor in getattr(each, "inputs", ()))
-        super().__init__(len(which), shapes.pop(), inputs=(which, *inputs))
-        if not all(hasattr(each, "inputs") for each in built):
-            # What does not say what it hangs on must be evaluated anew each time.
-            del self.inputs
+        super().__init__(len(which), shapes.pop())
 
     @property
     def log_prob_bound(self) -> float:

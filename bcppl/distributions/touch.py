@@ -30,10 +30,6 @@ OFF_PATH = 1e-3
 UPRIGHT = 1e-6
 
 
-def _latent(scales: tuple[Scale, ...]) -> tuple[Tensor, ...]:
-    return tuple(s for s in scales if isinstance(s, Tensor) and s.ndim > 0)
-
-
 def _refuse_impossible(where: str, outlier: float | None, **scales: Scale) -> None:
     """Refuse scales that are no scales. A latent one, (N,), may leave its support: then it is impossible."""
     for name, scale in scales.items():
@@ -53,6 +49,8 @@ class Placed:
         distance: the signed distance to the part.
         pose: (N, 7) world_from_part.
     """
+
+    __caches__ = ("_expected", "_known")
 
     def __init__(self, distance: Distance, pose: Tensor) -> None:
         self.distance, self.pose = distance, pose
@@ -156,11 +154,16 @@ class OnsetLocation(LazyDistribution):
         _refuse_impossible("an onset's location", outlier, spread=spread)
         self.distance, self.pose, self.path = distance, pose, path
         self.offset, self.spread, self.outlier = offset, spread, outlier
-        super().__init__(len(pose), (3,), (pose, *_latent((offset, spread))))
+        super().__init__(len(pose), (3,))
+
+    def threshold(self) -> tuple[Scale, Scale]:
+        """Offset and spread of the threshold, metres."""
+        return self.offset, self.spread
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density (N,) of one location (3,), or of one for each particle (N, 3)."""
-        # What is the same for all particles is worked out once: the inputs keep the shape they have.
+        # What is the same for all particles is computed once: arguments keep the shape they have.
+        offset, width = self.threshold()
         travelled = _travelled(self.path, value)
         felt = torch.isfinite(travelled)
         place = value if bool(felt.all()) else torch.where(felt[..., None], value, self.path.points[0])
@@ -168,9 +171,9 @@ class OnsetLocation(LazyDistribution):
         here, normal = _at(self.distance, self.pose, place)
         lowest = _lowest(self.distance, self.pose, self.path, travelled)
 
-        inlier, spread = math.log1p(-self.outlier), torch.as_tensor(self.spread, dtype=torch.float64)
+        inlier, spread = math.log1p(-self.outlier), torch.as_tensor(width, dtype=torch.float64)
         approach = -(normal * located.direction).sum(dim=-1)
-        score = (here + self.offset) / spread
+        score = (here + offset) / spread
         passage = -0.5 * score**2 - torch.log(spread) - 0.5 * math.log(2.0 * math.pi)
         passage = passage + torch.log(approach.clamp(min=0.0))
         passage = inlier + torch.where(here < lowest, passage, -torch.inf)
@@ -178,12 +181,13 @@ class OnsetLocation(LazyDistribution):
         density = torch.logaddexp(passage, stray)
         density = torch.where(travelled == 0.0, inlier + log_ndtr(-score), density)
         density = torch.where(located.off <= OFF_PATH, density, -torch.inf)
-        return torch.where(felt, density, inlier + log_ndtr((lowest + self.offset) / spread))
+        return torch.where(felt, density, inlier + log_ndtr((lowest + offset) / spread))
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Where contact is first felt, (N, 3): interpolated between the path's points; NaN for never."""
         particles, path = len(self.pose), self.path
-        threshold = -self.offset + self.spread * torch.randn(particles, dtype=torch.float64)
+        offset, spread = self.threshold()
+        threshold = -offset + spread * torch.randn(particles, dtype=torch.float64)
         distances = _everywhere(self.distance, self.pose, path)
         below = distances <= threshold[:, None]
         first = below.to(torch.uint8).argmax(dim=-1, keepdim=True)
@@ -238,7 +242,7 @@ class ForceDirection(LazyDistribution):
         self.distance, self.pose = distance, pose
         self.tip, self.motion = tip.expand(len(pose), 3), motion.expand(len(pose), 3)
         self.friction, self.spread, self.outlier = friction, spread, outlier
-        super().__init__(len(pose), (), (pose, self.tip, self.motion, *_latent((friction, spread))))
+        super().__init__(len(pose), ())
 
     def _expected(self) -> tuple[Tensor, Tensor, Tensor]:
         """The expected angle (N,), where it has a direction (N,), and where anything was felt (N,)."""
@@ -307,7 +311,7 @@ class FreePath(LazyDistribution):
         _refuse_impossible("a free path", None, spread=spread)
         self.distance, self.pose, self.path = distance, pose, path
         self.onset, self.tolerance, self.spread = onset.expand(len(pose), 3), tolerance, spread
-        super().__init__(len(pose), (), (pose, self.onset, *_latent((tolerance, spread))))
+        super().__init__(len(pose), ())
 
     def _score(self) -> Tensor:
         travelled = _travelled(self.path, self.onset)

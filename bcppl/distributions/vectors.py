@@ -25,7 +25,7 @@ class NormalStep(LazyDistribution):
 
     def __init__(self, at: Tensor, factor: Tensor, size: Tensor) -> None:
         self.at, self.factor, self.size = at, factor, size
-        super().__init__(len(at), tuple(at.shape[1:]), (at, size))
+        super().__init__(len(at), tuple(at.shape[1:]))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density (N,) w.r.t. Lebesgue on the value's entries."""

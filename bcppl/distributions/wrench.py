@@ -20,10 +20,6 @@ class WrenchTrack(Protocol):
     """A probe as N particles feel it: `bcppl.contact.track.ContactTrack`, or what answers alike."""
 
     @property
-    def inputs(self) -> tuple[Tensor, ...]:
-        """The tensors that the track hangs on, particle axis first."""
-
-    @property
     def diverged(self) -> Tensor:
         """(N,) particles whose simulation failed, as far as it was run."""
 
@@ -102,8 +98,7 @@ class Wrench(LazyDistribution):
         self.track, self.first, self.last, self.bias = track, first, last, bias
         self.force_scale, self.torque_scale = force_scale, torque_scale
         self.relative, self.outlier, self.every = relative, outlier, every
-        inputs = track.inputs if bias is None else (*track.inputs, bias)
-        super().__init__(len(track), (last - first, 6), inputs)
+        super().__init__(len(track), (last - first, 6))
 
     @property
     def log_prob_bound(self) -> float:

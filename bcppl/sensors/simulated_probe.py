@@ -109,8 +109,7 @@ class SimulatedProbe:
         settings, unknowns = self.settings, self.unknowns
         own = () if unknowns is None else (unknowns,)
         begin = partial(ContactTrack.start, self.physics, self.sensing, world_from_part, action.probe, *own)
-        inputs = (world_from_part, *(() if unknowns is None else unknowns.tensors))
-        track = carried(f"probe {action.probe.name}", inputs, begin)
+        track = carried(f"probe {action.probe.name}", begin)
         window = (track, action.first, action.last)
         pyro.sample(
             f"contacts_{number}", ChamferContacts(*window, settings.contact_scale, settings.one_empty)

@@ -1,6 +1,7 @@
 """Traces: runs of a program for N particles at once, and the verbs on them."""
 
 from bcppl.traces.carried import carried
+from bcppl.traces.check import check_program
 from bcppl.traces.model import Model
 from bcppl.traces.propose import Proposed, assess, propose
 from bcppl.traces.series import Series
@@ -17,6 +18,7 @@ __all__ = [
     "Update",
     "assess",
     "carried",
+    "check_program",
     "extend",
     "generate",
     "propose",

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
+from bcppl.traces.dependence import alike, equal
 from bcppl.traces.run import Program, Run, inward, run
 from bcppl.traces.trace import Trace
 
@@ -52,16 +53,16 @@ def log_prob_with_grad(
     Raises:
         InputError: a site that hangs on the values runs a simulator, or passes no gradient on.
     """
-    given = {**trace.choices, **trace.observations, **values}
+    given, before = {**trace.choices, **trace.observations, **values}, trace._run.distributions
     program = differentiable(trace.program)
     ran: Run = _refusing(partial(run, program, trace.args, trace.particles, given, trace.carried), "", values)
     total = torch.zeros(trace.particles, dtype=torch.float64, device=next(iter(values.values())).device)
     with torch.enable_grad(), pyro.validation_enabled(False):
         for address, distribution in ran.distributions.items():
-            parameters = _parameters(distribution)
-            if not parameters and not ran.values[address].requires_grad:
+            parameters, depends = _parameters(before[address], distribution)
+            if depends is False and not ran.values[address].requires_grad:
                 continue
-            if parameters and getattr(distribution, "cost", 0) > 0:
+            if depends is not False and getattr(distribution, "cost", 0) > 0:
                 _refuse(address, "runs a simulator, which passes no gradient on", parameters, values)
             exponent = 1.0 if exponents is None else exponents.get(address, 1.0)
             if exponent == 0.0:
@@ -69,7 +70,7 @@ def log_prob_with_grad(
             density = _refusing(
                 partial(distribution.log_prob, inward(ran.values[address], distribution)), address, values
             )
-            if parameters and not density.requires_grad:
+            if depends and not density.requires_grad:
                 _refuse(address, "passes no gradient on", parameters, values)
             # Plates lie to the left of the particles.
             density = density.to(torch.float64).expand(distribution.batch_shape)
@@ -77,22 +78,33 @@ def log_prob_with_grad(
     return total
 
 
-def _parameters(distribution: Any) -> list[Tensor]:
-    """The tensors of a distribution that ask for gradients."""
-    found = [*getattr(distribution, "inputs", ())]
-    found += [value for value in vars(distribution).values() if isinstance(value, Tensor)]
-    for inner in ("base_dist", "_categorical", "_mixture_distribution", "_component_distribution"):
-        if inner in vars(distribution):
-            found += _parameters(vars(distribution)[inner])
-    return [value for value in found if value.requires_grad]
+def _parameters(before: Any, now: Any) -> tuple[list[Tensor], bool | None]:
+    """The tensors of a distribution that ask for gradients, and whether it depends on the new values.
+
+    None where its structure is not understood (`bcppl.traces.dependence`).
+    """
+    parameters, changed = [], []
+
+    def met(a: Any, b: Any) -> bool:
+        if isinstance(b, Tensor) and b.requires_grad:
+            parameters.append(b)
+        elif not equal(a, b):
+            # It was taken out of torch and carries no gradient.
+            changed.append(b)
+        return True
+
+    understood = alike(before, now, met)
+    return parameters, True if parameters or changed else False if understood else None
 
 
 def _refuse(address: str, why: str, parameters: list[Tensor], values: Mapping[str, Tensor]) -> None:
-    total = torch.stack([value.sum().to(torch.float64) for value in parameters]).sum()
-    slopes = torch.autograd.grad(total, list(values.values()), allow_unused=True)
-    moved = [a for a, slope in zip(values, slopes, strict=True) if slope is not None]
+    moved = list(values)
+    if parameters:
+        total = torch.stack([value.sum().to(torch.float64) for value in parameters]).sum()
+        gradients = torch.autograd.grad(total, list(values.values()), allow_unused=True)
+        moved = [a for a, gradient in zip(values, gradients, strict=True) if gradient is not None]
     raise InputError(
-        f"site {address!r} hangs on {', '.join(map(repr, moved))} and {why}; "
+        f"site {address!r} depends on {', '.join(map(repr, moved))} and {why}; "
         "move that address with a proposal that needs no gradient."
     )
 

@@ -84,7 +84,7 @@ def run(
         )
     refuse_other_than_tensors(given)
     recorder = _Recorder(particles, given, draws_lazy)
-    with carrying(carried) as used, torch.no_grad(), pyro.validation_enabled(False):
+    with carrying(carried, particles) as used, torch.no_grad(), pyro.validation_enabled(False):
         try:
             with _apart(), recorder, _Particles(PARTICLES, particles, dim=-1) as plate:
                 result = program(*args)
@@ -254,7 +254,7 @@ class _Recorder(Messenger):
         """Whether another axis has as many entries as there are particles; what is lazy checks its own."""
         batch, event = distribution.batch_shape, distribution.event_shape
         return (len(batch) > 1 and self.particles in batch[:-1]) or (
-            len(event) > 0 and self.particles in event and not hasattr(distribution, "inputs")
+            len(event) > 0 and self.particles in event and not isinstance(distribution, LazyDistribution)
         )
 
     def _has_shape(self, address: str, value: Tensor, distribution: Any) -> None:

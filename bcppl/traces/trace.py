@@ -14,7 +14,8 @@ from torch import Tensor
 
 from bcppl.distributions.support import log_prob_inside
 from bcppl.errors import InputError, NotANumberError
-from bcppl.traces.carried import Entry, same_inputs
+from bcppl.traces.carried import Entry
+from bcppl.traces.dependence import Comparison, equal
 from bcppl.traces.hiding import Hiding, refused
 from bcppl.traces.indexing import Index, particles_at
 from bcppl.traces.run import Program, Run, inward, refuse_other_than_tensors, run
@@ -207,7 +208,9 @@ class Trace:
                 for a, v in self.choices.items()
             },
             carried={
-                a: e.where(mask, other.carried[a]) for a, e in self.carried.items() if a in other.carried
+                a: merged
+                for a, e in self.carried.items()
+                if a in other.carried and (merged := e.where(mask, other.carried[a])) is not None
             },
             known={a: torch.where(mask, self.known[a], other.known[a]) for a in shared},
             hidden=self.hidden | other.hidden,
@@ -281,20 +284,21 @@ class Trace:
             moved._ran(ran)
         if set(moved.addresses) != set(self.addresses):
             raise InputError("new values changed which addresses the program visits; mask sites instead.")
-        for address, value in self.known.items():
-            if address not in new and unchanged(self, moved, address):
-                moved.known[address] = value
+        for address in unchanged(self, moved, [a for a in self.known if a not in new]):
+            moved.known[address] = self.known[address]
         # A state that was thrown away must not be merged back in later.
         for name in [n for n in moved.carried_states() if n not in moved._run.carried]:
             del moved.carried_states()[name]
         return moved
 
 
-def unchanged(first: Trace, second: Trace, address: str) -> bool:
-    """Whether a site of the same value in two traces hangs on the same inputs, so that it says the same."""
-    then, now = first._run.distributions[address], second._run.distributions[address]
-    if not (hasattr(then, "inputs") and hasattr(now, "inputs") and same_inputs(then.inputs, now.inputs)):
-        return False
-    # What a program observes itself (`obs=`) may hang on a latent value.
-    fixed = address in second._run.fixed
-    return not fixed or same_inputs((first._run.values[address],), (second._run.values[address],))
+def unchanged(first: Trace, second: Trace, addresses: Iterable[str]) -> list[str]:
+    """Those of some addresses, of equal values in two traces, whose log-probability is the same in both."""
+    same, then, now = Comparison(), first._run, second._run
+    return [
+        address
+        for address in addresses
+        if same(then.distributions[address], now.distributions[address])
+        # What a program observes itself (`obs=`) may depend on a latent value.
+        and (address not in now.fixed or equal(then.values[address], now.values[address]))
+    ]

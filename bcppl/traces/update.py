@@ -69,10 +69,11 @@ class Regenerated:
         against the proposal. A site whose inputs are unchanged is not evaluated.
         """
         total = torch.zeros(self.trace.particles, dtype=torch.float64)
-        for address in self.trace.addresses:
-            if address in self.discarded or unchanged(self.previous, self.trace, address):
-                continue
-            total = total + self.trace.log_prob(address) - self.previous.log_prob(address)
+        others = [address for address in self.trace.addresses if address not in self.discarded]
+        same = unchanged(self.previous, self.trace, others)
+        for address in others:
+            if address not in same:
+                total = total + self.trace.log_prob(address) - self.previous.log_prob(address)
         return total
 
 

@@ -56,7 +56,7 @@ def _independent(trace: Trace, observed: Sequence[str], values: Mapping[str, Ten
     for turn in (*turns, *(1 + turn for turn in turns[:1])):
         index = turn % count
         moved = trace.at({a: values[a][index] for a in observed})
-        fixed = [a for k, a in enumerate(fixed) if k == 0 or unchanged(trace, moved, a)]
+        fixed = [fixed[0], *unchanged(trace, moved, fixed[1:])]
     return fixed
 
 
@@ -64,10 +64,11 @@ def _at_one(trace: Trace, addresses: Sequence[str], values: Mapping[str, Tensor]
     """Log-probability (N,) of one observation at sites that hang on the observations before."""
     shared = {a: v[which] for a, v in values.items()}
     moved = trace.at({a: v.expand(trace.particles, *v.shape) for a, v in shared.items()})
+    same = unchanged(trace, moved, addresses)
     total = torch.zeros(trace.particles, dtype=torch.float64)
     for address in addresses:
         # What was rendered or simulated for a site is kept by it.
-        site = (trace if unchanged(trace, moved, address) else moved).distributions[address]
+        site = (trace if address in same else moved).distributions[address]
         total += _summed(_density(address, site, inward(shared[address], site)), site)
     return total
 

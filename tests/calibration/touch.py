@@ -53,7 +53,7 @@ class Felt:
         pose = pyro.sample("pose", PRIOR)
         if count:
             begin = partial(ContactTrack.start, PHYSICS, SENSING, pose, PROBE)
-            track = carried("press", pose, begin)
+            track = carried("press", begin)
             seen: Any
             if self.surrogate:
                 seen = ChamferContacts(track, 4, STAMPS, self.scale, 2.0 * (3.0 * self.scale) ** 2)

@@ -128,7 +128,7 @@ class ClutteredDepth(LazyDistribution):
             )
         self.lines = whole_number("a cluttered depth image is looked at in every {}th line", lines)
         rim = whole_number("a cluttered depth image has a rim of {} pixels", rim, least=0)
-        super().__init__(len(pose), (camera.height, camera.width), inputs=(pose,))
+        super().__init__(len(pose), (camera.height, camera.width))
         self.renderer, self.camera, self.pose = renderer, camera, pose
         self.scale, self.temperature = float(scale), float(temperature)
         wander = self.scale * math.sqrt(1.0 - correlation**2)

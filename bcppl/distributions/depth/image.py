@@ -106,8 +106,7 @@ class DepthDistribution(LazyDistribution):
                 "rendered where the camera is said to stand; leave the background out, or render it as a "
                 "part of the scene (bcppl.rendering.scene.background_part)."
             )
-        latent = tuple(x for x in (camera_error, bias) if isinstance(x, Tensor))
-        super().__init__(len(pose), shape, inputs=(pose, *latent))
+        super().__init__(len(pose), shape)
         self.renderer = renderer
         self.camera = camera
         self.pose = pose

@@ -67,6 +67,8 @@ class HitsOfPoses:
         region: (H * W,) pixels that may count; None for all.
     """
 
+    __caches__ = ("_asked", "_every")
+
     def __init__(self, render: Callable[[Mask | None], PixelHits], region: Mask | None) -> None:
         self._render, self._region = render, region
         self._asked = False
