@@ -11,6 +11,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
@@ -83,6 +84,28 @@ class Plannable(Protocol):
 
     def duration(self, candidate: Any) -> float:
         """Seconds that it takes."""
+
+
+class PlannedAsIs:
+    """`Plannable` for actions that have a name and are their own candidates; mixed into a sensor."""
+
+    needs_peg = False
+
+    def action_of(self, candidate: Any) -> Any:
+        """The candidate itself."""
+        return candidate
+
+    def name_of(self, candidate_or_action: Any) -> str:
+        """Its name."""
+        return str(candidate_or_action.name)
+
+    def renamed(self, candidate: Any, name: str) -> Any:
+        """The same under another name."""
+        return replace(candidate, name=name)
+
+    def duration(self, candidate: Any) -> float:
+        """No time."""
+        return 0.0
 
 
 @runtime_checkable

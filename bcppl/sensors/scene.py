@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, TypeVar
 
+import pyro
 from torch import Tensor
 
 from bcppl.effort import Effort
 from bcppl.errors import InputError
+from bcppl.sensors.capabilities import Approximated
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.protocol import HasLikelihood, sensor_named, sensor_of
 
@@ -42,6 +44,45 @@ class Likelihood(Protocol):
     @property
     def efforts(self) -> Mapping[str, Effort]:
         """The cumulative cost of each simulator, by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class OneSite:
+    """The likelihood of measurements with one site each (`Likelihood` and `capabilities.Linearised`).
+
+    Attributes:
+        name: of the sites; addresses are name_0, name_1, ...
+        site: the distribution at poses (N, 7) of the part, given the action and metres that are added to its
+            standard deviation in quadrature; it has a `quadratic` for filters that approximate it.
+        value: the observed value of an observation.
+    """
+
+    name: str
+    site: Callable[[Tensor, Any, float], Any]
+    value: Callable[[Any], Tensor]
+
+    def address(self, number: int) -> str:
+        """The address of a measurement."""
+        return f"{self.name}_{number}"
+
+    def observe(self, number: int, action: Any, world_from_part: Tensor) -> None:
+        """Sample the site of one measurement."""
+        pyro.sample(self.address(number), self.site(world_from_part, action, 0.0))
+
+    def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
+        """The observed values of these measurements, by address."""
+        return {self.address(n): self.value(m.observation) for n, m in measurements}
+
+    def sites(
+        self, measurements: Sequence[Approximated], part: Tensor, blur: float
+    ) -> Iterator[tuple[Any, Tensor]]:
+        """Each measurement's likelihood at poses (S, 7), its noise `blur` wider, and its value."""
+        yield from ((self.site(part, action, blur), value) for _, action, value in measurements)
+
+    @property
+    def efforts(self) -> Mapping[str, Effort]:
+        """The cost of simulators: it is not counted."""
+        return {}
 
 
 Prepare = Callable[[Recording], Likelihood | None]

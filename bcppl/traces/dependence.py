@@ -14,7 +14,7 @@ a write into an object that both runs share.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from struct import calcsize
@@ -301,7 +301,7 @@ def _attributes(layout: _Layout, a: Any, b: Any, shared: bool) -> list[tuple[Any
         kind = type(x)
         if kind not in _PLAIN:
             pairs.append((x, y))
-        elif kind is not type(y) or not (x == y and x or _equal_plain(x, y)):
+        elif kind is not type(y) or not ((x == y and x) or _equal_plain(x, y)):
             raise _UnlikeError
     return pairs
 
