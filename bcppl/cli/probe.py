@@ -23,7 +23,7 @@ from bcppl.figures import action_in_3d
 from bcppl.geometry.gap import PegGap
 from bcppl.inference.design.ranking import Ranking
 from bcppl.inference.design.rules import Rank, by_information, by_reweighing, can_be_linearised
-from bcppl.inference.planning.candidates import MIXED, candidates, refuse_settled
+from bcppl.inference.planning.candidate_list import MIXED, candidates, refuse_settled
 from bcppl.inference.planning.filters import (
     Candidates,
     Filter,
