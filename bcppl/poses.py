@@ -17,10 +17,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import roma
 import torch
 from torch import Tensor
 
+from bcppl import quaternions
 from bcppl.errors import InputError
 
 LOG_8_PI_SQUARED = math.log(8.0 * math.pi**2)
@@ -64,7 +64,7 @@ def translation(pose: Tensor) -> Tensor:
 
 
 def quaternion_xyzw(pose: Tensor) -> Tensor:
-    """The rotations of poses (..., 7) as unit quaternions in roma's and scipy's order, shape (..., 4)."""
+    """The rotations of poses (..., 7) as unit quaternions in scipy's order, shape (..., 4)."""
     return pose[..., [4, 5, 6, 3]]
 
 
@@ -78,28 +78,25 @@ def from_translation_quaternion_xyzw(translation: Tensor, quaternion: Tensor) ->
 
 def from_rotation_matrix(translation: Tensor, rotation: Tensor) -> Tensor:
     """Poses (..., 7) from translations (..., 3) in metres and rotation matrices (..., 3, 3)."""
-    return from_translation_quaternion_xyzw(translation, roma.rotmat_to_unitquat(rotation))
+    return from_translation_quaternion_xyzw(translation, quaternions.from_rotation_matrix(rotation))
 
 
 def rotation_matrix(pose: Tensor) -> Tensor:
     """The rotations of poses (..., 7) as matrices (..., 3, 3)."""
-    return roma.unitquat_to_rotmat(quaternion_xyzw(pose))
+    return quaternions.rotation_matrix(quaternion_xyzw(pose))
 
 
 def compose(a_from_b: Tensor, b_from_c: Tensor) -> Tensor:
     """`a_from_c` of two batches of poses (..., 7) that broadcast against each other."""
     turned = (rotation_matrix(a_from_b) @ b_from_c[..., :3, None])[..., 0]
-    first, second = torch.broadcast_tensors(quaternion_xyzw(a_from_b), quaternion_xyzw(b_from_c))
-    product = roma.quat_product(first, second)
-    product = product / product.norm(dim=-1, keepdim=True)
-    return from_translation_quaternion_xyzw(a_from_b[..., :3] + turned, product)
+    return _turned(a_from_b, turned, quaternion_xyzw(b_from_c))
 
 
 def inverse(a_from_b: Tensor) -> Tensor:
     """`b_from_a` of poses (..., 7)."""
     rotation = rotation_matrix(a_from_b)
     translation = -(rotation.transpose(-1, -2) @ a_from_b[..., :3, None])[..., 0]
-    return from_translation_quaternion_xyzw(translation, roma.quat_conjugation(quaternion_xyzw(a_from_b)))
+    return from_translation_quaternion_xyzw(translation, quaternions.conjugate(quaternion_xyzw(a_from_b)))
 
 
 def transform(a_from_b: Tensor, points: Tensor) -> Tensor:
@@ -109,20 +106,20 @@ def transform(a_from_b: Tensor, points: Tensor) -> Tensor:
 
 def retract(pose: Tensor, tangent: Tensor) -> Tensor:
     """The pose (..., 7) reached from a pose (..., 7) by a tangent (..., 6): metres, then radians."""
-    turn = roma.rotvec_to_unitquat(tangent[..., 3:])
-    first, second = torch.broadcast_tensors(quaternion_xyzw(pose), turn)
-    product = roma.quat_product(first, second)
-    product = product / product.norm(dim=-1, keepdim=True)
-    return from_translation_quaternion_xyzw(pose[..., :3] + tangent[..., :3], product)
+    return _turned(pose, tangent[..., :3], quaternions.from_rotation_vector(tangent[..., 3:]))
 
 
 def local(pose: Tensor, other: Tensor) -> Tensor:
     """The tangent (..., 6) from `pose` to `other`: the inverse of `retract`, rotation angle at most pi."""
-    first, second = torch.broadcast_tensors(
-        roma.quat_conjugation(quaternion_xyzw(pose)), quaternion_xyzw(other)
-    )
-    turn = roma.quat_product(first, second)
-    return torch.cat([other[..., :3] - pose[..., :3], roma.unitquat_to_rotvec(turn)], dim=-1)
+    turn = quaternions.product(quaternions.conjugate(quaternion_xyzw(pose)), quaternion_xyzw(other))
+    return torch.cat([other[..., :3] - pose[..., :3], quaternions.rotation_vector(turn)], dim=-1)
+
+
+def _turned(pose: Tensor, shift: Tensor, turn: Tensor) -> Tensor:
+    """A pose (..., 7) moved by (..., 3) in its outer frame and turned by (..., 4) in its inner one."""
+    product = quaternions.product(quaternion_xyzw(pose), turn)
+    product = product / product.norm(dim=-1, keepdim=True)
+    return from_translation_quaternion_xyzw(pose[..., :3] + shift, product)
 
 
 def log_haar_density_of_rotation_vector(angle: Tensor) -> Tensor:

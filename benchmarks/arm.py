@@ -35,8 +35,7 @@ from bcppl.models.arm_calibration import (
     read_seatings,
     sockets,
 )
-from bcppl.models.arm_in_view import arm_in_view, fitted, prepare
-from bcppl.models.arm_in_view import observations as images_of
+from bcppl.models.arm_in_view import arm_in_view, fitted, observations as images_of, prepare
 from bcppl.recordings.importers.bop import draw
 from bcppl.robot.kinematics import Robot
 

@@ -24,7 +24,7 @@ from bcppl.geometry.gap import PegGap
 from bcppl.inference.design.loop import probing_loop
 from bcppl.inference.design.rules import by_information
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.planning.candidates import MIXED, candidates
+from bcppl.inference.planning.candidate_list import MIXED, candidates
 from bcppl.inference.planning.chance import chance_of_success
 from bcppl.inference.planning.filters import Candidate
 from bcppl.inference.planning.insertion import insertion_plan

@@ -28,7 +28,7 @@ from bcppl.inference.design import mode_entropy
 from bcppl.inference.design.loop import Round, probing_loop
 from bcppl.inference.design.rules import Rank, at_random, by_information, by_largest_variance, in_order
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.planning.candidates import MIXED, candidates
+from bcppl.inference.planning.candidate_list import MIXED, candidates
 from bcppl.inference.planning.faces import sides, spots_on_top
 from bcppl.inference.planning.touching import Spot, touch
 from bcppl.models.look_and_touch import model

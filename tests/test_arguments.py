@@ -41,7 +41,7 @@ from bcppl.inference.proposals import (
     rotations,
     symmetry,
 )
-from bcppl.inference.repeated import repeated
+from bcppl.inference.repetitions import repeated
 from bcppl.inference.resampling import adaptive, always, systematic
 from bcppl.inference.strata import generate_stratified
 from bcppl.inference.targets import POSTERIOR, Target

@@ -25,7 +25,7 @@ from bcppl.inference.filters.step import StepInfo, Stepped
 from bcppl.inference.kernels import cycle, metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
-from bcppl.inference.repeated import Repeated
+from bcppl.inference.repetitions import Repeated
 from bcppl.traces import generate
 
 arviz = export.import_arviz()

@@ -20,7 +20,7 @@ from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
 from bcppl.inference.design.rules import surface_variance
-from bcppl.inference.planning.candidates import candidates
+from bcppl.inference.planning.candidate_list import candidates
 from bcppl.inference.planning.filters import (
     Candidates,
     Filter,

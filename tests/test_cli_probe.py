@@ -99,11 +99,14 @@ def test_views_and_touches_are_ranked_together_and_other_models_by_reweighing(
     assert len(views) == 2 and 0.5 < max(views) < touched
     save(short(1), here / "push.h5")
     for kind, says in (
-        ("view", "model point_probe cannot foretell what"),
+        ("view", "point_probe does not explain a measurement of kind 'view'"),
         ("touch", "holds no peg to carry out 'touch' with"),
     ):
         refused(bcppl("probe", "push.h5", "--candidates", f"{kind}:1", "--particles", 6), says)
-    refused(bcppl("probe", "runs/belief_002.h5", "--by", "luck"), "--by is 'luck'")
+    refused(
+        bcppl("probe", "runs/belief_002.h5", "--by", "luck"),
+        "'luck' is not one of 'linearised', 'reweighing'",
+    )
 
 
 def refused(ran: Ran, says: str) -> None:
@@ -120,8 +123,8 @@ WRONG = {
     "number": (["--candidates", "touch:x"], "'touch:x'"),
     "zero": (["--candidates", "touch:0"], "there are no candidates"),
     "no file": (["--candidates", "plans.json"], "no file of actions plans.json"),
-    "top": (["--top", "0"], "--top is 0"),
-    "rate": (["--rate", "-1"], "--rate is -1"),
+    "top": (["--top", "0"], "'--top'"),
+    "rate": (["--rate", "-1"], "'--rate'"),
     "output": (["--output", "next.txt"], "ends in .h5 or .json"),
     "folder": (["--output", "nowhere/next.h5"], "no folder nowhere"),
     "force": (["--force", "3"], "press with more than 3 N"),
@@ -136,14 +139,14 @@ WRONG = {
         "out of panda's reach",
     ),
     "link": (["--link", "panda_hand"], "give it with --robot"),
-    "depth": (["--depth", "3"], "--depth is 3"),
+    "depth": (["--depth", "3"], "'--depth'"),
     "seconds": (["--seconds", "0.5"], "last longer than 0.5 s"),
     "itself": (["--output", "runs/belief_002.h5"], "would overwrite runs/belief_002.h5"),
-    "folder's name": (["--output", "folder.json"], "is a folder"),
+    "folder's name": (["--output", "folder.json"], "is a directory"),
     "many": (["--candidates", "touch:" + "9" * 5000], "10000 at most"),
-    "hypotheses": (["--hypotheses", "1"], "--hypotheses is 1"),
+    "hypotheses": (["--hypotheses", "1"], "'--hypotheses'"),
     "table's height": (["--table", "nan"], "--table is nan"),
-    "inference": (["--inference", "guided_smc"], "--inference says nothing"),
+    "inference": (["--inference", "guided_smc"], "--inference is given with"),
     "of": (["--of", "nothing"], "there is no recording 'nothing'"),
 }
 
@@ -200,7 +203,7 @@ def test_beliefs_that_say_nothing_are_refused(bcppl: Callable[..., Ran], here: P
     refused(bcppl("probe", weightless, "--candidates", "touch:1"), "has no weight")
     refused(bcppl("probe", point, "--candidates", "touch:1"), "collapsed to a point")
     (here / "runs/run.json").unlink()
-    refused(bcppl("probe", point), "say so with --of RECORDING")
+    refused(bcppl("probe", point), "give --of RECORDING")
     refused(bcppl("probe", "look.h5", "--of", "look.h5"), "leave it out")
     refused(bcppl("probe", point, "--of", SHIPPED), "does not fit the model or the recording")
     twice = load_twice(here)

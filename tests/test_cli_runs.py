@@ -107,6 +107,7 @@ from pyro.distributions import Categorical, Normal
 from bcppl import poses
 from bcppl.distributions.poses import NormalPose
 from bcppl.models import point_probe
+from bcppl.sensors.scene import Scene
 from bcppl.traces import Model
 
 def many(scene, actions):
@@ -117,7 +118,7 @@ def many(scene, actions):
     pyro.sample("grip", NormalPose(turned, spread))
     point_probe.point_probe(scene, actions)
 
-model = Model(program=many, prepare=point_probe.prepare, observe=point_probe.observe, pose="part")
+model = Model(program=many, prepare=point_probe.prepare, observe=Scene.observed, pose="part")
 """
 
 
@@ -159,7 +160,7 @@ def test_a_model_of_the_pose_alone_prints_no_other_sites(bcppl: Callable[..., Ra
         save(dataclasses.replace(short(1), truth=truth), tmp_path / f"{name}.h5")
         ran = bcppl("run", f"{name}.h5", "--particles", 4)
         assert ran.code == 0 and "other latent values" not in ran.out
-        assert ("the recording does not know the truth" in ran.out) == (name == "unknown")
+        assert ("the recording has no truth" in ran.out) == (name == "unknown")
     path = tmp_path / "runs/known/belief_001.h5"
     with h5py.File(path, "r+") as file:
         del file["latent"]  # as earlier versions wrote it
@@ -168,7 +169,7 @@ def test_a_model_of_the_pose_alone_prints_no_other_sites(bcppl: Callable[..., Ra
         load_latent(path)
 
 
-def test_what_cannot_be_run_or_simulated_is_told_from_what_can(bcppl: Callable[..., Ran]) -> None:
+def test_what_cannot_be_run_or_simulated_is_refused(bcppl: Callable[..., Ran]) -> None:
     ran = bcppl("simulate", "part_in_view")
     assert ran.code == 2 and "camera_error, grasped_peg, look_and_touch, peg_in_hole" in ran.err
     for name in ("arm_in_view", str(PROBE.with_name("arm_in_view.py"))):

@@ -17,7 +17,14 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.inference import progress
-from bcppl.inference.collect import acceptance, collect, distinct, effective_sample_size, log_evidence, mean
+from bcppl.inference.collectors import (
+    acceptance,
+    collect,
+    distinct,
+    effective_sample_size,
+    log_evidence,
+    mean,
+)
 from bcppl.inference.filters import tempered_smc
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.step import Observed, Stepped, steps
@@ -25,7 +32,7 @@ from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.proposals import drift
-from bcppl.inference.repeated import repeated
+from bcppl.inference.repetitions import repeated
 from bcppl.inference.resampling import always
 from bcppl.models.point_probe import model
 from bcppl.recordings import Recording, load

@@ -15,8 +15,8 @@ import numpy as np
 import pyro
 import pyro.distributions as dist
 import pytest
-import roma
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bcppl import poses
@@ -169,7 +169,7 @@ class SeenPoints(LazyDistribution):
 
 
 # Turning what is seen turns the posterior, not the evidence: it must not matter where the mode lies.
-TURN = roma.rotvec_to_rotmat(torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64))
+TURN = torch.from_numpy(Rotation.from_rotvec([2.0, -1.0, 0.5]).as_matrix())
 NOISE = 0.1
 
 

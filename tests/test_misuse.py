@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.inference import collect
+from bcppl.inference import collectors
 from bcppl.inference.arviz import to_arviz
 from bcppl.inference.chains import markov_chains
 from bcppl.inference.filters.smcp3 import moved, smcp3
@@ -115,7 +115,7 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
         r"give tempered\(kernel\)",
     ),
     "a column of nothing": (
-        lambda: list(collect.collect(steps(tempered(), start(), [SEEN]), x=collect.mean("nope"))),
+        lambda: list(collectors.collect(steps(tempered(), start(), [SEEN]), x=collectors.mean("nope"))),
         "'nope' was asked for, which is no latent address; latent are mu",
     ),
     "a belief over nothing": (lambda: start().belief("nope"), "'nope' .* no latent address; latent are mu"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from bcppl import poses
+from bcppl import poses, quaternions
 from bcppl.distributions.poses import NormalPose, SwingTwistPose, UniformPose, tilt_and_yaw
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
@@ -35,9 +35,7 @@ def haar_reference(center: torch.Tensor, half_width: float, freedom: Freedom) ->
         turn = torch.zeros(DRAWS, 3, dtype=torch.float64)
         if freedom.rotation != "none":
             turn[:, "xyz".index(freedom.rotation)] = 2 * math.pi * torch.rand(DRAWS, dtype=torch.float64)
-        import roma
-
-        quaternion = roma.rotvec_to_unitquat(turn)
+        quaternion = quaternions.from_rotation_vector(turn)
     draws = poses.compose(
         center, poses.from_translation_quaternion_xyzw(torch.zeros(3, dtype=torch.float64), quaternion)
     )

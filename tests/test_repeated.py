@@ -18,7 +18,7 @@ from bcppl import poses
 from bcppl.distributions.poses import UniformPose
 from bcppl.errors import InputError, NoWeightError
 from bcppl.inference.population import Population
-from bcppl.inference.repeated import Repeated, repeated
+from bcppl.inference.repetitions import Repeated, repeated
 from bcppl.inference.summaries import mean
 from bcppl.traces import generate
 

@@ -27,8 +27,7 @@ from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import adaptive, always, never, systematic
 from bcppl.models.point_probe import model
 from bcppl.recordings import Recording, load
-from bcppl.traces import Trace, generate
-from bcppl.traces import update as real_update
+from bcppl.traces import Trace, generate, update as real_update
 from bcppl.traces.propose import assessed
 
 

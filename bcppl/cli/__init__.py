@@ -1,10 +1,12 @@
-"""The command line: `bcppl run`, `probe`, `check`, `import`, `simulate`."""
+"""The command line: `bcppl run`, `probe`, `check`, `import`, `simulate`.
+
+A command imports what it computes with when it is called, so that `bcppl --help` answers at once.
+"""
 
 from __future__ import annotations
 
 import os
 import sys
-from importlib.metadata import version
 from typing import Annotated
 
 import typer
@@ -14,15 +16,15 @@ from bcppl.errors import InferenceError, InputError
 
 app = typer.Typer(
     name="bcppl",
-    help="Find where a part is, from depth images and touches, as weighted particles.",
-    no_args_is_help=True,
+    help="Estimate where a part is, from depth images and touches, as weighted particles.",
     add_completion=False,
-    pretty_exceptions_enable=False,
 )
 
 
 def _version(asked: bool) -> None:
     if asked:
+        from importlib.metadata import version
+
         print(f"bcppl {version('bcppl')}")
         raise typer.Exit
 
@@ -30,7 +32,7 @@ def _version(asked: bool) -> None:
 @app.callback()
 def _options(
     _: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which version this is.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None: ...
 
@@ -41,24 +43,27 @@ app.command("check")(recordings.check)
 app.command("simulate")(recordings.simulate)
 app.add_typer(recordings.import_app, name="import")
 
-BAD_INPUT, FAILED = 2, 1
+BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
 
 def main() -> None:
-    """Run the command line; what goes wrong is one sentence and an exit code, 2 for bad input.
+    """Run the command line; an error is one sentence and an exit code, 2 for bad input.
 
     With BCPPL_TRACEBACK set in the environment, Python's own traceback is shown instead.
     """
+    words = sys.argv[1:] or ["--help"]
     if os.environ.get("BCPPL_TRACEBACK"):
-        app()
+        sys.exit(app(words, standalone_mode=False))
     try:
-        app()
+        sys.exit(app(words, standalone_mode=False))
+    except typer.TyperException as error:
+        _stop(error.format_message(), BAD_INPUT)
     except InputError as error:
         _stop(str(error), BAD_INPUT)
     except (InferenceError, OSError) as error:
         _stop(str(error), FAILED)
-    except KeyboardInterrupt:
-        _stop("stopped.", 130)
+    except (KeyboardInterrupt, typer.Abort):
+        _stop("stopped.", INTERRUPTED)
     except Exception as error:
         _stop(
             f"something went wrong ({type(error).__name__}: {error}); "
@@ -68,5 +73,6 @@ def main() -> None:
 
 
 def _stop(sentence: str, code: int) -> None:
-    print(f"bcppl: {' '.join(sentence.split())}", file=sys.stderr)
+    sentence = " ".join(sentence.split())
+    print(f"bcppl: {sentence}{'' if sentence.endswith(('.', '?')) else '.'}", file=sys.stderr)
     sys.exit(code)

@@ -1,4 +1,4 @@
-"""What a run says of all that its model leaves open: which hole it is, how a peg sits in the hand."""
+"""Summaries of a run's latent sites: which hole it is, how a peg sits in the hand."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ INTERVAL = (0.05, 0.95)
 
 
 class Row(NamedTuple):
-    """One row of the table: the site, what is most likely of it, and how sure that is."""
+    """One row of the table: the site, its mean or likeliest values, and their spread."""
 
     name: str
     middle: str
@@ -32,7 +32,7 @@ class Row(NamedTuple):
 
 
 def values_of(step: Any) -> Mapping[str, Tensor]:
-    """The values (N, *event) at every latent address after a step; none where it shows no population."""
+    """The values (N, *event) at every latent address after a step; none where it has no population."""
     population = getattr(step, "population", None)
     return dict(population.trace.choices) if isinstance(population, Population) else {}
 
@@ -40,8 +40,8 @@ def values_of(step: Any) -> Mapping[str, Tensor]:
 def summarised(step: Any) -> dict[str, dict[str, Any]]:
     """A summary of every latent site after a step by its address, made of plain lists and numbers.
 
-    A pose has its `mean` (7 numbers) and `spread` (6: metres, radians); a discrete site its likeliest
-    `values`, their `probabilities`, and that of all `others` together; any other site its `mean` and the ends
+    A pose has its `mean` (7 numbers) and `spread` (6: metres, radians), a discrete site its likeliest
+    `values`, their `probabilities`, and that of all `others` together, any other site its `mean` and the ends
     of the interval that holds 90 % of the weight, `from` and `to`, each number by itself.
     """
     population = getattr(step, "population", None)
@@ -58,13 +58,13 @@ def _summary(population: Population, address: str) -> dict[str, Any]:
         belief = population.belief(address)
         return {"kind": "pose", "mean": belief.mean.tolist(), "spread": belief.spread.tolist()}
     if _is_discrete(values, distribution):
-        found = probabilities(population, address)
-        order = found.probabilities.argsort(descending=True, stable=True)[:LIKELIEST]
-        kept = found.probabilities[order]
-        others = max(0.0, 1.0 - float(kept.sum())) if len(order) < len(found.probabilities) else 0.0
+        marginal = probabilities(population, address)
+        order = marginal.probabilities.argsort(descending=True, stable=True)[:LIKELIEST]
+        kept = marginal.probabilities[order]
+        others = max(0.0, 1.0 - float(kept.sum())) if len(order) < len(marginal.probabilities) else 0.0
         return {
             "kind": "discrete",
-            "values": found.values[order].tolist(),
+            "values": marginal.values[order].tolist(),
             "probabilities": kept.tolist(),
             "others": others,
         }
@@ -84,25 +84,27 @@ def _is_discrete(values: Tensor, distribution: Any) -> bool:
 
 def rows(summaries: Mapping[str, Mapping[str, Any]], pose: str) -> list[Row]:
     """The rows of the table, of all sites but the sought pose."""
-    return [row for address, said in summaries.items() if address != pose for row in _rows(address, said)]
+    return [
+        row for address, summary in summaries.items() if address != pose for row in _rows(address, summary)
+    ]
 
 
-def _rows(address: str, said: Mapping[str, Any]) -> Iterator[Row]:
-    if said["kind"] == "pose":
-        center, spread = torch.tensor(said["mean"], dtype=torch.float64), said["spread"]
+def _rows(address: str, summary: Mapping[str, Any]) -> Iterator[Row]:
+    if summary["kind"] == "pose":
+        center, spread = torch.tensor(summary["mean"], dtype=torch.float64), summary["spread"]
         turn = poses.local(poses.identity(), center)[3:].tolist()
         millimetres = (_numbers([1e3 * x for x in part], 3) for part in (center[:3].tolist(), spread[:3]))
         degrees = (_numbers([math.degrees(x) for x in part], 3) for part in (turn, spread[3:]))
         yield Row(f"{address} x y z", f"{next(millimetres)} mm", f"± {next(millimetres)} mm")
         yield Row(f"{address} turn", f"{next(degrees)}°", f"± {next(degrees)}°")
-    elif said["kind"] == "discrete":
-        pairs = zip(said["values"], said["probabilities"], strict=True)
+    elif summary["kind"] == "discrete":
+        pairs = zip(summary["values"], summary["probabilities"], strict=True)
         likely = [f"{_value(value)}: {100 * share:.1f} %" for value, share in pairs]
-        if said["others"] > 0.0:
-            likely.append(f"others: {100 * said['others']:.1f} %")
+        if summary["others"] > 0.0:
+            likely.append(f"others: {100 * summary['others']:.1f} %")
         yield Row(address, ", ".join(likely), "")
-    elif said["kind"] == "real":
-        middle, low, high = (torch.tensor(said[k], dtype=torch.float64) for k in ("mean", "from", "to"))
+    elif summary["kind"] == "real":
+        middle, low, high = (torch.tensor(summary[k], dtype=torch.float64) for k in ("mean", "from", "to"))
         places = list(np.ndindex(*middle.shape))
         for at in places[:ROWS]:
             name = f"{address}[{', '.join(map(str, at))}]" if at else address
@@ -110,7 +112,7 @@ def _rows(address: str, said: Mapping[str, Any]) -> Iterator[Row]:
         if len(places) > ROWS:
             yield Row(f"{address}: {len(places) - ROWS} more", "in run.json", "")
     else:
-        yield Row(address, said["kind"], "in the belief files")
+        yield Row(address, summary["kind"], "in the belief files")
 
 
 def _numbers(values: list[float], digits: int) -> str:
@@ -123,26 +125,26 @@ def _value(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def table(found: list[Row]) -> Table:
+def table(rows: list[Row]) -> Table:
     """The rows for a terminal."""
     shown = Table(title="other latent values", title_justify="left", box=None, pad_edge=False)
     for name in ("site", "mean (SI units) or probability", "90 % interval, or standard deviation"):
         shown.add_column(name, justify="left")
-    for row in found:
+    for row in rows:
         shown.add_row(*map(escape, row))
     return shown
 
 
 def why_no_truth_gap(model: Any, truth_is_known: bool, sites: Mapping[str, Any]) -> str | None:
-    """A line that says why the column is empty; None where it is not for want of the truth."""
+    """The reason why the column is empty, as a line; None where it need not be."""
     if not truth_is_known:
-        return "ADD, truth gap: empty, for the recording does not know the truth."
+        return "ADD, truth gap: empty, for the recording has no truth."
     if isinstance(model.program, Series):
-        return "truth gap: empty, for one true pose is known, and in this model the pose moves."
+        return "truth gap: empty, for a recording has one true pose, and in this model the pose moves."
     others = [address for address in sites if address != model.pose]
     if others:
         return (
-            "truth gap: empty, for only the pose's truth is known, and this model has "
+            "truth gap: empty, for a recording has the true pose alone, and this model has "
             f"{', '.join(others)} besides."
         )
     return None

@@ -1,12 +1,16 @@
-"""From a name or a file on the command line to a recording, a model, an inference program."""
+"""Recordings, models and inference programs by name, or from a file that the command line gives.
+
+Data never runs code: what a recording or a run.json names is looked up among installed models, and a file is
+run only where a person gives it with --model or --inference.
+"""
 
 from __future__ import annotations
 
-import importlib
-import importlib.resources
 import importlib.util
+import inspect
 import pkgutil
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,13 +18,16 @@ from typing import Any
 import bcppl.inference.filters
 import bcppl.models
 from bcppl.errors import InputError
-from bcppl.recordings import Recording, load, validate
+from bcppl.inference.default import Infer, default_inference
+from bcppl.models.shipped import load_recording
+from bcppl.recordings import Recording, validate
 from bcppl.traces import Model
 
-# Where a program that the command line cannot run is run from Python.
-EXAMPLES = {
-    f"bcppl.models.{name}": ", and benchmarks/arm.py runs it on recordings"
-    for name in ("arm_calibration", "arm_in_view")
+MODEL, INFERENCE = "model", "inference program"
+# By word: where installed ones are, the name under which a file defines one, and what that has to be.
+HOMES: dict[str, tuple[ModuleType, str, str]] = {
+    MODEL: (bcppl.models, "model", "a bcppl.Model named `model`"),
+    INFERENCE: (bcppl.inference.filters, "infer", "a function named `infer`"),
 }
 
 
@@ -30,108 +37,103 @@ def recording(name: str) -> Recording:
     Raises:
         InputError: there is none, it cannot be read, or it has a problem.
     """
-    found = unchecked_recording(name)
-    validate(found)
-    return found
+    loaded = load_recording(name)
+    validate(loaded)
+    return loaded
 
 
-def unchecked_recording(name: str) -> Recording:
-    """The recording in a file, or a shipped one by name, whatever is wrong with it.
+def model(given: str | None, named: str = "", by: str = "the recording") -> Model:
+    """The model that the command line gives, else the installed one that data names.
 
-    Raises:
-        InputError: there is none, or it cannot be read.
-    """
-    path = Path(name)
-    if not path.exists() and not path.suffix:
-        shipped = importlib.resources.files(bcppl.models) / "recordings"
-        names = sorted(p.name.removesuffix(".h5") for p in shipped.iterdir() if p.name.endswith(".h5"))
-        if name not in names:
-            raise InputError(
-                f"there is no recording {name!r}: give a file, or one that ships: {', '.join(names)}."
-            )
-        with importlib.resources.as_file(shipped / f"{name}.h5") as file:
-            return load(file)
-    return load(path)
-
-
-def model(name: str) -> Model:
-    """The model of a shipped file by name, or of a user's file: what it defines as `model`.
+    Args:
+        given: an installed model's name, or a file that defines `model`; None for none.
+        named: in data.
+        by: what data.
 
     Raises:
-        InputError: there is no such model, or the file cannot be run.
+        InputError: there is no such model, the file cannot be run, or data names a file.
     """
-    return _defined(name, bcppl.models, "model", Model)
+    if given is None and _is_file(named):
+        raise InputError(
+            f"{by} names the file {named!r} as its model, and data never runs code; "
+            "if you trust the file, give it with --model."
+        )
+    return _defined(named if given is None else given, MODEL)
 
 
-def inference(name: str) -> Any:
-    """The inference program of a shipped file by name, or of a user's file: the function `infer`.
+def inference(given: str | None, chosen: Model) -> tuple[str, Infer]:
+    """The name and the `infer` of an inference program, with the model's settings where it is its own.
+
+    Args:
+        given: an installed program's name, or a file that defines `infer`; None for the model's own.
+        chosen: the model.
 
     Raises:
-        InputError: there is no such program, or the file cannot be run.
+        InputError: there is no such program, the file cannot be run, or its `infer` cannot be called.
     """
-    return _defined(name, bcppl.inference.filters, "infer", None)
+    name, infer = default_inference(chosen)
+    if given is None or given == name:
+        return name, infer
+    infer = _defined(given, INFERENCE)
+    try:
+        inspect.signature(infer).bind(chosen, None, particles=2, seed=0, scene=None)
+    except TypeError as error:
+        raise InputError(
+            f"`infer` of {given} cannot be called ({error}); "
+            "define it as infer(model, recording, *, particles=75, seed=0, scene=None)."
+        ) from error
+    return given, infer
 
 
-def refuse_seed(seed: int) -> None:
-    """Refuse a seed that a generator does not take.
-
-    Raises:
-        InputError: it is negative, or does not fit into 63 bits.
-    """
-    if not 0 <= seed < 2**63:
-        raise InputError(f"--seed is {seed}; give a number from 0 to {2**63 - 1}.")
+def simulating() -> list[str]:
+    """The names of the installed models that simulate recordings."""
+    return [name for name in _offered(MODEL) if model(name).simulate_recording is not None]
 
 
-def offered(package: ModuleType, attribute: str) -> list[str]:
-    """The names of a package's files that define `attribute`."""
-    return [
-        n for n in _files(package) if hasattr(importlib.import_module(f"{package.__name__}.{n}"), attribute)
-    ]
+def _offered(word: str) -> list[str]:
+    """The names of the installed models or inference programs that the command line can run."""
+    package, attribute, _ = HOMES[word]
+    return [n for n in _files(package) if hasattr(import_module(f"{package.__name__}.{n}"), attribute)]
 
 
 def _files(package: ModuleType) -> list[str]:
     return [info.name for info in pkgutil.iter_modules(package.__path__) if not info.ispkg]
 
 
-def simulating() -> list[str]:
-    """The names of the shipped models that make recordings up."""
-    return [n for n in offered(bcppl.models, "model") if model(n).simulate_recording is not None]
+def _is_file(name: str) -> bool:
+    return name.endswith(".py") or "/" in name
 
 
-def _defined(name: str, package: ModuleType, attribute: str, kind: type | None) -> Any:
-    word = "model" if attribute == "model" else "inference program"
-    if name.endswith(".py") or "/" in name:
+def _defined(name: str, word: str) -> Any:
+    package, attribute, needed = HOMES[word]
+    if _is_file(name):
         module = _from_file(Path(name), package, word)
     elif name in _files(package):
-        module = importlib.import_module(f"{package.__name__}.{name}")
+        module = import_module(f"{package.__name__}.{name}")
     else:
         raise InputError(
-            f"there is no {word} {name!r}: give one of {', '.join(offered(package, attribute))}, "
-            "or a file ending in .py."
+            f"there is no {word} {name!r}: give one of {', '.join(_offered(word))}, or a file ending in .py."
         )
-    found = getattr(module, attribute, None)
-    if found is None or (kind is not None and not isinstance(found, kind)) or not (kind or callable(found)):
-        if module.__name__.startswith(f"{package.__name__}."):
-            place = module.__name__
-            raise InputError(
-                f"{place.rpartition('.')[2]} is used from Python, the command line cannot run it as its "
-                f"{word}: `import {place}` and `help({place})` say how"
-                f"{EXAMPLES.get(place, '')}; the command line has {', '.join(offered(package, attribute))}."
-            )
-        what = "a bcppl.traces.Model named `model`" if attribute == "model" else "a function named `infer`"
-        raise InputError(f"{name} defines no {word}: it needs {what}.")
-    return found
+    defined = getattr(module, attribute, None)
+    if isinstance(defined, Model) if word == MODEL else callable(defined):
+        return defined
+    if module.__name__.startswith(f"{package.__name__}."):
+        raise InputError(
+            f"{module.__name__} is used from Python, the command line cannot run it as its {word}: see "
+            f"`help({module.__name__})`; the command line has {', '.join(_offered(word))}."
+        )
+    raise InputError(f"{name} defines no {word}: it needs {needed}.")
 
 
 def _from_file(path: Path, package: ModuleType, word: str) -> ModuleType:
     if not path.is_file():
         raise InputError(
-            f"there is no {word} file {path}; give an existing file ending in .py, or a shipped name."
+            f"there is no {word} file {path}; give an existing file ending in .py, or the name of one."
         )
-    # A shipped file given by its path is the shipped module: loaded twice, its classes would exist twice.
+    # An installed file given by its path is the installed module: otherwise its classes would exist twice.
     for home in package.__path__:
         if path.resolve().parent == Path(home).resolve():
-            return importlib.import_module(f"{package.__name__}.{path.stem}")
+            return import_module(f"{package.__name__}.{path.stem}")
     name = f"bcppl_user_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:

@@ -6,47 +6,54 @@ import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
+from typer.core import TyperGroup
 
-from bcppl.cli import loading
+from bcppl.arguments import LARGEST_SEED
 from bcppl.errors import InputError
-from bcppl.recordings import Recording, describe, notes, problems, save, validate
-from bcppl.recordings.importers import importers
 
-OUT = Annotated[Path, typer.Option("--out", "-o", help="The recording to write (.h5).")]
+if TYPE_CHECKING:
+    from bcppl.recordings import Recording
+
+OUT = Annotated[Path, typer.Option("--out", "-o", dir_okay=False, help="The recording to write (.h5).")]
 
 
 def check(
     recording: Annotated[str, typer.Argument(help="A recording (.h5), or the name of a shipped one.")],
 ) -> None:
-    """Say what a recording holds, and what is wrong with it (exit code 2 if anything is)."""
-    found = loading.unchecked_recording(recording)
+    """Describe a recording and list its problems (exit code 2 if there are any)."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from bcppl.models.shipped import load_recording
+    from bcppl.recordings import describe, notes, problems
+
+    loaded = load_recording(recording)
     console = Console()
     table = Table(show_header=False, box=None, pad_edge=False)
-    for what, value in describe(found):
+    for what, value in describe(loaded):
         table.add_row(f"[bold]{what}[/bold]", value)
     console.print(table)
-    for note in notes(found):
+    for note in notes(loaded):
         console.print(f"[yellow]note:[/yellow] {note}", highlight=False)
-    wrong = problems(found)
+    wrong = problems(loaded)
     for problem in wrong:
         console.print(f"[red]wrong:[/red] {problem}", highlight=False)
     if wrong:
         raise typer.Exit(2)
-    console.print("[green]nothing wrong was found.[/green]")
+    console.print("[green]no problem.[/green]")
 
 
 def simulate(
     model: Annotated[str, typer.Argument(help="A model's name, or a file.")] = "peg_in_hole",
     out: OUT = Path("recording.h5"),
-    seed: Annotated[int, typer.Option(help="Same seed, same recording.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same recording.")] = 0,
 ) -> None:
-    """Write a recording that a model's own world makes up: a true pose from the prior, and noisy sensors."""
-    loading.refuse_seed(seed)
+    """Write a recording that a model's own world simulates: a true pose from the prior, and noisy sensors."""
+    from bcppl.cli import loading
+
     chosen = loading.model(model)
     if chosen.simulate_recording is None:
         raise InputError(
@@ -56,17 +63,43 @@ def simulate(
     _write(chosen.simulate_recording(seed), out)
 
 
-import_app = typer.Typer(help="Make a recording from data in another format.", no_args_is_help=True)
-
-
 def _write(recording: Recording, out: Path) -> None:
+    from rich.console import Console
+
+    from bcppl.recordings import describe, save, validate
+
     validate(recording)
     if not out.parent.is_dir():
         raise InputError(f"there is no folder {out.parent} to write {out.name} into; make it first.")
-    if out.is_dir():
-        raise InputError(f"{out} is a folder; give the name of a file to write.")
     save(recording, out)
     Console().print(f"wrote {out}: {dict(describe(recording))['measurements']}", highlight=False)
+
+
+class Importers(TyperGroup):
+    """One command for each importer; they are imported when `bcppl import` is called."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """The importers' names."""
+        return list(_commands())
+
+    def get_command(self, ctx: Any, name: str) -> Any:
+        """The command of an importer."""
+        return _commands().get(name)
+
+
+import_app = typer.Typer(cls=Importers, help="Make a recording from data in another format.")
+
+
+@functools.cache
+def _commands() -> dict[str, Any]:
+    from bcppl.recordings.importers import importers
+
+    commands = {}
+    for name, module in importers().items():
+        app = typer.Typer(add_completion=False)
+        app.command(name, help=module.HELP)(_importing(module.command))
+        commands[name] = typer.main.get_command(app)
+    return commands
 
 
 def _importing(command: Callable[..., Recording]) -> Callable[..., None]:
@@ -74,7 +107,6 @@ def _importing(command: Callable[..., Recording]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def importing(*, out: Path, **options: Any) -> None:
-        loading.refuse_seed(options.get("seed", 0))
         _write(command(**options), out)
 
     wrapped: Any = importing
@@ -86,7 +118,3 @@ def _importing(command: Callable[..., Recording]) -> Callable[..., None]:
     wrapped.__signature__ = signature.replace(parameters=[*parameters, added], return_annotation=None)
     wrapped.__annotations__ = {p.name: p.annotation for p in [*parameters, added]}
     return wrapped
-
-
-for _name, _module in importers().items():
-    import_app.command(_name, help=_module.HELP)(_importing(_module.command))

@@ -14,12 +14,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-import roma
 import torch
 import trimesh
 from torch import Tensor
 
-from bcppl import poses
+from bcppl import poses, quaternions
 from bcppl.arguments import number_within
 from bcppl.compiled import compiled
 from bcppl.contact.peg_model import commands
@@ -321,6 +320,6 @@ def _between(first: Tensor, second: Tensor, share: float) -> Tensor:
         return torch.cat([place, first[:, 3:]], dim=1)
     start, stop = poses.quaternion_xyzw(first), poses.quaternion_xyzw(second)
     stop = torch.where((start * stop).sum(dim=-1, keepdim=True) < 0.0, -stop, stop)
-    step = share * roma.unitquat_to_rotvec(roma.quat_product(roma.quat_conjugation(start), stop))
-    turned = roma.quat_product(start, roma.rotvec_to_unitquat(step))
+    step = share * quaternions.rotation_vector(quaternions.product(quaternions.conjugate(start), stop))
+    turned = quaternions.product(start, quaternions.from_rotation_vector(step))
     return poses.from_translation_quaternion_xyzw(place, turned)

@@ -9,13 +9,12 @@ import math
 from typing import Any, Protocol, SupportsFloat
 
 import numpy as np
-import roma
 import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import MultivariateNormal, constraints
 
-from bcppl import poses
+from bcppl import poses, quaternions
 from bcppl.errors import InputError
 from bcppl.poses import FREE, Freedom
 
@@ -50,7 +49,7 @@ class _PoseDistribution(TorchDistribution):
     def _turned(self, shape: torch.Size, rotation: Tensor, translation: Tensor) -> Tensor:
         """The centre moved by free translations (*shape, 3) and quaternions x y z w (*shape, 4)."""
         center = self.center.expand(*shape, 7)
-        quaternion = roma.quat_product(poses.quaternion_xyzw(center).contiguous(), rotation)
+        quaternion = quaternions.product(poses.quaternion_xyzw(center).contiguous(), rotation)
         quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
         return poses.from_translation_quaternion_xyzw(center[..., :3] + translation, quaternion)
 
@@ -116,13 +115,13 @@ class UniformPose(_PoseDistribution):
         if self.freedom.rotation == "all":
             direction = torch.randn(*shape, 3, dtype=torch.float64)
             direction = direction / direction.norm(dim=-1, keepdim=True)
-            rotation = roma.rotvec_to_unitquat(direction * _haar_angle(shape, self.angle)[..., None])
+            rotation = quaternions.from_rotation_vector(direction * _haar_angle(shape, self.angle)[..., None])
         else:
             turn = torch.zeros(*shape, 6, dtype=torch.float64)
             if self.freedom.rotation != "none":
                 axis = self.freedom.axes[-1]
                 turn[..., axis] = self.angle * (2.0 * torch.rand(*shape, dtype=torch.float64) - 1.0)
-            rotation = roma.rotvec_to_unitquat(turn[..., 3:])
+            rotation = quaternions.from_rotation_vector(turn[..., 3:])
         return self._turned(shape, rotation, translation)
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -189,7 +188,9 @@ class SwingTwistPose(_PoseDistribution):
         )
         twist = torch.zeros(*shape, 3, dtype=torch.float64)
         twist[..., 2] = self.yaw * (2.0 * uniform[..., 5] - 1.0)
-        rotation = roma.quat_product(roma.rotvec_to_unitquat(swing), roma.rotvec_to_unitquat(twist))
+        rotation = quaternions.product(
+            quaternions.from_rotation_vector(swing), quaternions.from_rotation_vector(twist)
+        )
         return self._turned(shape, rotation, translation)
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -205,9 +206,9 @@ class SwingTwistPose(_PoseDistribution):
 def tilt_and_yaw(center: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
     """Tilt of the z axis (0 to pi) and twist about it (-pi to pi) from `center` to `pose`, (...,) radians."""
     first, second = torch.broadcast_tensors(
-        roma.quat_conjugation(poses.quaternion_xyzw(center)), poses.quaternion_xyzw(pose)
+        quaternions.conjugate(poses.quaternion_xyzw(center)), poses.quaternion_xyzw(pose)
     )
-    x, y, z, w = roma.quat_product(first, second).unbind(dim=-1)
+    x, y, z, w = quaternions.product(first, second).unbind(dim=-1)
     tilt = 2.0 * torch.atan2(torch.hypot(x, y), torch.hypot(z, w))
     yaw = torch.remainder(2.0 * torch.atan2(z, w) + math.pi, 2.0 * math.pi) - math.pi
     return tilt, yaw

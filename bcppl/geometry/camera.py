@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bcppl import poses
@@ -279,4 +278,6 @@ def looking_at(eye: npt.ArrayLike, point: npt.ArrayLike, up: npt.ArrayLike = (0.
         )
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
     axes = np.stack([right, np.cross(forward, right), forward], axis=1)
+    from scipy.spatial.transform import Rotation
+
     return np.concatenate([there, Rotation.from_matrix(axes).as_quat()[[3, 0, 1, 2]]])

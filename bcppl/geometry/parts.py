@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-import trimesh
 
 from bcppl import poses
 from bcppl.errors import InputError
+
+if TYPE_CHECKING:
+    import trimesh
 
 Array = npt.NDArray[np.float64]
 
@@ -55,6 +58,8 @@ class Part:
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
         """The trimesh mesh, its vertices unmerged."""
+        import trimesh  # takes as long to import as all that a check needs
+
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
     @property
@@ -72,7 +77,9 @@ class Part:
 
     def surface_points(self, count: int = 1000, seed: int = 0) -> Array:
         """Points (count, 3) sampled uniformly by area on the surface, in the part's frame, as for ADD."""
-        points, _ = trimesh.sample.sample_surface(self.mesh, count, seed=seed)
+        from trimesh.sample import sample_surface
+
+        points, _ = sample_surface(self.mesh, count, seed=seed)
         return np.ascontiguousarray(points, dtype=np.float64)
 
     def moved(self, new_from_old: object, name: str | None = None) -> Part:
@@ -116,17 +123,32 @@ class Part:
                 f"part {self.name!r} is {self.extent.max():.0f} m long: its mesh is probably in millimetres; "
                 "scale it by 0.001 to metres."
             )
-        if closed and not self.mesh.is_watertight:
-            edges = int(trimesh.grouping.group_rows(self.mesh.edges_sorted, require_count=1).shape[0])
+        if not closed:
+            return
+        if not self.is_closed:
             raise InputError(
-                f"part {self.name!r} has an open mesh ({edges} open edges); close its holes, "
+                f"part {self.name!r} has an open mesh ({self._open_edges} open edges); close its holes, "
                 "or merge duplicate vertices at seams."
             )
-        if closed and self.mesh.volume < -1e-9 * self.extent.max() ** 3:
+        first, second, third = np.moveaxis(self.vertices[self.faces], 1, 0)
+        volume = float((first * np.cross(second, third)).sum()) / 6.0
+        if volume < -1e-9 * self.extent.max() ** 3:
             raise InputError(
-                f"part {self.name!r} has a mesh that is inside out (its volume is {self.mesh.volume:.3g} "
-                "m^3); turn its faces with faces[:, ::-1]."
+                f"part {self.name!r} has a mesh that is inside out (its volume is {volume:.3g} m^3); "
+                "turn its faces with faces[:, ::-1]."
             )
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether every edge of the mesh is shared by exactly two faces."""
+        return self._open_edges == 0
+
+    @cached_property
+    def _open_edges(self) -> int:
+        """How many edges are not shared by exactly two faces."""
+        low, high = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)).astype(np.int64).T
+        _, shared = np.unique(low * len(self.vertices) + high, return_counts=True)
+        return int((shared != 2).sum())
 
 
 def _moved(piece: Piece, rotation: Array, shift: Array, name: str) -> Piece:

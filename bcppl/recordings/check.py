@@ -33,7 +33,7 @@ def validate(recording: Recording) -> None:
 def notes(recording: Recording) -> list[str]:
     """Remarks on a recording that do not stop inference, one sentence each."""
     part = recording.part
-    if _touched(recording) or list(checks.part(part, closed=False)) or part.mesh.is_watertight:
+    if _touched(recording) or list(checks.part(part, closed=False)) or part.is_closed:
         return []
     return [f"part {part.name!r} has an open mesh: it can be looked at, as here, but not touched."]
 

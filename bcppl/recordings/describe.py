@@ -32,7 +32,7 @@ def _part(part: Part) -> str:
     if part.vertices.ndim != 2 or len(part.vertices) == 0 or len(part.faces) == 0:
         return f"{part.name}, empty mesh"
     size = " × ".join(f"{1e3 * side:.1f}" for side in part.extent)
-    closed = "closed" if part.mesh.is_watertight else "open"
+    closed = "closed" if part.is_closed else "open"
     pieces = f", convex pieces: {len(part.pieces)}" if part.pieces else ""
     return f"{part.name}, {size} mm, {len(part.faces)} triangles, {closed}{pieces}"
 

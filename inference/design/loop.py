@@ -26,7 +26,7 @@ from bcppl.inference.design.ranking import Ranking
 from bcppl.inference.design.rules import Rank, by_information
 from bcppl.inference.filters import guided_smc
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.planning.candidates import refuse_settled
+from bcppl.inference.planning.candidate_list import refuse_settled
 from bcppl.inference.planning.filters import (
     Candidates,
     no_longer_than,

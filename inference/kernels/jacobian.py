@@ -18,11 +18,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import roma
 import torch
 from torch import Tensor
 
-from bcppl import poses
+from bcppl import poses, quaternions
 from bcppl.distributions.support import freedom_of, support_of
 from bcppl.errors import InferenceError, InputError
 from bcppl.poses import Freedom
@@ -85,13 +84,13 @@ class Tangent(Chart):
         half = 0.5 * whole[..., 3:]
         # The exponential map has the derivative of q (1, w / 2) at 0, and its gradient is no number there.
         turn = torch.cat([half, torch.ones_like(half[..., :1])], dim=-1)
-        turned = roma.quat_product(poses.quaternion_xyzw(value), turn)
+        turned = quaternions.product(poses.quaternion_xyzw(value), turn)
         return poses.from_translation_quaternion_xyzw(value[..., :3] + whole[..., :3], turned)
 
     def read(self, value: Tensor) -> Tensor:  # noqa: D102
         quaternion = poses.quaternion_xyzw(value)
         about = quaternion.detach()
-        turn = roma.quat_product(roma.quat_conjugation(about), quaternion)[..., :3]
+        turn = quaternions.product(quaternions.conjugate(about), quaternion)[..., :3]
         turn = 2.0 * turn / (about**2).sum(dim=-1, keepdim=True)
         tangent = torch.cat([value[..., :3], turn], dim=-1)
         return self.freedom.coordinates(tangent).reshape(len(value), -1)

@@ -1,1 +1,5 @@
-"""Worlds: what makes recordings up, with parameters of its own that inference is not told."""
+"""Worlds: what simulates recordings, with parameters of its own that inference does not know."""
+
+from bcppl.exports import exported
+
+__getattr__, __dir__, __all__ = exported(__name__)

@@ -55,3 +55,7 @@ And where, from the mean of 50 samples in contact. Its noise is that of 50 sampl
     >>> print("known to", np.round(1e3 * np.sqrt(np.diagonal(found.covariance[0, 0])), 1), "mm")
     known to [0.  0.1 0.1] mm
 """
+
+from bcppl.exports import exported
+
+__getattr__, __dir__, __all__ = exported(__name__)

@@ -19,6 +19,7 @@ import typer
 from PIL import Image
 from scipy.optimize import brentq
 
+from bcppl.arguments import LARGEST_SEED
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.guess import Guess
@@ -39,7 +40,7 @@ Array = npt.NDArray[np.float64]
 def command(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of the scene.")],
     object_id: Annotated[int, typer.Option("--object", help="Which object is sought (its BOP id).")],
-    seed: Annotated[int, typer.Option(help="Seed of the guess.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the guess.")] = 0,
     translation: Annotated[float, typer.Option(help="Half width of the prior's box, m.")] = 0.04,
     angle: Annotated[float, typer.Option(help="Largest rotation of the prior, degrees.")] = 25.0,
     frame: Annotated[int | None, typer.Option(help="Which frame; the first if not given.")] = None,

@@ -18,6 +18,7 @@ import typer
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from bcppl.arguments import LARGEST_SEED
 from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.guess import Guess
@@ -176,7 +177,7 @@ def measurement(push: LoggedPush, world_from_object: Tensor, after: float) -> Me
 def command(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="MLab_EXP push logs, pooled.")],
     pushes: Annotated[int, typer.Option(help="How many pushes to draw, without replacement.")] = 10,
-    seed: Annotated[int, typer.Option(help="Seed of the draws.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the draws.")] = 0,
     translation: Annotated[float, typer.Option(help="Half width of the prior in x and y, m.")] = 0.02,
     yaw: Annotated[float, typer.Option(help="Half width of the prior in yaw, degrees.")] = 20.0,
     after: Annotated[float, typer.Option(help="How long to keep a push beyond its contact, s.")] = 0.5,

@@ -24,8 +24,7 @@ from bcppl.inference.planning.filters import (
     sifted,
 )
 from bcppl.inference.planning.insertion import Attempt
-from bcppl.inference.planning.kinds import SHORT, SOURCES, Setup, source
-from bcppl.inference.planning.kinds import kinds as known_kinds
+from bcppl.inference.planning.kinds import SHORT, SOURCES, Setup, kinds as known_kinds, source
 from bcppl.inference.planning.touching import Touching
 from bcppl.sensors import sensor_of
 from bcppl.sensors.candidates import Candidate, name_of, planner_of

@@ -1,4 +1,4 @@
-"""`bcppl run` marks measurements that do not fit the belief, and says so in one sentence."""
+"""`bcppl run` marks measurements that fail their posterior predictive check, and warns in one sentence."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bcppl.cli.surprises import MEANING, NAMED, sentence, together
+from bcppl.cli.predictive_checks import MEANING, NAMED, sentence, together
 from bcppl.inference.predictive import Check
 from bcppl.models.worlds.bench import Bench, bench_scene
 from bcppl.recordings import save
@@ -27,22 +27,22 @@ def test_a_hidden_view_is_marked_and_named_and_a_clean_one_is_not(
     ran = bcppl("run", "look.h5", *SETTINGS)
     assert ran.code == 0, ran.err
     rows = json.loads((tmp_path / "runs/look/run.json").read_text())["rows"]
-    said = [row["p value"] for row in rows]
-    assert said[0] == "" and all(said[1:])
-    marked = [k for k, p in enumerate(said) if p.endswith("!")]
-    warnings = [line for line in ran.out.splitlines() if "surprising" in line]
+    values = [row["p value"] for row in rows]
+    assert values[0] == "" and all(values[1:])
+    marked = [k for k, p in enumerate(values) if p.endswith("!")]
+    warnings = [line for line in ran.out.splitlines() if "predictive check" in line]
     if hidden:
         assert scene.hidden_view is not None and scene.hidden_view + 1 in marked
         assert len(warnings) == 1 and f"view {scene.hidden_view + 1}" in warnings[0]
-        assert "before the camera" in warnings[0]
+        assert "occlude the view" in warnings[0]
     else:
         assert not marked and not warnings
 
 
-def test_a_model_of_which_nothing_can_be_told_says_so(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+def test_a_model_without_a_check_has_no_p_values(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(1), tmp_path / "short.h5")
     ran = bcppl("run", "short.h5", "--particles", 4)
-    assert ran.code == 0 and "p value: empty" in ran.out and "surprising" not in ran.out
+    assert ran.code == 0 and "p value: empty" in ran.out and "predictive check" not in ran.out
 
 
 def of(kind: str, probability: float = 1e-9) -> Mapping[str, Check]:
@@ -50,10 +50,10 @@ def of(kind: str, probability: float = 1e-9) -> Mapping[str, Check]:
 
 
 def test_one_sentence_names_the_measurements_and_what_each_kind_may_mean() -> None:
-    said = sentence({"view 1": of("image"), "window 7": of("contacts")})
-    assert "view 1, window 7 do not fit" in said
-    assert MEANING["image"] in said and MEANING["contacts"] in said and MEANING["normal"] not in said
-    assert_one_sentence(said)
+    warning = sentence({"view 1": of("image"), "window 7": of("contacts")})
+    assert "view 1, window 7 do not fit" in warning
+    assert MEANING["image"] in warning and MEANING["contacts"] in warning and MEANING["normal"] not in warning
+    assert_one_sentence(warning)
     many = sentence({f"window {k}": of("contacts") for k in range(1, NAMED + 4)})
     assert "and 3 more" in many and many.count(MEANING["contacts"]) == 1
     # Of several sites that came with one measurement the least likely says what is wrong.

@@ -1,5 +1,0 @@
-"""`python -m bcppl.cli`."""
-
-from bcppl.cli import main
-
-main()

@@ -1,0 +1,170 @@
+"""The candidates that `bcppl probe` ranks, from its options."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bcppl import poses
+from bcppl.arguments import number_within
+from bcppl.beliefs import Belief
+from bcppl.errors import InputError
+from bcppl.geometry.gap import PegGap
+from bcppl.inference.planning.candidate_list import MIXED, candidates
+from bcppl.inference.planning.filters import (
+    Candidates,
+    Filter,
+    Mounted,
+    clear_of_part,
+    clear_of_table,
+    filtered,
+    from_within,
+    no_harder_than,
+    no_longer_than,
+    refuse_none,
+    within_reach,
+)
+from bcppl.inference.planning.kinds import SOURCES, kinds
+from bcppl.models.robots import load_robot
+from bcppl.recordings import Recording
+from bcppl.recordings.action_file import SUFFIXES, load_actions
+from bcppl.sensors.candidates import Candidate, name_of, planner_of
+
+COUNT = 8  # of a kind that is named without a number
+MOST = 10_000  # of a kind: more fit no memory, and are ranked in hours
+NUMBERS = "x y z qw qx qy qz"
+ORIGIN = "0 0 0 1 0 0 0"
+
+# A user's own candidates, or how many of each kind are to be laid out.
+Asked = Sequence[Candidate] | Mapping[str, int]
+
+
+def asked_for(words: str | None) -> Asked:
+    """The candidates in a file, or numbers by kind, of words such as touch:20,slide.
+
+    Raises:
+        InputError: the file cannot be read, or a word is neither a kind nor a number of one.
+    """
+    if words is None:
+        return dict(MIXED)
+    if Path(words).suffix in SUFFIXES or "/" in words:
+        own = load_actions(words)
+        refuse_none(Candidates(tuple(own)))
+        names = [name_of(each) for each in own]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"two candidates are called {twice!r}; give each a name of its own.")
+        return own
+    counts: dict[str, int] = {}
+    for word in filter(None, (each.strip() for each in words.split(","))):
+        kind, _, count = word.partition(":")
+        if kind not in kinds() or (count and not count.isdecimal()):
+            raise InputError(
+                f"--candidates has {word!r}; give kinds ({', '.join(kinds())}), each with a number if you "
+                "like (touch:20,slide:12), or a file that ends in .h5 or .json."
+            )
+        if len(count) > len(str(MOST)) or int(count or COUNT) > MOST:
+            raise InputError(f"--candidates asks for {count[:20]} of {kind}; give {MOST} at most.")
+        counts[kind] = counts.get(kind, 0) + int(count or COUNT)
+    if not any(counts.values()):
+        raise InputError(
+            f"there are no candidates: --candidates is {words!r}; give kinds such as touch:20,slide:12, or a "
+            "file of plans."
+        )
+    return counts
+
+
+def refuse_without_peg(asked: Asked, recording: Recording) -> None:
+    """Refuse a recording without a peg where a candidate needs one.
+
+    Raises:
+        InputError: there is none; names the candidate or its kind.
+    """
+    if isinstance(asked, Mapping):
+        needing = [kind for kind, count in asked.items() if count and kind in SOURCES]
+    else:
+        needing = [name_of(each) for each in asked if planner_of(each).needs_peg]
+    if needing and recording.peg is None:
+        raise InputError(
+            f"the recording holds no peg to carry out {needing[0]!r} with; add the peg, or where the model "
+            "explains depth images ask for views (--candidates view:8)."
+        )
+
+
+def filters(force: float | None, seconds: float | None, above: float | None) -> list[Filter]:
+    """The filters of candidates by force (N), duration (s) and angle from straight above (degrees)."""
+    chosen = [] if seconds is None else [no_longer_than(seconds)]
+    if force is not None:
+        chosen.append(no_harder_than(force))
+    if above is not None:
+        removes = f"come from more than {above:g}° beside straight above"
+        chosen.append(from_within((0.0, 0.0, -1.0), math.radians(above), removes))
+    return chosen
+
+
+def reach(
+    robot: str | None, link: str | None, link_from_peg: str | None, world_from_base: str | None, seed: int
+) -> list[Filter]:
+    """The filter of candidates by the reach of an arm, where one is given.
+
+    Raises:
+        InputError: an option is missing, superfluous or no pose, or there is no such arm.
+    """
+    if robot is None:
+        if (link, link_from_peg, world_from_base) != (None, None, None):
+            raise InputError(
+                "--link, --link-from-peg and --world-from-base are of an arm; give it with --robot."
+            )
+        return []
+    if link is None:
+        raise InputError("--robot is given without --link; name the link of the arm that holds the peg.")
+    arm = load_robot(robot, tip=link)
+    if link_from_peg is None:
+        raise InputError(
+            "--robot is given without --link-from-peg; state how the link holds the peg (panda_hand, whose "
+            'z leads along the fingers, at about "0 0 0.1 0 1 0 0").'
+        )
+    held, base = (
+        _pose("--link-from-peg", link_from_peg),
+        _pose("--world-from-base", world_from_base or ORIGIN),
+    )
+    return [within_reach(Mounted(arm, link, held, base), seed=seed)]
+
+
+def _pose(option: str, words: str) -> Any:
+    try:
+        numbers = np.array([float(word) for word in words.replace(",", " ").split()])
+    except ValueError:
+        raise InputError(f"{option} is {words!r}; give seven numbers, {NUMBERS}, in metres.") from None
+    if numbers.shape != (7,):
+        raise InputError(f"{option} has {numbers.size} numbers; give seven, {NUMBERS}, in metres.")
+    return poses.as_pose(numbers, option).numpy()
+
+
+def laid_out(
+    asked: Asked,
+    belief: Belief,
+    recording: Recording,
+    filters: Sequence[Filter],
+    table: float | None,
+    seed: int,
+) -> Candidates:
+    """The candidates that pass the filters, a table's height (m) among them.
+
+    Raises:
+        InputError: none is left.
+    """
+    if table is not None:
+        number_within("--table is {}", table)
+        if recording.peg is not None:
+            filters = [clear_of_table(recording.peg, table), *filters]
+    if isinstance(asked, Mapping):
+        like = [m.action for m in recording.measurements]
+        return candidates(belief, recording.part, recording.peg, asked, filters=filters, like=like, seed=seed)
+    if recording.peg is not None and any(planner_of(each).needs_peg for each in asked):
+        filters = [clear_of_part(PegGap(recording.part, recording.peg), belief.mean), *filters]
+    return filtered(asked, filters)

@@ -1,0 +1,155 @@
+"""The posterior that candidates are ranked from: of a recording that is run, or of a run's belief file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from bcppl.cli import loading
+from bcppl.errors import InputError
+from bcppl.inference.population import Population
+from bcppl.inference.progress import sole_bar
+from bcppl.recordings import Recording
+from bcppl.recordings.beliefs import is_belief, load_belief, load_fingerprint, load_label, load_latent
+from bcppl.recordings.fingerprint import is_of
+from bcppl.traces import Model, Series, generate
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """A population after some measurements, and what it is of.
+
+    Attributes:
+        recording: with the assimilated measurements, and no others.
+        model: what explains it.
+        population: after them.
+        scene: of the model.
+    """
+
+    recording: Recording
+    model: Model
+    population: Population
+    scene: Any
+
+
+def posterior(
+    name: str,
+    of: str | None,
+    model: str | None,
+    inference: str | None,
+    particles: int,
+    seed: int,
+    console: Console,
+    check: Callable[[Recording], None] = lambda recording: None,
+) -> Posterior:
+    """Run a recording, or read a belief.
+
+    Args:
+        name: a recording's file or name, or a belief's file.
+        of: the recording that a belief is of; None: the one that the run.json beside it names.
+        model: None: the one that the recording or the run.json names.
+        inference: None: the model's own.
+        particles: of a run.
+        seed: of a run.
+        console: shows the progress of a run.
+        check: refuses a recording before anything is run.
+
+    Raises:
+        InputError: a file or a name does not exist or does not fit the others.
+    """
+    if Path(name).is_file() and is_belief(name):
+        if inference is not None:
+            raise InputError(f"--inference is given with {name}, a belief, which needs no run; leave it out.")
+        return _read(Path(name), of, model, check)
+    if of is not None:
+        raise InputError(f"--of names a belief's recording, but {name} is a recording; leave it out.")
+    recording = loading.recording(name)
+    check(recording)
+    chosen = _static(loading.model(model, recording.model), model or recording.model)
+    _, infer = loading.inference(inference, chosen)
+    scene = chosen.prepare(recording)
+    population = None
+    with sole_bar(console) as progress:
+        task = progress.add_task("prior", total=len(recording.measurements) + 1)
+        for step in infer(chosen, recording, particles=particles, seed=seed, scene=scene):
+            population = getattr(step, "population", None)
+            progress.update(task, advance=1, description=step.info.label)
+    if not isinstance(population, Population):
+        raise InputError(
+            "the steps of this inference program have no population, which predictions need; use another."
+        )
+    return Posterior(recording, chosen, population, scene)
+
+
+def _static(model: Model, name: str) -> Model:
+    if isinstance(model.program, Series):
+        raise InputError(
+            f"in model {name} the pose moves, so a plan made now would miss it; give a model of a part that "
+            "stays where it is."
+        )
+    return model
+
+
+def _read(path: Path, of: str | None, model: str | None, check: Callable[[Recording], None]) -> Posterior:
+    """The population of a belief's file, its sites observed as the recording has them."""
+    label, belief, latent = load_label(path), load_belief(path), load_latent(path)
+    record = _run_record(path)
+    of = of or record.get("recording")
+    if of is None:
+        raise InputError(
+            f"{path} does not name its recording, and there is no run.json beside it; give --of RECORDING."
+        )
+    whole = loading.recording(of)
+    by = "the recording" if record.get("model") is None else str(path.parent / "run.json")
+    named = record.get("model") or whole.model
+    chosen = _static(loading.model(model, named, by), model or named)
+    assimilated = _assimilated(path, label)
+    if assimilated > len(whole.measurements):
+        raise InputError(
+            f"{path} is after {label}, but {of} has {len(whole.measurements)} measurements; "
+            "give the recording that it was run on with --of."
+        )
+    if not is_of(load_fingerprint(path), whole, assimilated):
+        raise InputError(
+            f"{path} is of another recording than {of}: part, guess or measurements differ; give the "
+            "one that it was run on with --of."
+        )
+    measured = list(whole.measurements[:assimilated])
+    scene = chosen.prepare(whole)
+    observed = chosen.observe(scene, measured)
+    try:
+        trace, _ = generate(
+            chosen.program, (scene, [m.action for m in measured]), observed, len(belief), choices=latent
+        )
+    except (KeyError, ValueError, InputError) as error:
+        raise InputError(
+            f"{path} does not fit the model or the recording ({error}); give --of and --model as it was run."
+        ) from error
+    check(whole)
+    recording = replace(whole, measurements=measured)
+    return Posterior(recording, chosen, Population(trace, belief.log_weights), scene)
+
+
+def _assimilated(path: Path, label: str) -> int:
+    """How many measurements a belief has assimilated, by the label of its step."""
+    count = "0" if label == "prior" else label.rpartition(" ")[2]
+    if not (count.isascii() and count.isdecimal() and len(count) < 10):
+        raise InputError(
+            f"{path} has the label {label!r}, which does not give the number of its measurements; give one "
+            'that `bcppl run` wrote, or save it with the label of its step ("prior", "measurement 3").'
+        )
+    return int(count)
+
+
+def _run_record(path: Path) -> dict[str, Any]:
+    """The record that `bcppl run` wrote beside a belief; empty where there is none."""
+    try:
+        record = json.loads((path.parent / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}

@@ -1,0 +1,182 @@
+"""What a run prints: a row for each measurement, then the posterior, in one line and in tables."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from bcppl import poses
+from bcppl.beliefs import Belief, average_distance, average_nearest_distance, average_point_distance
+from bcppl.cli import latent_sites
+from bcppl.cli.predictive_checks import NO_CHECK, PredictiveChecks
+from bcppl.recordings import Recording
+from bcppl.traces import Model
+
+WIDTHS = {
+    "measurement": 12,
+    "time s": 7,
+    "ESS": 6,
+    "distinct": 8,
+    "log Z": 9,
+    "accepted": 8,
+    "steps": 5,
+    "ADD mm": 7,
+    "truth gap": 9,
+    "p value": 8,
+    "sim. s": 7,
+    "wall s": 6,
+}
+LARGEST_GAP = 5.0  # nats: the truth may score better than the best particle by chance, not by more
+MASS = 0.9  # of the credible region in the last line
+UNITS = {"rendering": "images", "physics": "rollouts"}
+
+
+class Report:
+    """Prints a run.
+
+    Attributes:
+        steps: so far.
+    """
+
+    def __init__(self, console: Console, recording: Recording, model: Model) -> None:
+        self.console = console
+        self.recording = recording
+        self.model = model
+        self.steps: list[Any] = []
+        self._checks = PredictiveChecks()
+
+    def row(self, step: Any) -> dict[str, str]:
+        """Print a step's row, and give its cells by column."""
+        if not self.steps:
+            self._print_row({name: name for name in WIDTHS}, style="bold")
+        self.steps.append(step)
+        info, add = step.info, math.nan
+        if self.recording.truth is not None:
+            add = 1e3 * step.belief.weighted_add(self.recording.part.surface_points(), self.recording.truth)
+        simulated = info.effort["physics"].amount if "physics" in info.effort else math.nan
+        cells = [
+            info.label,
+            _number(info.time, 2),
+            _number(info.effective_sample_size, 1),
+            str(info.distinct),
+            _number(info.log_evidence, 2),
+            _number(info.acceptance, 2),
+            str(len(info.exponents) or ""),
+            _number(add, 2),
+            _number(info.truth_gap, 2),
+            self._checks.cell(step),
+            _number(simulated, 0),
+            _number(info.seconds, 2),
+        ]
+        row = dict(zip(WIDTHS, cells, strict=True))
+        self._print_row(row)
+        return row
+
+    def _print_row(self, row: dict[str, str], style: str | None = None) -> None:
+        first, *others = (row[name].rjust(width) for name, width in WIDTHS.items())
+        line = " ".join([first.strip().ljust(WIDTHS["measurement"]), *others])
+        self.console.print(line, style=style, soft_wrap=True, markup=False)
+
+    def finish(self) -> None:
+        """Print the posterior after the last step, and the warnings."""
+        last, sites = self.steps[-1], latent_sites.summarised(self.steps[-1])
+        total = len(self.recording.measurements)
+        if len(self.steps) <= total:
+            self._warn(
+                f"stopped after {last.info.label}: {len(self.steps) - 1} of {total} measurements were "
+                "assimilated."
+            )
+        why = latent_sites.why_no_truth_gap(self.model, self.recording.truth is not None, sites)
+        if why is not None and all(math.isnan(step.info.truth_gap) for step in self.steps):
+            self._note(why)
+        if not self._checks.made:
+            self._note(NO_CHECK)
+        self.console.print(self._pose(last.belief))
+        rows = latent_sites.rows(sites, self.model.pose)
+        if rows:
+            self.console.print(latent_sites.table(rows))
+        gap = last.info.truth_gap
+        if gap > LARGEST_GAP:
+            self._warn(
+                f"the particles missed the truth, which scores {gap:.0f} nats better than the best of them: "
+                "try more particles or another seed."
+            )
+        warning = self._checks.warning(last)
+        if warning is not None:
+            self._warn(warning)
+        self._note(self._effort())
+        self.console.print(result(last.belief, self.recording), markup=False)
+
+    def _warn(self, sentence: str) -> None:
+        self.console.print(sentence, style="yellow", markup=False)
+
+    def _note(self, sentence: str) -> None:
+        self.console.print(sentence, style="dim", markup=False)
+
+    def _pose(self, belief: Belief) -> Table:
+        guess = torch.as_tensor(self.recording.guess.world_from_part, dtype=torch.float64)
+        turned = torch.rad2deg(poses.local(guess, belief.mean)[3:]).tolist()
+        mean, spread = belief.mean.tolist(), belief.spread.tolist()
+        # q and -q are one rotation: the one with w >= 0 is what people compare.
+        sign = -1.0 if mean[3] < 0 else 1.0
+        table = Table(
+            title="pose of the part (world_from_part)",
+            caption="quaternion w x y z: " + " ".join(f"{sign * q:.6f}" for q in mean[3:]),
+            title_justify="left",
+            caption_justify="left",
+            box=None,
+            pad_edge=False,
+        )
+        for name in ("axis", "mean", "standard deviation"):
+            table.add_column(name, justify="left" if name == "axis" else "right")
+        for k, axis in enumerate("xyz"):
+            table.add_row(axis, f"{1e3 * mean[k]:.3f} mm", f"{1e3 * spread[k]:.3f} mm")
+        for k, axis in enumerate("xyz"):
+            name = f"turn about the part's {axis}, from the guess"
+            table.add_row(name, f"{turned[k]:.3f}°", f"{math.degrees(spread[3 + k]):.3f}°")
+        return table
+
+    def _effort(self) -> str:
+        spent = [f"wall time {sum(step.info.seconds for step in self.steps):.2f} s"]
+        for name in self.steps[-1].info.effort:
+            efforts = [step.info.effort[name] for step in self.steps if name in step.info.effort]
+            seconds, items = sum(e.seconds for e in efforts), sum(e.items for e in efforts)
+            simulated = f", {sum(e.amount for e in efforts):.0f} s simulated" if name == "physics" else ""
+            spent.append(f"{name} {seconds:.2f} s ({items} {UNITS.get(name, 'items')}{simulated})")
+        return ", ".join(spent)
+
+
+def result(belief: Belief, recording: Recording) -> str:
+    """The posterior in one line: its error where the truth is known, else its spread; a credible region."""
+    points = recording.part.surface_points()
+    region = belief.credible_region(MASS, average_point_distance(points))
+    size = f"the {100 * MASS:.0f} % credible region is within {1e3 * region.radius:.2f} mm ADD of the mean"
+    if math.isinf(region.radius):
+        size = f"the particles are too few for a {100 * MASS:.0f} % credible region"
+    truth = recording.truth
+    if truth is None:
+        spread = belief.spread
+        return (
+            f"standard deviations {_listed(1e3 * spread[:3])} mm and {_listed(torch.rad2deg(spread[3:]))}°; "
+            f"{size}."
+        )
+    if not math.isinf(region.radius):
+        size += " and contains the truth" if bool(region.contains(truth)) else " and misses the truth"
+    error = 1e3 * float(average_distance(belief.mean, points, truth))
+    nearest = 1e3 * float(average_nearest_distance(belief.mean, points, truth))
+    return (
+        f"ADD {error:.2f} mm at the posterior mean (ADD-S {nearest:.2f} mm), "
+        f"{1e3 * belief.weighted_add(points, truth):.2f} mm on average over the particles; {size}."
+    )
+
+
+def _listed(values: torch.Tensor) -> str:
+    return " ".join(f"{value:.3f}" for value in values.tolist())
+
+
+def _number(value: float, digits: int) -> str:
+    return "" if math.isnan(value) else f"{value:.{digits}f}"

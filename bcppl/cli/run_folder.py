@@ -1,0 +1,81 @@
+"""The folder of a run: a belief after each measurement, run.json, and two figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bcppl.cli import latent_sites
+from bcppl.figures import add_over_time, belief_in_3d
+from bcppl.recordings import Recording
+from bcppl.recordings.beliefs import save_belief
+from bcppl.recordings.fingerprint import fingerprint
+from bcppl.sensors import sensor_named
+
+
+class RunFolder:
+    """Holds what a run has computed so far, whenever it is stopped; an earlier run's files are removed.
+
+    Args:
+        path: of the folder, made with the first step.
+        recording: that is run.
+        settings: of the run, for run.json.
+    """
+
+    def __init__(self, path: Path, recording: Recording, settings: Mapping[str, Any]) -> None:
+        self.path = path
+        self.recording = recording
+        self.record = {**settings, "version": version("bcppl")}
+        self.rows: list[Mapping[str, str]] = []
+
+    def add(self, step: Any, row: Mapping[str, str]) -> None:
+        """Write a step's belief, and run.json with the table so far and a summary of every latent site."""
+        number = len(self.rows)
+        if number == 0:
+            self.path.mkdir(parents=True, exist_ok=True)
+            for old in (*self.path.glob("belief_*.h5"), *self.path.glob("*.png")):
+                old.unlink()
+        save_belief(
+            step.belief,
+            self.path / f"belief_{number:03d}.h5",
+            label=step.info.label,
+            log_evidence=step.info.log_evidence,
+            random_state=step.random_state,
+            latent=latent_sites.values_of(step),
+            of=fingerprint(self.recording, number),
+        )
+        self.rows.append(row)
+        unfinished = self.path / "run.json.part"
+        whole = {**self.record, "rows": self.rows, "latent": latent_sites.summarised(step)}
+        unfinished.write_text(json.dumps(whole, indent=1), encoding="utf-8")
+        unfinished.replace(self.path / "run.json")
+
+    def draw(self, steps: Sequence[Any]) -> None:
+        """Draw ADD over the measurements, from the final mean where the truth is unknown, and beliefs."""
+        recording, points = self.recording, self.recording.part.surface_points()
+        known = recording.truth is not None
+        true = recording.truth if known else steps[-1].belief.mean
+        adds = np.stack([step.belief.add(points, true).numpy() for step in steps])
+        weights = np.stack([step.belief.weights.numpy() for step in steps])
+        kinds = ["prior", *(m.kind for m in recording.measurements)][: len(steps)]
+        touched = [k for k, kind in enumerate(kinds) if k and sensor_named(kind).contact]
+        labels = [step.info.label for step in steps]
+        contact = touched[0] if touched and "view" in kinds else None
+        figure = add_over_time(np.arange(len(steps), dtype=np.float64), adds, weights, labels, contact)
+        if not known:
+            figure.axes[0].set_ylabel("distance from the final mean (mm)")
+        figure.savefig(self.path / "add_over_time.png", dpi=150)
+        views = [k for k, kind in enumerate(kinds) if kind == "view"]
+        middle, last = views[-1] if views else len(steps) // 2, len(steps) - 1
+        titles = {0: "start", middle: "after vision" if views else f"after {labels[middle]}"}
+        titles[last] = ("after contact" if touched else "after vision") if last else "start"
+        shown = [
+            (titles[k], steps[k].belief.world_from_part.numpy(), steps[k].belief.log_weights.numpy())
+            for k in dict.fromkeys([0, middle, last])
+        ]
+        belief_in_3d(recording.part, shown, recording.truth).savefig(self.path / "belief_in_3d.png", dpi=150)

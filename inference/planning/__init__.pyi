@@ -1,0 +1,16 @@
+from bcppl.inference.planning import filters as filters
+from bcppl.inference.planning.candidate_list import candidates as candidates
+from bcppl.inference.planning.chance import chance_of_success as chance_of_success
+from bcppl.inference.planning.filters import (
+    Candidates as Candidates,
+    Filter as Filter,
+    Mounted as Mounted,
+)
+from bcppl.inference.planning.insertion import Attempt as Attempt, insertion_plan as insertion_plan
+from bcppl.inference.planning.metrology import Pace as Pace, three_two_one as three_two_one
+from bcppl.inference.planning.touching import (
+    Touching as Touching,
+    pair as pair,
+    slide as slide,
+    touch as touch,
+)

@@ -1,0 +1,31 @@
+"""The recordings that come with bcppl."""
+
+from __future__ import annotations
+
+from importlib.resources import as_file, files
+from pathlib import Path
+
+from bcppl.errors import InputError
+from bcppl.recordings import Recording, load
+
+
+def load_recording(name: str | Path) -> Recording:
+    """A shipped recording by its name, or any other by its file.
+
+    Args:
+        name: "peg_probe", "point_probe_10_pushes", or the path of a recording (.h5).
+
+    Raises:
+        InputError: there is neither a shipped recording nor a file of that name, or it cannot be read.
+    """
+    path = Path(name)
+    if path.exists() or path.suffix:
+        return load(path)
+    shipped = files("bcppl.models") / "recordings"
+    names = sorted(p.name.removesuffix(".h5") for p in shipped.iterdir() if p.name.endswith(".h5"))
+    if name not in names:
+        raise InputError(
+            f"there is no recording {str(name)!r}: give a file, or one that ships: {', '.join(names)}."
+        )
+    with as_file(shipped / f"{name}.h5") as file:
+        return load(file)

@@ -1,0 +1,6 @@
+from bcppl.models.worlds.bench import (
+    Bench as Bench,
+    BenchScene as BenchScene,
+    bench_scene as bench_scene,
+)
+from bcppl.models.worlds.bench_arm import BenchArm as BenchArm
