@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -11,6 +12,7 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import networkx as nx
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -166,11 +168,66 @@ def wrong_way(path: Path) -> list[str]:
     ]
 
 
+def sources() -> list[Path]:
+    """Every file of the package, once."""
+    found = [*(ROOT / "models").rglob("*.py"), *(ROOT / "inference").rglob("*.py")]
+    return found + [
+        p for p in (ROOT / "bcppl").rglob("*.py") if p.resolve().is_relative_to((ROOT / "bcppl").resolve())
+    ]
+
+
 def test_imports_follow_the_arrows() -> None:
-    sources = [*(ROOT / "models").rglob("*.py"), *(ROOT / "inference").rglob("*.py")]
-    sources += [p for p in (ROOT / "bcppl").rglob("*.py") if p.resolve().is_relative_to(ROOT / "bcppl")]
-    assert len(sources) > 20
-    assert [wrong for path in sources for wrong in wrong_way(path)] == []
+    assert len(sources()) > 20
+    assert [wrong for path in sources() for wrong in wrong_way(path)] == []
+
+
+def package_of(parts: tuple[str, ...]) -> str | None:
+    """The folder that a module lies in: `geometry`, `models`, `inference.kernels`; None where in none."""
+    if parts[0] == "inference":
+        inner = len(parts) > 1 and (ROOT / "inference" / parts[1]).is_dir()
+        return f"inference.{parts[1]}" if inner else None
+    return parts[0] if (ROOT / "bcppl" / parts[0]).is_dir() else None
+
+
+def packages() -> nx.DiGraph:
+    """Folders of modules, with an arrow from each to those that it imports."""
+    graph = nx.DiGraph()
+    for path in sources():
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        own = package_of(parts[1:] if parts[0] == "bcppl" else parts)
+        for _, name in imports(path):
+            other = package_of(tuple(name.split(".")[1:])) if name.startswith("bcppl.") else None
+            if own is not None and other is not None and other != own:
+                graph.add_edge(own, other)
+    return graph
+
+
+def test_no_packages_import_one_another_in_a_circle() -> None:
+    graph = packages()
+    assert {"geometry", "sensors", "models", "inference.filters"} <= set(graph)
+    assert list(nx.simple_cycles(graph)) == []
+
+
+def test_a_circle_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
+    for place, line in (("geometry", "import bcppl.robot.arm"), ("robot", "import bcppl.geometry.parts")):
+        folder = tmp_path / "bcppl" / place
+        folder.mkdir(parents=True)
+        (folder / "a.py").write_text(line)
+    assert list(nx.simple_cycles(packages())) != []
+
+
+KIND = re.compile(r"isinstance\([^()]*\b(View|DepthImage|ProbeWindow|Touch|Push|Plan|Beam|Distance)\b")
+
+
+def test_nobody_outside_sensors_asks_which_kind_a_measurement_is() -> None:
+    asking = [
+        f"{path.relative_to(ROOT)}:{number}"
+        for path in sources()
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if KIND.search(line) and "sensors" not in path.parts
+    ]
+    assert asking == []
 
 
 @pytest.mark.parametrize(

@@ -18,54 +18,17 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.beliefs import normalised
 from bcppl.errors import InputError
+from bcppl.inference.exponents import next_exponent
 from bcppl.inference.filters.step import Observed, StepInfo, Stepped
 from bcppl.inference.kernels import Kernel, Until, refuse_other, rejuvenate, takes
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Resample, adaptive, refuse_scheme
 from bcppl.inference.targets import POSTERIOR, Target, cost_of
 from bcppl.traces import Trace, extend
-
-SMALLEST_STEP = 1e-6
-
-
-def conditional_effective_sample_size(log_weights: Tensor, log_factor: Tensor) -> float:
-    """N (sum W w)^2 / sum W w^2 for weights W and incremental weights w = exp(log_factor), each (N,)."""
-    return _conditional(normalised(log_weights), log_factor)
-
-
-def _conditional(weights: Tensor, log_factor: Tensor) -> float:
-    factor = torch.exp(log_factor - log_factor.max())
-    weighted = weights * factor
-    return float(len(weights) * weighted.sum() ** 2 / (weighted @ factor))
-
-
-def next_exponent(log_weights: Tensor, log_likelihood: Tensor, exponent: float, share: float = 0.5) -> float:
-    """The next exponent in (exponent, 1] for a likelihood (N,) let in up to `exponent`.
-
-    Particles with a log-likelihood of -inf lose their weight at any exponent; the others are bisected over.
-    """
-    finite = torch.isfinite(log_likelihood) & (log_weights > -torch.inf)
-    if not bool(finite.any()):
-        return 1.0
-    weights, likelihood = normalised(log_weights[finite]), log_likelihood[finite]
-    target = share * len(weights)
-    low, high = 0.0, 1.0 - exponent
-    if _conditional(weights, high * likelihood) >= target:
-        return 1.0
-    # The sharpest likelihoods need steps of 1e-5 and less; one part in ten thousand of a step is nothing.
-    while high - low > 1e-4 * high and high > SMALLEST_STEP:
-        middle = 0.5 * (low + high)
-        if _conditional(weights, middle * likelihood) >= target:
-            low = middle
-        else:
-            high = middle
-    return min(1.0, exponent + max(low, SMALLEST_STEP))
 
 
 class Rejuvenated(NamedTuple):
