@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -125,21 +125,55 @@ def guided(
     resample = adaptive(systematic, share)
     rejuvenation = resample_move(moves, sweeps, resample, always_move=True)
     by_tempering = tempered(moves, sweeps=2 * sweeps, resample=resample)
+    copies = Copies(few, most, least, room)
 
     def step(population: Population, observed: Observed) -> Stepped:
         scene, actions = observed.args
-        known = population.trace.observations
-        newest = (scene, len(actions) - 1, actions[-1], {**known, **observed.observations})
+        action, values = actions[-1], {**population.trace.observations, **observed.observations}
         before = population.approximation
         if before is None:
             before = _given_all(start(scene), population.trace, actions[:-1])
         certain = _certain(population, observed)
         if certain is not None:
-            stayed = certain.with_approximation(before.deferring(*newest))
-            return Stepped(stayed, _info(population, stayed, stayed.effective_sample_size))
+            later = before.deferring(scene, len(actions) - 1, action, values)
+            return Stepped(certain.with_approximation(later), _info(population, certain))
         before = before.updated()
-        after = before.including(*newest)
-        by_pair = smcp3(programs.pair(before, after, actions[-1]), resample=never)
+        after = before.including(scene, len(actions) - 1, action, values)
+        population = population.with_approximation(after)
+        assimilated = copies.assimilate(population, observed, programs.pair(before, after, action))
+        if assimilated is None:
+            return by_tempering(population, observed)
+        moved, ancestors, acceptance, _ = rejuvenation(assimilated.population, POSTERIOR)
+        return Stepped(moved, _info(population, moved, assimilated, acceptance, ancestors))
+
+    return step
+
+
+class Assimilated(NamedTuple):
+    """A population given one more measurement.
+
+    Attributes:
+        population: of N particles.
+        effective: the effective sample size of all copies.
+        origin: (N,) the particle that each copy was made of; None where each is its own.
+    """
+
+    population: Population
+    effective: float
+    origin: Tensor | None
+
+
+class Copies(NamedTuple):
+    """How many copies of each particle SMCP3 is run with: see `guided`."""
+
+    few: float
+    most: int
+    least: float
+    room: int
+
+    def assimilate(self, population: Population, observed: Observed, pair: Pair) -> Assimilated | None:
+        """The particles moved and weighted by a pair of kernels; None where too few keep weight."""
+        by_pair, count = smcp3(pair, resample=never), len(population)
 
         def weighted(population: Population) -> Population | None:
             try:
@@ -147,30 +181,21 @@ def guided(
             except NoWeightError:
                 return None
 
-        count = len(population)
-        population = population.with_approximation(after)
-        chosen: Tensor | None = None
-        times, goal = 1, few * count
-        allowed = max(1, min(most, room // count))
+        times, goal = 1, self.few * count
+        allowed = max(1, min(self.most, self.room // count))
         reached = weighted(population)
         while times < allowed and (reached is None or reached.effective_sample_size < goal):
             each = 0.0 if reached is None else reached.effective_sample_size / times
             # The estimate is often too large: ask for more copies than would just do.
-            times = min(allowed, max(2 * times, math.ceil(1.5 * goal / max(each, goal / most))))
+            times = min(allowed, max(2 * times, math.ceil(1.5 * goal / max(each, goal / self.most))))
             reached = weighted(replicated(population, times))
-        if reached is None or reached.effective_sample_size < least * count * times / most:
-            return by_tempering(population, observed)
+        if reached is None or reached.effective_sample_size < self.least * count * times / self.most:
+            return None
         effective = reached.effective_sample_size
-        if len(reached) > count:
-            chosen = systematic(reached.log_weights, count)
-            reached = reached.selected(chosen)
-        moved, ancestors, acceptance, _ = rejuvenation(reached, POSTERIOR)
-        if chosen is not None:
-            origin = chosen // times
-            ancestors = origin if ancestors is None else origin[ancestors]
-        return Stepped(moved, _info(population, moved, effective, acceptance, ancestors))
-
-    return step
+        if times == 1:
+            return Assimilated(reached, effective, None)
+        chosen = systematic(reached.log_weights, count)
+        return Assimilated(reached.selected(chosen), effective, chosen // times)
 
 
 def _given_all(approximation: Any, trace: Trace, actions: Sequence[Any]) -> Any:
@@ -198,14 +223,17 @@ def _certain(population: Population, observed: Observed) -> Population | None:
 def _info(
     before: Population,
     after: Population,
-    effective: float,
+    assimilated: Assimilated | None = None,
     acceptance: float | None = None,
     ancestors: Tensor | None = None,
 ) -> StepInfo:
+    if assimilated is not None and assimilated.origin is not None:
+        ancestors = assimilated.origin if ancestors is None else assimilated.origin[ancestors]
+    reached = after.effective_sample_size if assimilated is None else assimilated.effective
     return StepInfo(
         acceptance=float("nan") if acceptance is None else acceptance,
         resampled=int(ancestors is not None),
-        effective_sample_size_before=effective,
+        effective_sample_size_before=reached,
         effective_sample_size=after.effective_sample_size,
         log_evidence=after.log_evidence - before.log_evidence,
         ancestors=ancestors,
