@@ -177,7 +177,7 @@ def test_imports_follow_the_arrows() -> None:
     ("place", "line"),
     [
         ("bcppl/poses.py", "from bcppl import models"),
-        ("bcppl/distributions/depth.py", "    from bcppl.rendering.renderer import DepthRenderer"),
+        ("bcppl/distributions/depth.py", "    from bcppl.rendering.ray_casting import RayCaster"),
         ("models/peg.py", "import bcppl.inference.filters.smc"),
         ("inference/filters/smc.py", "from models import peg"),
     ],
