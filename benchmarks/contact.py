@@ -1,6 +1,6 @@
-"""Contact physics beside a bare MuJoCo rollout, what skipping free motion saves, what unknowns cost.
+"""Contact physics beside a bare MuJoCo rollout, what skipping free motion saves, what nuisances cost.
 
-Beside the skip stands what a skip of all free motion would leave: the particles that are in contact.
+Beside the skip stands what sharing all free motion would leave: the particles that are in contact.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from report import Row, cores, finish, options, show
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.contact.model_copies import ModelCopies
-from bcppl.contact.peg_model import build_model, controls, hold
+from bcppl.contact.mujoco_model import build_model, rollout_controls, set_controller
+from bcppl.contact.nuisances import Nuisances
+from bcppl.contact.particle_models import ParticleModels
 from bcppl.contact.physics import PegPhysics
+from bcppl.contact.sensing.location import ContactSensing
 from bcppl.contact.stepping import WRENCH
-from bcppl.contact.unknowns import Unknowns
-from bcppl.contact.wrench import Sensing
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.peg_in_hole import CONTACT, model
@@ -56,9 +56,9 @@ def bare(recording: Recording, probe: Probe, world_from_part: Tensor) -> tuple[C
     """MuJoCo's own rollout of the same model, controls and steps, all arrays ready-made; and its steps."""
     assert recording.peg is not None
     chosen = build_model(recording.part, recording.peg, CONTACT)
-    hold(chosen, probe)
+    set_controller(chosen, probe)
     steps = 1 + round((probe.stamps[-1] - probe.command_times[0]) / CONTACT.time_step)
-    told = controls(probe, probe.command_times[0] + CONTACT.time_step * np.arange(steps))
+    told = rollout_controls(probe, probe.command_times[0] + CONTACT.time_step * np.arange(steps))
     part = world_from_part.numpy()
     control = np.empty((len(part), steps, 20))
     control[..., :9], control[..., 12:16] = told[:, :9], told[:, 9:]
@@ -81,37 +81,37 @@ def after_vision(recording: Recording, particles: int) -> Tensor:
 
 
 def least(physics: PegPhysics, pose: Tensor, probe: Probe, repeats: int) -> tuple[float, float]:
-    """What a skip of all free motion would leave: shares of the steps and of the time spent in contact.
+    """What sharing all free motion would leave: shares of the steps and of the time spent in contact.
 
     In every tenth of a second only the particles that are in contact then are simulated, from states that are
     given; the time is compared with that of all particles in the same stretches. No skip leaves fewer steps;
     short runs of few particles cost more for each step, so that a skip that runs longer ones may take less
     time than this.
     """
-    session = physics.start(pose, probe).session
-    clock, free, part = session.clocks[0], session.approach.rows, pose.numpy()
+    simulation = physics.start(pose, probe).simulation
+    stepper, free, part = simulation.steppers[0], simulation.free_motion.rows, pose.numpy()
     ends = list(range(0, len(probe.stamps) + 1, STRETCH))
-    standing, stretches = clock.beginning(len(part)), []
+    state, stretches = stepper.at_rest(len(part)), []
     for first, last in itertools.pairwise(ends):
-        rows, moved = clock.read(standing, part, {}, first, last)
+        rows, moved = stepper.run(state, part, {}, first, last)
         felt = (
             np.linalg.norm(rows[..., WRENCH][..., :3] - free[first:last, WRENCH][..., :3], axis=-1) > TOUCHING
         )
-        stretches.append((first, last, standing, felt))
-        standing = moved
+        stretches.append((first, last, state, felt))
+        state = moved
 
     def spent(only: bool) -> None:
         for first, last, before, felt in stretches:
             some = felt.any(axis=1) if only else np.ones(len(part), dtype=bool)
             if some.any():
-                clock.read(before[some], part[some], {}, first, last)
+                stepper.run(before[some], part[some], {}, first, last)
 
     found = timed({"touching": lambda: spent(True), "all": lambda: spent(False)}, repeats)
     share = float(np.mean([felt for *_, felt in stretches]))
     return share, found["touching"] / found["all"]
 
 
-def unknowns(particles: int) -> dict[str, Unknowns]:
+def nuisances(particles: int) -> dict[str, Nuisances]:
     """What may be unknown, as a model would draw it."""
     one = torch.ones(particles, dtype=torch.float64)
     spread = torch.rand(particles, dtype=torch.float64)
@@ -121,10 +121,10 @@ def unknowns(particles: int) -> dict[str, Unknowns]:
         "grip_from_peg": poses.retract(poses.identity(particles), offset),
     }
     return {
-        "friction": Unknowns(friction=shared["friction"]),
-        "friction and the peg in the hand": Unknowns(**shared),
-        "controller's stiffness": Unknowns(stiffness=0.8 + 0.4 * spread),
-        "grasp's compliance": Unknowns(grasp_compliance=1e-5 * spread[:, None] * one[:, None].expand(-1, 6)),
+        "friction": Nuisances(friction=shared["friction"]),
+        "friction and the peg in the hand": Nuisances(**shared),
+        "controller's stiffness": Nuisances(stiffness=0.8 + 0.4 * spread),
+        "grasp's compliance": Nuisances(grasp_compliance=1e-5 * spread[:, None] * one[:, None].expand(-1, 6)),
     }
 
 
@@ -141,11 +141,13 @@ def main() -> None:
         "prior": prior_from_guess(recording.guess).sample((particles,)),
         "after vision": after_vision(recording, particles),
     }
-    whole, skipping = (PegPhysics(recording.part, peg, CONTACT, skip=skip) for skip in (False, True))
-    sensing = Sensing(peg, rate=(stamps - 1) / (probe.stamps[-1] - probe.stamps[0]))
+    whole, skipping = (
+        PegPhysics(recording.part, peg, CONTACT, share_free_motion=skip) for skip in (False, True)
+    )
+    sensing = ContactSensing(peg, rate=(stamps - 1) / (probe.stamps[-1] - probe.stamps[0]))
     rows: list[Row] = []
 
-    def run(physics: PegPhysics, pose: Tensor, given: Unknowns | None = None) -> Callable[[], Any]:
+    def run(physics: PegPhysics, pose: Tensor, given: Nuisances | None = None) -> Callable[[], Any]:
         return lambda: physics.start(pose, probe, given).advance(stamps)
 
     lines = []
@@ -196,7 +198,7 @@ def main() -> None:
         lines,
     )
 
-    pose, given = beliefs["after vision"], unknowns(particles)
+    pose, given = beliefs["after vision"], nuisances(particles)
     found = timed(
         {
             f"{name}, {kind}": run(physics, pose, each)
@@ -218,19 +220,19 @@ def main() -> None:
     lines = []
     for count in (PARTICLES, 1000):
         copies, values = (
-            ModelCopies(whole.model),
-            unknowns(count)["friction and the peg in the hand"].rows(count),
+            ParticleModels(whole.model),
+            nuisances(count)["friction and the peg in the hand"].rows(count),
         )
         begun = time.perf_counter()
-        copies.of(values)
+        copies.given(values)
         made = time.perf_counter() - begun
-        again = timed({"again": lambda copies=copies, values=values: copies.of(values)}, 5)["again"]
+        again = timed({"again": lambda copies=copies, values=values: copies.given(values)}, 5)["again"]
         lines.append([f"{count} models", 1e3 * made, 1e3 * again])
         rows += [
             Row(f"{count} models copied and set", 1e3 * made, "ms"),
             Row(f"{count} models set again", 1e3 * again, "ms"),
         ]
-    show("models for unknowns", ["", "copied and set ms", "set again ms"], lines)
+    show("models for nuisances", ["", "copied and set ms", "set again ms"], lines)
 
     if not arguments.quick:
         spent = {}

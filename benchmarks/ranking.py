@@ -21,7 +21,7 @@ from scipy.stats import spearmanr
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
 from bcppl.inference.design import Ranking, expected_information_gain, linearised_information_gain
 from bcppl.inference.filters.guided_smc import infer
@@ -62,7 +62,7 @@ def after_vision(seed: int, particles: int) -> tuple[Setting, list[Plan]]:
     recording = world.look()
     scene = model.prepare(recording)
     *_, last = infer(model, recording, particles=particles, seed=seed, scene=scene)
-    physics = PegPhysics(world.part, world.peg, ContactParameters(time_step=0.002), skip=False)
+    physics = PegPhysics(world.part, world.peg, ContactParameters(time_step=0.002), share_free_motion=False)
     asked = {"touch": 80, "slide": 48}
     found = candidates(last.belief, world.part, world.peg, asked, gap=scene.gap, seed=seed)
     plans = [each for each in found if isinstance(each, Plan)]

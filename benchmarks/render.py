@@ -31,8 +31,8 @@ from scipy.spatial.transform import Rotation
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
 from bcppl.rendering.choice import renderer_for
-from bcppl.rendering.rasteriser import DepthRasteriser
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.rasterisation import Rasteriser
+from bcppl.rendering.ray_casting import RayCaster
 
 Array = npt.NDArray[np.float64]
 
@@ -125,8 +125,8 @@ def by_trimesh(scene: Scene) -> npt.NDArray[np.floating]:
 def here(scene: Scene) -> dict[str, Callable[[], object]]:
     """What runs in this process."""
     poses, tree, camera = scene.poses, embree(scene), scene.camera
-    chosen, cast = renderer_for(scene.part), DepthRenderer(scene.part)
-    one_thread = DepthRasteriser(scene.part, threads=1)
+    chosen, cast = renderer_for(scene.part), RayCaster(scene.part)
+    one_thread = Rasteriser(scene.part, threads=1)
     drawn = chosen.images(camera, poses)
     hit = np.isfinite(drawn.reshape(POSES, -1))
     each = [rays_of(scene, slice(k, k + 1)) for k in range(POSES)]

@@ -12,10 +12,10 @@ import trimesh
 from report import Row, finish, options, show
 from scipy.stats import chi2
 
-from bcppl.contact.sensing.candidates import CORNER, EDGE, FACE
 from bcppl.contact.sensing.intrinsic import IntrinsicSensing
-from bcppl.contact.sensing.noise import WrenchNoise, filtered_share
-from bcppl.contact.wrench import Sensing
+from bcppl.contact.sensing.location import ContactSensing
+from bcppl.contact.sensing.noise import WrenchNoise, variance_gain
+from bcppl.contact.sensing.surface_posterior import CORNER, EDGE, FACE
 from bcppl.geometry.extrusion import box_peg, round_peg
 from bcppl.geometry.parts import Part
 
@@ -164,7 +164,7 @@ def measured(
     step = np.nan_to_num(apart, nan=1.0)
     squared = np.sum(step * np.linalg.solve(spread, step[..., None])[..., 0], axis=-1)
     inside = squared <= np.array([chi2.ppf(0.9, 2), chi2.ppf(0.9, 1), 1.0])[found.kind]
-    one = Sensing(sensing.peg, rate=100.0, friction=sensing.friction).locate(wrench)
+    one = ContactSensing(sensing.peg, rate=100.0, friction=sensing.friction).locate(wrench)
     off = 1e3 * np.linalg.norm(one - true.point, axis=1)
     return Result(
         float(np.median(error[:, 0])),
@@ -208,7 +208,7 @@ def main() -> None:
     show("all pegs, 3 to 15 N: where the contact was", ["", "contacts", "in 50 %", "in 90 %"], kinds)
 
     box = box_peg(0.016, LENGTH)
-    filtered = filtered_share(Sensing(box, rate=100.0).sections)
+    filtered = variance_gain(ContactSensing(box, rate=100.0).sections)
     others = []
     for label, share, told, friction, shares in (
         ("one sample", 1.0, FRICTION, FRICTION, (0.6, 0.3, 0.1)),

@@ -16,9 +16,9 @@ from report import Row, finish, options, show
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.mujoco_model import ContactParameters
+from bcppl.contact.probe_rollout import ProbeRollout
 from bcppl.contact.touch import Touch
-from bcppl.contact.track import ContactTrack
 from bcppl.distributions.contact import ChamferContacts, PegPose
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.wrench import Wrench
@@ -65,7 +65,7 @@ class Feeling:
                 )
                 pyro.sample(f"depth_{k}", depth)
                 continue
-            begin = partial(ContactTrack.start, scene.physics, scene.sensing, hole, action.probe)
+            begin = partial(ProbeRollout.start, scene.physics, scene.sensing, hole, action.probe)
             window = (carried(f"probe {action.probe.name}", begin), action.first, action.last)
             if self.contacts:
                 felt = ChamferContacts(*window, settings.contact_scale, settings.one_empty)

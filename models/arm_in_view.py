@@ -32,7 +32,7 @@ from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, bin_depth
 from bcppl.geometry.parts import Part
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.robot.kinematics import Robot
 from bcppl.traces import Trace
 
@@ -94,7 +94,7 @@ class Scene:
 
     camera: Camera
     prior: Any
-    renderers: Sequence[DepthRenderer]
+    renderers: Sequence[RayCaster]
     backgrounds: Sequence[Array]
     insides: Sequence[npt.NDArray[np.bool_]] | None
     settings: Settings
@@ -183,11 +183,11 @@ def prepare(
     drawn = [robot.as_part(q) for q in angles]
     if masks is None:
         # Where no mask says where the arm ends, depth has to, and smears it.
-        renderers = [DepthRenderer(widened(part, chosen.widening)) for part in drawn]
+        renderers = [RayCaster(widened(part, chosen.widening)) for part in drawn]
         return Scene(small, prior, renderers, backgrounds, None, chosen)
     shown = checked_masks(still, masks, len(angles))
     insides = [_inside(mask, chosen) for mask in shown]
-    return Scene(small, prior, [DepthRenderer(part) for part in drawn], backgrounds, insides, chosen)
+    return Scene(small, prior, [RayCaster(part) for part in drawn], backgrounds, insides, chosen)
 
 
 def checked_masks(camera: Camera, masks: Sequence[npt.ArrayLike], views: int) -> list[npt.NDArray[np.bool_]]:

@@ -16,8 +16,8 @@ import pyro
 from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.geometry.parts import Part
-from bcppl.rendering.renderer import DepthRenderer
-from bcppl.rendering.scene import RendersPart
+from bcppl.rendering.part_renderer import PartRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors.cameras import ClutteredCamera
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Scene, likelihoods_for
@@ -66,7 +66,7 @@ def part_in_view(scene: Scene, actions: Sequence[Any]) -> None:
 
 
 def prepare(
-    recording: Recording, renderer: Callable[[Part], RendersPart] = DepthRenderer, **settings: Any
+    recording: Recording, renderer: Callable[[Part], PartRenderer] = RayCaster, **settings: Any
 ) -> Scene:
     """The scene of a recording.
 

@@ -15,8 +15,8 @@ import pyro
 
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.geometry.parts import Part
-from bcppl.rendering.renderer import DepthRenderer
-from bcppl.rendering.scene import RendersPart
+from bcppl.rendering.part_renderer import PartRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors.cameras import CalibratedCamera
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Likelihood, Scene, likelihoods_for
@@ -49,7 +49,7 @@ def peg_in_hole(scene: Scene, actions: Sequence[Any]) -> None:
 
 
 def prepare(
-    recording: Recording, renderer: Callable[[Part], RendersPart] = DepthRenderer, **settings: Any
+    recording: Recording, renderer: Callable[[Part], PartRenderer] = RayCaster, **settings: Any
 ) -> Scene:
     """The scene of a recording.
 
@@ -66,7 +66,7 @@ def prepare(
 
 
 def likelihoods(
-    recording: Recording, renderer: Callable[[Part], RendersPart], settings: Any, model: str = "peg_in_hole"
+    recording: Recording, renderer: Callable[[Part], PartRenderer], settings: Any, model: str = "peg_in_hole"
 ) -> dict[str, Likelihood]:
     """The sensors' likelihoods, with settings that are fields of `DepthSettings` and `ProbeSettings`."""
     depth, probe = chosen(model, settings, DepthSettings(), ProbeSettings())

@@ -1,4 +1,4 @@
-"""Pegs that are pressed somewhere, and the wrenches that say so."""
+"""Pegs that are pressed somewhere, and their wrenches."""
 
 from __future__ import annotations
 

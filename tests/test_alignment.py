@@ -27,7 +27,7 @@ from bcppl.inference.proposals import contact_alignment, depth_alignment, progra
 from bcppl.inference.proposals.proposal import Proposal
 from bcppl.inference.targets import POSTERIOR
 from bcppl.poses import Freedom
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import Proposed, Trace, assess, propose, simulate
 from tests.invariance import equal_weights, largest_z
 
@@ -42,7 +42,7 @@ def matrix(rows: object) -> Tensor:
 # A corner of a box, at its frame's origin, fills the view with three faces: a coarse image's outline
 # would say more than planes do.
 BOX = trimesh.creation.box((0.3, 0.3, 0.3), trimesh.transformations.translation_matrix((-0.15, -0.15, -0.15)))
-RENDERER = DepthRenderer(Part("box", np.asarray(BOX.vertices), np.asarray(BOX.faces, dtype=np.int64)))
+RENDERER = RayCaster(Part("box", np.asarray(BOX.vertices), np.asarray(BOX.faces, dtype=np.int64)))
 DISTANCE = SignedDistance(RENDERER.part)
 CAMERA = Camera(
     "above", 16, 12, 22.0, 22.0, 7.5, 5.5, looking_at((0.1, 0.1, 0.12), (0.0, 0.0, 0.0)), near=0.05, far=0.6
@@ -192,7 +192,7 @@ AIMS = torch.cat([TIPS * (1 - torch.eye(3)), TIPS.flip(0) * (1 - torch.eye(3))])
 
 
 class Spring:
-    """What `ContactTrack` answers, of a tip that would go to AIMS[k] at stamp k and is kept outside."""
+    """What `ProbeRollout` answers, of a tip that would go to AIMS[k] at stamp k and is kept outside."""
 
     def __init__(self, world_from_part: Tensor) -> None:
         self.inputs = (world_from_part,)

@@ -33,7 +33,7 @@ from bcppl.models.arm_in_view import (
     widened,
 )
 from bcppl.models.robots import load_robot
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.robot.kinematics import Robot
 from bcppl.traces import generate
 
@@ -57,7 +57,7 @@ def drawn(added: float, masked: bool = False, **settings: float) -> tuple[Scene,
     angles = [np.array(q) for q in POSTURES]
     images = []
     for q in angles:
-        renderer = DepthRenderer(robot.as_part(q))
+        renderer = RayCaster(robot.as_part(q))
         small = renderer.images(CAMERA.binned(2), poses.inverse(TRUTH)[None])[0]
         image = np.where(np.isfinite(small), small + added, 3.0)
         images.append(np.kron(image, np.ones((2, 2))))  # read back by blocks

@@ -11,7 +11,7 @@ import shapely
 import torch
 
 from bcppl import poses
-from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
 from bcppl.errors import InputError
 from bcppl.geometry.outlines import check_fit
@@ -19,7 +19,7 @@ from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
 from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, bench_part
 from bcppl.models.worlds.guarded_motion import CarriedOut, command_of
 from bcppl.recordings import Recording
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.robot.motion import Probe
 from bcppl.robot.plan import Plan
 
@@ -229,7 +229,7 @@ def test_an_occluder_hides_a_third_of_the_part_from_one_camera_only() -> None:
         np.testing.assert_array_equal(open_.world_from_cameras, hidden.world_from_cameras)
         for k in range(2):
             camera = replace(open_.cameras[k], world_from_camera=open_.world_from_cameras[k])
-            part = np.isfinite(DepthRenderer(open_.part).images(camera, open_.truth[None])[0])
+            part = np.isfinite(RayCaster(open_.part).images(camera, open_.truth[None])[0])
             without, box = open_.true_depth(k), hidden.true_depth(k)
             if k == hidden.hidden_view:
                 assert 0.25 < float((box < without - 0.05)[part].mean()) < 0.42

@@ -22,11 +22,11 @@ from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import metropolis_hastings, rejuvenate
 from bcppl.inference.proposals.climbing import Modes, jumps, modes
 from bcppl.inference.targets import POSTERIOR
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import generate
 
 BOX = trimesh.creation.box((0.06, 0.04, 0.03))
-RENDERER = DepthRenderer(Part("box", np.asarray(BOX.vertices), np.asarray(BOX.faces, dtype=np.int64)))
+RENDERER = RayCaster(Part("box", np.asarray(BOX.vertices), np.asarray(BOX.faces, dtype=np.int64)))
 LENS = Camera(
     "front", 80, 60, 200.0, 200.0, 39.5, 29.5, np.array([0, 0, -0.4, 1.0, 0, 0, 0]), near=0.2, far=0.8
 )

@@ -19,12 +19,12 @@ from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
 from bcppl.models import part_in_view
 from bcppl.recordings.importers import bop
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 
 CLUTTER = Path(__file__).parents[2] / "shared/data/lmo_scene2_frame3"
 
 BOX = trimesh.creation.box((0.06, 0.04, 0.03))
-RENDERER = DepthRenderer(Part("box", np.asarray(BOX.vertices), np.asarray(BOX.faces, dtype=np.int64)))
+RENDERER = RayCaster(Part("box", np.asarray(BOX.vertices), np.asarray(BOX.faces, dtype=np.int64)))
 EYE = np.array([0, 0, -0.4, 1.0, 0, 0, 0])
 SCALE, STEP = 0.004, 0.004
 

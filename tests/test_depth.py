@@ -18,13 +18,13 @@ from bcppl.distributions.depth import LaplaceDepth, RobustDepth
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 
 Array = npt.NDArray[np.float64]
 
 SCALE, OUTLIER = 0.003, 0.1
 RING = trimesh.creation.annulus(r_min=0.01, r_max=0.03, height=0.03, sections=32)
-RENDERER = DepthRenderer(Part("ring", np.asarray(RING.vertices), np.asarray(RING.faces, dtype=np.int64)))
+RENDERER = RayCaster(Part("ring", np.asarray(RING.vertices), np.asarray(RING.faces, dtype=np.int64)))
 EYE = np.array([0, 0, -0.15, 1.0, 0, 0, 0])
 CAMERA = Camera("front", 24, 18, 40.0, 42.0, 10.2, 9.1, EYE, near=0.05, far=0.6)
 

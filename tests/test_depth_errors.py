@@ -18,8 +18,8 @@ from bcppl.distributions.depth import DepthDistribution, LaplaceDepth, OccludedD
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.parts import Part
-from bcppl.rendering.renderer import DepthRenderer
-from bcppl.rendering.scene import SceneRenderer, placed
+from bcppl.rendering.ray_casting import RayCaster
+from bcppl.rendering.scene import SceneRenderer, scene_poses
 
 Array = npt.NDArray[np.float64]
 Kind = type[DepthDistribution]
@@ -28,7 +28,7 @@ KINDS = [LaplaceDepth, RobustDepth, OccludedDepth]
 SCALE = 0.003
 BOX = trimesh.creation.box((0.06, 0.04, 0.03))
 PART = Part("box", np.asarray(BOX.vertices), np.asarray(BOX.faces, dtype=np.int64))
-RENDERER = DepthRenderer(PART)
+RENDERER = RayCaster(PART)
 CAMERA = Camera(
     "above", 24, 18, 40.0, 42.0, 10.2, 9.1, looking_at((0.1, -0.12, 0.2), (0, 0, 0)), near=0.05, far=0.6
 )
@@ -79,7 +79,7 @@ def test_a_camera_error_moves_the_whole_scene(kind: Kind) -> None:
     flat = trimesh.creation.box((0.5, 0.5, 0.01))
     scene = SceneRenderer([PART, Part("table", np.asarray(flat.vertices), np.asarray(flat.faces, np.int64))])
     under = torch.tensor([0, 0, -0.05, 1, 0, 0, 0], dtype=torch.float64)
-    pose, seen = placed(POSE, under), image(table())
+    pose, seen = scene_poses(POSE, under), image(table())
     found = kind(scene, CAMERA, pose, SCALE, camera_error=ERROR, bias=BIAS).log_prob(seen)
     stated = torch.from_numpy(CAMERA.world_from_camera)
     for k in range(N):
@@ -237,8 +237,8 @@ def test_bad_input_is_named() -> None:
     scene = SceneRenderer([PART, PART])
     for renderer, pose, said in [
         (scene, POSE, r"\(N, 2, 7\)"),
-        (RENDERER, placed(POSE, POSE), r"\(N, 7\)"),
-        (scene, placed(POSE, POSE, POSE), "2 parts"),
+        (RENDERER, scene_poses(POSE, POSE), r"\(N, 7\)"),
+        (scene, scene_poses(POSE, POSE, POSE), "2 parts"),
     ]:
         with pytest.raises(InputError, match=said):
             LaplaceDepth(renderer, CAMERA, pose, SCALE)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.contact.peg_model import ContactParameters, build_model
+from bcppl.contact.mujoco_model import ContactParameters, build_model
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, block_with_hole, box_peg, peg_for
 from bcppl.geometry.gap import PegGap

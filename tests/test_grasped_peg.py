@@ -17,8 +17,8 @@ from bcppl.models import grasped_peg, part_in_view, peg_in_hole
 from bcppl.models.worlds import grasped_peg as world
 from bcppl.recordings import Recording, View
 from bcppl.rendering.choice import renderer_for
-from bcppl.rendering.rasteriser import DepthRasteriser
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.rasterisation import Rasteriser
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import Trace, extend, generate, simulate, update
 
 
@@ -121,7 +121,7 @@ def test_a_model_accepts_another_renderer(model: Any) -> None:
         trace, _ = extend(trace, (prepared, [m.action for m in views]), values)
         compared.append((type(prepared.likelihoods["view"].renderer), trace.log_prob(*values)))
     (cast, rays), (drawn, triangles) = compared
-    assert cast is DepthRenderer and issubclass(drawn, DepthRasteriser)
+    assert cast is RayCaster and issubclass(drawn, Rasteriser)
     torch.testing.assert_close(rays, triangles, rtol=0.0, atol=0.5)
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.contact.god_object import GodObject, WindowMotion
+from bcppl.contact.quasi_static import QuasiStaticMotion, WindowMotion
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.manifold import ContactManifold, Quadratic
 from bcppl.distributions.poses import NormalPose
@@ -227,7 +227,7 @@ def touch(x: float, depth: float) -> Plan:
 
 
 def test_of_touches_those_that_meet_the_part_tell_its_height() -> None:
-    proxy = GodObject(PegGap(block((0.06, 0.06, 0.025)), box_peg(0.016, 0.05)))
+    proxy = QuasiStaticMotion(PegGap(block((0.06, 0.06, 0.025)), box_peg(0.016, 0.05)))
     spread = torch.diag(torch.tensor([1e-3, 1e-3, 2e-3, 1e-2, 1e-2, 1e-2], dtype=torch.float64) ** 2)
 
     def touching(windows: list[ProbeWindow]) -> None:

@@ -15,9 +15,9 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 from shapely.affinity import translate
 
-from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.mujoco_model import ContactParameters
+from bcppl.contact.nuisances import Nuisances
 from bcppl.contact.physics import PegPhysics
-from bcppl.contact.unknowns import Unknowns
 from bcppl.errors import InputError
 from bcppl.geometry import extrusion
 from bcppl.geometry.extrusion import block, block_with_hole, box_peg, cylinder_peg, extruded, peg_for
@@ -234,7 +234,5 @@ def test_contact_parameters_and_poses_that_are_no_numbers_are_refused() -> None:
     with pytest.raises(InputError, match="quaternion of length 0"):
         physics.start(np.zeros((2, 7)), probe)
     place = np.tile([0.0, 0, 0, 1, 0, 0, 0], (2, 1))
-    rollout = physics.start(place, probe, Unknowns(friction=np.array([0.2, 0.4])))
-    np.testing.assert_array_equal(rollout.unknowns["friction"], [0.2, 0.4])
-    with pytest.raises(InputError, match="not made of numbers"):
-        Unknowns(friction="slippery")  # type: ignore[arg-type]
+    rollout = physics.start(place, probe, Nuisances(friction=np.array([0.2, 0.4])))
+    np.testing.assert_array_equal(rollout.nuisances["friction"], [0.2, 0.4])

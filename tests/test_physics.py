@@ -1,9 +1,9 @@
-"""Contact physics: the spring's force, what is touched where, times, and that splitting changes nothing."""
+"""Contact physics: the spring's force, places and times of contact, and that chunks change nothing."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,30 +11,15 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from bcppl.contact.peg_model import ContactParameters, commands
-from bcppl.contact.physics import PegPhysics, Rollout
+from bcppl.contact.mujoco_model import ContactParameters, interpolated_command
+from bcppl.contact.physics import PegPhysics
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, round_peg
 from bcppl.geometry.parts import Part, Piece
 from bcppl.robot.motion import Probe
+from tests.contact_probes import DAMPING, HOLE, SEARCH, STIFFNESS, path, same
 
-STIFFNESS = np.array([1500.0, 1000.0, 2000.0, 60.0, 50.0, 40.0])
-DAMPING = np.array([80.0, 80.0, 80.0, 2.0, 2.0, 2.0])
 SQUARE = box_peg(0.016, 0.05)
-
-
-def path(*points: tuple[float, float, float, float], turn: Rotation | None = None, **options: Any) -> Probe:
-    """A probe through (time, x, y, z) of the peg's origin, at a fixed rotation."""
-    values = np.array(points)
-    command = np.zeros((len(values), 7))
-    command[:, :3] = values[:, 1:]
-    command[:, 3:] = (Rotation.identity() if turn is None else turn).as_quat()[[3, 0, 1, 2]]
-    settings: dict[str, Any] = {
-        "stiffness": STIFFNESS,
-        "damping": DAMPING,
-        "stamps": np.arange(0.0, values[-1, 0] + 1e-9, 0.01),
-    } | options
-    return Probe("probe", values[:, 0], command, **settings)
 
 
 def at(*translations: tuple[float, float, float]) -> torch.Tensor:
@@ -81,14 +66,14 @@ def test_a_side_touch_stops_at_the_face() -> None:
     force, torque = rollout.wrench[0, -1, :3], rollout.wrench[0, -1, 3:]
     assert rollout.world_from_peg[0, -1, 0] == pytest.approx(0.022, abs=1e-4)
     assert force[0] == pytest.approx(-1500 * 0.004, rel=0.02)
-    # (r x f)_y = r_z f_x: what is touched lies between the wall's top edge and the peg's tip.
+    # (r x f)_y = r_z f_x: the contact lies between the wall's top edge and the peg's tip.
     assert -0.05 - 1e-4 <= torque[1] / force[0] <= -0.02 + 1e-4
 
 
 def test_free_motion_is_read_at_the_right_time() -> None:
     probe = path((0, 0, 0, 0.2), (1.0, 0.2, 0, 0.2), (2.0, 0.2, 0.1, 0.2), stamps=np.arange(0.5, 1.0, 0.0137))
     rollout = PegPhysics(block((0.1, 0.1, 0.02)), SQUARE).start(at((0, 0, 0)), probe).advance(30)
-    expected, twist = commands(probe, probe.stamps[:30])
+    expected, twist = interpolated_command(probe, probe.stamps[:30])
     np.testing.assert_allclose(twist[0], [0.2, 0, 0, 0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(rollout.world_from_peg[0], expected, atol=1e-6)
 
@@ -102,7 +87,7 @@ def test_turning_commands_are_followed_along_the_geodesic() -> None:
 
 
 def test_the_wrench_and_the_pose_are_of_the_same_moment() -> None:
-    # At 0.2 m/s a step of 2 ms is 0.4 mm: the first force is felt where the faces meet, not a step off.
+    # At 0.2 m/s a step of 2 ms is 0.4 mm: contact begins where the faces meet, not a step off.
     probe = path((0, 0, 0, 0.09), (0.4, 0, 0, 0.01), (0.5, 0, 0, 0.01), stamps=np.arange(0.0, 0.5, 0.002))
     rollout = PegPhysics(block((0.1, 0.1, 0.02)), SQUARE).start(at((0, 0, 0)), probe).advance(240)
     height, force = rollout.world_from_peg[0, :, 2], rollout.wrench[0, :, 2]
@@ -131,10 +116,6 @@ def test_a_peg_slides_without_chatter() -> None:
     assert (force[:, 0] < 0).all() and (force[:, 1] > 0).all()
 
 
-SEARCH = path((0, 0, 0, 0.06), (0.5, 0, 0, 0.047), (1.0, 0.006, 0.002, 0.045), (1.2, 0.006, 0.002, 0.03))
-HOLE = block_with_square_hole(hole=0.0165, offset=(0.005, 0.002))
-
-
 @cache
 def poses(count: int = 7) -> torch.Tensor:
     generator = torch.Generator().manual_seed(3)
@@ -144,54 +125,28 @@ def poses(count: int = 7) -> torch.Tensor:
     return pose
 
 
-def same(a: Rollout, b: Rollout) -> None:
-    np.testing.assert_array_equal(a.wrench, b.wrench)
-    np.testing.assert_array_equal(a.world_from_peg, b.world_from_peg)
-
-
-def test_chunks_batches_order_and_skipping_change_nothing() -> None:
+def test_chunks_batches_order_and_shared_free_motion_change_nothing() -> None:
     physics = PegPhysics(HOLE, SQUARE)
     whole = physics.start(poses(), SEARCH).advance(120)
+    effort = physics.effort.copy()
     assert (abs(whole.wrench[1:, :, 2]).max(axis=1) > 1.0).all()
     chunked = physics.start(poses(), SEARCH)
     for count in (1, 2, 40, 41, 77, 120):
         chunked.advance(count)
     same(whole, chunked)
-    same(whole, PegPhysics(HOLE, SQUARE, skip=False).start(poses(), SEARCH).advance(120))
+    apart = PegPhysics(HOLE, SQUARE, share_free_motion=False)
+    same(whole, apart.start(poses(), SEARCH).advance(120))
+    assert apart.effort.amount == pytest.approx(7 * 1.192, abs=0.02)
+    assert effort.amount < 0.75 * apart.effort.amount and effort.items == 7
     order = torch.tensor([4, 1, 6, 1])
     same(whole[order], physics.start(poses()[order], SEARCH).advance(120))
     same(whole[order], physics.start(poses(), SEARCH).advance(60)[order].advance(120))
-    odd = path(*[(t, *p) for t, p in zip(SEARCH.command_times, SEARCH.command[:, :3], strict=True)])
-    odd = Probe(
-        "odd", odd.command_times, odd.command, STIFFNESS, DAMPING, np.sort(np.r_[0.0033:1.19:0.0071, 0.6004])
-    )
+    odd = replace(SEARCH, stamps=np.sort(np.r_[0.0033:1.19:0.0071, 0.6004]))
     one = physics.start(poses(), odd).advance(100)
     two = physics.start(poses(), odd)
     for count in range(1, 101, 3):
         two.advance(count)
     same(one, two)
-
-
-def test_skipping_saves_the_free_approach() -> None:
-    physics, whole = PegPhysics(HOLE, SQUARE), PegPhysics(HOLE, SQUARE, skip=False)
-    physics.start(poses(), SEARCH).advance(120)
-    whole.start(poses(), SEARCH).advance(120)
-    assert whole.effort.amount == pytest.approx(7 * 1.192, abs=0.02)
-    assert physics.effort.amount < 0.75 * whole.effort.amount
-    assert physics.effort.items == 7
-
-
-def test_rollouts_merge_row_by_row() -> None:
-    physics = PegPhysics(HOLE, SQUARE)
-    one, two = physics.start(poses(), SEARCH).advance(50), physics.start(poses().flip(0), SEARCH).advance(80)
-    mask = torch.tensor([True, False, True, True, False, False, True])
-    merged = one.where(mask, two)
-    expected = physics.start(torch.where(mask[:, None], poses(), poses().flip(0)), SEARCH).advance(120)
-    before = one.wrench.copy()
-    same(merged.advance(120), expected)
-    np.testing.assert_array_equal(one.wrench, before)
-    with pytest.raises(InputError, match="cannot be merged"):
-        one.where(mask, physics.start(poses()[:3], SEARCH))
 
 
 def test_what_diverges_is_tried_at_half_the_step_and_then_counted() -> None:

@@ -23,7 +23,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.predictive import THRESHOLD, Check, surprise
 from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
 from bcppl.recordings import DepthImage
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import Series, generate, simulate
 from tests.test_manifold import ledge, window
 
@@ -37,7 +37,7 @@ def belief(program: Any, args: tuple[Any, ...], observed: dict[str, Tensor], cou
 def looked_at(bench: Bench | None = None, seed: int = 0) -> tuple[BenchScene, Any]:
     """A scene, and a program by which its first camera that may be hidden sees the part where it is."""
     scene = bench_scene(seed, bench)
-    renderer, view = DepthRenderer(scene.part), 0 if scene.hidden_view is None else scene.hidden_view
+    renderer, view = RayCaster(scene.part), 0 if scene.hidden_view is None else scene.hidden_view
     camera = replace(scene.cameras[view], world_from_camera=scene.world_from_cameras[view])
 
     def program(shift: Tensor) -> None:

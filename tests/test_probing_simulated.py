@@ -32,7 +32,7 @@ from bcppl.inference.design import (
 from bcppl.inference.design.observations import simulated
 from bcppl.inference.design.weighing import weighed
 from bcppl.inference.population import Population
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import Series, Trace, carried, extend, generate, simulate
 from tests.invariance import equal_weights, matrix, number
 
@@ -147,7 +147,7 @@ def test_what_is_weighed_is_what_inference_would_weigh() -> None:
 
 def test_an_image_is_rendered_no_more_often_than_four_times() -> None:
     ring = trimesh.creation.annulus(r_min=0.01, r_max=0.03, height=0.03, sections=32)
-    renderer = DepthRenderer(Part("ring", np.asarray(ring.vertices), np.asarray(ring.faces, dtype=np.int64)))
+    renderer = RayCaster(Part("ring", np.asarray(ring.vertices), np.asarray(ring.faces, dtype=np.int64)))
     eye = np.array([0, 0, -0.15, 1.0, 0, 0, 0])
     camera = Camera("front", 24, 18, 40.0, 42.0, 10.2, 9.1, eye, near=0.05, far=0.6)
 

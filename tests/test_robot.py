@@ -18,7 +18,7 @@ from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.models.robots import SHIPPED, load_robot
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.robot.kinematics import Robot
 
 FOLDER = Path(__file__).parents[1] / "models/robots"
@@ -164,10 +164,10 @@ def test_the_arm_drawn_as_one_part_looks_as_its_links_do(robot: Robot) -> None:
     angles = postures(robot, 1, seed=3)[0]
     camera = Camera("c", 64, 48, 60.0, 60.0, 32.0, 24.0, looking_at([1.8, 0.4, 0.6], [0.0, 0.0, 0.5]))
     links = [
-        DepthRenderer(part).images(camera, pose[None])[0]
+        RayCaster(part).images(camera, pose[None])[0]
         for part, pose in zip(robot.parts, robot.base_from_parts(angles), strict=True)
     ]
-    whole = DepthRenderer(robot.as_part(angles)).images(camera, poses.identity(1))[0]
+    whole = RayCaster(robot.as_part(angles)).images(camera, poses.identity(1))[0]
     assert np.isfinite(whole).sum() > 100
     assert np.array_equal(np.isfinite(whole), np.isfinite(np.min(links, axis=0)))
     seen = np.isfinite(whole)

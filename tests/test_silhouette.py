@@ -15,10 +15,10 @@ from bcppl.distributions.silhouette import Silhouette, binned_mask
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.extrusion import block, block_with_square_hole
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 
 PART = block_with_square_hole((0.1, 0.08, 0.03), 0.02, (0.01, 0.005))
-RENDERER = DepthRenderer(PART)
+RENDERER = RayCaster(PART)
 CAMERA = Camera("c", 64, 48, 80.0, 80.0, 31.5, 23.5, looking_at([0.2, -0.25, 0.3], [0.0, 0.0, 0.0]))
 TRUTH = poses.retract(poses.identity(), torch.tensor([0.004, -0.003, 0.002, 0.05, 0.1, -0.2]).double())
 
@@ -78,7 +78,7 @@ def test_a_rim_moves_a_straight_outline_by_so_many_pixels() -> None:
     camera = Camera(
         "e", 60, 20, 100.0, 100.0, 29.5, 9.5, looking_at([0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [0, 1, 0])
     )
-    renderer = DepthRenderer(block((0.2, 5.0, 0.01)))
+    renderer = RayCaster(block((0.2, 5.0, 0.01)))
     rims = torch.tensor([0.0, 2.0, -2.0]).double()
     chances = Silhouette(renderer, camera, poses.identity(3), 1.5, rim=rims).chances()[:, 10]
     right = [float(np.interp(-0.5, -row[30:], np.arange(30.0))) for row in chances]
@@ -86,7 +86,7 @@ def test_a_rim_moves_a_straight_outline_by_so_many_pixels() -> None:
 
 
 def test_a_mask_and_a_depth_image_are_rendered_once() -> None:
-    renderer = DepthRenderer(PART)
+    renderer = RayCaster(PART)
     pose, mask = moved(0.004, 0.03), shown()
     image = torch.from_numpy(renderer.images(CAMERA, TRUTH[None])[0])
     image[~torch.isfinite(image)] = 1.0

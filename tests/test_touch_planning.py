@@ -13,7 +13,7 @@ import torch
 
 from bcppl import poses
 from bcppl.beliefs import Belief
-from bcppl.contact.sensing.felt import Felt
+from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, round_peg
 from bcppl.geometry.gap import PegGap
@@ -146,7 +146,7 @@ def forces(*sizes: float) -> torch.Tensor:
 
 
 def test_a_contact_is_felt_from_one_force_on_and_none_below_another() -> None:
-    at_once = Felt(contact=1.5, free=0.8, load=0.3, beside=0)
+    at_once = ContactDetector(contact=1.5, free=0.8, mass=0.3, neighbours=0)
     told = at_once(forces(0.0, 0.79, 0.81, 1.49, 1.51, 40.0, NAN))
     np.testing.assert_array_equal(told.numpy(), [0, 0, NAN, NAN, 1, 1, NAN])
     # Accelerating the tool takes force: 4 m/s^2 hide 1.2 N.
@@ -157,18 +157,18 @@ def test_a_contact_is_felt_from_one_force_on_and_none_below_another() -> None:
 
 def test_neighbours_must_agree_either_way_in_time() -> None:
     sizes = [0.1] * 6 + [1.0] + [3.0] * 7 + [0.1] * 5 + [9.0] + [0.1] * 4
-    told = Felt(beside=2)(forces(*sizes)).numpy()
+    told = ContactDetector(neighbours=2)(forces(*sizes)).numpy()
     expected = [0] * 4 + [NAN] * 5 + [1] * 3 + [NAN] * 4 + [0] * 1 + [NAN] * 5 + [0] * 2
     np.testing.assert_array_equal(told, expected)
-    np.testing.assert_array_equal(Felt(beside=2)(forces(*sizes[::-1])).numpy(), told[::-1])
+    np.testing.assert_array_equal(ContactDetector(neighbours=2)(forces(*sizes[::-1])).numpy(), told[::-1])
 
 
 def test_forces_and_numbers_that_make_no_sense_are_refused() -> None:
     with pytest.raises(InputError, match=r"shape \(5, 6\); give \(T, 3\)"):
-        Felt()(torch.zeros(5, 6))
-    for numbers in ({"free": 2.0}, {"contact": 0.0}, {"load": -1.0}, {"beside": -1}):
+        ContactDetector()(torch.zeros(5, 6))
+    for numbers in ({"free": 2.0}, {"contact": 0.0}, {"mass": -1.0}, {"neighbours": -1}):
         with pytest.raises(InputError):
-            Felt(**numbers)
+            ContactDetector(**numbers)
 
 
 # ---------------------------------------------------------------- 3-2-1

@@ -17,7 +17,7 @@ from bcppl.inference.population import Population
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.rendering.information import pixel_information
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors import View
 from bcppl.sensors.candidates import with_candidates
 from bcppl.sensors.erring_camera import ErringCamera
@@ -31,7 +31,7 @@ def from_above(height: float, name: str = "camera") -> Camera:
 
 def test_of_a_plane_that_fills_the_image_it_is_the_closed_form() -> None:
     """Each pixel reads the depth of a plane: it tells of height and tilt, and of nothing else."""
-    renderer, camera = DepthRenderer(block((1.0, 1.0, 0.02))), from_above(0.3)
+    renderer, camera = RayCaster(block((1.0, 1.0, 0.02))), from_above(0.3)
     found = pixel_information(renderer, camera, poses.identity(2))
     top = 0.3 - float(renderer.part.vertices[:, 2].max())
     rays = np.stack(np.meshgrid((np.arange(80) - 39.5) / 100, (np.arange(60) - 29.5) / 100), -1).reshape(
@@ -47,7 +47,7 @@ def test_of_a_plane_that_fills_the_image_it_is_the_closed_form() -> None:
 
 
 def test_what_is_out_of_the_sensors_range_tells_nothing() -> None:
-    renderer = DepthRenderer(block((0.3, 0.3, 0.02)))
+    renderer = RayCaster(block((0.3, 0.3, 0.02)))
     seen = pixel_information(renderer, from_above(0.3), poses.identity(1))
     assert float(seen[0, 2, 2]) > 1000.0
     for near, far in ((0.05, 0.2), (0.4, 2.0)):
@@ -75,7 +75,7 @@ def test_the_cameras_error_bounds_what_it_tells_and_a_second_image_tells_less() 
 
 
 def _error(sensor: ErringCamera, camera: Camera, part: torch.Tensor) -> torch.Tensor:
-    from bcppl.rendering.stated_cameras import apparent_covariance
+    from bcppl.rendering.extrinsics_error import apparent_covariance
 
     settings = sensor.settings
     return apparent_covariance(camera, part, settings.camera_shift, settings.camera_turn)

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from bcppl.contact.physics import PegPhysics
-from bcppl.contact.track import ContactTrack
-from bcppl.contact.wrench import Sensing
+from bcppl.contact.probe_rollout import ProbeRollout
+from bcppl.contact.sensing.location import ContactSensing
 from bcppl.distributions.wrench import Wrench
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg
@@ -131,8 +131,8 @@ def test_the_truth_explains_its_own_wrench_best() -> None:
     probe = Probe("press", times, command, stiffness, damping, np.arange(80) / 100.0)
     part = torch.zeros(5, 7, dtype=torch.float64)
     part[:, 3], part[1, 0], part[2, 0], part[3, 2], part[4, 2] = 1.0, 0.002, -0.002, 0.001, -0.001
-    sensing = Sensing(PEG, rate=100.0)
-    track = ContactTrack.start(PegPhysics(block((0.03, 0.03, 0.02)), PEG), sensing, part, probe)
+    sensing = ContactSensing(PEG, rate=100.0)
+    track = ProbeRollout.start(PegPhysics(block((0.03, 0.03, 0.02)), PEG), sensing, part, probe)
     torch.manual_seed(1)
     likelihood = Wrench(track, 0, 80, 0.2, 0.003, 0.02, every=5)
     seen = likelihood.sample()[0]

@@ -1,4 +1,4 @@
-"""What is read while something held touches a part."""
+"""The observation of a touch."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """Observation: the raw wrench, and the held peg's measured pose.
+    """Observation: the raw wrench, and the measured pose of the grasped peg.
 
     Attributes:
         times: (T,) seconds, increasing.
-        wrench: (T, 6) force (N) then torque (N m) that the environment exerts on the peg or finger, in the
-            peg's frame about its origin (for a push: in the world's axes, about the tip). Not tared.
+        wrench: (T, 6) force (N) then torque (N m) of the environment on the peg or finger, in the peg's frame
+            about its origin (for a push: in the world's axes, about the tip). Not tared.
         world_from_peg: (T, 7) measured pose of the peg; empty (0, 7) for a push, whose path is in the action.
     """
 

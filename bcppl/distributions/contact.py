@@ -16,7 +16,7 @@ from bcppl.errors import InputError
 
 
 class Track(Protocol):
-    """A probe as N particles feel it: `bcppl.contact.track.ContactTrack`, or what answers alike."""
+    """A probe as N particles feel it: `bcppl.contact.probe_rollout.ProbeRollout`, or what answers alike."""
 
     @property
     def diverged(self) -> Tensor:

@@ -78,7 +78,7 @@ class ContactManifold(LazyDistribution):
         sink: m that a peg sinks into the part at the forces of a probe.
         outlier: a probability.
         motion: where pegs get to, and whether they touch, (N, T, 8) for poses (N, 7) of the part; asked for
-            samples only. Such is `bcppl.contact.god_object.GodObject`, along a command.
+            samples only. Such is `bcppl.contact.quasi_static.QuasiStaticMotion`, along a command.
 
     Raises:
         InputError: a number is out of range.
@@ -184,8 +184,8 @@ class ContactManifold(LazyDistribution):
         if self.motion is None:
             raise InputError(
                 "ContactManifold weighs poses of the part by where a peg got to and cannot say where it will "
-                "get to; give it a `motion`, such as bcppl.contact.god_object.WindowMotion, or "
-                "simulate the probe with bcppl.contact.track.ContactTrack."
+                "get to; give it a `motion`, such as bcppl.contact.quasi_static.WindowMotion, or "
+                "simulate the probe with bcppl.contact.probe_rollout.ProbeRollout."
             )
         return self._with_errors(self.motion(self.pose))
 

@@ -17,7 +17,7 @@ WIDER = 10.0  # the wide component's scale over the narrow one's
 
 
 class WrenchTrack(Protocol):
-    """A probe as N particles feel it: `bcppl.contact.track.ContactTrack`, or what answers alike."""
+    """A probe as N particles feel it: `bcppl.contact.probe_rollout.ProbeRollout`, or what answers alike."""
 
     @property
     def diverged(self) -> Tensor:

@@ -1,1 +1,1 @@
-"""Depth images of parts at many poses: rays, triangles, scenes, and the noise of a depth sensor."""
+"""Depth images of parts at many poses: ray casting, rasterisation, occlusion, and a depth sensor's noise."""

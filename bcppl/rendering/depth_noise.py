@@ -1,8 +1,8 @@
-"""What a real depth sensor makes of a rendered image: for simulation, never for inference.
+"""Simulated errors of a depth sensor, for worlds and not for inference.
 
-A pixel at the edge of a thing may read a depth between the two sides (a flying pixel), or nothing. Surfaces
-seen at a grazing angle are lost. What is left has noise that grows with the square of the range, as stereo
-and structured light have it, is read in steps of depth or of disparity, and only within the sensor's range.
+A pixel at a depth discontinuity may read a depth between the two sides (a flying pixel), or nothing. Pixels
+drop out at grazing incidence. The others have noise that grows with the square of the range, as in stereo and
+structured light, are quantised in depth or in disparity, and are missing beyond the sensor's range.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """How a depth sensor errs. The defaults are the noise of a bench: 2 mm, read in millimetres.
+    """Noise model of a depth sensor. The defaults are those of a bench: 2 mm, quantised to millimetres.
 
     Attributes:
-        scale: of the noise at any range, m: Laplace's b, or a standard deviation where it is gaussian.
-        growth: the noise grows by this times the squared range beyond `growth_from`, 1/m.
+        scale: of the noise at any range, m: Laplace's b, or the standard deviation where it is gaussian.
+        growth: the scale grows by this times the squared range beyond `growth_from`, 1/m.
         growth_from: m.
-        gaussian: whether the noise is normal; Laplace's otherwise.
-        step: depths are read in multiples of this, m; 0 for none.
-        inverse_step: inverse depths are read in multiples of this, 1/m; 0 for none. For stereo it is the
-            smallest step of the disparity (pixels) over focal length (pixels) times baseline (m).
-        dropout: the probability that a pixel is missing, wherever it is.
-        grazing_from: at this angle between the ray and the surface's normal pixels begin to go missing, rad.
-        grazing_to: at this angle all are missing, rad.
-        edge: two neighbours that lie further apart than this, and not on one plane, have an edge between
-            them, m.
-        flying: the probability that a pixel beside an edge reads a depth between the two sides, uniformly.
-        edge_dropout: the probability that a pixel beside an edge is missing.
+        gaussian: whether the noise is normal rather than Laplace's.
+        step: quantum of the depth, m; 0 for none.
+        inverse_step: quantum of the inverse depth, 1/m; 0 for none. For stereo it is the quantum of the
+            disparity (pixels) over focal length (pixels) times baseline (m).
+        dropout: probability that a pixel is missing, anywhere.
+        grazing_from: angle of incidence at which pixels begin to be missing, rad.
+        grazing_to: angle of incidence from which on all are missing, rad.
+        edge: a discontinuity lies between two neighbours whose depths differ by more than this, and that do
+            not lie on one plane, m.
+        flying: probability that a pixel at a discontinuity reads a depth between the two sides, uniformly.
+        edge_dropout: probability that a pixel at a discontinuity is missing.
     """
 
     scale: float = 0.002
@@ -67,19 +67,19 @@ class DepthNoise:
                 "give the smaller angle first, in radians."
             )
 
-    def read(self, camera: Camera, depth: npt.ArrayLike, seed: int | np.random.Generator) -> Array:
-        """What the sensor reads where rendered depths are true.
+    def sample(self, camera: Camera, depth: npt.ArrayLike, seed: int | np.random.Generator) -> Array:
+        """A noisy depth image.
 
         Args:
-            camera: its rays tell how surfaces are slanted, its range what can be read.
-            depth: (..., H, W) true depth along the optical axis, m; infinite or NaN where nothing is seen.
-            seed: same seed, same image.
+            camera: its rays give the angles of incidence, its range the depths that are not missing.
+            depth: (..., H, W) true depth along the optical axis, m; infinite or NaN where there is none.
+            seed: of the random numbers.
 
         Returns:
             (..., H, W) m, NaN where missing.
 
         Raises:
-            InputError: the image is not the camera's.
+            InputError: the image is not of the camera's shape.
         """
         true = np.array(depth, dtype=np.float64)
         if true.shape[-2:] != (camera.height, camera.width) or true.ndim < 2:
@@ -89,18 +89,16 @@ class DepthNoise:
             )
         true[~np.isfinite(true) | (true <= 0.0)] = np.nan
         generator = np.random.default_rng(seed)
-        across, beside = _edges(true, self.edge)
+        across, beside = _discontinuities(true, self.edge)
         lost = generator.random(true.shape) < self.dropout
         lost |= beside & (generator.random(true.shape) < self.edge_dropout)
-        share = np.clip(
-            (_incidence(camera, true) - self.grazing_from) / (self.grazing_to - self.grazing_from), 0.0, 1.0
-        )
-        lost |= generator.random(true.shape) < share
+        grazing = (_incidence(camera, true) - self.grazing_from) / (self.grazing_to - self.grazing_from)
+        lost |= generator.random(true.shape) < grazing
         flies = np.isfinite(across) & (generator.random(true.shape) < self.flying)
         between = true + generator.random(true.shape) * (np.where(flies, across, true) - true)
-        read = self._noisy(between, generator)
-        read[lost | ~(read >= camera.near) | ~(read <= camera.far)] = np.nan
-        return read
+        noisy = self._noisy(between, generator)
+        noisy[lost | ~(noisy >= camera.near) | ~(noisy <= camera.far)] = np.nan
+        return noisy
 
     def _noisy(self, depth: Array, generator: np.random.Generator) -> Array:
         size = self.scale + self.growth * np.square(np.maximum(depth - self.growth_from, 0.0))
@@ -108,16 +106,17 @@ class DepthNoise:
         noisy = depth + size * draw(size=depth.shape)
         if self.inverse_step > 0.0:
             steps = np.round(1.0 / (self.inverse_step * np.maximum(noisy, 1e-9)))
-            # Nothing is read of what is so far away that its disparity rounds to zero.
+            # A disparity that rounds to zero has no depth.
             noisy = np.where(steps > 0.0, 1.0 / (self.inverse_step * np.maximum(steps, 1.0)), np.nan)
         if self.step > 0.0:
             noisy = np.round(noisy / self.step) * self.step
         return noisy
 
 
-# Intel's D435 at 848 pixels: a focal length of 424 pixels (90 degrees), a baseline of 50 mm, a disparity that
-# is right to 0.08 of a pixel and read in steps of 1/32. Grunnet-Jepsen, Sweetser and Woodfill: Tuning depth
-# cameras for best performance; Subpixel linearity improvement for Intel RealSense depth camera D400 series.
+# Intel's D435 at 848 pixels: a focal length of 424 pixels (90 degrees), a baseline of 50 mm, a standard
+# deviation of the disparity of 0.08 pixels and a quantum of 1/32. Grunnet-Jepsen, Sweetser and Woodfill:
+# Tuning depth cameras for best performance; Subpixel linearity improvement for Intel RealSense depth camera
+# D400 series.
 REALSENSE_D435 = DepthNoise(
     scale=0.0,
     growth=0.08 / (424.0 * 0.05),
@@ -129,7 +128,7 @@ REALSENSE_D435 = DepthNoise(
 
 # Axial noise of the first Kinect up to 60 degrees, 1.2 mm + 1.9 mm (z/m - 0.4)^2: Nguyen, Izadi and Lovell,
 # Modeling Kinect sensor noise for improved 3D reconstruction and tracking, 3DIMPVT 2012, section 2. Its
-# disparity of 580 pixels x 75 mm is read in eighths: Khoshelham and Elberink, Sensors 12, 2012.
+# disparity of 580 pixels x 75 mm is quantised to eighths: Khoshelham and Elberink, Sensors 12, 2012.
 KINECT = DepthNoise(
     scale=0.0012,
     growth=0.0019,
@@ -143,23 +142,23 @@ KINECT = DepthNoise(
 )
 
 
-def _edges(depth: Array, edge: float) -> tuple[Array, Mask]:
-    """The depth (..., H, W) across the widest edge beside each pixel, NaN without one; and where one is.
+def _discontinuities(depth: Array, edge: float) -> tuple[Array, Mask]:
+    """The depth (..., H, W) across the widest discontinuity at each pixel, NaN without one; and its mask.
 
-    An edge between two neighbours: they differ by more than `edge`, and by more than twice as much as each
-    differs from its neighbour on its own side, so that a slanted plane has none. A pixel beside nothing at
-    all is at an edge too, with nothing across.
+    Two neighbours at a discontinuity differ by more than `edge`, and by more than twice as much as each
+    differs from its neighbour on its own side, so that a slanted plane has none. A pixel beside one without
+    depth is at a discontinuity too, with NaN across.
     """
     across = np.full(depth.shape, np.nan)
     widest = np.zeros(depth.shape)
     beside = np.zeros(depth.shape, dtype=bool)
     for axis in (-1, -2):
-        # Four in a row: o, a | b, p, the edge between a and b.
-        a, b = _sides(depth, axis)
+        # Four in a row: o, a | b, p, the discontinuity between a and b.
+        a, b = depth[_slot(depth.ndim, axis, True)], depth[_slot(depth.ndim, axis, False)]
         o, p = _outer(depth, axis)
         gap = np.abs(b - a)
-        slope = np.fmax(np.nan_to_num(np.abs(a - o)), np.nan_to_num(np.abs(p - b)))
-        step = (gap > edge) & (gap > 2.0 * slope)
+        slant = np.fmax(np.nan_to_num(np.abs(a - o)), np.nan_to_num(np.abs(p - b)))
+        step = (gap > edge) & (gap > 2.0 * slant)
         rim = np.isnan(a) ^ np.isnan(b)
         for here, there, first in ((a, b, True), (b, a, False)):
             place = _slot(depth.ndim, axis, first)
@@ -176,10 +175,6 @@ def _slot(dimensions: int, axis: int, first: bool) -> tuple[slice, ...]:
     return tuple(place)
 
 
-def _sides(depth: Array, axis: int) -> tuple[Array, Array]:
-    return depth[_slot(depth.ndim, axis, True)], depth[_slot(depth.ndim, axis, False)]
-
-
 def _outer(depth: Array, axis: int) -> tuple[Array, Array]:
     """The neighbours beyond each pair of neighbours, the pair's own depth repeated at the border."""
     moved = np.moveaxis(depth, axis, -1)
@@ -188,9 +183,9 @@ def _outer(depth: Array, axis: int) -> tuple[Array, Array]:
 
 
 def _incidence(camera: Camera, depth: Array) -> Array:
-    """The angle (..., H, W) between each ray and its surface's normal, rad; 0 where too little is seen.
+    """Angles of incidence (..., H, W), rad; 0 where a pixel has too few neighbours with a depth.
 
-    The surface runs to the nearer in depth of the two neighbours along each axis, so not across an edge.
+    The tangents lead to the nearer in depth of the two neighbours along each axis, so not across an edge.
     """
     rays = camera.rays().reshape(camera.height, camera.width, 3)
     points = depth[..., None] * rays
@@ -203,7 +198,7 @@ def _incidence(camera: Camera, depth: Array) -> Array:
 
 
 def _tangent(points: Array, depth: Array, axis: int) -> Array:
-    """From each point (..., H, W, 3) along the image's axis, on the side on which the depth changes less."""
+    """Tangents (..., H, W, 3) along an image axis, on the side on which the depth changes less."""
     step = np.full(points.shape, np.nan)
     change = np.full(depth.shape, np.inf)
     forward = np.diff(points, axis=axis - 1)

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.geometry.camera import Camera
-from bcppl.rendering.region import region_of
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.part_renderer import PartRenderer
+from bcppl.rendering.region_of_interest import region_of_interest
 
 Array = npt.NDArray[np.float64]
 
@@ -20,7 +20,7 @@ JUMP = 0.01  # m: a pixel that changes by more goes from the part to its backgro
 WITHIN = 0.01  # m: margin of the rendered region around the mean pose
 
 
-def pixel_information(renderer: DepthRenderer, camera: Camera, part: Tensor, bins: int = 1) -> Tensor:
+def pixel_information(renderer: PartRenderer, camera: Camera, part: Tensor, bins: int = 1) -> Tensor:
     """The sum (N, 7, 7) over pixels of the outer products of their gradients.
 
     The gradient of a pixel's depth is with respect to the part's pose (N, 7), in its tangent space, and to a
@@ -29,7 +29,7 @@ def pixel_information(renderer: DepthRenderer, camera: Camera, part: Tensor, bin
     """
     middle = part[0].numpy()
     spread = float((part[:, :3] - part[0, :3]).norm(dim=1).max())
-    near = camera.cropped(*region_of(camera, renderer.part, middle, WITHIN + spread)).binned(bins)
+    near = camera.cropped(*region_of_interest(camera, renderer.part, middle, WITHIN + spread)).binned(bins)
     gradients = []
     for axis, step in enumerate(STEPS):
         away = torch.zeros(6, dtype=torch.float64)
@@ -44,7 +44,7 @@ def pixel_information(renderer: DepthRenderer, camera: Camera, part: Tensor, bin
     return rows @ rows.transpose(-1, -2)
 
 
-def _read(renderer: DepthRenderer, camera: Camera, part: Tensor) -> Array:
+def _read(renderer: PartRenderer, camera: Camera, part: Tensor) -> Array:
     """Depths (N, height, width) in the sensor's range, NaN elsewhere."""
     depth = renderer.images(camera, part)
     with np.errstate(invalid="ignore"):

@@ -15,8 +15,8 @@ from torch import Tensor
 from bcppl.distributions.depth import ClutteredDepth, RobustDepth
 from bcppl.effort import Effort
 from bcppl.geometry.camera import Camera
-from bcppl.rendering.renderer import DepthRenderer
-from bcppl.rendering.scene import RendersPart
+from bcppl.rendering.part_renderer import PartRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors.depth import View
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Numbered
@@ -31,8 +31,8 @@ class CalibratedCamera:
         noise: further arguments of `RobustDepth`: scale, outlier, effective_pixels, ...
     """
 
-    def __init__(self, recording: Recording, renderer: RendersPart | None = None, **noise: Any) -> None:
-        self.renderer = DepthRenderer(recording.part) if renderer is None else renderer
+    def __init__(self, recording: Recording, renderer: PartRenderer | None = None, **noise: Any) -> None:
+        self.renderer = RayCaster(recording.part) if renderer is None else renderer
         self.background, self.noise = recording.background, noise
 
     @property
@@ -70,7 +70,7 @@ class ClutteredCamera(CalibratedCamera):
     def __init__(
         self,
         recording: Recording,
-        renderer: RendersPart | None = None,
+        renderer: PartRenderer | None = None,
         *,
         stride: int,
         temperature: float,

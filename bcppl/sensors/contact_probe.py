@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.contact.god_object import GodObject, WindowMotion
-from bcppl.contact.sensing.felt import Felt, accelerations
-from bcppl.contact.wrench import Sensing
+from bcppl.contact.quasi_static import QuasiStaticMotion, WindowMotion
+from bcppl.contact.sensing.contact_detection import ContactDetector, commanded_acceleration
+from bcppl.contact.sensing.location import ContactSensing
 from bcppl.distributions.manifold import ContactManifold, Gaps, MeasuresGap
 from bcppl.effort import Effort
 from bcppl.errors import InputError
@@ -41,7 +41,7 @@ class TouchSettings:
         sink: penetration at the forces of a probe, m.
         gap_outlier: probability that a stamp, or all contacts of a window, are outliers.
         every: stride of the stamps that are used.
-        felt: force thresholds of contact.
+        contact_detector: force thresholds of contact and of free motion.
         free_space: whether stamps without contact count, which exclude the part from where the peg moved.
     """
 
@@ -50,7 +50,7 @@ class TouchSettings:
     sink: float = 0.00002
     gap_outlier: float = 0.001
     every: int = 5
-    felt: Felt = field(default_factory=Felt)
+    contact_detector: ContactDetector = field(default_factory=ContactDetector)
     free_space: bool = True
 
     def __post_init__(self) -> None:
@@ -59,10 +59,10 @@ class TouchSettings:
 
 
 @lru_cache(maxsize=4)
-def _solids(part: Part, peg: Part) -> tuple[PegGap, GodObject]:
+def _solids(part: Part, peg: Part) -> tuple[PegGap, QuasiStaticMotion]:
     """Distances between two solids, prepared once for all scenes of the same two."""
     gap = PegGap(part, peg)
-    return gap, GodObject(gap)
+    return gap, QuasiStaticMotion(gap)
 
 
 class ContactProbe:
@@ -83,10 +83,10 @@ class ContactProbe:
         if recording.peg is None:
             raise InputError("the recording has probe windows but no peg; add the peg that was held.")
         self.settings = settings
-        self.gap, self.proxy = _solids(recording.part, recording.peg)
+        self.gap, self.quasi_static = _solids(recording.part, recording.peg)
         windows = [m.action for m in recording.measurements if isinstance(m.action, ProbeWindow)]
         self.sensing = (
-            Sensing(recording.peg, rate=1.0 / float(np.median(np.diff(windows[0].probe.stamps))))
+            ContactSensing(recording.peg, rate=1.0 / float(np.median(np.diff(windows[0].probe.stamps))))
             if windows
             else None
         )
@@ -121,7 +121,7 @@ class ContactProbe:
             math.hypot(settings.gap_shared, blur),
             settings.sink,
             settings.gap_outlier,
-            WindowMotion(self.proxy, window, settings.every),
+            WindowMotion(self.quasi_static, window, settings.every),
         )
 
     def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
@@ -135,8 +135,8 @@ class ContactProbe:
         assert self.sensing is not None
         touches = [measurement.observation for _, measurement in windows]
         tared = self.sensing.tared(touches)
-        commanded = accelerations([measurement.action for _, measurement in windows])
-        flags = self.settings.felt(torch.cat(tared)[:, :3], commanded)
+        commanded = commanded_acceleration([measurement.action for _, measurement in windows])
+        flags = self.settings.contact_detector(torch.cat(tared)[:, :3], commanded)
         if not self.settings.free_space:
             flags = torch.where(flags == 0.0, torch.nan, flags)
         each = flags[:, None].split([len(wrench) for wrench in tared])

@@ -23,10 +23,10 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, bin_depth
+from bcppl.rendering.extrinsics_error import apparent_covariance, apparent_pose, line_of_sight
 from bcppl.rendering.information import pixel_information
-from bcppl.rendering.region import region_of
-from bcppl.rendering.renderer import DepthRenderer
-from bcppl.rendering.stated_cameras import apparent_covariance, line_of_sight, seen_elsewhere
+from bcppl.rendering.ray_casting import RayCaster
+from bcppl.rendering.region_of_interest import region_of_interest
 from bcppl.sensors.depth import View
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Numbered
@@ -115,13 +115,15 @@ class ErringCamera:
 
     def __init__(self, recording: Recording, prior: Any, settings: CameraSettings) -> None:
         self.settings, self.prior = settings, prior
-        self.renderer = DepthRenderer(recording.part)
+        self.renderer = RayCaster(recording.part)
         self.looks: dict[str, Look] = {}
         within = float(np.linalg.norm(recording.guess.translation))
         for view in (m.action for m in recording.measurements if isinstance(m.action, View)):
             if view.camera.name not in self.looks:
                 camera, bins = view.camera, settings.bins
-                region = region_of(camera, recording.part, recording.guess.world_from_part, within, bins)
+                region = region_of_interest(
+                    camera, recording.part, recording.guess.world_from_part, within, bins
+                )
                 self.looks[camera.name] = Look(region, camera.cropped(*region).binned(bins))
 
     @property
@@ -152,7 +154,7 @@ class ErringCamera:
         first = once(f"instrument {name}", partial(self._instrument, name, camera, world_from_part))
         there = without_bias(first.camera, first.apparent, first.bias)
         if camera.name != first.camera.name:
-            there = seen_elsewhere(first.camera, camera, world_from_part, there)
+            there = apparent_pose(first.camera, camera, world_from_part, there)
         pyro.sample(f"depth_{number}", self.image(camera, there, first.bias))
 
     def _instrument(self, name: str, camera: Camera, part: Tensor) -> Instrument:

@@ -12,11 +12,11 @@ import pyro
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.mujoco_model import ContactParameters
+from bcppl.contact.nuisances import Nuisances
 from bcppl.contact.physics import PegPhysics
-from bcppl.contact.track import ContactTrack
-from bcppl.contact.unknowns import Unknowns
-from bcppl.contact.wrench import Sensing
+from bcppl.contact.probe_rollout import ProbeRollout
+from bcppl.contact.sensing.location import ContactSensing
 from bcppl.distributions.contact import ChamferContacts, PegPose
 from bcppl.effort import Effort
 from bcppl.errors import InputError
@@ -72,16 +72,16 @@ class SimulatedProbe:
         InputError: the recording has no peg, or the part cannot be touched in simulation.
     """
 
-    unknowns: Unknowns | None
+    nuisances: Nuisances | None
 
     def __init__(self, recording: Recording, settings: ProbeSettings) -> None:
         if recording.peg is None:
             raise InputError("the recording has probe windows but no peg; add the peg that was held.")
         windows = [m.action for m in recording.measurements if isinstance(m.action, ProbeWindow)]
-        self.settings, self.unknowns = settings, None
+        self.settings, self.nuisances = settings, None
         self.physics = PegPhysics(recording.part, recording.peg, settings.contact)
         rate = 1.0 / float(np.median(np.diff(windows[0].probe.stamps)))
-        self.sensing = Sensing(recording.peg, rate=rate)
+        self.sensing = ContactSensing(recording.peg, rate=rate)
 
     @classmethod
     def prepare(cls, recording: Recording, settings: ProbeSettings) -> SimulatedProbe | None:
@@ -96,19 +96,19 @@ class SimulatedProbe:
 
     def grasping(self, grip_from_peg: Tensor) -> SimulatedProbe:
         """The same with the peg's surface at poses (N, 7) in the grip's frame."""
-        return self.given(Unknowns(grip_from_peg=grip_from_peg))
+        return self.given(Nuisances(grip_from_peg=grip_from_peg))
 
-    def given(self, unknowns: Unknowns) -> SimulatedProbe:
+    def given(self, nuisances: Nuisances) -> SimulatedProbe:
         """The same, given nuisance parameters of the contact, one value for each particle."""
         other = copy(self)
-        other.unknowns = unknowns
+        other.nuisances = nuisances
         return other
 
     def observe(self, number: int, action: ProbeWindow, world_from_part: Tensor) -> None:
         """Sample `contacts_*` and `peg_*`."""
-        settings, unknowns = self.settings, self.unknowns
-        own = () if unknowns is None else (unknowns,)
-        begin = partial(ContactTrack.start, self.physics, self.sensing, world_from_part, action.probe, *own)
+        settings, nuisances = self.settings, self.nuisances
+        own = () if nuisances is None else (nuisances,)
+        begin = partial(ProbeRollout.start, self.physics, self.sensing, world_from_part, action.probe, *own)
         track = carried(f"probe {action.probe.name}", begin)
         window = (track, action.first, action.last)
         pyro.sample(

@@ -101,7 +101,7 @@ def _equations(trace: Trace, address: str, felt: str) -> tuple[Equations, Tensor
     every = getattr(site, "every", 1)
     chosen = slice(-site.first % every, None, every)
     contacts, world_from_peg = contacts[:, chosen], world_from_peg[:, chosen]
-    push, value = track.pushes(site.first, site.last)[:, chosen], value[..., chosen, :]
+    push, value = track.force_directions(site.first, site.last)[:, chosen], value[..., chosen, :]
     known = torch.isfinite(torch.cat([contacts, push, value.expand(len(pose), -1, -1)], dim=-1)).all(dim=-1)
     contacts, push, value = (torch.nan_to_num(x) for x in (contacts, push, value))
     world_from_peg = torch.where(known[..., None], world_from_peg, poses.identity())

@@ -25,7 +25,7 @@ from bcppl.inference.proposals.least_squares import Alignment, Equations, aligne
 from bcppl.inference.proposals.proposal import Fitted
 from bcppl.inference.proposals.spread import spread_of
 from bcppl.poses import FREE
-from bcppl.rendering.renderer import Hits
+from bcppl.rendering.part_renderer import Hits
 from bcppl.traces import Trace
 
 Array = npt.NDArray[np.float64]

@@ -17,7 +17,7 @@ import torch
 
 from bcppl import poses
 from bcppl.arguments import number_within, seed_number
-from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.touch import Touch
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.camera import Camera, looking_at
@@ -218,7 +218,7 @@ class BenchScene:
         for k, camera in enumerate(self.cameras):
             background[camera.name] = empty.background(camera, poses.identity(1))
             depth = self.true_depth(k) + self.range_bias[k]
-            read = self.bench.depth_noise.read(camera, depth, generator)
+            read = self.bench.depth_noise.sample(camera, depth, generator)
             images.append(DepthImage(read.astype(np.float32).astype(np.float64)))
         return images, background
 

@@ -82,5 +82,5 @@ class BenchArm:
         off, bias = self._off[camera.instrument]
         stands = poses.retract(torch.as_tensor(camera.world_from_camera), torch.from_numpy(off))
         depth = self.scene.depth_from(replace(camera, world_from_camera=stands.numpy()))
-        read = bench.depth_noise.read(camera, depth + bias, self._looking)
+        read = bench.depth_noise.sample(camera, depth + bias, self._looking)
         return DepthImage(read.astype(np.float32).astype(np.float64))

@@ -13,9 +13,9 @@ import torch
 from scipy.ndimage import uniform_filter1d
 
 from bcppl import poses
+from bcppl.contact.nuisances import Nuisances
 from bcppl.contact.physics import PegPhysics
 from bcppl.contact.touch import Touch
-from bcppl.contact.unknowns import Unknowns
 from bcppl.models.worlds import peg_in_hole as bench
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors.measurements import Measurement, Recording
@@ -98,7 +98,7 @@ def record(seed: int, world: World | None = None) -> Recording:
     truth, generator = torch.from_numpy(seen.truth), np.random.default_rng([seed, 2])
     action = probe(bench.shifted(truth, world.estimate_shift, world.estimate_turn, generator))
     count = len(action.stamps)
-    held = Unknowns(grip_from_peg=grip_from_peg(seed, world)[None])
+    held = Nuisances(grip_from_peg=grip_from_peg(seed, world)[None])
     rollout = PegPhysics(seen.part, seen.peg, world.contact).start(truth[None], action, held).advance(count)
     noise = generator.normal(size=(count, 6)) * ([world.force_noise] * 3 + [world.torque_noise] * 3)
     bias = generator.normal(size=6) * ([world.force_bias] * 3 + [world.torque_bias] * 3)

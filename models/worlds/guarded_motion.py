@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bcppl.contact.peg_model import ContactParameters, build_model, commands
-from bcppl.contact.stepping import POSE, WRENCH, Clock, Standing
+from bcppl.contact.mujoco_model import ContactParameters, build_model, interpolated_command
+from bcppl.contact.stepping import POSE, WRENCH, SimulationState, Stepper
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 from bcppl.robot.motion import Probe
@@ -39,7 +39,7 @@ class CarriedOut:
         wrench: (T, 6) what was truly exerted on the peg at the stamps, N and N m, in the peg's frame.
         world_from_peg: (T, 7) where the peg truly was.
         met: (7,) where the peg was when the last guarded motion was stopped; None where none was.
-        standing: where the simulation stood at the last stamp: what follows goes on from there.
+        state: of the simulation at the last stamp, from which the next motion continues.
     """
 
     probe: Probe
@@ -47,7 +47,7 @@ class CarriedOut:
     wrench: Array
     world_from_peg: Array
     met: Array | None
-    standing: Standing
+    state: SimulationState
 
 
 def stamps_of(plan: Plan) -> Array:
@@ -82,7 +82,7 @@ def command_of(plan: Plan, stops: Mapping[int, float]) -> Probe:
         elif k in stops:
             found = manner == "searching"
             path = _path(plan, np.array([times[-1], plan.times[k + 1]]), np.stack([ends[-1], end]))
-            end = commands(path, np.array([stops[k]]))[0][0]
+            end = interpolated_command(path, np.array([stops[k]]))[0][0]
             shift, turn = end[:3] - planned[:3], _rotation(planned).inv() * _rotation(end)
             times.append(stops[k])
             ends.append(end)
@@ -90,7 +90,7 @@ def command_of(plan: Plan, stops: Mapping[int, float]) -> Probe:
         ends.append(end)
     count = round((plan.times[-1] - plan.times[0]) / STEP)
     fine = plan.times[0] + STEP * np.arange(count + 1)
-    led = commands(_path(plan, np.array(times), np.stack(ends)), fine)[0]
+    led = interpolated_command(_path(plan, np.array(times), np.stack(ends)), fine)[0]
     opposite = np.cumprod(np.sign(np.sum(led[1:, 3:] * led[:-1, 3:], axis=1)))
     led[1:, 3:] *= opposite[:, None]
     late = np.concatenate([np.repeat(led[:1], ROUNDED - 1, axis=0), led])
@@ -141,13 +141,13 @@ def carry_out(
     model, pose = build_model(part, peg, contact), np.asarray(world_from_part, dtype=np.float64)[None]
     stops: dict[int, float] = {}
     probe = command_of(plan, stops)
-    clock = Clock(model, probe, contact.time_step)
-    standing = clock.beginning(1) if following is None else following.standing
+    stepper = Stepper(model, probe, contact.time_step)
+    state = stepper.at_rest(1) if following is None else following.state
     rows = np.empty((len(stamps), WRENCH.stop))
     motion = np.clip(np.searchsorted(plan.times, stamps + 1e-9, side="right") - 1, 0, len(manners) - 1)
     done, met = len(stamps), None
     for k, of in enumerate(motion):
-        row, standing = clock.read(standing, pose, {}, k, k + 1)
+        row, state = stepper.run(state, pose, {}, k, k + 1)
         rows[k] = row[0, 0]
         if of in stops or k + 1 == len(stamps):
             continue
@@ -169,17 +169,17 @@ def carry_out(
         if stopped and manners[motion[k + 1]] == manners[of]:  # else it is over anyway
             stops[int(motion[k + 1])] = float(stamps[k + 1])
             probe = _going_on(probe, command_of(plan, stops), stamps[k + 1])
-            clock = Clock(model, probe, contact.time_step)
+            stepper = Stepper(model, probe, contact.time_step)
     rows = rows[:done]
     probe = replace(probe, stamps=stamps[:done])
-    return CarriedOut(probe, stops, rows[:, WRENCH].copy(), rows[:, POSE].copy(), met, standing)
+    return CarriedOut(probe, stops, rows[:, WRENCH].copy(), rows[:, POSE].copy(), met, state)
 
 
 def _sunk(probe: Probe, world_from_peg: Array, time: float, met: Array | None) -> float:
     """How far (m) a peg is below where it met a surface, along the commanded z; none met: infinite."""
     if met is None:
         return float("inf")
-    led = commands(probe, np.array([time]))[0][0]
+    led = interpolated_command(probe, np.array([time]))[0][0]
     return float(_rotation(led).inv().apply(met[:3] - world_from_peg[:3])[2])
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 
 from bcppl import poses
-from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.geometry.parts import Part
 from bcppl.models.worlds.guarded_motion import TARE, carry_out, stamps_of
 from bcppl.robot.insertion_plan import InsertionPlan

@@ -13,7 +13,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.extrusion import block
 from bcppl.geometry.parts import Part
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 
 Array = npt.NDArray[np.float64]
 
@@ -40,7 +40,7 @@ def occluder(
     Raises:
         InputError: the camera does not see the part.
     """
-    depth = DepthRenderer(part).images(camera, world_from_part[None])[0].ravel()
+    depth = RayCaster(part).images(camera, world_from_part[None])[0].ravel()
     seen = np.isfinite(depth)
     if not seen.any():
         raise InputError(f"camera {camera.name!r} does not see part {part.name!r}; turn it towards the part.")

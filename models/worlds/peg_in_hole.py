@@ -16,7 +16,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from bcppl import poses
-from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
 from bcppl.contact.touch import Touch
 from bcppl.distributions.poses import SwingTwistPose
@@ -24,7 +24,7 @@ from bcppl.geometry.camera import Camera
 from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors import DepthImage, Measurement, Recording, View
 
@@ -171,7 +171,7 @@ def record(seed: int, world: World | None = None) -> Recording:
         torch.manual_seed(int(generator.integers(2**62)))
         truth = prior.sample()
 
-    behind, renderer = DepthRenderer(table()), DepthRenderer(part)
+    behind, renderer = RayCaster(table()), RayCaster(part)
     measurements, background = [], {}
     for camera in cameras(generator):
         background[camera.name] = behind.images(camera, poses.identity(1))[0]

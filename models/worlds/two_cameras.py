@@ -70,7 +70,7 @@ def record(seed: int, world: World | None = None) -> Recording:
         bias = generator.normal(scale=world.bias)
         seen = bench.images(replace(camera, world_from_camera=there.numpy()), both)[0] + bias
         for _ in range(world.views):
-            depth = world.noise.read(camera, seen, generator)
+            depth = world.noise.sample(camera, seen, generator)
             image = DepthImage(depth.astype(np.float32).astype(np.float64))
             measurements.append(Measurement(View(camera), image))
     return Recording(

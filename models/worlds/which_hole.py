@@ -24,7 +24,7 @@ from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part, Piece
 from bcppl.models.which_hole import HOLES, PITCH
 from bcppl.models.worlds import peg_in_hole as bench
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors import DepthImage, Measurement, Recording, View
 
@@ -108,7 +108,7 @@ def record(seed: int, world: bench.World | None = None) -> Recording:
     camera = Camera("near", 60, 60, 700.0, 700.0, 29.5, 29.5, np.asarray(eye), near=0.1, far=1.0)
     stood = torch.from_numpy(camera.world_from_camera)
     there = bench.shifted(stood, world.camera_shift, world.camera_turn, generator).numpy()
-    renderer = DepthRenderer(part)
+    renderer = RayCaster(part)
     depth = renderer.images(Camera(**{**camera.__dict__, "world_from_camera": there}), world_from_plate[None])
     image = depth[0] + generator.laplace(scale=world.depth_noise, size=depth[0].shape)
     image[~np.isfinite(image)] = np.nan

@@ -19,7 +19,7 @@ from bcppl.inference.filters.tempered_smc import kernel as shipped
 from bcppl.inference.kernels import cycle, metropolis_hastings, repeat
 from bcppl.inference.proposals import depth_alignment, drift, independent
 from bcppl.poses import FREE, Freedom
-from bcppl.rendering.renderer import DepthRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import Trace
 from tests.calibration.case import Case
 
@@ -33,7 +33,7 @@ def box() -> Part:
     return Part("box", np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
-RENDERER = DepthRenderer(box())
+RENDERER = RayCaster(box())
 
 
 class Seen:

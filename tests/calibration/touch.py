@@ -9,10 +9,10 @@ import numpy as np
 import pyro
 
 from bcppl import poses
-from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
-from bcppl.contact.track import ContactTrack
-from bcppl.contact.wrench import Sensing
+from bcppl.contact.probe_rollout import ProbeRollout
+from bcppl.contact.sensing.location import ContactSensing
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime
 from bcppl.distributions.poses import UniformPose
 from bcppl.geometry.extrusion import block, box_peg
@@ -37,7 +37,7 @@ def pressed() -> Probe:
 
 PROBE = pressed()
 PHYSICS = PegPhysics(BLOCK, PEG, ContactParameters(time_step=0.005))
-SENSING = Sensing(PEG, rate=RATE, tare=4)
+SENSING = ContactSensing(PEG, rate=RATE, tare=4)
 # The block may be beside where it is thought to be, above it, and tilted about the edge that is pressed.
 PRIOR = UniformPose(CENTER, (0.004, 0.0, 0.003), 0.15, rotation="y")
 EFFORT: dict[str, Any] = {"sweeps": 8, "share": 0.6, "particles": 75, "settling": 24}
@@ -52,7 +52,7 @@ class Felt:
     def __call__(self, count: int) -> None:
         pose = pyro.sample("pose", PRIOR)
         if count:
-            begin = partial(ContactTrack.start, PHYSICS, SENSING, pose, PROBE)
+            begin = partial(ProbeRollout.start, PHYSICS, SENSING, pose, PROBE)
             track = carried("press", begin)
             seen: Any
             if self.surrogate:

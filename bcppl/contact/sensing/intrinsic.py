@@ -1,16 +1,16 @@
-"""Intrinsic contact sensing: where on a peg a measured wrench says that it is touched, and how surely.
+"""Intrinsic contact sensing: the posterior of a contact's location on a peg, given its wrench.
 
 A single contact at r that only pushes exerts a wrench (f, tau) with r x f = tau: r lies on the wrench's line
 of action, where that enters the peg with f inside the friction cone (Bicchi, Salisbury and Brock 1993,
-"Contact sensing from force measurements", IJRR 12(3), section 3). With noise of covariance S on the wrench,
-and nothing known of the force, the likelihood of r is, the force integrated out,
+"Contact sensing from force measurements", IJRR 12(3), section 3). With noise of covariance S on the wrench
+and a flat prior of the force, which is integrated out, the likelihood of r is
 
     p(wrench | r) ~ |V(r)|^(-1/2) exp(-e' V(r)^-1 e / 2),
     e = tau - r x f,   V(r) = [-[r]x, I] S [-[r]x, I]',
 
 times the probability that the force lies in a friction cone at r. The posterior over the surface is computed
-on nodes: everywhere that a bundle of lines parallel to the measured one enters the peg, and on sharp edges
-and corners near it. Nothing is linearised but the friction cone's margin.
+on nodes: where a bundle of lines parallel to the measured one enters the peg, and on sharp edges and corners
+near it. Only the friction cone's margin is linearised.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import log_ndtr
 
-from bcppl.contact.sensing.candidates import CORNER, EDGE, FACE, Candidates, Nodes, SurfacePosterior
 from bcppl.contact.sensing.noise import WrenchNoise, checked_covariance
 from bcppl.contact.sensing.surface import PegSurface
+from bcppl.contact.sensing.surface_posterior import CORNER, EDGE, FACE, Candidates, Nodes, SurfacePosterior
 from bcppl.contact.sensing.units import refuse_millimetres
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
@@ -32,27 +32,27 @@ from bcppl.geometry.parts import Part
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-WIDTH = 3.2  # how many deviations the bundle reaches to each side, of a bound of them along the line
+WIDTH = 3.2  # half width of the bundle, in standard deviations (of their bound along the line)
 ACROSS = 19  # lines across the bundle
-ALONG = 21  # nodes on the stretch of an edge
+ALONG = 21  # nodes on a segment of an edge
 _BATCH = 400  # wrenches whose bundles are cast at once
-_FLATTEST = 0.05  # cosine between force and normal below which a surface is not pushed
-_WEAKEST = 5.0  # deviations of a force below which it has no direction to speak of
-_UNLIKELY = -18.0  # exponent of the likelihood below which a wrench is not explained: six deviations
+_FLATTEST = 0.05  # lower bound of the cosine between force and normal
+_WEAKEST = 5.0  # lower bound of a force, in standard deviations: a weaker one has no direction
+_UNLIKELY = -18.0  # lower bound of the likelihood's exponent: six standard deviations
 
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicSensing:
-    """Contact locations on a peg from wrenches: all candidates, and their uncertainty.
+    """Posteriors of contact locations on a peg from wrenches.
 
-    Beforehand a contact is on a face, a sharp edge or a corner with the probabilities `shares`, anywhere on
-    them evenly, and its force anywhere in the friction cone. An edge's and a corner's cone are those of all
+    A priori a contact is on a face, a sharp edge or a corner with the probabilities `shares`, uniformly on
+    each, and its force anywhere in the friction cone. The cones of an edge or a corner are those of all
     normals between its faces'.
 
     Attributes:
         peg: the held peg; wrenches and locations are in its frame.
-        friction: the coefficient of the steepest cone that a contact may have.
-        shares: of contacts on faces, sharp edges and corners.
+        friction: upper bound of the friction coefficient.
+        shares: prior probabilities of faces, sharp edges and corners.
 
     Raises:
         InputError: the peg's mesh is empty, open, not finite or in millimetres, or a setting is out of range.
@@ -67,56 +67,54 @@ class IntrinsicSensing:
             raise InputError(f"a contact's friction is {self.friction!r}; give a coefficient from 0 to 10.")
         if len(self.shares) != 3 or not min(self.shares) >= 0 or not 0 < sum(self.shares) < np.inf:
             raise InputError(
-                f"contacts are on faces, edges, corners with shares {self.shares!r}; give three, 0 or more."
+                f"faces, edges and corners have shares {self.shares!r}; give three numbers, 0 or more."
             )
         _ = self.surface
 
     @cached_property
     def surface(self) -> PegSurface:
-        """The peg's, prepared."""
+        """The peg's surface."""
         return PegSurface(self.peg)
 
     def candidates(
         self, wrench: Array, covariance: Array | WrenchNoise, most: int = 8, least: float = 0.005
     ) -> Candidates:
-        """The candidates of wrenches (M, 6): see `posterior` and `SurfacePosterior.candidates`."""
+        """Candidate contact locations; see `posterior` and `SurfacePosterior.candidates`."""
         return self.posterior(wrench, covariance).candidates(most, least)
 
     def posterior(self, wrench: Array, covariance: Array | WrenchNoise) -> SurfacePosterior:
-        """What wrenches say of where the peg is touched.
+        """Posteriors of the contact location, one for each wrench.
 
         Args:
-            wrench: (M, 6) force (N) and torque (N m) on the peg, in its frame about its origin: tared, free
-                of the tool's weight, averaged or filtered.
+            wrench: (M, 6) force (N) and torque (N m) on the peg, in its frame about its origin: tared,
+                gravity compensated, averaged or filtered.
             covariance: (6, 6), or (M, 6, 6), of their noise: `WrenchNoise.covariance`. A `WrenchNoise` itself
-                is that of wrenches that are single samples, neither averaged nor filtered.
+                is for wrenches that are single samples, neither averaged nor filtered.
 
         Returns:
-            The posterior of each wrench. It has no nodes for a wrench that is not finite, or whose force is
-            below five deviations; and for one that no single contact explains within six deviations: a line
-            of action that passes beside the peg, a force that leaves every friction cone (is `friction` large
-            enough?), a torque about the line that only several contacts can make.
+            The posteriors. There are no nodes for a wrench that is not finite, or whose force is below five
+            standard deviations; nor for one that no single contact explains within six: a line of action that
+            misses the peg, a force outside of every friction cone (is `friction` large enough?), a torque
+            about the line that only several contacts can exert.
 
         Raises:
-            InputError: shapes do not fit, a covariance is not symmetric and positive definite, or torques are
+            InputError: the covariance does not fit or is not symmetric and positive definite, or torques are
                 in N mm.
         """
         wrench = np.asarray(wrench, dtype=np.float64)
-        if wrench.ndim != 2 or wrench.shape[1] != 6:
-            raise InputError(f"wrenches have shape {wrench.shape}; give (wrenches, 6).")
         covariance = checked_covariance(covariance, len(wrench))
         rows = np.flatnonzero(np.isfinite(wrench).all(axis=1))
         noise = np.linalg.eigvalsh(_of_rows(covariance, rows)[..., :3, :3])[..., -1]
         clear = np.linalg.norm(wrench[rows, :3], axis=1) > _WEAKEST * np.sqrt(noise)
         rows = rows[clear]
         refuse_millimetres(wrench[rows], self.surface.radius + float(np.linalg.norm(self.surface.center)))
-        parts = [_NONE]
+        nodes = [_NO_NODES]
         for first in range(0, len(rows), _BATCH):
             chosen = rows[first : first + _BATCH]
             bundle = _Bundle.around(wrench[chosen], _of_rows(covariance, chosen), self.surface)
-            for found in (self._on_faces(bundle), self._on_edges(bundle), self._on_corners(bundle)):
-                parts.append(self._scored(found, chosen, wrench, covariance))
-        return SurfacePosterior.of(Nodes.joined(parts), len(wrench))
+            for places in (self._on_faces(bundle), self._on_edges(bundle), self._on_corners(bundle)):
+                nodes.append(self._scored(places, chosen, wrench, covariance))
+        return SurfacePosterior.of(Nodes.joined(nodes), len(wrench))
 
     def credible_level(
         self,
@@ -133,32 +131,32 @@ class IntrinsicSensing:
             wrench: (M, 6).
             covariance: (6, 6) or (M, 6, 6), or a `WrenchNoise`.
             point: (M, 3) in the peg's frame.
-            normals: (M, K, 3) outward, of the face there, or of those that meet there and between.
+            normals: (M, K, 3) outward, of the face there, or of all faces that meet there and between.
         """
         covariance = checked_covariance(covariance, len(wrench))
         score, *_ = self._log_likelihood(wrench, covariance, point, normals)
         level = posterior.mass_above(score)
         return np.where(np.isfinite(posterior.log_evidence), level, 1.0)
 
-    def _on_faces(self, bundle: _Bundle) -> _Found:
-        """Where each bundle of lines enters the peg, and what share of its area every line stands for."""
+    def _on_faces(self, bundle: _Bundle) -> _Places:
+        """Points where each bundle of lines enters the peg, and the share of its area of each line."""
         grid, step = _disc(ACROSS)
         offset = np.einsum("mxi,mij,gj->mgx", bundle.side, bundle.root, grid)
         lines = (bundle.point[:, None] + offset).reshape(-1, 3)
-        crossing = self.surface.entered(lines, np.repeat(bundle.direction, len(grid), axis=0))
+        crossing = self.surface.entries(lines, np.repeat(bundle.direction, len(grid), axis=0))
         row, normal = crossing.line // len(grid), self.surface.normals[crossing.face]
-        slope = -np.sum(bundle.direction[row] * normal, axis=1)
-        kept = slope > _FLATTEST
-        row, normal, slope = row[kept], normal[kept], slope[kept]
+        cosine = -np.sum(bundle.direction[row] * normal, axis=1)
+        kept = cosine > _FLATTEST
+        row, normal, cosine = row[kept], normal[kept], cosine[kept]
         cell = step**2 * np.abs(np.linalg.det(bundle.root))
-        # Neighbouring lines meet a surface that the force may push at depths that differ by this at most.
+        # Bound of the difference in depth of neighbouring lines on a surface with the force in its cone.
         gap = 2.0 * step * np.linalg.norm(bundle.root, axis=(1, 2)) * max(self.friction, 0.3) + 1e-6
         group = self.surface.patch[crossing.face[kept]]
-        size = cell[row] / slope / self.surface.area
-        return _Found(FACE, row, group, crossing.point[kept], normal[:, None], size, gap[row])
+        size = cell[row] / cosine / self.surface.area
+        return _Places(FACE, row, group, crossing.point[kept], normal[:, None], size, gap[row])
 
-    def _on_edges(self, bundle: _Bundle) -> _Found:
-        """Nodes on the stretches of sharp edges that each line passes near, and their share of all length."""
+    def _on_edges(self, bundle: _Bundle) -> _Places:
+        """Points on the segments of sharp edges near each line, and their shares of the total length."""
         edges = self.surface.edges
         begin = bundle.whitened(edges.start)
         extent = bundle.whitened(edges.start + edges.extent) - begin
@@ -168,69 +166,62 @@ class IntrinsicSensing:
         low, high = np.clip(nearest - reach, 0.0, 1.0), np.clip(nearest + reach, 0.0, 1.0)
         away = np.linalg.norm(begin + np.clip(nearest, 0.0, 1.0)[..., None] * extent, axis=-1)
         row, edge = np.nonzero((away < WIDTH) & (high > low))
-        stretch = (high - low)[row, edge]
-        share = low[row, edge][:, None] + stretch[:, None] * (np.arange(ALONG) + 0.5) / ALONG
+        segment = (high - low)[row, edge]
+        share = low[row, edge][:, None] + segment[:, None] * (np.arange(ALONG) + 0.5) / ALONG
         point = edges.start[edge][:, None] + share[..., None] * edges.extent[edge][:, None]
-        metres = stretch * np.linalg.norm(edges.extent[edge], axis=1) / ALONG
+        metres = segment * np.linalg.norm(edges.extent[edge], axis=1) / ALONG
         many = np.repeat(np.arange(len(row)), ALONG)
         size = metres[many] / max(self.surface.length, 1e-30)
         far = np.full(len(many), np.inf)
-        return _Found(
-            EDGE,
-            row[many],
-            edges.chain[edge][many],
-            point.reshape(-1, 3),
-            edges.normals[edge][many],
-            size,
-            far,
-        )
+        chain, normals = edges.chain[edge][many], edges.normals[edge][many]
+        return _Places(EDGE, row[many], chain, point.reshape(-1, 3), normals, size, far)
 
-    def _on_corners(self, bundle: _Bundle) -> _Found:
-        """The corners that each line passes near."""
+    def _on_corners(self, bundle: _Bundle) -> _Places:
+        """The corners near each line."""
         point, normals = self.surface.corners
         away = np.linalg.norm(bundle.whitened(point), axis=-1)
         row, corner = np.nonzero(away < WIDTH)
         size = np.full(len(row), 1.0 / max(len(point), 1))
-        return _Found(CORNER, row, corner, point[corner], normals[corner], size, np.full(len(row), np.inf))
+        return _Places(CORNER, row, corner, point[corner], normals[corner], size, np.full(len(row), np.inf))
 
-    def _scored(self, found: _Found, chosen: Indices, wrench: Array, covariance: Array) -> Nodes:
-        row = chosen[found.row]
-        share = self.shares[found.kind] / sum(self.shares)
+    def _scored(self, places: _Places, chosen: Indices, wrench: Array, covariance: Array) -> Nodes:
+        row = chosen[places.row]
+        share = self.shares[places.kind] / sum(self.shares)
         given = wrench[row], _of_rows(covariance, row)
-        score, fit, normal = self._log_likelihood(*given, found.point, found.normals)
+        score, fit, normal = self._log_likelihood(*given, places.point, places.normals)
         with np.errstate(divide="ignore"):
-            log_weight = np.where(fit > _UNLIKELY, score + np.log(found.size * share), -np.inf)
+            log_weight = np.where(fit > _UNLIKELY, score + np.log(places.size * share), -np.inf)
         force = wrench[row, :3]
-        along = np.sum(found.point * force, axis=1) / np.linalg.norm(force, axis=1)
-        kind = np.full(len(row), found.kind)
-        return Nodes(row, kind, found.group, found.point, normal, along, found.gap, score, log_weight)
+        along = np.sum(places.point * force, axis=1) / np.linalg.norm(force, axis=1)
+        kind = np.full(len(row), places.kind)
+        return Nodes(row, kind, places.group, places.point, normal, along, places.gap, score, log_weight)
 
     def _log_likelihood(
         self, wrench: Array, covariance: Array, point: Array, normals: Array
     ) -> tuple[Array, Array, Array]:
-        """Log p (Q,) of wrenches (Q, 6) of contacts at points (Q, 3), its exponent, the normals pushed.
+        """Log p (Q,) of wrenches (Q, 6) given contacts at points (Q, 3), its exponent, the normals.
 
-        The covariance is (6, 6) or (Q, 6, 6); the normals (Q, K, 3) are all that a contact may have there.
+        The covariance is (6, 6) or (Q, 6, 6); the normals (Q, K, 3) are all that a contact there may have.
         """
         force = wrench[:, :3]
         error = wrench[:, 3:] - np.cross(point, force)
-        spread = _of_residual(point, covariance)
-        fit = -0.5 * np.sum(error * np.linalg.solve(spread, error[..., None])[..., 0], axis=1)
-        squarely = -np.einsum("qx,qkx->qk", force, normals)
-        best = squarely.argmax(axis=1) if len(force) else np.empty(0, dtype=np.int64)
+        residual = _of_residual(point, covariance)
+        fit = -0.5 * np.sum(error * np.linalg.solve(residual, error[..., None])[..., 0], axis=1)
+        components = -np.einsum("qx,qkx->qk", force, normals)
+        best = components.argmax(axis=1) if len(force) else np.empty(0, dtype=np.int64)
         normal = normals[np.arange(len(best)), best]
-        pressed = squarely[np.arange(len(best)), best]
-        sliding = force + pressed[:, None] * normal
-        size = np.linalg.norm(sliding, axis=1)
-        gradient = self.friction * normal + sliding / np.maximum(size, 1e-12)[:, None]
+        pressing = components[np.arange(len(best)), best]
+        tangential = force + pressing[:, None] * normal
+        size = np.linalg.norm(tangential, axis=1)
+        gradient = self.friction * normal + tangential / np.maximum(size, 1e-12)[:, None]
         variance = np.sum((gradient[:, None] @ covariance[..., :3, :3])[:, 0] * gradient, axis=1)
-        fit = fit + log_ndtr((self.friction * pressed - size) / np.sqrt(variance))
-        return fit - 0.5 * np.linalg.slogdet(spread)[1], fit, normal
+        fit = fit + log_ndtr((self.friction * pressing - size) / np.sqrt(variance))
+        return fit - 0.5 * np.linalg.slogdet(residual)[1], fit, normal
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """Nodes of one kind, Q in all; `size` is the share of that kind's surface that each stands for."""
+class _Places:
+    """Points of one kind, Q in all; `size` is each one's share of that kind's surface."""
 
     kind: int
     row: Indices
@@ -243,13 +234,13 @@ class _Found:
 
 @dataclass(frozen=True, eq=False)
 class _Bundle:
-    """The lines of action of M wrenches and how far off they may be.
+    """The lines of action of M wrenches and their uncertainty.
 
     Attributes:
         direction: (M, 3) unit vectors along the forces.
         point: (M, 3) the lines' points nearest to the peg's middle.
         side: (M, 3, 2) unit vectors across.
-        root: (M, 2, 2) a root of a bound of the covariance of the line's place across, m.
+        root: (M, 2, 2) a square root of a bound of the line's covariance across, m.
     """
 
     direction: Array
@@ -258,7 +249,7 @@ class _Bundle:
     root: Array
 
     def whitened(self, place: Array) -> Array:
-        """How far places (E, 3) lie beside each line, in deviations along two axes: (M, E, 2)."""
+        """Offsets (M, E, 2) of points (E, 3) from each line, in standard deviations."""
         whiten = np.linalg.inv(self.root) @ np.swapaxes(self.side, 1, 2)
         return np.asarray(whiten @ place.T - whiten @ self.point[..., None]).swapaxes(1, 2)
 
@@ -276,18 +267,18 @@ class _Bundle:
 
         def bounded(first: Array, last: Array) -> Array:
             # The covariance is convex along the line, so the sum of those at both ends bounds it.
-            spread = np.zeros((len(wrench), 2, 2))
+            bound = np.zeros((len(wrench), 2, 2))
             for along in (first, last):
                 there = _of_residual(point + along[:, None] * direction, covariance)
-                spread += moved @ there @ np.swapaxes(moved, 1, 2)
-            return np.asarray(np.linalg.cholesky(spread), dtype=np.float64)
+                bound += moved @ there @ np.swapaxes(moved, 1, 2)
+            return np.asarray(np.linalg.cholesky(bound), dtype=np.float64)
 
         radius = np.full(len(wrench), surface.radius)
         root = bounded(-radius, radius)
-        # A few lines tell where along it a peg is entered at all; from there to there is a closer bound.
+        # The range of the entries of a few lines gives a closer bound.
         grid, _ = _disc(7)
         lines = (point[:, None] + np.einsum("mxi,mij,gj->mgx", side, root, grid)).reshape(-1, 3)
-        crossing = surface.entered(lines, np.repeat(direction, len(grid), axis=0))
+        crossing = surface.entries(lines, np.repeat(direction, len(grid), axis=0))
         row = crossing.line // len(grid)
         along = np.sum((crossing.point - point[row]) * direction[row], axis=1)
         first, last = np.full(len(wrench), np.inf), np.full(len(wrench), -np.inf)
@@ -300,7 +291,7 @@ class _Bundle:
 
 
 def _disc(across: int) -> tuple[Array, float]:
-    """Points (G, 2) of a square grid within `WIDTH`, so many from side to side, and their distance."""
+    """Points (G, 2) of a square grid within `WIDTH`, `across` from side to side, and their spacing."""
     step = 2.0 * WIDTH / across
     axis = step * (np.arange(across) - 0.5 * (across - 1))
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
@@ -330,4 +321,6 @@ def _of_rows(covariance: Array, rows: Indices) -> Array:
 
 _EMPTY, _NO_POINTS = np.empty(0), np.empty((0, 3))
 _NO_INDICES = np.empty(0, dtype=np.int64)
-_NONE = Nodes(_NO_INDICES, _NO_INDICES, _NO_INDICES, _NO_POINTS, _NO_POINTS, _EMPTY, _EMPTY, _EMPTY, _EMPTY)
+_NO_NODES = Nodes(
+    _NO_INDICES, _NO_INDICES, _NO_INDICES, _NO_POINTS, _NO_POINTS, _EMPTY, _EMPTY, _EMPTY, _EMPTY
+)

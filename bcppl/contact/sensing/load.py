@@ -1,4 +1,4 @@
-"""The weight of what hangs on a wrench sensor: taken off a measured wrench, identified from static poses."""
+"""Gravity compensation of a wrench sensor: the tool's load, its weight, and its identification."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ Array = npt.NDArray[np.float64]
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 FARTHEST_CENTER = 2.0  # m: a centre farther than this from the sensor comes from torques in N mm
-TURNED = 0.05  # the least singular value, over the largest, of gravity's directions that tell the load apart
+TURNED = 0.05  # lower bound of the second singular value of gravity's directions, over gravity
 
 
 @dataclass(frozen=True)
 class ToolLoad:
-    """Everything below the sensor, as gravity sees it.
+    """Mass and centre of mass of everything below the sensor.
 
     Attributes:
         mass: kg.
-        center: (3,) the centre of mass, metres, in the frame that the wrenches are in: the peg's, say.
+        center: (3,) the centre of mass, metres, in the frame of the wrenches, such as the peg's.
         gravity: (3,) in the world, m/s^2.
     """
 
@@ -47,10 +47,9 @@ class ToolLoad:
         _check_gravity(self.gravity)
 
     def weight(self, world_from_sensor: Array) -> Array:
-        """Force and torque (..., 6) of the weight, in the sensor's frame about its origin, at poses (..., 7).
+        """Wrench (..., 6) of the weight, in the sensor's frame about its origin, at poses (..., 7).
 
-        Only the orientation matters. The tool is taken to be at rest: what it takes to accelerate it stays in
-        the wrench.
+        It depends on the orientation only. Inertial forces are not compensated.
 
         Raises:
             InputError: a pose is not seven finite numbers with a unit quaternion.
@@ -61,7 +60,7 @@ class ToolLoad:
 
 
 def gravity_in(world_from_sensor: Array, gravity: tuple[float, float, float] = STANDARD_GRAVITY) -> Array:
-    """Gravity (..., 3) in the axes of sensors at poses (..., 7), m/s^2.
+    """Gravity (..., 3) in the frames of sensors at poses (..., 7), m/s^2.
 
     Raises:
         InputError: a pose is not seven finite numbers with a unit quaternion.
@@ -73,37 +72,33 @@ def gravity_in(world_from_sensor: Array, gravity: tuple[float, float, float] = S
     return np.asarray(turn.inv().apply(gravity)).reshape(*pose.shape[:-1], 3)
 
 
-def in_frame(wrench: Array, to_from_from: Array) -> Array:
-    """Wrenches (..., 6) of one frame, about its origin, in another's: say from the sensor's to the peg's.
+def transform_wrench(wrench: Array, to_from_from: Array) -> Array:
+    """Wrenches (..., 6) in another frame, about its origin, such as the peg's instead of the sensor's.
 
     Args:
         wrench: force and torque (..., 6).
-        to_from_from: (7,) the pose that takes from the wrench's frame to the other: `peg_from_sensor`.
+        to_from_from: (7,) the pose from the wrench's frame to the other: `peg_from_sensor`.
 
     Raises:
-        InputError: the shapes do not fit, or the pose holds no unit quaternion.
+        InputError: the pose is not seven finite numbers with a unit quaternion.
     """
     wrench = np.asarray(wrench, dtype=np.float64)
     pose = as_pose(to_from_from, "the pose from one wrench's frame to the other").numpy()
-    if wrench.ndim == 0 or wrench.shape[-1] != 6 or pose.shape != (7,):
-        raise InputError(
-            f"wrenches have shape {wrench.shape} and the pose {pose.shape}; give (..., 6) and (7,)."
-        )
     turn = Rotation.from_quat(pose[[4, 5, 6, 3]]).as_matrix()
     force = wrench[..., :3] @ turn.T
     return np.concatenate([force, wrench[..., 3:] @ turn.T + np.cross(pose[:3], force)], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
-class IdentifiedLoad:
-    """What static poses say of a tool.
+class LoadEstimate:
+    """A tool's load, estimated from static readings.
 
     Attributes:
         load: mass and centre of mass.
-        bias: (6,) what the sensor reads without any load, N and N m.
+        bias: (6,) the sensor's zero, N and N m.
         covariance: (10, 10) of mass (kg), centre (m) and bias (N, N m), in this order.
-        noise: standard deviations of a reading about the fit, N and N m.
-        readings: how many poses there were.
+        noise: standard deviations of a reading's residuals, N and N m.
+        readings: the number of readings.
     """
 
     load: ToolLoad
@@ -113,25 +108,26 @@ class IdentifiedLoad:
     readings: int
 
     @property
-    def spread(self) -> Array:
+    def standard_deviation(self) -> Array:
         """Standard deviations (10,) of mass, centre and bias."""
         return np.sqrt(np.diagonal(self.covariance))
 
 
 def identify_load(
     wrench: Array, world_from_sensor: Array, gravity: tuple[float, float, float] = STANDARD_GRAVITY
-) -> IdentifiedLoad:
+) -> LoadEstimate:
     """Mass, centre of mass and the sensor's bias, from readings at rest and free of contact.
 
-    With g the gravity in the sensor's axes, force = m g + bias and torque = (m c) x g + bias are linear in m,
-    m c and the biases: two least squares, their noise from their residuals. The centre is m c over m, its
-    covariance to first order. Poses tilted about two axes by 30 degrees or more are enough; six to ten, each
-    the mean of a second, are usual. Readings that share an error (a cable that pulls) are not that certain.
+    With g the gravity in the sensor's frame, force = m g + bias and torque = (m c) x g + bias are linear in
+    m, m c and the biases: two least-squares problems, whose noise is estimated from their residuals. The
+    centre is m c over m, its covariance to first order. Poses tilted about two axes by 30 degrees or more are
+    enough; six to ten, each the mean of a second, are usual. The covariance does not include errors that
+    readings share, such as the pull of a cable.
 
     Args:
-        wrench: (K, 6) raw readings, force (N) and torque (N m) that the tool's weight exerts on the sensor,
-            in the sensor's frame about its origin.
-        world_from_sensor: (K, 7) where the sensor was.
+        wrench: (K, 6) raw readings, force (N) and torque (N m) of the tool's weight on the sensor, in the
+            sensor's frame about its origin.
+        world_from_sensor: (K, 7) the sensor's poses.
         gravity: (3,) in the world, m/s^2.
 
     Raises:
@@ -146,7 +142,7 @@ def identify_load(
         )
     if len(wrench) < 4:
         raise InputError(
-            f"{len(wrench)} static readings do not tell a load from a bias; give four or more, "
+            f"{len(wrench)} static readings do not determine load and bias; give four or more, "
             "tilted about different axes."
         )
     if not np.isfinite(wrench).all():
@@ -154,7 +150,7 @@ def identify_load(
     _check_gravity(gravity)
     pulls = gravity_in(pose, gravity)
     values = np.linalg.svd(pulls - pulls.mean(axis=0), compute_uv=False) / np.sqrt(len(pulls))
-    # Gravity that only moves along one line leaves the centre's place on it open.
+    # Directions of gravity in one plane leave the centre's place along a line undetermined.
     if values[1] < TURNED * np.linalg.norm(gravity):
         raise InputError(
             "the static readings hold the sensor at nearly the same tilt, or tilted about one axis only by "
@@ -169,8 +165,8 @@ def identify_load(
     solution, torque_covariance, torque_noise = _least_squares(torques, wrench[:, 3:].reshape(-1))
     if mass <= 0:
         raise InputError(
-            f"the static readings give a mass of {mass:.3g} kg; the forces have the wrong sign or too little "
-            "load: give what the weight exerts on the sensor."
+            f"the static readings give a mass of {mass:.3g} kg; the forces have the wrong sign, or the load "
+            "is too small: give the weight's force on the sensor."
         )
     center = solution[:3] / mass
     if not np.linalg.norm(center) <= FARTHEST_CENTER:
@@ -179,32 +175,28 @@ def identify_load(
             "the torques are probably in N mm; scale them by 0.001."
         )
     # From (mass, force bias) and (m c, torque bias) to mass, centre and bias.
-    turn = np.zeros((10, 10))
-    turn[0, 0] = 1.0
-    turn[1:4, 0], turn[1:4, 4:7] = -center / mass, np.eye(3) / mass
-    turn[4:7, 1:4], turn[7:, 7:] = np.eye(3), np.eye(3)
-    apart = np.zeros((10, 10))
-    apart[:4, :4], apart[4:, 4:] = force_covariance, torque_covariance
+    jacobian = np.zeros((10, 10))
+    jacobian[0, 0] = 1.0
+    jacobian[1:4, 0], jacobian[1:4, 4:7] = -center / mass, np.eye(3) / mass
+    jacobian[4:7, 1:4], jacobian[7:, 7:] = np.eye(3), np.eye(3)
+    blocks = np.zeros((10, 10))
+    blocks[:4, :4], blocks[4:, 4:] = force_covariance, torque_covariance
     load = ToolLoad(float(mass), (float(center[0]), float(center[1]), float(center[2])), gravity)
-    return IdentifiedLoad(
+    return LoadEstimate(
         load,
         np.concatenate([force_bias, solution[3:]]),
-        turn @ apart @ turn.T,
+        jacobian @ blocks @ jacobian.T,
         (force_noise, torque_noise),
         count,
     )
 
 
-def _least_squares(design: Array, seen: Array) -> tuple[Array, Array, float]:
-    """Solution, its covariance, and the noise's standard deviation from the residuals."""
-    solution = np.asarray(np.linalg.lstsq(design, seen, rcond=None)[0], dtype=np.float64)
-    residual = seen - design @ solution
-    variance = float(residual @ residual) / (len(seen) - design.shape[1])
-    return (
-        solution,
-        np.asarray(variance * np.linalg.inv(design.T @ design), dtype=np.float64),
-        float(np.sqrt(variance)),
-    )
+def _least_squares(design: Array, readings: Array) -> tuple[Array, Array, float]:
+    """Solution, its covariance, and the noise's standard deviation estimated from the residuals."""
+    solution = np.asarray(np.linalg.lstsq(design, readings, rcond=None)[0])
+    residual = readings - design @ solution
+    variance = float(residual @ residual) / (len(readings) - design.shape[1])
+    return solution, np.asarray(variance * np.linalg.inv(design.T @ design)), float(np.sqrt(variance))
 
 
 def _check_gravity(gravity: tuple[float, float, float]) -> None:

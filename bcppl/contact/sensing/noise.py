@@ -1,4 +1,4 @@
-"""How a wrench errs, and how much of that is left after averaging, filtering and taring."""
+"""Noise of a wrench, and its covariance after averaging, filtering and taring."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class WrenchNoise:
-    """Independent noise of each sample of a wrench, the same along and about every axis.
+    """Independent noise of the samples of a wrench, isotropic in force and in torque.
 
     Attributes:
         force: standard deviation of a force, N.
@@ -32,14 +32,12 @@ class WrenchNoise:
             )
 
     def covariance(self, share: float = 1.0) -> Array:
-        """Covariance (6, 6) of a wrench that keeps a share of a sample's variance.
+        """Covariance (6, 6) of a wrench with a share of a sample's variance.
 
         Args:
-            share: 1 / n for the mean of n samples, `filtered_share` behind a filter; and 1 / n more where the
+            share: 1 / n for the mean of n samples, `variance_gain` after a filter; and 1 / n more where the
                 sensor's zero is the mean of n samples.
         """
-        if not share > 0:
-            raise InputError(f"a wrench keeps {share!r} of its noise's variance; give a share above 0.")
         return share * np.diag([self.force**2] * 3 + [self.torque**2] * 3)
 
 
@@ -52,8 +50,7 @@ def checked_covariance(given: Array | WrenchNoise, wrenches: int) -> Array:
     covariance = given.covariance() if isinstance(given, WrenchNoise) else np.asarray(given, np.float64)
     if covariance.shape not in ((6, 6), (wrenches, 6, 6)):
         raise InputError(
-            f"the wrenches' covariance has shape {covariance.shape} for {wrenches} wrenches; "
-            "give (6, 6) or (wrenches, 6, 6)."
+            f"the covariance has shape {covariance.shape} for {wrenches} wrenches; give (6, 6) or (M, 6, 6)."
         )
     turned = np.swapaxes(covariance, -1, -2)
     scale = np.sqrt(np.abs(np.diagonal(covariance, axis1=-2, axis2=-1)))
@@ -67,13 +64,13 @@ def checked_covariance(given: Array | WrenchNoise, wrenches: int) -> Array:
 
 
 def noise_at_rest(wrench: Array) -> WrenchNoise:
-    """The noise of samples (n, 6) without contact: their scatter about their mean, all axes alike.
+    """The noise of samples (n, 6) without contact, estimated from their variance.
 
     Raises:
         InputError: fewer than five samples, or one that is not finite.
     """
     wrench = np.asarray(wrench, dtype=np.float64)
-    if wrench.ndim != 2 or wrench.shape[1] != 6 or len(wrench) < 5 or not np.isfinite(wrench).all():
+    if len(wrench) < 5 or not np.isfinite(wrench).all():
         raise InputError(
             f"wrenches at rest have shape {wrench.shape} or are not finite; give five samples (n, 6) or more."
         )
@@ -81,8 +78,8 @@ def noise_at_rest(wrench: Array) -> WrenchNoise:
     return WrenchNoise(float(np.sqrt(variance[:3].mean())), float(np.sqrt(variance[3:].mean())))
 
 
-def filtered_share(sections: Array) -> float:
-    """The share of white noise's variance that a filter of second-order sections (S, 6) lets through."""
+def variance_gain(sections: Array) -> float:
+    """Variance of filtered white noise of unit variance, for a filter of second-order sections (S, 6)."""
     impulse = np.zeros(20000)
     impulse[0] = 1.0
     return float(np.square(sosfilt(sections, impulse)).sum()) if len(sections) else 1.0

@@ -1,8 +1,9 @@
-"""When contact begins: found in a force as it comes in, and then how surely it is known when."""
+"""Contact onset detection: when a force leaves its noise, and the posterior of the time of onset."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +15,10 @@ from bcppl.errors import InputError
 Array = npt.NDArray[np.float64]
 
 _FINE = 0.05  # of the time between samples: the grid of onset times
-_STEPS = {0.0: 0.2, 0.5: 0.05, 1.0: 0.05}  # samples in which a force may grow to what it stays at: how likely
-_RATES = np.geomspace(1.0, 1e-3, 7)  # shares of the largest force that a sample may add, all equally likely
-_QUIET = 10.0  # nats by which nothing must explain the force better than a contact does, for it to be over
-_LARGEST = 1e4  # deviations beyond which a force is no surer
+_STEPS = {0.0: 0.2, 0.5: 0.05, 1.0: 0.05}  # prior of rise times to a constant force, in samples
+_RATES = np.geomspace(1.0, 1e-3, 7)  # of a growing force, in largest forces per sample, equally likely
+_QUIET = 10.0  # nats by which noise must explain the force better than contact does at its end
+_LARGEST = 1e4  # standard deviations at which a force is clipped
 
 
 @dataclass(frozen=True)
@@ -25,62 +26,62 @@ class Onset:
     """One contact in a signal.
 
     Attributes:
-        alarm: the sample at which it was noticed.
-        end: the first sample at which it is over; the signal's length where it lasts.
-        time: when it began, seconds on the signal's clock: the mean of what the force says of it.
-        spread: standard deviation of that, seconds.
+        alarm: the sample at which it is detected.
+        end: the first sample after it; the signal's length where it lasts.
+        time: posterior mean of the time of onset, seconds on the signal's clock.
+        standard_deviation: of that time, seconds.
     """
 
     alarm: int
     end: int
     time: float
-    spread: float
+    standard_deviation: float
 
 
 @dataclass(frozen=True)
 class OnsetDetector:
-    """Finds where a force leaves its noise.
+    """Detects where a force leaves its noise.
 
-    Zero and noise are those of the first samples. Contact is noticed where the force's multivariate
+    Zero and noise are estimated from the first samples. Contact is detected where the force's multivariate
     cumulative sum (Crosier 1988, "Multivariate generalizations of cumulative sum quality-control schemes",
-    Technometrics 30(3), the second scheme) exceeds `limit`, or, with a threshold, where the force does. Only
-    samples up to the present one decide. With the defaults and white Gaussian noise on three axes, one signal
-    in a thousand of 2000 samples has a false alarm.
+    Technometrics 30(3), the second scheme) exceeds `limit`, or, with a threshold, where the force does. An
+    alarm depends on no later sample. With the defaults and white Gaussian noise on three axes, one signal in
+    a thousand of 2000 samples has a false alarm.
 
-    It is over once the cumulative sum of the opposite question says so (Page 1954, "Continuous inspection
-    schemes", Biometrika 41): whether noise alone explains the forces better, by 10 nats, than one of `drift`
-    deviations in any direction. So a force that lasts is one contact, whether it is strong or hardly seen.
-    With a threshold it is over once the force stays below `release` times that for `quiet` samples. That it
-    is over is known some samples after `end`: eight or so, or `quiet`.
+    The end of a contact is detected by the cumulative sum of the opposite test (Page 1954, "Continuous
+    inspection schemes", Biometrika 41): whether noise alone explains the forces better, by 10 nats, than a
+    force of `drift` standard deviations in any direction. So a lasting force is one contact, strong or weak.
+    With a threshold the contact ends where the force stays below `release` times that for `quiet` samples.
+    The end is detected some samples after `end`: about eight, or `quiet`.
 
-    When it began is computed once `after` more samples are there: the force is taken to be zero until the
-    onset and then to grow evenly, in an unknown direction at a rate of unknown size, or to step
-    within a sample; beforehand the onset is anywhere before the alarm.
+    The time of onset has a posterior given `after` more samples: the force is zero until the onset and then
+    grows linearly, in an unknown direction at an unknown rate, or rises to a constant within a sample. The
+    prior is uniform over the samples before the alarm.
 
     Measured on 1000 contacts each, on three axes of white noise, at any time between two samples, ten samples
-    at rest (z is the time's error over `spread`, errors in samples):
+    at rest (z is the time's error over `standard_deviation`, errors in samples):
 
-        force, in deviations           error       spread         z        |z| < 2
+        force over noise               error       stated         z        |z| < 2
         steps to 8                 -0.12 (0.32)     0.33    -0.35 (0.96)    98.9 %
         steps to 4                 -0.58 (1.19)     1.25    -0.41 (0.96)    97.5 %
         grows by 0.3 in a sample    0.07 (2.07)     2.06     0.18 (1.18)    93.7 %
         grows by 1 in a sample     -0.01 (0.86)     0.82     0.08 (1.11)    93.0 %
         grows by 4 in a sample     -0.03 (0.25)     0.24    -0.06 (1.08)    93.7 %
 
-    In the brackets are standard deviations. After a step, `time` is between the last sample before it and the
-    first one after it, for nothing tells more; it is a little early, for a force may also grow within a
-    sample. A noise that is judged by ten samples is off by a seventh and more: give it more where there are.
+    Standard deviations are in brackets. After a step, `time` is between the last sample before it and the
+    first one after it; it is a little early, because a force may also grow within a sample. The noise
+    estimated from ten samples is off by a seventh and more: use more where there are.
 
     Attributes:
         rest: the number of first samples, free of contact.
         threshold: N; None for one that follows from the noise.
-        drift: deviations by which the force may be off for ever without an alarm: a zero that wanders.
-        limit: deviations that the cumulative sum may reach.
-        release: share of the threshold below which contact is over.
+        drift: error of the zero, in standard deviations, that never raises an alarm.
+        limit: of the cumulative sum, in standard deviations.
+        release: share of the threshold below which contact ends.
         quiet: samples for which the force must stay below that.
-        resolution: N: the noise is taken to be at least this; a sensor's least count, say.
-        before: samples ahead of the alarm among which the onset is looked for.
-        after: samples beyond the alarm that the ramp is fitted to.
+        resolution: N; lower bound of the noise, such as a sensor's quantum.
+        before: samples before the alarm among which the onset may be.
+        after: samples after the alarm that the posterior uses.
 
     Raises:
         InputError: a setting is no number, not finite or out of range.
@@ -98,20 +99,19 @@ class OnsetDetector:
 
     def __post_init__(self) -> None:
         for name, least in (("rest", 5), ("quiet", 1), ("before", 1), ("after", 0)):
-            whole_number(f"an onset is looked for with {name} = {{}}", getattr(self, name), least=least)
+            whole_number(f"an onset detector has {name} = {{}}", getattr(self, name), least=least)
         for name in ("drift", "limit", *(() if self.threshold is None else ("threshold",))):
-            number_within(f"an onset is looked for with {name} = {{}}", getattr(self, name), above=0.0)
-        number_within("an onset is looked for with release = {}", self.release, above=0.0, most=1.0)
-        number_within("an onset is looked for with resolution = {}", self.resolution, least=0.0)
+            number_within(f"an onset detector has {name} = {{}}", getattr(self, name), above=0.0)
+        number_within("an onset detector has release = {}", self.release, above=0.0, most=1.0)
+        number_within("an onset detector has resolution = {}", self.resolution, least=0.0)
 
     def onsets(self, times: Array, force: Array) -> list[Onset]:
-        """All contacts in a signal, in order; none where nothing is touched.
+        """The contacts in a signal, in order.
 
         Args:
             times: (T,) seconds, increasing.
-            force: (T, D) raw, newtons, or any other quantity that contact moves. Rows that are not finite
-                before the first that is, as `Sensing.tared` gives them while taring, are passed over; samples
-                are counted from the first row all the same.
+            force: (T, D) raw, newtons, or any other quantity that contact changes. Leading rows that are not
+                finite, as `ContactSensing.tared` returns them while taring, are ignored but counted.
 
         Raises:
             InputError: shapes do not fit, a later number is not finite, there are no more samples than
@@ -123,50 +123,50 @@ class OnsetDetector:
                 f"a force of shape {force.shape} at times {times.shape} does not fit; "
                 "give (T, axes) and (T,)."
             )
-        told = np.asarray(np.isfinite(force).all(axis=1))
-        lead = int(told.argmax()) if told.any() else len(told)
+        finite = np.asarray(np.isfinite(force).all(axis=1))
+        lead = int(finite.argmax()) if finite.any() else len(finite)
         if len(times) - lead <= self.rest:
             raise InputError(
                 f"a force of {len(times) - lead} samples is too short, or not finite; give more than the "
                 f"{self.rest} at rest."
             )
-        if not told[lead:].all():
+        if not finite[lead:].all():
             raise InputError(
-                f"a force is not finite at row {lead + int((~told[lead:]).argmax())}; fill it by "
+                f"a force is not finite at row {lead + int((~finite[lead:]).argmax())}; fill it by "
                 "interpolation, or cut the signal there."
             )
         if not (np.diff(times) > 0).all():
-            raise InputError("a force's times do not increase; sort its rows and drop doubles.")
+            raise InputError("a force's times do not increase; sort its rows and drop duplicates.")
         return [
-            Onset(onset.alarm + lead, onset.end + lead, onset.time, onset.spread)
-            for onset in self._found(times[lead:], force[lead:])
+            replace(onset, alarm=onset.alarm + lead, end=onset.end + lead)
+            for onset in self._detected(times[lead:], force[lead:])
         ]
 
-    def _found(self, times: Array, force: Array) -> list[Onset]:
-        calm = force[: self.rest]
-        variance = calm.var(axis=0, ddof=1).mean()
+    def _detected(self, times: Array, force: Array) -> list[Onset]:
+        rest = force[: self.rest]
+        variance = rest.var(axis=0, ddof=1).mean()
         noise = max(float(np.sqrt(variance)), self.resolution)
         if noise == 0.0:
             raise InputError(
                 f"the first {self.rest} samples of a force are all equal; set resolution to the sensor's."
             )
-        scaled = (force - calm.mean(axis=0)) / noise
+        scaled = (force - rest.mean(axis=0)) / noise
         size = np.linalg.norm(scaled, axis=1)
         level = self.limit if self.threshold is None else self.threshold / noise
-        found, sample = [], self.rest
+        onsets, sample = [], self.rest
         while (alarm := self._alarm(scaled, size, sample, level)) is not None:
-            end = self._over(size, scaled.shape[1], alarm + 1, self.release * level)
-            found.append(Onset(alarm, end, *self._began(times, scaled, sample, alarm)))
+            end = self._end(size, scaled.shape[1], alarm + 1, self.release * level)
+            onsets.append(Onset(alarm, end, *self._onset_time(times, scaled, sample, alarm)))
             sample = end
-        return found
+        return onsets
 
-    def _over(self, size: Array, axes: int, first: int, level: float) -> int:
-        """The first sample from `first` on at which contact is over, of sizes (T,) in deviations."""
+    def _end(self, size: Array, axes: int, first: int, level: float) -> int:
+        """The first sample from `first` on without contact, of magnitudes (T,) in standard deviations."""
         if self.threshold is not None:
             low = np.convolve(size[first:] < level, np.ones(self.quiet), mode="valid") > self.quiet - 0.5
-            # Fewer samples than `quiet` are left at the end: too few to say.
+            # Fewer samples than `quiet` at the end do not end a contact.
             return first + int(low.argmax()) if len(size) - first >= self.quiet and low.any() else len(size)
-        # log 0F1(; D/2; z^2/4): of the mean, over all directions, of exp(z cos).
+        # log 0F1(; D/2; z^2/4), the logarithm of the mean of exp(z cos) over all directions.
         z, order = self.drift * np.clip(size[first:], 1e-9, _LARGEST), 0.5 * axes - 1.0
         mean = np.log(ive(order, z)) + z + gammaln(order + 1.0) - order * np.log(0.5 * z)
         total, begin = 0.0, first
@@ -179,7 +179,7 @@ class OnsetDetector:
         return len(size)
 
     def _alarm(self, scaled: Array, size: Array, first: int, level: float) -> int | None:
-        """The first sample from `first` on at which contact is noticed."""
+        """The first sample from `first` on at which contact is detected."""
         if self.threshold is not None:
             above = np.flatnonzero(size[first:] > level)
             return first + int(above[0]) if above.size else None
@@ -192,33 +192,37 @@ class OnsetDetector:
                 return k
         return None
 
-    def _began(self, times: Array, scaled: Array, free: int, alarm: int) -> tuple[float, float]:
-        """Mean and deviation of the onset's time, for an alarm at a sample and no contact at `free`."""
+    def _onset_time(self, times: Array, scaled: Array, free: int, alarm: int) -> tuple[float, float]:
+        """Mean and standard deviation of the time of onset, for an alarm at a sample and none at `free`."""
         first = max(alarm - self.before, min(free, alarm - 1), 0)
-        seen, at = scaled[first : alarm + self.after + 1], times[first : alarm + self.after + 1]
+        used, at = scaled[first : alarm + self.after + 1], times[first : alarm + self.after + 1]
         step = float(np.median(np.diff(at)))
         onset = np.arange(times[first], times[alarm] - 0.5 * _FINE * step, _FINE * step)
         risen = np.maximum(at - onset[:, None], 0.0) / step
-        # The force in the end is beforehand normal, as wide as the largest seen; the rate, per sample, normal
-        # too, but how wide is not known: one width only would favour early onsets or late ones.
-        largest = float(np.linalg.norm(seen, axis=1).max()) ** 2
-        shapes = [
-            (np.minimum(risen / max(rise, 1e-9), 1.0), largest, likely) for rise, likely in _STEPS.items()
+        # Priors: the final force is normal, of the largest one's scale; the rate per sample is a mixture of
+        # normals of several scales, for a single one would favour early onsets or late ones.
+        largest = float(np.linalg.norm(used, axis=1).max()) ** 2
+        ramps = [
+            (np.minimum(risen / max(rise, 1e-9), 1.0), [largest], prior) for rise, prior in _STEPS.items()
         ]
         growing = (1.0 - sum(_STEPS.values())) / len(_RATES)
-        shapes += [(risen, largest * share**2, growing) for share in _RATES]
-        log_p = np.stack([np.log(weight) + self._fit(seen, ramp, wide) for ramp, wide, weight in shapes])
+        ramps.append((risen, [largest * share**2 for share in _RATES], growing))
+        log_p = np.concatenate(
+            [np.log(prior) + self._log_evidence(used, ramp, sizes) for ramp, sizes, prior in ramps]
+        )
         weight = np.exp(log_p - log_p.max()).sum(axis=0)
         weight /= weight.sum()
         mean = float(weight @ onset)
-        spread = float(np.sqrt(weight @ np.square(onset - mean) + (_FINE * step) ** 2 / 12.0))
-        return mean, spread
+        variance = weight @ np.square(onset - mean) + (_FINE * step) ** 2 / 12.0
+        return mean, float(np.sqrt(variance))
 
-    def _fit(self, seen: Array, ramp: Array, wide: float) -> Array:
-        """Log-evidence (G,) of ramps (G, n) in forces (n, D), their height normal, of variance `wide`."""
-        # The zero is the mean of `rest` samples and errs alike in all that are seen (Woodbury's identity).
-        known = self.rest + len(seen)
+    def _log_evidence(self, force: Array, ramp: Array, variances: Sequence[float]) -> Array:
+        """Log-evidence (V, G) of ramps (G, n) in forces (n, D), their height normal with V variances."""
+        # The error of the zero, the mean of `rest` samples, is common to all forces (Woodbury's identity).
+        known = self.rest + len(force)
         power = np.square(ramp).sum(axis=1) - ramp.sum(axis=1) ** 2 / known
-        fit = ramp @ seen - ramp.sum(axis=1)[:, None] * seen.sum(axis=0) / known
-        log_p = 0.5 * np.square(fit).sum(axis=1) / (power + 1.0 / wide)
-        return np.asarray(log_p - 0.5 * seen.shape[1] * np.log1p(wide * power), dtype=np.float64)
+        fit = ramp @ force - ramp.sum(axis=1)[:, None] * force.sum(axis=0) / known
+        square = 0.5 * np.square(fit).sum(axis=1)
+        return np.stack(
+            [square / (power + 1.0 / v) - 0.5 * force.shape[1] * np.log1p(v * power) for v in variances]
+        )

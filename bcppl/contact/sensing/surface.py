@@ -1,4 +1,4 @@
-"""Where a peg can be touched: its faces as lines enter them, its sharp edges and its corners."""
+"""The surface of a peg: its intersections with lines, its sharp edges and its corners."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from bcppl.geometry.parts import Part
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-SHARP = np.radians(30.0)  # faces that meet at less than this are one smooth surface, edges one smooth curve
-STEP = 2e-5  # m past a crossing from which the next one is looked for: thinner walls are not seen
-MOST_LAYERS = 12  # how often a line may cross the surface
+SHARP = np.radians(30.0)  # faces that meet at less than this form one smooth surface, edges one smooth curve
+STEP = 2e-5  # m past a crossing where the next ray begins: thinner walls are missed
+MOST_LAYERS = 12  # times that a line may enter the surface
 
 
 class Crossings(NamedTuple):
-    """Where lines enter a solid, one row for each crossing.
+    """Points where lines enter a solid.
 
     Attributes:
-        line: (Q,) which line.
-        point: (Q, 3) where.
-        face: (Q,) which triangle.
+        line: (Q,) index of the line.
+        point: (Q, 3).
+        face: (Q,) index of the triangle.
     """
 
     line: Indices
@@ -42,9 +42,9 @@ class Edges(NamedTuple):
 
     Attributes:
         start: (E, 3).
-        extent: (E, 3) from its start to its end.
-        normals: (E, 9, 3) outward normals from one face's to the other's.
-        chain: (E,) which smooth curve it belongs to.
+        extent: (E, 3) from start to end.
+        normals: (E, 9, 3) outward normals, from one face's to the other's.
+        chain: (E,) index of its smooth curve.
     """
 
     start: Array
@@ -53,12 +53,8 @@ class Edges(NamedTuple):
     chain: Indices
 
 
-def closed_mesh(part: Part) -> trimesh.Trimesh:
-    """A part's mesh, its doubled vertices merged and its empty triangles left out.
-
-    Raises:
-        InputError: it is empty, open, not finite or in millimetres.
-    """
+def _closed_mesh(part: Part) -> trimesh.Trimesh:
+    """A part's mesh, its duplicate vertices merged and its degenerate triangles left out."""
     mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
     if len(part.vertices) and len(part.faces):
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
@@ -68,24 +64,22 @@ def closed_mesh(part: Part) -> trimesh.Trimesh:
 
 
 class PegSurface:
-    """The surface of a part that is touched, in its frame.
+    """The surface of a part, in its frame.
 
     Attributes:
-        mesh: closed, its doubled vertices merged.
-        center: (3,) of a ball around it.
+        mesh: closed, its duplicate vertices merged.
+        center: (3,) of a bounding ball.
         radius: of that ball, metres.
-        normals: (F, 3) outward normals of its triangles.
-        patch: (F,) which smooth surface each triangle belongs to.
+        anchors: (F, 3) a corner of each triangle.
+        normals: (F, 3) outward normals of the triangles.
         area: m^2.
+
+    Raises:
+        InputError: the mesh is empty, open, not finite or in millimetres.
     """
 
     def __init__(self, part: Part) -> None:
-        """Prepare a part.
-
-        Raises:
-            InputError: its mesh is empty, open, not finite or in millimetres.
-        """
-        self.mesh = mesh = closed_mesh(part)
+        self.mesh = mesh = _closed_mesh(part)
         vertices = np.asarray(mesh.vertices, dtype=np.float64)
         self.center = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         self.radius = float(np.linalg.norm(vertices - self.center, axis=1).max())
@@ -93,10 +87,13 @@ class PegSurface:
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self.normals = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         self.area = float(mesh.area)
-        self._anchor = corners[:, 0]
-        smooth = mesh.face_adjacency[mesh.face_adjacency_angles < SHARP]
-        self.patch = _groups(smooth, len(mesh.faces))
-        self._layers = 1 if mesh.is_convex else MOST_LAYERS
+        self.anchors = corners[:, 0]
+
+    @cached_property
+    def patch(self) -> Indices:
+        """(F,) the smooth surface that each triangle belongs to."""
+        smooth = self.mesh.face_adjacency[self.mesh.face_adjacency_angles < SHARP]
+        return _groups(smooth, len(self.mesh.faces))
 
     @cached_property
     def _scene(self) -> EmbreeScene:
@@ -104,41 +101,47 @@ class PegSurface:
         TriangleMesh(scene, self.mesh.vertices.astype(np.float32), self.mesh.faces.astype(np.int32))
         return scene
 
-    def entered(self, point: Array, direction: Array) -> Crossings:
-        """Everywhere that lines through points (L, 3), with unit directions (L, 3), enter the solid.
+    def first_face(self, origin: Array, direction: Array) -> Indices:
+        """The first triangle (L,) that rays meet, -1 for none, in single precision."""
+        rays = (origin.astype(np.float32), direction.astype(np.float32))
+        return np.asarray(self._scene.run(*rays), dtype=np.int64)
 
-        In double precision: the ray tracer only says which triangle.
+    def entries(self, point: Array, direction: Array) -> Crossings:
+        """All points where lines through points (L, 3), with unit directions (L, 3), enter the solid.
+
+        They are computed in double precision from the triangles that the ray tracer returns.
         """
         along = np.sum((self.center - point) * direction, axis=1, keepdims=True)
         origin = point + (along - 1.1 * self.radius) * direction
         line = np.arange(len(point))
-        found: list[tuple[Indices, Array, Indices]] = []
-        for _ in range(2 * self._layers - 1):
-            if len(line) == 0:
-                break
-            rays = (origin.astype(np.float32), direction.astype(np.float32))
-            face = np.asarray(self._scene.run(*rays), dtype=np.int64)
+        batches: list[tuple[Indices, Array, Indices]] = []
+        for _ in range(2 * (1 if self.mesh.is_convex else MOST_LAYERS) - 1):
+            face = self.first_face(origin, direction)
             hit = face >= 0
             line, origin, direction, face = line[hit], origin[hit], direction[hit], face[hit]
             normal = self.normals[face]
-            slope = np.sum(direction * normal, axis=1)
+            cosine = np.sum(direction * normal, axis=1)
             # A ray that grazes a triangle in single precision may be parallel to it in double precision.
-            safe = np.where(np.abs(slope) < 1e-9, 1e-9, slope)
-            reach = np.sum((self._anchor[face] - origin) * normal, axis=1) / safe
-            reach = np.where(np.abs(slope) < 1e-9, 0.0, reach)
+            safe = np.where(np.abs(cosine) < 1e-9, 1e-9, cosine)
+            reach = np.sum((self.anchors[face] - origin) * normal, axis=1) / safe
+            reach = np.where(np.abs(cosine) < 1e-9, 0.0, reach)
             at = origin + reach[:, None] * direction
-            into = slope < -1e-9
-            found.append((line[into], at[into], face[into]))
+            into = cosine < -1e-9
+            batches.append((line[into], at[into], face[into]))
+            if not len(line):
+                break
             origin = origin + (np.maximum(reach, 0.0) + STEP)[:, None] * direction
-        if not found:
-            return Crossings(np.empty(0, np.int64), np.empty((0, 3)), np.empty(0, np.int64))
-        return Crossings(*(np.concatenate(column) for column in zip(*found, strict=True)))
+        return Crossings(*(np.concatenate(column) for column in zip(*batches, strict=True)))
+
+    @property
+    def _sharp(self) -> npt.NDArray[np.bool_]:
+        """Pairs of adjacent triangles that meet at a sharp convex edge."""
+        return np.asarray((self.mesh.face_adjacency_angles >= SHARP) & self.mesh.face_adjacency_convex)
 
     @cached_property
     def edges(self) -> Edges:
         """The sharp convex edges."""
-        mesh = self.mesh
-        sharp = np.asarray((mesh.face_adjacency_angles >= SHARP) & mesh.face_adjacency_convex)
+        mesh, sharp = self.mesh, self._sharp
         pairs = np.asarray(mesh.face_adjacency_edges[sharp], dtype=np.int64)
         ends = np.asarray(mesh.vertices, dtype=np.float64)[pairs]
         start, extent = ends[:, 0], ends[:, 1] - ends[:, 0]
@@ -151,18 +154,17 @@ class PegSurface:
 
     @cached_property
     def length(self) -> float:
-        """Of all sharp convex edges, metres."""
+        """The total length of the sharp convex edges, metres."""
         return float(np.linalg.norm(self.edges.extent, axis=1).sum())
 
     @cached_property
     def corners(self) -> tuple[Array, Array]:
-        """Where three or more sharp convex edges meet (C, 3), and outward normals (C, K, 3) at each.
+        """Points (C, 3) where three or more sharp convex edges meet, and outward normals (C, K, 3) at each.
 
-        The normals are those of the faces and between; where there are fewer, some are there twice.
+        The normals are those of the faces and between; where there are fewer, some are repeated.
         """
         mesh = self.mesh
-        sharp = np.asarray((mesh.face_adjacency_angles >= SHARP) & mesh.face_adjacency_convex)
-        count = np.bincount(mesh.face_adjacency_edges[sharp].reshape(-1), minlength=len(mesh.vertices))
+        count = np.bincount(mesh.face_adjacency_edges[self._sharp].reshape(-1), minlength=len(mesh.vertices))
         chosen = np.flatnonzero(count >= 3)
         weights = np.array([(i, j, 9 - i - j) for i in range(10) for j in range(10 - i)]) / 9.0
         normals = []
@@ -179,14 +181,14 @@ class PegSurface:
 
 
 def _groups(pairs: npt.ArrayLike, count: int) -> Indices:
-    """Labels (count,) of what is connected by pairs (P, 2)."""
+    """Labels (count,) of the connected components of a graph with edges (P, 2)."""
     linked = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
     graph = coo_array((np.ones(len(linked)), (linked[:, 0], linked[:, 1])), shape=(count, count))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def _chains(pairs: Indices, extent: Array) -> Indices:
-    """Labels (E,) of edges that go on into one another without a sharp turn."""
+    """Labels (E,) of edges that continue one another without a sharp turn."""
     ends: dict[int, list[int]] = {}
     for edge, vertices in enumerate(pairs):
         for vertex in vertices:

@@ -1,4 +1,4 @@
-"""Whether wrenches can be in the units that they should be in."""
+"""A check of the units of wrenches."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from bcppl.errors import InputError
 
 Array = npt.NDArray[np.float64]
 
-LONGEST_LEVER = 30.0  # a force that acts this many times as far off as the peg reaches has torques in N mm
+LONGEST_LEVER = 30.0  # in reaches of the peg; torques that need a longer one are in N mm
 
 
 def refuse_millimetres(wrench: Array, reach: float) -> None:
-    """Refuse tared wrenches (M, 6) in contact with a peg that ends `reach` metres from their origin.
+    """Refuse tared wrenches (M, 6) in contact whose torques are in N mm, unless they are fewer than three.
 
-    Fewer than three are not judged.
+    Args:
+        wrench: (M, 6) force and torque.
+        reach: the distance of the peg's farthest point from their origin, metres.
 
     Raises:
-        InputError: the torques are so large that they must be in N mm.
+        InputError: the torques are too large to be in N m.
     """
     if len(wrench) < 3:
         return
@@ -26,6 +28,6 @@ def refuse_millimetres(wrench: Array, reach: float) -> None:
     lever = float(np.median(torque / force))
     if lever > LONGEST_LEVER * reach:
         raise InputError(
-            f"the wrenches push {lever:.3g} m beside the origin of a peg that ends {reach:.3g} m from it: "
+            f"the wrenches act {lever:.3g} m from the origin of a peg that ends {reach:.3g} m from it: "
             "their torques are probably in N mm; scale them by 0.001."
         )

@@ -34,7 +34,7 @@ class PixelHits(Protocol):
 
 
 class RendersDepth(Protocol):
-    """A simulator of depth images, such as `bcppl.rendering.renderer.DepthRenderer`.
+    """A simulator of depth images, such as `bcppl.rendering.ray_casting.RayCaster`.
 
     One that renders K parts together has them in its attribute `parts` and takes poses (N, K, 7), as
     `bcppl.rendering.scene.SceneRenderer` does.

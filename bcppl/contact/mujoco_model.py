@@ -1,4 +1,4 @@
-"""The MuJoCo model of a peg that is held by a Cartesian spring-damper, beside a part."""
+"""The MuJoCo model of a peg that a Cartesian spring-damper holds, and of a part."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bcppl.robot.motion import Probe
 
 Array = npt.NDArray[np.float64]
 
-# MuJoCo's solimp, in its order, and what each may be.
+# The numbers of MuJoCo's solimp in their order, and their bounds.
 _IMPEDANCE: Mapping[str, dict[str, float]] = {
     "dmin": {"least": 0.0, "most": 1.0},
     "dmax": {"least": 0.0, "most": 1.0},
@@ -27,28 +27,28 @@ _IMPEDANCE: Mapping[str, dict[str, float]] = {
     "power": {"least": 1.0},
 }
 
-SENSED = 13  # numbers sensed at each step: position 3, quaternion 4, force 3, torque 3
+SENSOR_COLUMNS = 13  # of a sensor row: position 3, quaternion 4, force 3, torque 3
 
 
 @dataclass(frozen=True)
 class ContactParameters:
-    """What the physics of a touch hangs on, poses and the probe aside.
+    """Parameters of contact physics, apart from poses and the probe.
 
     Attributes:
-        time_step: seconds. Going down and sliding into a hole, a peg is off its path at 0.25 ms by at most
-            5 um at 1 ms, 13 at 2 and 19 at 4 (medians over poses), save where it just finds the hole.
+        time_step: seconds. Lowered into a hole and sliding in it, a peg departs from its path at 0.25 ms by
+            at most 5 um at 1 ms, 13 at 2 and 19 at 4 (medians over poses), except at the rim of the hole.
         friction: Coulomb's coefficient between peg and part.
-        time_constant: of a contact that settles, seconds (MuJoCo's solref; taken as at least two time steps).
-        damping_ratio: of a contact that settles; 1 is critical.
-        impedance: MuJoCo's solimp (5,): how hard a contact is at first, in the end, and over which depth (m).
-            A contact that is hard from the first micrometre chatters: at 3 N of steady sliding the force went
-            from 0.3 to 8 N within three steps at any time step. With the default it is steady within 1 mN,
-            and a peg sinks in by 5 um at 3 N, 12 um at 20 N flat, 45 um at 17 N on a corner.
-        arm_mass: kg that the arm seems to have at the wrench sensor.
-        arm_inertia: kg m^2 that the arm seems to have about the wrench sensor.
-        tool_mass: kg below the wrench sensor: the sensor feels it when it is accelerated.
-        elliptic: friction cones are elliptic rather than pyramidal.
-        impratio: how much harder friction is than the normal force: 100 keeps a resting peg from creeping.
+        time_constant: of a contact, seconds (MuJoCo's solref, which has a lower bound of two time steps).
+        damping_ratio: of a contact; 1 is critical.
+        impedance: MuJoCo's solimp (5,): the initial and the final impedance, and the penetration (m) between
+            them. With a high initial impedance contacts chatter: at 3 N of steady sliding the force went from
+            0.3 to 8 N within three steps at any time step. With the default it is steady within 1 mN, and the
+            penetration is 5 um at 3 N, 12 um at 20 N on a face, 45 um at 17 N on a corner.
+        arm_mass: effective mass of the arm at the wrench sensor, kg.
+        arm_inertia: effective inertia of the arm about the wrench sensor, kg m^2.
+        tool_mass: mass below the wrench sensor, whose inertial force the sensor measures, kg.
+        elliptic: whether friction cones are elliptic rather than pyramidal.
+        impratio: ratio of the impedances of friction and normal force: 100 keeps a resting peg from creeping.
     """
 
     time_step: float = 0.002
@@ -63,9 +63,9 @@ class ContactParameters:
     impratio: float = 100.0
 
     def __post_init__(self) -> None:
-        for field in ("time_step", "time_constant", "damping_ratio", "arm_mass", "arm_inertia", "tool_mass"):
+        positive = ("time_step", "time_constant", "damping_ratio", "arm_mass", "arm_inertia", "tool_mass")
+        for field in (*positive, "impratio"):
             number_within(f"contact parameter {field} is {{}}", getattr(self, field), above=0.0)
-        number_within("contact parameter impratio is {}", self.impratio, above=0.0)
         number_within("contact parameter friction is {}", self.friction, least=0.0)
         if len(self.impedance) != 5:
             raise InputError(
@@ -76,10 +76,10 @@ class ContactParameters:
 
 
 def pieces_of(part: Part) -> Sequence[Piece]:
-    """The convex pieces that a part is touched by: its own, or its hull where its mesh is convex.
+    """The convex pieces of a part in contact: its own, or its hull where its mesh is convex.
 
-    Few pieces are fast: in the hole, one simulated second took 19 ms with 4 pieces of the part, 51 with 16,
-    and 217 with 64.
+    The time grows with their number: in the hole, one simulated second took 19 ms with 4 pieces of the part,
+    51 with 16, and 217 with 64.
 
     Raises:
         InputError: the part has no pieces and its mesh is not convex.
@@ -88,8 +88,8 @@ def pieces_of(part: Part) -> Sequence[Piece]:
         return part.pieces
     if not part.mesh.is_convex:
         raise InputError(
-            f"part {part.name!r} has no convex pieces and its mesh is not convex, so it cannot be touched in "
-            "simulation; give it convex pieces with `bcppl.geometry.extrusion.extruded` (from its "
+            f"part {part.name!r} has no convex pieces and its mesh is not convex, so contact cannot be "
+            "simulated; give it convex pieces with `bcppl.geometry.extrusion.extruded` (from its "
             "outline), `bcppl.geometry.layers.prismatic` (upright walls) or "
             "`bcppl.geometry.decomposition.decomposed` (any mesh)."
         )
@@ -106,10 +106,6 @@ def _add_pieces(
         "hull": mujoco.mjtGeom.mjGEOM_MESH,
     }
     for k, piece in enumerate(pieces):
-        if piece.kind not in kinds:
-            raise InputError(
-                f"part {part.name!r} has a piece of kind {piece.kind!r}; use 'box', 'cylinder' or 'hull'."
-            )
         geom = body.add_geom(type=kinds[piece.kind])
         if piece.kind == "hull":
             name = f"{body.name} {k}"
@@ -128,11 +124,11 @@ def _add_pieces(
 def build_model(part: Part, peg: Part, parameters: ContactParameters) -> mujoco.MjModel:
     """A model with bodies "part" and "command" (mocap), "flange" (free) and "peg" (fixed below the flange).
 
-    Six actuators pull the peg's origin to the command's, along and about the command's axes, as
-    force = control - stiffness * displacement - damping * velocity; `hold` sets the two constants.
-    Sensors, in order: the peg's position and quaternion, and the force and torque that the flange exerts on
-    the peg, in the peg's frame about its origin: the opposite of the environment's wrench on the peg.
-    Gravity is compensated. No state is carried from step to step but position, velocity and time.
+    Six actuators pull the peg's origin to the command's, along and about the command's axes:
+    force = control - stiffness * displacement - damping * velocity; `set_controller` sets the two constants.
+    Sensors, in order: the peg's position and quaternion, and the flange's force and torque on the peg, in the
+    peg's frame about its origin: the negative of the environment's wrench on the peg. Gravity is compensated.
+    The state is position, velocity and time.
 
     Raises:
         InputError: the part or the peg has no convex pieces and is not convex.
@@ -152,7 +148,7 @@ def build_model(part: Part, peg: Part, parameters: ContactParameters) -> mujoco.
     cone = mujoco.mjtCone
     option.cone = cone.mjCONE_ELLIPTIC if parameters.elliptic else cone.mjCONE_PYRAMIDAL
     option.impratio = parameters.impratio
-    # A rollout that goes on from where it stopped has no warm start: only without any is it equal to the bit.
+    # A chunk of a rollout begins without a warm start: without any, chunks equal the whole to the bit.
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
 
@@ -187,18 +183,8 @@ def build_model(part: Part, peg: Part, parameters: ContactParameters) -> mujoco.
     return model
 
 
-def hold(model: mujoco.MjModel, probe: Probe) -> None:
-    """Set the spring-damper's constants of a model from `build_model` to those of a probe.
-
-    Raises:
-        InputError: a constant is negative or not finite, or there are not six of each.
-    """
-    for name, values in (("stiffness", probe.stiffness), ("damping", probe.damping)):
-        values = np.asarray(values, dtype=np.float64)
-        if values.shape != (6,) or not (np.isfinite(values).all() and (values >= 0).all()):
-            raise InputError(
-                f"probe {probe.name!r} has {name} {values.tolist()}; give six numbers, none of them negative."
-            )
+def set_controller(model: mujoco.MjModel, probe: Probe) -> None:
+    """Set the spring-damper's constants of a model from `build_model` to those of a probe."""
     model.actuator_biasprm[:, 1] = -np.asarray(probe.stiffness)
     model.actuator_biasprm[:, 2] = -np.asarray(probe.damping)
 
@@ -207,8 +193,15 @@ def check_probe(probe: Probe) -> None:
     """Refuse a probe that cannot be simulated.
 
     Raises:
-        InputError: times do not increase, shapes do not fit, or a stamp is before the command's first time.
+        InputError: times do not increase, shapes do not fit, a number is not finite, a constant of the
+            controller is negative, or a stamp is before the command's first time.
     """
+    for name, values in (("stiffness", probe.stiffness), ("damping", probe.damping)):
+        values = np.asarray(values, dtype=np.float64)
+        if values.shape != (6,) or not (np.isfinite(values).all() and (values >= 0).all()):
+            raise InputError(
+                f"probe {probe.name!r} has {name} {values.tolist()}; give six numbers, none of them negative."
+            )
     times, command, stamps = probe.command_times, probe.command, probe.stamps
     if times.ndim != 1 or command.shape != (len(times), 7) or len(times) == 0:
         raise InputError(
@@ -227,22 +220,20 @@ def check_probe(probe: Probe) -> None:
         )
 
 
-def commands(probe: Probe, times: Array) -> tuple[Array, Array]:
-    """The commanded pose (S, 7) and twist (S, 6) of a probe at times (S,), in seconds.
+def interpolated_command(probe: Probe, times: Array) -> tuple[Array, Array]:
+    """Commanded poses (S, 7) and twists (S, 6) of a probe at times (S,), in seconds.
 
     Translations are interpolated linearly and rotations along the geodesic, so that the twist, in the
-    commanded peg's axes (m/s, rad/s), is constant between two command times. After the last command the
-    pose is held.
+    commanded peg's axes (m/s, rad/s), is constant between two command times. The last pose is held.
     """
     knots, poses = probe.command_times, np.asarray(probe.command, dtype=np.float64)
     turns = Rotation.from_quat(poses[:, [4, 5, 6, 3]])
     if len(knots) == 1:
-        poses = np.broadcast_to(poses, (len(times), 7)).copy()
-        return poses, np.zeros((len(times), 6))
+        return np.repeat(poses, len(times), axis=0), np.zeros((len(times), 6))
     spans = np.diff(knots)
     speed = np.diff(poses[:, :3], axis=0) / spans[:, None]
     spin = (turns[:-1].inv() * turns[1:]).as_rotvec() / spans[:, None]
-    # A step that starts within a rounding error before a knot belongs to what follows.
+    # A step that starts within a rounding error before a knot belongs to the next segment.
     segment = np.clip(np.searchsorted(knots, times + 1e-9, side="right") - 1, 0, len(spans) - 1)
     elapsed = np.clip(times - knots[segment], 0.0, spans[segment])
     rotation = turns[segment] * Rotation.from_rotvec(spin[segment] * elapsed[:, None])
@@ -254,20 +245,22 @@ def commands(probe: Probe, times: Array) -> tuple[Array, Array]:
     return pose, twist
 
 
-def controls(probe: Probe, times: Array) -> Array:
-    """What `mujoco.rollout` is told at times (S,): control (6,) and the command's pose (7,), shape (S, 13).
+def rollout_controls(probe: Probe, times: Array) -> Array:
+    """Inputs (S, 13) of `mujoco.rollout` at times (S,): controls 6, the command's pose 7.
 
-    The control is damping * commanded twist: with it the damping acts on the peg's velocity relative to the
+    The control is damping * commanded twist, so that the damping acts on the peg's velocity relative to the
     command's, and a peg in free motion follows without lag.
     """
-    pose, twist = commands(probe, times)
+    pose, twist = interpolated_command(probe, times)
     return np.concatenate([twist * np.asarray(probe.damping), pose], axis=1)
 
 
-def steps_of(probe: Probe, time_step: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
-    """Between which steps each stamp lies: rows `low` and `high` (T,) and the weight (T,) of `high`.
+def steps_around(
+    probe: Probe, time_step: float
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
+    """The steps before and after each stamp, (T,) each, and the weight (T,) of the second.
 
-    Stamps within a nanosecond of a step are read from that step alone.
+    Stamps within a nanosecond of a step are taken from that step alone.
     """
     position = (probe.stamps - probe.command_times[0]) / time_step
     nearest = np.rint(position)

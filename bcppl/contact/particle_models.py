@@ -1,4 +1,4 @@
-"""Copies of one MuJoCo model, one for each particle, that differ in what is unknown about a touch."""
+"""Copies of one MuJoCo model, one for each particle, that differ in nuisance parameters."""
 
 from __future__ import annotations
 
@@ -13,9 +13,18 @@ from scipy.spatial.transform import Rotation
 
 Array = npt.NDArray[np.float64]
 
+# The column of a model's array that holds a parameter.
+_COLUMNS = {
+    "friction": ("friction", 0),
+    "time_constant": ("solref", 0),
+    "damping_ratio": ("solref", 1),
+    "stiffness": ("bias", 1),
+    "damping": ("bias", 2),
+}
+
 
 class _Copy(NamedTuple):
-    """A model and views of what is set in it: looking them up takes longer than setting them."""
+    """A model and views of its arrays: looking them up takes longer than setting them."""
 
     model: mujoco.MjModel
     friction: Array
@@ -26,11 +35,11 @@ class _Copy(NamedTuple):
     boxes: Array
 
 
-class ModelCopies:
-    """Copies of a model from `bcppl.contact.peg_model`, made when first needed and set anew for each use.
+class ParticleModels:
+    """Copies of a model from `bcppl.contact.mujoco_model`, made on first use and set on each use.
 
     Args:
-        model: what they are copies of, its controller set by `peg_model.hold`.
+        model: the original, its controller set by `mujoco_model.set_controller`.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -40,47 +49,39 @@ class ModelCopies:
         first, count = int(model.body_bvhadr[peg]), int(model.body_bvhnum[peg])
         self._boxes = slice(first, first + count)
         self._inertial = np.array(model.body_ipos[peg]), _rotation(np.array(model.body_iquat[peg]))
-        # One pool for each set of unknowns: what one program sets, another would not set back.
+        # One pool for each set of parameters: a program would not reset those that only another one sets.
         self._pools: dict[frozenset[str], list[_Copy]] = {}
 
-    def of(self, rows: Mapping[str, Array]) -> mujoco.MjModel | list[mujoco.MjModel]:
-        """The models of N particles, valid until the next call; the one model where nothing is unknown.
+    def given(self, nuisances: Mapping[str, Array]) -> mujoco.MjModel | list[mujoco.MjModel]:
+        """The models of N particles, valid until the next call; the one model without nuisance parameters.
 
         Args:
-            rows: what is unknown, from `grasp.in_series`.
+            nuisances: arrays (N, ...) by name, from `grasp_compliance.springs_in_series`.
         """
-        if not rows:
+        if not nuisances:
             return self.model
-        particles = len(next(iter(rows.values())))
-        pool = self._pools.setdefault(frozenset(rows), [])
+        particles = len(next(iter(nuisances.values())))
+        pool = self._pools.setdefault(frozenset(nuisances), [])
         while len(pool) < particles:
             pool.append(self._copied())
-        chosen = pool[:particles]
-        if "stiffness" in rows:
-            stiffness = self.model.actuator_biasprm[:, 1] * rows["stiffness"]
-        if "damping" in rows:
-            damping = self.model.actuator_biasprm[:, 2] * rows["damping"]
-        if "grip_from_peg" in rows:
-            places, turns, boxes = self._moved(rows["grip_from_peg"])
-        for k, each in enumerate(chosen):
-            if "friction" in rows:
-                each.friction[:, 0] = rows["friction"][k]
-            if "time_constant" in rows:
-                each.solref[:, 0] = rows["time_constant"][k]
-            if "damping_ratio" in rows:
-                each.solref[:, 1] = rows["damping_ratio"][k]
-            if "stiffness" in rows:
-                each.bias[:, 1] = stiffness[k]
-            if "damping" in rows:
-                each.bias[:, 2] = damping[k]
-            if "grip_from_peg" in rows:
+        values = dict(nuisances)
+        for column, name in ((1, "stiffness"), (2, "damping")):
+            if name in values:
+                values[name] = self.model.actuator_biasprm[:, column] * values[name]
+        moved = self._moved(values.pop("grip_from_peg")) if "grip_from_peg" in values else None
+        settings = [(*_COLUMNS[name], value) for name, value in values.items() if name in _COLUMNS]
+        for k, each in enumerate(pool[:particles]):
+            for array, column, value in settings:
+                getattr(each, array)[:, column] = value[k]
+            if moved is not None:
+                places, turns, boxes = moved
                 each.places[self._geoms], each.turns[self._geoms] = places[k], turns[k]
                 each.boxes[self._boxes] = boxes[k]
-        return [each.model for each in chosen]
+        return [each.model for each in pool[:particles]]
 
     def _copied(self) -> _Copy:
         model = copy.copy(self.model)
-        # A geom that the compiler found at a frame's place is put there whatever its own place says.
+        # MuJoCo ignores the place of a geom that coincided with a frame when the model was compiled.
         model.geom_sameframe[self._geoms] = 0
         return _Copy(
             model,
@@ -93,13 +94,13 @@ class ModelCopies:
         )
 
     def _moved(self, grip_from_peg: Array) -> tuple[Array, Array, Array]:
-        """Places (N, G, 3), quaternions (N, G, 4) and tree of boxes (N, B, 6) of geoms moved with the peg."""
+        """Places (N, G, 3), quaternions (N, G, 4) and box trees (N, B, 6) of the peg's geoms in the grip."""
         shift, turn = grip_from_peg[:, None, :3], _rotation(grip_from_peg[:, 3:])
         matrix = turn.as_matrix()
         places = shift + np.einsum("nij,gj->ngi", matrix, self.model.geom_pos[self._geoms])
         own = _rotation(np.array(self.model.geom_quat[self._geoms]))
         turns = np.stack([(turn * g).as_quat()[:, [3, 0, 1, 2]] for g in own], axis=1)
-        # The tree is in the axes of the body's inertia, which stays where it is.
+        # The tree is in the axes of the body's inertia, which do not move.
         origin, axes = self._inertial[0], self._inertial[1].as_matrix()
         tree = np.asarray(self.model.bvh_aabb[self._boxes])
         centers = shift + np.einsum("nij,bj->nbi", matrix, origin + tree[:, :3] @ axes.T)

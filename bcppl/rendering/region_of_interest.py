@@ -1,4 +1,4 @@
-"""Which pixels of an image a part can be in."""
+"""The region of interest of an image: the pixels in which a part can be."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
 
 
-def region_of(
+def region_of_interest(
     camera: Camera, part: Part, world_from_part: npt.ArrayLike, within: float, least: int = 1
 ) -> tuple[int, int, int, int]:
-    """The left, top, width and height of the pixels in which a part can be, for `Camera.cropped`.
+    """Left, top, width and height of the pixels in which a part can be, for `Camera.cropped`.
 
     Args:
-        camera: what looks.
-        part: what is looked for.
-        world_from_part: (7,) where it is expected.
-        within: how far from there it may be, metres, turned in any way about its middle.
-        least: pixels that each side has at least, where the image has so many.
+        camera: of the image.
+        part: the part to be localised.
+        world_from_part: (7,) its expected pose.
+        within: bound of its displacement from there, metres; its rotation about its middle is arbitrary.
+        least: lower bound of each side's pixels, where the image has so many.
 
     Returns:
-        Whole pixels; the whole image where the part may be beside or behind the camera.
+        Numbers of pixels; the whole image where the part may be beside or behind the camera.
 
     Raises:
-        InputError: the camera's pose or intrinsics are none, or no pixel can show the part.
+        InputError: the camera's pose or intrinsics are invalid, or no pixel can show the part.
     """
     camera_from_world = poses.inverse(camera.stated_pose())
     expected = poses.as_pose(torch.as_tensor(np.asarray(world_from_part)))
     middle = torch.as_tensor(0.5 * (part.vertices.min(axis=0) + part.vertices.max(axis=0)))[None]
     there = poses.transform(camera_from_world, poses.transform(expected, middle)).numpy()
     reach = float(np.linalg.norm(part.extent) / 2 + within)
-    # All corners of the cube around all it may fill: off the axis, its far face reaches farthest inwards.
+    # All corners of the cube that it may fill: off the axis, the far face reaches farthest inwards.
     corners = there + reach * np.array(list(product((-1, 1), repeat=3)))
     pixel = camera.project(corners)
     if not np.isfinite(pixel).all():

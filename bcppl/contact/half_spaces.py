@@ -1,4 +1,4 @@
-"""The point nearest to another one that is on the free side of a few planes."""
+"""Projection of a point onto an intersection of half-spaces."""
 
 from __future__ import annotations
 
@@ -10,51 +10,55 @@ from bcppl.compiled import compiled
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-_ROUNDING = 2e-8  # m: no violation of a plane
+_ROUNDING = 2e-8  # m: no violation of a constraint
 
 
 @compiled
-def nearest_allowed(point: Array, normals: Array, offsets: Array, kept: Mask) -> Array:
-    """The point on the free side of kept planes that is nearest to a point, by trying which ones hold it."""
+def project_onto_half_spaces(point: Array, normals: Array, offsets: Array, active: Mask) -> Array:
+    """The point nearest to another one with normals @ x >= offsets for the active constraints.
+
+    Every set of up to three constraints is tried as the one that holds with equality. Where no such point
+    satisfies all, the result is the one that violates them least.
+    """
     count = len(offsets)
     best, least = point.copy(), np.inf
-    if _violation(point, normals, offsets, kept) <= _ROUNDING:
+    if _violation(point, normals, offsets, active) <= _ROUNDING:
         return best
     least_violation = np.inf
     for a in range(count):
-        if not kept[a]:
+        if not active[a]:
             continue
         for b in range(a, count):
-            if not kept[b]:
+            if not active[b]:
                 continue
             for c in range(b, count):
-                if not kept[c]:
+                if not active[c]:
                     continue
-                tried, sound = _on_planes(point, normals, offsets, a, b, c)
-                if not sound:
+                projected, independent = _on_planes(point, normals, offsets, a, b, c)
+                if not independent:
                     continue
-                off = ((tried - point) ** 2).sum()
-                violation = _violation(tried, normals, offsets, kept)
+                off = ((projected - point) ** 2).sum()
+                violation = _violation(projected, normals, offsets, active)
                 if violation <= _ROUNDING:
                     if off < least:
-                        best, least = tried, off
+                        best, least = projected, off
                 elif least == np.inf and violation < least_violation:
-                    best, least_violation = tried, violation
+                    best, least_violation = projected, violation
     return best
 
 
 @compiled
-def _violation(point: Array, normals: Array, offsets: Array, kept: Mask) -> float:
+def _violation(point: Array, normals: Array, offsets: Array, active: Mask) -> float:
     worst = 0.0
     for p in range(len(offsets)):
-        if kept[p]:
+        if active[p]:
             worst = max(worst, offsets[p] - (normals[p] * point).sum())
     return worst
 
 
 @compiled
 def _on_planes(point: Array, normals: Array, offsets: Array, a: int, b: int, c: int) -> tuple[Array, bool]:
-    """The point of up to three planes nearest to a point: projections by Gram and Schmidt."""
+    """A point projected onto up to three planes, by Gram-Schmidt, and whether they are independent."""
     chosen = (a, b, c)
     basis, values = np.zeros((3, 3)), np.zeros(3)
     rank = 0
@@ -72,7 +76,7 @@ def _on_planes(point: Array, normals: Array, offsets: Array, a: int, b: int, c: 
             return point, False
         basis[rank], values[rank] = normal / length, value / length
         rank += 1
-    found = point.copy()
+    projected = point.copy()
     for r in range(rank):
-        found += (values[r] - (basis[r] * found).sum()) * basis[r]
-    return found, True
+        projected += (values[r] - (basis[r] * projected).sum()) * basis[r]
+    return projected, True

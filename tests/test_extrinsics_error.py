@@ -1,4 +1,4 @@
-"""What errors of stated cameras do to what they see, and which pixels a part can be in."""
+"""Extrinsic errors against finite differences, and regions of interest against rendered parts."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.extrusion import block_with_square_hole
-from bcppl.rendering.region import region_of
-from bcppl.rendering.renderer import DepthRenderer
-from bcppl.rendering.stated_cameras import apparent_covariance, line_of_sight, seen_elsewhere
+from bcppl.rendering.extrinsics_error import apparent_covariance, apparent_pose, line_of_sight
+from bcppl.rendering.ray_casting import RayCaster
+from bcppl.rendering.region_of_interest import region_of_interest
 
 PART = poses.as_pose([0.03, -0.02, 0.04, 0.5, 0.5, -0.5, 0.5])
 SHIFT, TURN = 0.002, 0.009
@@ -41,8 +41,8 @@ def test_covariance_is_that_of_small_errors_of_the_stated_pose() -> None:
         for axis in torch.eye(6, dtype=torch.float64)
     ]
     scaled = torch.stack(columns, dim=-1) * torch.tensor([SHIFT] * 3 + [TURN] * 3, dtype=torch.float64)
-    found = apparent_covariance(CAMERA, PART.expand(2, 7), SHIFT, TURN)
-    torch.testing.assert_close(found, (scaled @ scaled.T).expand(2, 6, 6), rtol=1e-6, atol=1e-12)
+    computed = apparent_covariance(CAMERA, PART.expand(2, 7), SHIFT, TURN)
+    torch.testing.assert_close(computed, (scaled @ scaled.T).expand(2, 6, 6), rtol=1e-6, atol=1e-12)
 
 
 def test_a_part_farther_along_the_line_of_sight_stays_in_its_pixel_and_is_deeper() -> None:
@@ -56,18 +56,18 @@ def test_a_part_farther_along_the_line_of_sight_stays_in_its_pixel_and_is_deeper
 def test_one_error_is_carried_to_another_place() -> None:
     error = torch.tensor([0.004, -0.003, 0.002, 0.02, -0.01, 0.03], dtype=torch.float64)
     other = camera((-0.1, 0.4, 0.3), "elsewhere")
-    found = seen_elsewhere(CAMERA, other, PART, seen(CAMERA, error))
-    assert float(poses.local(found, seen(other, error)).abs().max()) < 1e-12
+    computed = apparent_pose(CAMERA, other, PART, seen(CAMERA, error))
+    assert float(poses.local(computed, seen(other, error)).abs().max()) < 1e-12
 
 
 def test_a_part_that_may_be_anywhere_within_reach_stays_in_its_region() -> None:
     part, generator = block_with_square_hole(hole=0.016, offset=(0.007, 0.005)), np.random.default_rng(0)
     middle = 0.5 * (part.vertices.min(axis=0) + part.vertices.max(axis=0))
     expected = poses.as_pose([0.01, 0.0, 0.02, 1.0, 0.0, 0.0, 0.0])
-    left, top, width, height = region_of(CAMERA, part, expected, within=0.02)
+    left, top, width, height = region_of_interest(CAMERA, part, expected, within=0.02)
     assert width < CAMERA.width and height < CAMERA.height
     camera_from_world = poses.inverse(torch.from_numpy(CAMERA.world_from_camera))
-    for turn in Rotation.random(300, random_state=generator):
+    for turn in Rotation.random(150, random_state=generator):
         shift = generator.normal(size=3)
         shift *= 0.02 / np.linalg.norm(shift)
         points = turn.apply(part.vertices - middle) + middle + expected[:3].numpy() + shift
@@ -79,12 +79,12 @@ def test_a_part_that_may_be_anywhere_within_reach_stays_in_its_region() -> None:
 
 def test_a_part_at_the_image_s_edge_fills_as_many_pixels_as_asked_for_and_none_beside_it() -> None:
     part, hidden, edge = block_with_square_hole(hole=0.016), 0, 0
-    renderer = DepthRenderer(part)
+    renderer = RayCaster(part)
     beside = poses.as_pose([0.0, 0, 0, 1, 0, 0, 0])
     for away in np.linspace(0.1, 0.4, 61):
         beside[:2] = torch.tensor([0.2, 0.3], dtype=torch.float64) * float(away) / 0.36
         try:
-            left, top, width, height = region_of(CAMERA, part, beside, within=0.02, least=9)
+            left, top, width, height = region_of_interest(CAMERA, part, beside, within=0.02, least=9)
         except InputError as error:
             assert "beside its image" in str(error)
             assert not np.isfinite(renderer.images(CAMERA, beside[None])).any()
@@ -101,4 +101,4 @@ def test_a_part_at_the_image_s_edge_fills_as_many_pixels_as_asked_for_and_none_b
 
 def test_the_whole_image_where_the_part_may_be_behind_the_camera() -> None:
     part = block_with_square_hole(hole=0.016)
-    assert region_of(CAMERA, part, CAMERA.world_from_camera, within=0.02) == (0, 0, 160, 120)
+    assert region_of_interest(CAMERA, part, CAMERA.world_from_camera, within=0.02) == (0, 0, 160, 120)

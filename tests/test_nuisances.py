@@ -1,4 +1,4 @@
-"""Unknown parameters of a touch: exact presses and slides, frames, and that equal values change nothing."""
+"""Nuisance parameters: exact presses and slides, frames, and that equal values change nothing."""
 
 from __future__ import annotations
 
@@ -12,48 +12,32 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.contact.nuisances import Nuisances
 from bcppl.contact.physics import PegPhysics, Rollout
-from bcppl.contact.track import ContactTrack
-from bcppl.contact.unknowns import Unknowns
-from bcppl.contact.wrench import Sensing
+from bcppl.contact.probe_rollout import ProbeRollout
+from bcppl.contact.sensing.location import ContactSensing
 from bcppl.distributions.contact import ChamferContacts
 from bcppl.errors import InputError
-from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg
+from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.parts import Part, Piece
 from bcppl.robot.motion import Probe
+from tests.contact_probes import DAMPING, HOLE, SEARCH, STIFFNESS, path, same
 
-STIFFNESS = np.array([1500.0, 1000.0, 2000.0, 60.0, 50.0, 40.0])
-DAMPING = np.array([80.0, 80.0, 80.0, 2.0, 2.0, 2.0])
 PEG = box_peg(0.016, 0.05)
 TABLE = block((0.1, 0.1, 0.02))
-HOLE = block_with_square_hole(hole=0.0165, offset=(0.005, 0.002))
-
-
-def path(*points: tuple[float, float, float, float], name: str = "probe") -> Probe:
-    """A probe through (time, x, y, z) of the grip's origin, upright."""
-    values = np.array(points)
-    command = np.tile([0.0, 0, 0, 1, 0, 0, 0], (len(values), 1))
-    command[:, :3] = values[:, 1:]
-    return Probe(name, values[:, 0], command, STIFFNESS, DAMPING, np.arange(0.0, values[-1, 0] + 1e-9, 0.01))
-
-
 PRESS = path((0, 0, 0, 0.055), (0.5, 0, 0, 0.047), (1.5, 0, 0, 0.047))
-SEARCH = path((0, 0, 0, 0.06), (0.5, 0, 0, 0.047), (1.0, 0.006, 0.002, 0.045), (1.2, 0.006, 0.002, 0.03))
 
 
 def numbers(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def pressed(unknowns: Unknowns, particles: int, probe: Probe = PRESS, part: Part = TABLE) -> Rollout:
+def pressed(nuisances: Nuisances, particles: int, probe: Probe = PRESS, part: Part = TABLE) -> Rollout:
     return (
-        PegPhysics(part, PEG).start(poses.identity(particles), probe, unknowns).advance(len(probe.stamps) - 1)
+        PegPhysics(part, PEG)
+        .start(poses.identity(particles), probe, nuisances)
+        .advance(len(probe.stamps) - 1)
     )
-
-
-def same(a: Rollout, b: Rollout) -> None:
-    np.testing.assert_array_equal(a.wrench, b.wrench)
-    np.testing.assert_array_equal(a.world_from_peg, b.world_from_peg)
 
 
 @cache
@@ -64,11 +48,11 @@ def around() -> Tensor:
     return poses.retract(poses.identity(6), shifts)
 
 
-def mixed() -> Unknowns:
+def mixed() -> Nuisances:
     """Every unknown, different for every particle."""
     step = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)
     turn = torch.stack([step, -step, 0.5 * step, 10 * step, -5 * step, 30 * step], dim=1) * 0.002
-    return Unknowns(
+    return Nuisances(
         friction=0.2 + 0.2 * step,
         time_constant=0.004 + 0.004 * step,
         damping_ratio=1.0 + 0.3 * step,
@@ -81,10 +65,10 @@ def mixed() -> Unknowns:
 
 @pytest.mark.parametrize("skip", [True, False])
 def test_equal_values_change_nothing_to_the_bit(skip: bool) -> None:
-    physics = PegPhysics(HOLE, PEG, skip=skip)
+    physics = PegPhysics(HOLE, PEG, share_free_motion=skip)
     plain, one = physics.start(around(), SEARCH).advance(120), torch.ones(6, dtype=torch.float64)
     known = physics.parameters
-    in_contact = Unknowns(
+    in_contact = Nuisances(
         friction=known.friction * one,
         time_constant=known.time_constant * one,
         damping_ratio=known.damping_ratio * one,
@@ -93,46 +77,51 @@ def test_equal_values_change_nothing_to_the_bit(skip: bool) -> None:
     same(plain, physics.start(around(), SEARCH, in_contact).advance(120))
     rigid = torch.zeros(6, 6, dtype=torch.float64)
     everything = {"stiffness": one, "damping": one, "grasp_compliance": rigid}
-    same(plain, physics.start(around(), SEARCH, Unknowns(**in_contact.given, **everything)).advance(120))
-    same(plain, physics.start(around(), SEARCH, Unknowns()).advance(120))
+    same(plain, physics.start(around(), SEARCH, Nuisances(**in_contact.given, **everything)).advance(120))
+    same(plain, physics.start(around(), SEARCH, Nuisances()).advance(120))
     # What was set for one program is not left behind for the next.
-    physics.start(around(), SEARCH, Unknowns(friction=0.0 * one)).advance(120)
+    physics.start(around(), SEARCH, Nuisances(friction=0.0 * one)).advance(120)
     same(plain, physics.start(around(), SEARCH).advance(120))
-    same(plain, physics.start(around(), SEARCH, Unknowns(stiffness=one)).advance(120))
+    same(plain, physics.start(around(), SEARCH, Nuisances(stiffness=one)).advance(120))
+
+
+def merged_where(mask: Tensor, one: Nuisances, other: Nuisances) -> Nuisances:
+    pairs = [(name, value, other.given[name]) for name, value in one.given.items()]
+    return Nuisances(**{n: torch.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b) for n, a, b in pairs})
 
 
 def test_chunks_order_and_merging_change_nothing() -> None:
-    physics, unknowns = PegPhysics(HOLE, PEG), mixed()
-    whole = physics.start(around(), SEARCH, unknowns).advance(120)
+    physics, nuisances = PegPhysics(HOLE, PEG), mixed()
+    whole = physics.start(around(), SEARCH, nuisances).advance(120)
     assert (abs(whole.wrench[..., 2]).max(axis=1) > 1.0).all()
-    for particle in range(6):
-        alone = physics.start(around()[[particle]], SEARCH, unknowns[torch.tensor([particle])]).advance(120)
+    for particle in (0, 5):
+        alone = physics.start(around()[[particle]], SEARCH, nuisances[torch.tensor([particle])]).advance(120)
         same(whole[torch.tensor([particle])], alone)
     order = torch.tensor([4, 1, 5, 1])
-    same(whole[order], physics.start(around(), SEARCH, unknowns).advance(50)[order].advance(73).advance(120))
+    same(whole[order], physics.start(around(), SEARCH, nuisances).advance(50)[order].advance(73).advance(120))
     mask = torch.tensor([True, False, True, True, False, False])
-    back = unknowns[torch.arange(5, -1, -1)]
-    one, two = physics.start(around(), SEARCH, unknowns), physics.start(around(), SEARCH, back)
-    merged = one.advance(40).where(mask, two.advance(70)).advance(120)
-    same(merged, physics.start(around(), SEARCH, unknowns.where(mask, back)).advance(120))
+    back = nuisances[torch.arange(5, -1, -1)]
+    one, two = physics.start(around(), SEARCH, nuisances), physics.start(around(), SEARCH, back)
+    before = one.advance(40).wrench.copy()
+    merged = one.where(mask, two.advance(70)).advance(120)
+    same(merged, physics.start(around(), SEARCH, merged_where(mask, nuisances, back)).advance(120))
+    np.testing.assert_array_equal(one.wrench[:, :40], before)
     same(one.advance(120), whole)
-    with pytest.raises(InputError, match="cannot be merged"):
+    with pytest.raises(ValueError, match="cannot be merged"):
         one.where(mask, physics.start(around(), SEARCH))
-    with pytest.raises(InputError, match="cannot be merged"):
-        unknowns.where(mask, Unknowns())
 
 
-def test_skipping_the_free_approach_changes_nothing_and_saves_where_it_is_shared() -> None:
-    every = mixed().given
+def test_shared_free_motion_changes_nothing_and_saves_time() -> None:
+    some, every = around()[:3], mixed()[torch.tensor([1, 3, 5])].given
     shared = {n: every[n] for n in ("friction", "time_constant", "damping_ratio", "grip_from_peg")}
     for given, saves in ((shared, True), ({"stiffness": every["stiffness"]}, False), (every, False)):
-        skipping, whole = PegPhysics(HOLE, PEG), PegPhysics(HOLE, PEG, skip=False)
-        one = skipping.start(around(), SEARCH, Unknowns(**given)).advance(120)
-        same(one, whole.start(around(), SEARCH, Unknowns(**given)).advance(120))
+        skipping, whole = PegPhysics(HOLE, PEG), PegPhysics(HOLE, PEG, share_free_motion=False)
+        one = skipping.start(some, SEARCH, Nuisances(**given)).advance(120)
+        same(one, whole.start(some, SEARCH, Nuisances(**given)).advance(120))
         assert (skipping.effort.amount < 0.8 * whole.effort.amount) == saves
 
 
-def test_a_peg_that_hangs_out_of_the_hand_is_not_skipped_into_the_part() -> None:
+def test_the_free_motion_of_a_displaced_peg_ends_before_contact() -> None:
     # 20 mm lower than planned, or lying on its side, the peg touches long before a planned one would.
     offset = poses.identity(3)
     offset[1, 2] = -0.02
@@ -141,18 +130,20 @@ def test_a_peg_that_hangs_out_of_the_hand_is_not_skipped_into_the_part() -> None
     part[2, :3] = numbers(-0.08, 0.0, 0.06)
     probe = path((0, 0, 0, 0.09), (0.5, 0, 0, 0.047), (1.0, 0, 0, 0.047))
     one, two = (
-        PegPhysics(TABLE, PEG, skip=skip).start(part, probe, Unknowns(grip_from_peg=offset)).advance(100)
+        PegPhysics(TABLE, PEG, share_free_motion=skip)
+        .start(part, probe, Nuisances(grip_from_peg=offset))
+        .advance(100)
         for skip in (True, False)
     )
     same(one, two)
     first = (abs(two.wrench[..., 2]) > 1.0).argmax(axis=1) / 100
-    # Lowered at 86 mm/s, from 90 mm to where each one's lowest point meets what is beneath it.
+    # Lowered at 86 mm/s, from 90 mm to where each one's lowest point meets the part.
     np.testing.assert_allclose(first, np.array([0.04, 0.02, 0.022]) / 0.086, atol=0.02)
 
 
 def test_friction_doubled_doubles_the_sliding_force() -> None:
     probe = path((0, -0.015, 0, 0.055), (0.6, -0.015, 0, 0.047), (1.6, -0.005, 0, 0.047))
-    force = pressed(Unknowns(friction=numbers(0.1, 0.2, 0.0)), 3, probe).wrench[:, 130:150]
+    force = pressed(Nuisances(friction=numbers(0.1, 0.2, 0.0)), 3, probe).wrench[:, 130:150]
     np.testing.assert_allclose(-force[:2, :, 0], [[0.1], [0.2]] * force[:2, :, 2], rtol=0.01)
     assert abs(force[2, :, 0]).max() < 0.01
 
@@ -160,19 +151,20 @@ def test_friction_doubled_doubles_the_sliding_force() -> None:
 def test_the_force_of_a_press_is_the_unknown_stiffness_times_the_displacement() -> None:
     factors = torch.ones(4, 6, dtype=torch.float64)
     factors[:, 2] = numbers(1.0, 0.5, 2.0, 3.0)
-    rollout = pressed(Unknowns(stiffness=factors), 4)
+    rollout = pressed(Nuisances(stiffness=factors), 4)
     force, height = rollout.wrench[:, -1, 2], rollout.world_from_peg[:, -1, 2]
     np.testing.assert_allclose(force, 2000 * factors[:, 2].numpy() * (height - 0.047), rtol=1e-3)
     np.testing.assert_allclose(force, 2000 * factors[:, 2].numpy() * 0.003, rtol=0.03)
     same(
-        pressed(Unknowns(stiffness=numbers(2.0)), 1), pressed(Unknowns(stiffness=torch.full((1, 6), 2.0)), 1)
+        pressed(Nuisances(stiffness=numbers(2.0)), 1),
+        pressed(Nuisances(stiffness=torch.full((1, 6), 2.0)), 1),
     )
 
 
-def test_damping_slows_what_is_let_go_and_moves_no_place_of_rest() -> None:
+def test_damping_slows_the_peg_and_moves_no_place_of_rest() -> None:
     start = path((0, 0, 0, 0.2), (0.001, 0.01, 0, 0.2), (1.5, 0.01, 0, 0.2))
     start = Probe("step", start.command_times, start.command, STIFFNESS, DAMPING, start.stamps)
-    place = pressed(Unknowns(damping=numbers(1.0, 6.0)), 2, start).world_from_peg[..., 0]
+    place = pressed(Nuisances(damping=numbers(1.0, 6.0)), 2, start).world_from_peg[..., 0]
     # 6 * 80 N s/m against 1500 N/m: a time constant of about 0.3 s, where 80 N s/m follows within 0.1 s.
     assert abs(place[0, 30:] - 0.01).max() < 5e-4 and abs(place[0, 145] - 0.01) < 1e-6
     slow = np.log(abs(place[1, 60] - 0.01) / abs(place[1, 30] - 0.01)) / 0.3
@@ -183,15 +175,15 @@ def test_damping_slows_what_is_let_go_and_moves_no_place_of_rest() -> None:
 def test_a_grasp_s_compliance_is_in_series_with_the_controller() -> None:
     compliance = torch.zeros(4, 6, dtype=torch.float64)
     compliance[:, 2] = numbers(0.0, 1e-5, 1e-4, 5e-4)
-    rollout = pressed(Unknowns(grasp_compliance=compliance), 4)
+    rollout = pressed(Nuisances(grasp_compliance=compliance), 4)
     force, height = rollout.wrench[:, -1, 2], rollout.world_from_peg[:, -1, 2]
     np.testing.assert_allclose(force, 0.003 / (1 / 2000 + compliance[:, 2].numpy()), rtol=0.015)
-    # The hand is where the controller's own spring says, and nearer to the table than the peg's length.
+    # The hand is where the controller's own spring puts it, and nearer to the table than the peg's length.
     np.testing.assert_allclose(force, 2000 * (height - 0.047), rtol=1e-3)
     np.testing.assert_allclose(height[0] - height, compliance[:, 2].numpy() * force, atol=1e-5)
 
 
-def test_a_grasp_that_turns_is_felt_at_the_sensor() -> None:
+def test_a_grasp_that_turns_changes_the_wrench_at_the_sensor() -> None:
     # Pushed 4 mm into a wall, the peg's tip stays and the hand turns about it as both springs allow.
     probe = path((0, 0, 0, 0), (1.0, 0.026, 0, 0), (3.0, 0.026, 0, 0))
     wall = poses.identity(2)
@@ -199,11 +191,11 @@ def test_a_grasp_that_turns_is_felt_at_the_sensor() -> None:
     compliance = torch.zeros(2, 6, dtype=torch.float64)
     compliance[1, 4] = 0.02
     rollout = PegPhysics(block((0.1, 0.1, 0.1)), PEG).start(
-        wall, probe, Unknowns(grasp_compliance=compliance)
+        wall, probe, Nuisances(grasp_compliance=compliance)
     )
     wrench, grip = rollout.advance(300).wrench[:, -1], rollout.world_from_peg[:, -1]
     turned = Rotation.from_quat(grip[:, [4, 5, 6, 3]]).as_rotvec()
-    # At rest the controller's springs carry all of the wrench, which is told in the grip's own axes.
+    # At rest the controller's springs carry all of the wrench, which is in the grip's own axes.
     force = Rotation.from_quat(grip[:, [4, 5, 6, 3]]).apply(wrench[:, :3])
     np.testing.assert_allclose(force[:, 0], 1500 * (grip[:, 0] - 0.026), rtol=1e-3)
     np.testing.assert_allclose(wrench[:, 4], 50 * turned[:, 1], rtol=0.01)
@@ -226,8 +218,8 @@ def test_an_offset_in_the_hand_is_a_peg_whose_surface_is_elsewhere(twist: list[f
     offset = poses.retract(poses.identity(), 0.001 * numbers(*twist))
     hull = moved(PEG, poses.identity())
     probe = path((0, 0.03, 0, 0.05), (0.8, 0.02, 0, 0.046), (1.2, 0.02, 0, 0.044), (2.0, 0.015, 0.003, 0.044))
-    unknowns = Unknowns(grip_from_peg=offset[None])
-    one = PegPhysics(HOLE, hull).start(poses.identity(1), probe, unknowns).advance(200)
+    nuisances = Nuisances(grip_from_peg=offset[None])
+    one = PegPhysics(HOLE, hull).start(poses.identity(1), probe, nuisances).advance(200)
     two = PegPhysics(HOLE, moved(PEG, offset)).start(poses.identity(1), probe).advance(200)
     assert abs(two.wrench[0, 100:, 2]).min() > 1.0
     # The tool's mass goes with the surface in the one, and not in the other: seen only where it is swung.
@@ -236,14 +228,14 @@ def test_an_offset_in_the_hand_is_a_peg_whose_surface_is_elsewhere(twist: list[f
     plain = PegPhysics(HOLE, hull).start(poses.identity(1), probe).advance(200)
     assert apart < 0.1 * abs(plain.world_from_peg - two.world_from_peg).max() and apart < 3e-5
     # A box in the hand and its hull are the same peg, but MuJoCo puts a flat contact's points elsewhere.
-    boxed = PegPhysics(HOLE, PEG).start(poses.identity(1), probe, unknowns).advance(200)
+    boxed = PegPhysics(HOLE, PEG).start(poses.identity(1), probe, nuisances).advance(200)
     np.testing.assert_allclose(boxed.world_from_peg, one.world_from_peg, atol=5e-4)
 
 
 def test_an_impossible_stiffness_diverges_alone_and_counts_as_impossible() -> None:
-    part, sensing = poses.identity(4), Sensing(PEG, rate=100.0)
+    part, sensing = poses.identity(4), ContactSensing(PEG, rate=100.0)
     factors = numbers(1.0, 1e7, 1.1, 1e9)
-    track = ContactTrack.start(PegPhysics(TABLE, PEG), sensing, part, PRESS, Unknowns(stiffness=factors))
+    track = ProbeRollout.start(PegPhysics(TABLE, PEG), sensing, part, PRESS, Nuisances(stiffness=factors))
     with pytest.warns(RuntimeWarning, match="2 of 4 rollouts of probe 'probe' diverged"):
         wrench = track.wrench(0, 150)
     assert track.diverged.tolist() == [False, True, False, True]
@@ -253,39 +245,46 @@ def test_an_impossible_stiffness_diverges_alone_and_counts_as_impossible() -> No
     assert log_prob[[1, 3]].tolist() == [-np.inf] * 2 and log_prob[0] == 0.0 and torch.isfinite(log_prob[2])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        alone = pressed(Unknowns(stiffness=factors[[0, 2]]), 2)
+        alone = pressed(Nuisances(stiffness=factors[[0, 2]]), 2)
     np.testing.assert_array_equal(alone.wrench, wrench[[0, 2]].numpy())
 
 
-def test_a_track_hangs_on_all_that_is_unknown() -> None:
-    physics, sensing, unknowns = PegPhysics(HOLE, PEG), Sensing(PEG, rate=100.0), mixed()
-    track = ContactTrack.start(physics, sensing, around(), SEARCH, unknowns)
-    assert len(track.inputs) == 8 and track.inputs[1] is unknowns.friction
-    whole, index = track.wrench(0, 120), torch.tensor([3, 0, 3])
-    some = track[index]
-    for mine, all_of_them in zip(some.inputs, track.inputs, strict=True):
-        assert torch.equal(mine, all_of_them[index])
-    assert torch.equal(some.wrench(0, 120), whole[index])
+def test_rollouts_are_indexed_and_merged_like_all_their_inputs() -> None:
+    physics, sensing, nuisances = PegPhysics(HOLE, PEG), ContactSensing(PEG, rate=100.0), mixed()
+    other = nuisances[torch.arange(5, -1, -1)]
+
+    def start(nuisances: Nuisances, count: int) -> ProbeRollout:
+        return ProbeRollout.start(physics, sensing, around(), SEARCH, nuisances).advance(count)
+
+    def equal(one: ProbeRollout, two: ProbeRollout, rows: Tensor | slice = slice(None)) -> None:
+        """The first goes on to the end; the second is whole."""
+        assert torch.equal(one.wrench(0, 120), two.wrench(0, 120)[rows])
+        for mine, theirs in zip(one.window(0, 120), two.window(0, 120), strict=True):
+            torch.testing.assert_close(mine, theirs[rows], rtol=0, atol=0, equal_nan=True)
+        for mine, theirs in zip(one.inputs, two.inputs, strict=True):
+            assert torch.equal(mine, theirs[rows])
+
+    whole, part, index = start(nuisances, 120), start(nuisances, 60), torch.tensor([3, 0, 3])
+    assert len(whole.inputs) == 8 and whole.inputs[1] is nuisances.friction
+    assert bool(torch.isfinite(whole.window(0, 120)[0]).any())
+    equal(part[index], whole, index)
     mask = torch.tensor([True, False, True, False, False, True])
-    other = unknowns[torch.arange(5, -1, -1)]
-    merged = track.where(mask, ContactTrack.start(physics, sensing, around(), SEARCH, other))
-    expected = ContactTrack.start(physics, sensing, around(), SEARCH, unknowns.where(mask, other))
-    assert torch.equal(merged.wrench(0, 120), expected.wrench(0, 120))
-    for mine, theirs in zip(merged.inputs, expected.inputs, strict=True):
-        assert torch.equal(mine, theirs)
+    merged = part.where(mask, start(other, 100))
+    assert part.count == 100
+    equal(merged, start(merged_where(mask, nuisances, other), 120))
 
 
 @pytest.mark.parametrize(
-    ("unknowns", "said"),
+    ("nuisances", "message"),
     [
-        (Unknowns(friction=numbers(0.3)), r"friction .* shape \(1,\); for 2 particles give \(2,\)"),
-        (Unknowns(friction=numbers(0.3, -0.1)), "friction .* negative"),
-        (Unknowns(stiffness=numbers(1.0, np.nan)), "stiffness .* not finite"),
-        (Unknowns(time_constant=numbers(0.004, 0.0)), "time_constant .* or 0"),
-        (Unknowns(damping=torch.ones(2, 3)), r"\(2,\) or \(2, 6\)"),
-        (Unknowns(grip_from_peg=torch.ones(2, 7)), "unit length"),
+        (Nuisances(friction=numbers(0.3)), r"friction .* shape \(1,\); for 2 particles give \(2,\)"),
+        (Nuisances(friction=numbers(0.3, -0.1)), "friction .* negative"),
+        (Nuisances(stiffness=numbers(1.0, np.nan)), "stiffness .* not finite"),
+        (Nuisances(time_constant=numbers(0.004, 0.0)), "time_constant .* or 0"),
+        (Nuisances(damping=torch.ones(2, 3)), r"\(2,\) or \(2, 6\)"),
+        (Nuisances(grip_from_peg=torch.ones(2, 7)), "quaternion of length 2"),
     ],
 )
-def test_what_cannot_be_is_refused(unknowns: Unknowns, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        PegPhysics(TABLE, PEG).start(poses.identity(2), PRESS, unknowns)
+def test_impossible_values_are_refused(nuisances: Nuisances, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        PegPhysics(TABLE, PEG).start(poses.identity(2), PRESS, nuisances)

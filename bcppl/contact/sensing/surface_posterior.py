@@ -1,4 +1,4 @@
-"""What wrenches say of where a peg is touched: weighted nodes on its surface, and candidates made of them."""
+"""Posteriors of contact locations: weighted nodes on a peg's surface, and candidates clustered from them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bcppl.arguments import number_within, whole_number
+from bcppl.contact.array_record import ArrayRecord
 from bcppl.errors import InputError
 
 Array = npt.NDArray[np.float64]
@@ -17,19 +18,19 @@ FACE, EDGE, CORNER = 0, 1, 2
 
 
 @dataclass(frozen=True, eq=False)
-class Nodes:
-    """Places on a peg's surface where a contact may be, Q in all, for several wrenches.
+class Nodes(ArrayRecord):
+    """Quadrature nodes on a peg's surface, Q in all, for several wrenches.
 
     Attributes:
-        row: (Q,) which wrench.
+        row: (Q,) index of the wrench.
         kind: (Q,) `FACE`, `EDGE` or `CORNER`.
-        group: (Q,) which smooth surface, smooth curve or corner it lies on, numbered within its kind.
+        group: (Q,) index of its smooth surface, smooth curve or corner, within its kind.
         point: (Q, 3) in the peg's frame.
-        normal: (Q, 3) outward, of the friction cone in which the force stands best.
-        along: (Q,) how far along the wrench's force it lies, metres.
-        gap: (Q,) how much farther along the next node of the same stretch of surface may lie, metres.
+        normal: (Q, 3) outward, of the friction cone in which the force is most central.
+        along: (Q,) its coordinate along the wrench's force, metres.
+        gap: (Q,) bound of the distance along the force to the next node of the same cluster, metres.
         score: (Q,) log-likelihood of a contact there.
-        log_weight: (Q,) that, with the prior probability of what the node stands for.
+        log_weight: (Q,) the same, plus the log prior probability that the node represents.
     """
 
     row: Indices
@@ -45,31 +46,20 @@ class Nodes:
     def __len__(self) -> int:
         return len(self.row)
 
-    def __getitem__(self, chosen: npt.NDArray[np.bool_] | Indices) -> Nodes:
-        """Some of them."""
-        return Nodes(**{name: values[chosen] for name, values in self.__dict__.items()})
-
-    @staticmethod
-    def joined(parts: list[Nodes]) -> Nodes:
-        """Several as one."""
-        return Nodes(
-            **{name: np.concatenate([getattr(p, name) for p in parts]) for name in parts[0].__dict__}
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Stretches of surface where each of M wrenches may come from, at most K, the likeliest first.
+    """Candidate contact locations of M wrenches, at most K each, the most probable first.
 
     Attributes:
-        location: (M, K, 3) posterior mean on that stretch, in the peg's frame, metres; NaN where there are
+        location: (M, K, 3) posterior mean in the cluster, in the peg's frame, metres; NaN where there are
             fewer.
-        covariance: (M, K, 3, 3) of the location within that stretch, m^2: of rank 2 on a plane face, 1 on a
+        covariance: (M, K, 3, 3) of the location in the cluster, m^2: of rank 2 on a plane face, 1 on a
             straight edge, 0 at a corner.
         normal: (M, K, 3) outward normal there.
-        probability: (M, K) that the contact is on that stretch; 0 where there are fewer.
+        probability: (M, K) that the contact is in the cluster; 0 where there are fewer.
         kind: (M, K) `FACE`, `EDGE` or `CORNER`; -1 where there are fewer.
-        group: (M, K) which smooth surface, curve or corner, numbered within its kind; -1 where fewer.
+        group: (M, K) index of the smooth surface, curve or corner within its kind; -1 where there are fewer.
     """
 
     location: Array
@@ -81,19 +71,19 @@ class Candidates:
 
     @property
     def count(self) -> Indices:
-        """(M,) how many there are of each wrench."""
+        """(M,) the number of candidates."""
         return np.asarray((self.probability > 0).sum(axis=1), dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class SurfacePosterior:
-    """Where a peg is touched, given each of M wrenches that one contact made.
+    """Posteriors of the contact location on a peg, given each of M wrenches of a single contact.
 
     Attributes:
-        nodes: places on the surface, sorted by wrench.
+        nodes: on the surface, sorted by wrench.
         mass: (Q,) posterior probability of each; those of one wrench sum to 1.
-        log_evidence: (M,) log-density of the wrench if one contact made it, up to a constant that is the same
-            for all wrenches of one peg and noise; -inf where no node explains it.
+        log_evidence: (M,) log-density of the wrench given a single contact, up to a constant that all
+            wrenches of one peg and noise share; -inf where no node explains it.
     """
 
     nodes: Nodes
@@ -102,7 +92,7 @@ class SurfacePosterior:
 
     @staticmethod
     def of(nodes: Nodes, wrenches: int) -> SurfacePosterior:
-        """The posterior of M wrenches on unsorted nodes; those that hold next to no mass are left out."""
+        """The posteriors of M wrenches on unsorted nodes; those of negligible mass are left out."""
         highest = np.full(wrenches, -np.inf)
         np.maximum.at(highest, nodes.row, nodes.log_weight)
         nodes = nodes[np.isfinite(nodes.log_weight) & (nodes.log_weight > highest[nodes.row] - 16.0)]
@@ -117,17 +107,17 @@ class SurfacePosterior:
         return len(self.log_evidence)
 
     def mass_above(self, score: Array) -> Array:
-        """The mass (M,) on places that are likelier than a log-likelihood (M,): a credible level.
+        """The mass (M,) of nodes with more than a log-likelihood (M,): a credible level.
 
-        The region of level L holds the places at which this is below L, and has probability L or, for
-        there are only so many nodes, little more.
+        The region of level L holds the points at which this is below L; its probability is L or, because the
+        nodes are discrete, little more.
         """
         above = self.nodes.score > score[self.nodes.row]
         mass = np.bincount(self.nodes.row[above], self.mass[above], len(self))
         return np.asarray(mass, dtype=np.float64)
 
     def region(self, level: float) -> npt.NDArray[np.bool_]:
-        """Which nodes (Q,) are in the credible region: the likeliest places that hold this much mass.
+        """Mask (Q,) of the nodes in the credible region: those of the highest likelihood with this mass.
 
         Raises:
             InputError: the level is not between 0 and 1.
@@ -144,49 +134,50 @@ class SurfacePosterior:
         return inside
 
     def candidates(self, most: int = 8, least: float = 0.005) -> Candidates:
-        """The stretches of surface that hold the mass.
+        """Clusters of the nodes.
 
-        A stretch is what is smooth (a plane, a cylinder, an edge, a rim) and near: where a line enters one
-        surface twice, these are two.
+        A cluster is smooth (of one plane, cylinder, edge or rim) and connected: where a line enters one
+        surface twice, there are two.
 
         Args:
-            most: K, how many are kept.
-            least: probability below which a stretch is left out.
+            most: K.
+            least: probability below which a cluster is left out.
 
         Raises:
             InputError: `most` is no whole number above 0, or `least` no probability below 1.
         """
-        most = whole_number("candidates are asked for with most = {}", most)
-        least = number_within("candidates are asked for with least = {}", least, least=0.0, below=1.0)
+        most = whole_number("candidates are given most = {}", most)
+        least = number_within("candidates are given least = {}", least, least=0.0, below=1.0)
         nodes, mass, rows = self.nodes, self.mass, len(self)
-        empty = Candidates(
-            np.full((rows, most, 3), np.nan),
-            np.full((rows, most, 3, 3), np.nan),
-            np.full((rows, most, 3), np.nan),
-            np.zeros((rows, most)),
-            np.full((rows, most), -1, dtype=np.int64),
-            np.full((rows, most), -1, dtype=np.int64),
+        shape = (rows, most)
+        candidates = Candidates(
+            np.full((*shape, 3), np.nan),
+            np.full((*shape, 3, 3), np.nan),
+            np.full((*shape, 3), np.nan),
+            np.zeros(shape),
+            np.full(shape, -1, dtype=np.int64),
+            np.full(shape, -1, dtype=np.int64),
         )
         if len(nodes) == 0:
-            return empty
+            return candidates
         new = np.ones(len(nodes), dtype=bool)
         same = (np.diff(nodes.row) == 0) & (np.diff(nodes.kind) == 0) & (np.diff(nodes.group) == 0)
         new[1:] = ~same | (np.diff(nodes.along) > nodes.gap[1:])
-        stretch = np.cumsum(new) - 1
+        cluster = np.cumsum(new) - 1
         first = np.flatnonzero(new)
-        probability = np.bincount(stretch, mass)
+        probability = np.bincount(cluster, mass)
 
         def mean(values: Array) -> Array:
             flat = values.reshape(len(mass), -1)
-            total = np.stack([np.bincount(stretch, mass * column) for column in flat.T], axis=1)
+            total = np.stack([np.bincount(cluster, mass * column) for column in flat.T], axis=1)
             return (total / probability[:, None]).reshape(-1, *values.shape[1:])
 
         middle = mean(nodes.point)
-        apart = nodes.point - middle[stretch]
+        apart = nodes.point - middle[cluster]
         covariance = mean(apart[:, :, None] * apart[:, None, :])
-        # On a curved surface the mean lies beneath it: it goes to the plane of the node nearest to it.
-        order = np.lexsort((np.square(apart).sum(axis=1), stretch))
-        near = order[np.searchsorted(stretch[order], np.arange(len(first)))]
+        # On a curved surface the mean lies beneath it: it is projected onto the plane of the nearest node.
+        order = np.lexsort((np.square(apart).sum(axis=1), cluster))
+        near = order[np.searchsorted(cluster[order], np.arange(len(first)))]
         on_face = (nodes.kind[first] == FACE)[:, None]
         off = np.sum((nodes.point[near] - middle) * nodes.normal[near], axis=1, keepdims=True)
         location = middle + np.where(on_face, off * nodes.normal[near], 0.0)
@@ -196,7 +187,7 @@ class SurfacePosterior:
         rank[order] = np.arange(len(first)) - np.searchsorted(row[order], row[order])
         kept = (probability >= least) & (rank < most)
         at = row[kept], rank[kept]
-        empty.location[at], empty.covariance[at] = location[kept], covariance[kept]
-        empty.normal[at], empty.probability[at] = nodes.normal[near][kept], probability[kept]
-        empty.kind[at], empty.group[at] = nodes.kind[first][kept], nodes.group[first][kept]
-        return empty
+        candidates.location[at], candidates.covariance[at] = location[kept], covariance[kept]
+        candidates.normal[at], candidates.probability[at] = nodes.normal[near][kept], probability[kept]
+        candidates.kind[at], candidates.group[at] = nodes.kind[first][kept], nodes.group[first][kept]
+        return candidates

@@ -1,4 +1,4 @@
-"""Wrench to contact location: known contacts are found, in the peg's frame, the same in chunks as at once."""
+"""Contact locations from wrenches: known contacts, frames, chunks, and simulated recordings."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bcppl import poses
-from bcppl.contact.peg_model import ContactParameters
+from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
+from bcppl.contact.probe_rollout import ProbeRollout
+from bcppl.contact.sensing.location import ContactSensing
 from bcppl.contact.touch import Touch
-from bcppl.contact.track import ContactTrack
-from bcppl.contact.wrench import Sensing
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, round_peg
 from bcppl.robot.motion import Probe
 
 PEG = box_peg(0.016, 0.05)
-PLAIN = Sensing(PEG, rate=100.0, tare=0, cutoff=None)
+PLAIN = ContactSensing(PEG, rate=100.0, tare=0, cutoff=None)
 STIFFNESS = np.array([1000.0, 1000.0, 1000.0, 50.0, 50.0, 50.0])
 DAMPING = np.array([80.0, 80.0, 80.0, 2.0, 2.0, 2.0])
 
@@ -41,11 +41,11 @@ def random_contacts(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(points), 7.0 * (inward + rng.uniform(0, 1, (500, 1)) * side)
 
 
-def test_a_contact_is_found_where_the_force_enters_the_peg() -> None:
+def test_a_contact_is_located_where_the_force_enters_the_peg() -> None:
     points, force = random_contacts()
     located = PLAIN.locate(wrench(points, force))
     np.testing.assert_allclose(located, points, atol=1e-9)
-    # The mutants: a flipped force or torque, and a wrench in the wrong frame, are found elsewhere or nowhere.
+    # Mutants: a flipped force or torque, and a wrench in the wrong frame, are located elsewhere, if at all.
     turn = Rotation.from_euler("zx", [90, 30], degrees=True)
     turned = np.concatenate([turn.apply(force), turn.apply(np.cross(points, force))], axis=1)
     flip = wrench(points, force) * [-1, -1, -1, 1, 1, 1]
@@ -70,13 +70,13 @@ def test_taring_and_filtering_in_chunks_equal_the_whole() -> None:
     rng = np.random.default_rng(1)
     points, force = random_contacts()
     signal = wrench(points, force).reshape(5, 100, 6).cumsum(axis=1) / 10 + rng.normal(size=(5, 1, 6))
-    sensing = Sensing(PEG, rate=100.0, tare=12, cutoff=10.0)
+    sensing = ContactSensing(PEG, rate=100.0, tare=12, cutoff=10.0)
     whole, state = sensing.contacts(signal, sensing.start(5))
     assert np.isnan(whole[:, :12]).all() and np.isfinite(whole[:, 12:]).any()
     chunks, running = [], sensing.start(5)
     for first, last in ((0, 5), (5, 13), (13, 14), (14, 70), (70, 100)):
-        found, running = sensing.contacts(signal[:, first:last], running)
-        chunks.append(found)
+        located, running = sensing.contacts(signal[:, first:last], running)
+        chunks.append(located)
     np.testing.assert_array_equal(np.concatenate(chunks, axis=1), whole)
     np.testing.assert_array_equal(running.filter, state.filter)
     rows = np.array([3, 0, 3])
@@ -90,7 +90,7 @@ def test_taring_and_filtering_in_chunks_equal_the_whole() -> None:
 def test_an_offset_of_the_sensor_changes_nothing() -> None:
     signal = np.zeros((1, 60, 6))
     signal[:, 20:] = wrench(np.array([0.003, -0.002, -0.05]), np.array([0.5, 0, 8.0]))
-    sensing = Sensing(PEG, rate=100.0, tare=10, cutoff=20.0)
+    sensing = ContactSensing(PEG, rate=100.0, tare=10, cutoff=20.0)
     plain, _ = sensing.contacts(signal, sensing.start(1))
     zero = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.1])
     offset, _ = sensing.contacts(signal + zero, sensing.start(1))
@@ -112,9 +112,9 @@ def lean(angle: float, yaw: float = 0.0) -> Probe:
 @pytest.mark.parametrize("yaw", [0.0, 120.0])
 def test_a_leaning_peg_touches_with_its_lowest_edge(yaw: float) -> None:
     probe = lean(20.0, yaw)
-    sensing = Sensing(PEG, rate=100.0, tare=10, cutoff=20.0)
+    sensing = ContactSensing(PEG, rate=100.0, tare=10, cutoff=20.0)
     part = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64)
-    track = ContactTrack.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
+    track = ProbeRollout.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
     contacts, pose = track.window(130, 150)
     local, _ = sensing.contacts(track.rollout.wrench, sensing.start(1))
     # Turned by +20 degrees about y, the edge at x = +8 mm is the lowest.
@@ -124,25 +124,25 @@ def test_a_leaning_peg_touches_with_its_lowest_edge(yaw: float) -> None:
     np.testing.assert_allclose(poses.transform(pose[0, 0], contacts[0])[:, 2], 0.0, atol=1e-4)
 
 
-def test_a_peg_pressed_on_the_rim_of_a_hole_feels_the_material_beneath_it() -> None:
+def test_a_peg_on_the_rim_of_a_hole_is_in_contact_with_the_material_beneath_it() -> None:
     # Half of the peg stands over the hole: flat contact along x < 0 only, so its middle is at x <= 0.
     part = block_with_square_hole(size=(0.1, 0.1, 0.02), hole=0.03, offset=(0.015, 0.0))
     command = np.array([[0, 0, 0.055, 1, 0, 0, 0], [0, 0, 0.047, 1, 0, 0, 0]], dtype=np.float64)
     stamps = np.arange(0.0, 1.5, 0.01)
     probe = Probe("rim", np.array([0.0, 0.7]), command, STIFFNESS * 10, DAMPING * 5, stamps)
     for peg, tolerance in ((PEG, 1e-5), (round_peg(0.008, 0.05), 1e-3)):
-        sensing = Sensing(peg, rate=100.0)
+        sensing = ContactSensing(peg, rate=100.0)
         pose = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64)
-        contacts, _ = ContactTrack.start(PegPhysics(part, peg), sensing, pose, probe).window(120, 150)
+        contacts, _ = ProbeRollout.start(PegPhysics(part, peg), sensing, pose, probe).window(120, 150)
         assert (contacts[0, :, 0] < 1e-4).all() and (contacts[0, :, 0] > -0.0081).all()
         np.testing.assert_allclose(contacts[0, :, 1], 0.0, atol=tolerance)
 
 
 def test_a_measured_recording_is_read_by_the_same_code() -> None:
     probe = lean(10.0, 30.0)
-    sensing = Sensing(PEG, rate=100.0)
+    sensing = ContactSensing(PEG, rate=100.0)
     part = torch.tensor([[0.0, 0, 0.001, 1, 0, 0, 0]], dtype=torch.float64)
-    track = ContactTrack.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
+    track = ProbeRollout.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
     whole, pose = track.window(0, 150)
     touches = [
         Touch(probe.stamps[a:b], track.rollout.wrench[0, a:b], track.rollout.world_from_peg[0, a:b])
@@ -152,13 +152,13 @@ def test_a_measured_recording_is_read_by_the_same_code() -> None:
     np.testing.assert_array_equal(torch.cat([m[0] for m in measured]), whole[0])
     np.testing.assert_array_equal(torch.cat([m[1] for m in measured]), pose[0])
     with pytest.raises(InputError, match="samples per second"):
-        Sensing(PEG, rate=500.0).measure(touches)
+        ContactSensing(PEG, rate=500.0).measure(touches)
     with pytest.raises(InputError, match="cutoff"):
-        Sensing(PEG, rate=30.0)
+        ContactSensing(PEG, rate=30.0)
 
 
 def test_a_missing_wrench_is_refused_where_a_filter_would_carry_it_on() -> None:
-    sensing, times = Sensing(PEG, rate=100.0), np.arange(80) / 100.0
+    sensing, times = ContactSensing(PEG, rate=100.0), np.arange(80) / 100.0
     pose, signal = np.tile([0.0, 0, 0, 1, 0, 0, 0], (80, 1)), np.zeros((80, 6))
     signal[20:] = wrench(np.array([0.003, -0.002, -0.05]), np.array([0.5, 0, 8.0]))
 
@@ -167,8 +167,10 @@ def test_a_missing_wrench_is_refused_where_a_filter_would_carry_it_on() -> None:
         bad[row, column] = np.nan if column else np.inf
         return [Touch(times[a:b], bad[a:b], pose[a:b]) for a, b in ((0, 30), (30, 80))]
 
-    for row, column, said in ((50, 4, "window 1 .* row 20"), (4, 0, "window 0 .* row 4")):
-        with pytest.raises(InputError, match=f"{said}; fill it by interpolation, or cut the recording there"):
+    for row, column, message in ((50, 4, "window 1 .* row 20"), (4, 0, "window 0 .* row 4")):
+        with pytest.raises(
+            InputError, match=f"{message}; fill it by interpolation, or cut the recording there"
+        ):
             sensing.measure(windows(row, column))
     # Nothing carries it on where nothing is filtered, unless it is in the zero.
     tared = torch.cat(sensing.tared(windows(50, 4)))
@@ -189,35 +191,35 @@ def test_a_missing_wrench_is_refused_where_a_filter_would_carry_it_on() -> None:
         {"friction": math.nan},
         {"friction": -1.0},
         {"miss_tolerance": math.nan},
-        {"force": math.inf},
+        {"threshold": math.inf},
         {"tare": 2.5},
         {"tare": -1},
         {"rate": math.nan},
     ],
 )
-def test_settings_that_read_no_contact_are_refused(bad: dict[str, float]) -> None:
+def test_settings_out_of_range_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(InputError, match=f"sensing has {next(iter(bad))} = "):
-        Sensing(PEG, **({"rate": 100.0} | bad))
+        ContactSensing(PEG, **({"rate": 100.0} | bad))
 
 
 def test_a_peg_may_be_doubled_at_its_seams_but_not_open() -> None:
     with pytest.raises(InputError, match="open mesh"):
-        Sensing(replace(PEG, faces=PEG.faces[:-2]), rate=100.0)
+        ContactSensing(replace(PEG, faces=PEG.faces[:-2]), rate=100.0)
     seams = replace(
         PEG, vertices=PEG.vertices[PEG.faces].reshape(-1, 3), faces=np.arange(PEG.faces.size).reshape(-1, 3)
     )
     points, force = random_contacts()
     np.testing.assert_allclose(
-        Sensing(seams, rate=100.0).locate(wrench(points, force)),
+        ContactSensing(seams, rate=100.0).locate(wrench(points, force)),
         PLAIN.locate(wrench(points, force)),
         atol=1e-12,
     )
 
 
-def test_the_wrench_of_a_window_is_what_contacts_are_read_from() -> None:
-    probe, sensing = lean(20.0), Sensing(PEG, rate=100.0)
+def test_contacts_are_those_of_the_window_s_wrench() -> None:
+    probe, sensing = lean(20.0), ContactSensing(PEG, rate=100.0)
     part = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0], [0.0, 0, -1, 1, 0, 0, 0]], dtype=torch.float64)
-    track = ContactTrack.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
+    track = ProbeRollout.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
     late = track.wrench(100, 150)
     assert late.shape == (2, 50, 6) and track.count == 150
     whole = torch.cat([track.wrench(0, 100), late], dim=1)
@@ -230,31 +232,6 @@ def test_the_wrench_of_a_window_is_what_contacts_are_read_from() -> None:
         force / np.linalg.norm(force), [-np.sin(0.349066), 0, np.cos(0.349066)], atol=0.3
     )
     assert float(late[1].abs().max()) < 0.05
-
-
-def test_tracks_are_indexed_and_merged_like_the_poses_they_hang_on() -> None:
-    probe = lean(15.0)
-    physics, sensing = PegPhysics(block((0.2, 0.2, 0.02)), PEG), Sensing(PEG, rate=100.0)
-    part = torch.zeros(4, 7, dtype=torch.float64)
-    part[:, 3], part[:, 2] = 1.0, torch.tensor([0.0, 0.002, -0.001, -1.0])
-    whole = ContactTrack.start(physics, sensing, part, probe)
-    expected = whole.window(0, 150)[0]
-    assert torch.isnan(expected[3]).all() and not torch.equal(expected[0], expected[1])
-    track = ContactTrack.start(physics, sensing, part, probe)
-    track.window(0, 60)
-    index = torch.tensor([2, 0, 2])
-    torch.testing.assert_close(
-        track[index].window(0, 150)[0], expected[index], rtol=0, atol=0, equal_nan=True
-    )
-    assert track.count == 60
-    torch.testing.assert_close(track[index].inputs[0], part[index])
-    mask = torch.tensor([True, False, False, True])
-    other = ContactTrack.start(physics, sensing, part.flip(0), probe)
-    other.window(0, 100)
-    merged = track.where(mask, other)
-    wanted = torch.where(mask[:, None, None], expected, expected.flip(0))
-    torch.testing.assert_close(merged.window(0, 150)[0], wanted, rtol=0, atol=0, equal_nan=True)
-    torch.testing.assert_close(merged.inputs[0], torch.where(mask[:, None], part, part.flip(0)))
 
 
 def test_the_truth_explains_its_own_recording_best() -> None:
@@ -281,13 +258,13 @@ def test_the_truth_explains_its_own_recording_best() -> None:
     truth = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64)
     real = PegPhysics(hole, PEG, ContactParameters(time_step=0.0005)).start(truth, probe).advance(350)
     noise = rng.normal(size=(350, 6)) * ([0.1] * 3 + [0.003] * 3) + [1.0, -1, 2, 0.1, 0, 0.1]
-    sensing = Sensing(PEG, rate=100.0, tare=20)
+    sensing = ContactSensing(PEG, rate=100.0, tare=20)
     contacts, pose = sensing.measure([Touch(stamps, real.wrench[0] + noise, real.world_from_peg[0])])[0]
 
     offsets = torch.tensor([[0.0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 0, 1], [0, 0, -1], [3, 0, 0], [0, 0, 3]])
     part = truth.repeat(len(offsets), 1)
     part[:, :3] += 0.001 * offsets
-    track = ContactTrack.start(PegPhysics(hole, PEG), sensing, part, probe)
+    track = ProbeRollout.start(PegPhysics(hole, PEG), sensing, part, probe)
     # A flush touch looks the same in the peg's frame at any depth: contacts must not speak against the truth,
     # where the peg stood has to speak for it.
     for likelihood, value, margin in (
@@ -300,7 +277,7 @@ def test_the_truth_explains_its_own_recording_best() -> None:
         assert (log_prob[[5, 6]] < log_prob[[1, 3]]).all()
 
 
-def test_a_press_beside_the_tip_is_felt_at_the_tip() -> None:
+def test_a_press_beside_the_tip_is_located_at_the_tip() -> None:
     """A line along the peg passes the tip's edge and the upper end's equally near; only the tip is pushed."""
     located = PLAIN.locate(wrench(np.array([[0.0085, 0.002, -0.05]]), np.array([[0.1, 0.0, 8.0]])))
     np.testing.assert_allclose(located, [[0.008, 0.002, -0.05]], atol=1e-4)

@@ -1,0 +1,313 @@
+"""Quasi-static motion of a compliantly held peg in contact with a part.
+
+A peg that is pressed slowly through a spring is where the spring is shortest: at its command where that is
+free, otherwise at the nearest pose that the part allows. Haptic rendering computes the same: the peg is the
+god-object, or virtual proxy, of C. Zilles and J. Salisbury, A constraint-based god-object method for haptic
+display, IROS 1995; friction follows W. Harwin and N. Melder, Improved haptic rendering for multi-finger
+manipulation using friction cone based god-objects, Eurohaptics 2002.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import trimesh
+from torch import Tensor
+
+from bcppl import poses, quaternions
+from bcppl.arguments import number_within
+from bcppl.compiled import compiled
+from bcppl.contact.half_spaces import project_onto_half_spaces
+from bcppl.contact.mujoco_model import interpolated_command
+from bcppl.geometry.gap import Frames, PegGap, frames_of
+from bcppl.geometry.parts import Part
+from bcppl.robot.motion import ProbeWindow
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+
+_LONGEST = 0.001  # m: of a step
+_SHORTEST = 0.0001
+_THIN = 0.4  # of the thinnest wall: a longer step might pass through it
+_TOUCHES = 2e-7  # m: contact below this distance
+_CONVERGED = 1e-7  # m: the step at which a blocked peg is at rest; a fifth of it is no penetration
+_ROUGHLY = 1e-5  # m: the same after `_PATIENT` iterations
+_PATIENT = 10
+_ITERATIONS = 40  # of a blocked peg, for one command
+_REFUTED = 1e-6  # m
+_ALIKE = 0.99999  # cosine between the normals of two planes that count as one
+_PLANES = 4  # contacts that are remembered
+_MEASURED = 0.0019  # m: larger gaps are upper bounds, because edges farther away are not measured
+
+
+class QuasiStaticMotion:
+    """Motion of a held peg along a commanded path, for many poses of the part.
+
+    Between stamps the peg moves straight towards its command, by steps shorter than the part's walls are
+    thick. Where the part blocks it, it slides along the tangent planes of up to four contacts to the point
+    nearest to the command, or, with friction, as far as the command lies outside of the friction cone. Its
+    rotation is the commanded one, and there are no dynamics: it suits slow probes, whose controller is much
+    stiffer in rotation than the forces of a touch ask for.
+
+    Attributes:
+        gap: the distance between part and peg.
+        friction: Coulomb's coefficient; 0 for none.
+        pressed: bound of the commanded penetration that counts for friction, metres: guarded motions stop
+            there.
+        step: upper bound of a step, metres.
+
+    Raises:
+        InputError: a number is out of range.
+    """
+
+    def __init__(self, gap: PegGap, friction: float = 0.0, pressed: float = 0.002) -> None:
+        self.gap = gap
+        self.friction = number_within("quasi-static motion is given friction {}", friction, least=0.0)
+        self.pressed = number_within("quasi-static motion is given pressed {}", pressed, least=0.0)
+        self.step = float(
+            np.clip(_THIN * min(_thickness(gap.part), _thickness(gap.peg)), _SHORTEST, _LONGEST)
+        )
+        self.reach = float(np.linalg.norm(gap.peg.vertices, axis=1).max())
+        low, high = gap.part.vertices.min(axis=0), gap.part.vertices.max(axis=0)
+        self._middle, self._half = torch.from_numpy(0.5 * (low + high)), torch.from_numpy(0.5 * (high - low))
+        self._corners = torch.from_numpy(gap.peg.mesh.convex_hull.vertices.view(np.ndarray))
+
+    def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Tensor:
+        """Poses of the peg.
+
+        Args:
+            world_from_part: (N, 7).
+            world_from_peg: (T, 7) commanded, or (N, T, 7) for a command of each particle's own. A peg that
+                begins inside the part is pushed out.
+
+        Returns:
+            (N, T, 8) world_from_peg, then 1 in contact and 0 out of it; NaN for a particle whose part or
+            command is.
+        """
+        part = world_from_part.detach().to(torch.float64)
+        command = world_from_peg.detach().to(torch.float64).expand(len(part), *world_from_peg.shape[-2:])
+        motion = torch.full((*command.shape[:2], 8), torch.nan, dtype=torch.float64)
+        finite = torch.isfinite(part).all(dim=1) & torch.isfinite(command).all(dim=2).all(dim=1)
+        if command.shape[1] and bool(finite.any()):
+            motion[finite] = _Integrator(self, part[finite], command[finite]).motion()
+        return motion
+
+    def separation(self, world_from_part: Tensor, world_from_peg: Tensor) -> Tensor:
+        """Distances (N, K, 6) of a peg at poses (N, K, 7) from the planes of the part's bounding box."""
+        peg = poses.compose(poses.inverse(world_from_part)[:, None], world_from_peg)
+        across = poses.rotation_matrix(peg) @ self._corners.T
+        place = peg[..., :3] - self._middle
+        return torch.cat(
+            [place + across.amin(-1) - self._half, -place - across.amax(-1) - self._half], dim=-1
+        )
+
+
+class WindowMotion:
+    """Quasi-static motion in a window of a probe, at every `every`-th of its stamps.
+
+    The probe is followed from its first stamp on, by a command that no guard stops.
+    """
+
+    def __init__(self, model: QuasiStaticMotion, window: ProbeWindow, every: int) -> None:
+        self.model, self.window, self.every = model, window, every
+
+    def __call__(self, world_from_part: Tensor) -> Tensor:
+        """(N, T, 8), as `QuasiStaticMotion` returns it, for poses (N, 7) of the part."""
+        return self.together([self], [world_from_part])[0]
+
+    @property
+    def command(self) -> Tensor:
+        """(S, 7) from the probe's beginning to the window's end."""
+        probe, first = self.window.probe, self.window.first % self.every
+        stamps = probe.stamps[first : self.window.last : self.every]
+        return torch.from_numpy(interpolated_command(probe, stamps)[0])
+
+    @staticmethod
+    def together(motions: Sequence[WindowMotion], world_from_part: Sequence[Tensor]) -> list[Tensor]:
+        """Motions for poses (N_k, 7) each, (N_k, T_k, 8), in one batch for each model."""
+        rows: dict[int, Tensor] = {}
+        commands = [motion.command for motion in motions]
+        for model in {id(motion.model): motion.model for motion in motions}.values():
+            own = [k for k, motion in enumerate(motions) if motion.model is model]
+            longest = max(len(commands[k]) for k in own)
+            # A command that has ended is held.
+            padded = [
+                torch.cat([commands[k], commands[k][-1:].expand(longest - len(commands[k]), 7)]) for k in own
+            ]
+            counts = [len(world_from_part[k]) for k in own]
+            command = torch.stack(padded).repeat_interleave(torch.tensor(counts), dim=0)
+            moved = model(torch.cat([world_from_part[k] for k in own]), command)
+            for k, row in zip(own, moved.split(counts), strict=True):
+                first = motions[k].window.first // motions[k].every
+                rows[k] = row[:, first : len(commands[k])]
+        return [rows[k] for k in range(len(motions))]
+
+
+class _Integrator:
+    """The motion of N particles, integrated from command to command."""
+
+    def __init__(self, model: QuasiStaticMotion, world_from_part: Tensor, command: Tensor) -> None:
+        self.model, self.part, self.command = model, frames_of(world_from_part), command
+        self.separation = model.separation(world_from_part, command)
+        self.place = command[:, 0, :3].clone()
+        self.blocked = torch.ones(len(command), dtype=torch.bool)  # until measured
+        # A lower bound of the distance to the part, by the last measurement and the motion since.
+        self.slack = torch.zeros(len(command), dtype=torch.float64)
+
+    def motion(self) -> Tensor:
+        """(N, T, 8)."""
+        model, command, separation = self.model, self.command, self.separation
+        # A straight motion stays beyond a plane that both of its ends are beyond; a rotation sags.
+        apart = torch.minimum(separation[:, 1:], separation[:, :-1]).amax(dim=-1)
+        turned = _angles(command[:, :-1, 3:], command[:, 1:, 3:])
+        moved = (command[:, 1:, :3] - command[:, :-1, :3]).norm(dim=-1) + model.reach * turned
+        free = apart > model.reach * (1.0 - torch.cos(0.5 * turned))
+        still = torch.zeros(len(command), dtype=torch.float64)
+        rows = [self._follow(command[:, 0], still, separation[:, 0].amax(-1) > 0)]
+        for t in range(1, command.shape[1]):
+            count = 1
+            near = moved[:, t - 1][~(free[:, t - 1] & ~self.blocked)]
+            if len(near):
+                count = max(1, math.ceil(float(near.max()) / model.step))
+            for share in torch.arange(1, count + 1) / count:
+                goal = _interpolated(command[:, t - 1], command[:, t], float(share))
+                row = self._follow(goal, moved[:, t - 1] / count, free[:, t - 1])
+            rows.append(row)
+        return torch.stack(rows, dim=1)
+
+    def _follow(self, goal: Tensor, moved: Tensor, free: Tensor) -> Tensor:
+        """Poses and contact (N, 8) at a command (N, 7), whose surface moved by at most (N,) from the last."""
+        self.slack -= moved
+        place, touches = goal[:, :3].clone(), torch.zeros(len(goal), dtype=torch.bool)
+        near = (self.blocked | ~(free | (self.slack > 0.0))).nonzero().flatten()
+        if len(near):
+            reached, distance = self._approach(near, goal[near])
+            place[near] = reached
+            off = (reached - goal[near, :3]).norm(dim=1)
+            self.blocked[near] = off > _CONVERGED
+            touches[near] = (distance < _TOUCHES) | (off > 10.0 * _CONVERGED)
+            self.slack[near] = distance.clamp(max=_MEASURED)
+        self.place = place
+        return torch.cat([place, goal[:, 3:], touches[:, None].to(torch.float64)], dim=1)
+
+    def _approach(self, chosen: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions (M, 3) of pegs moved towards a command (M, 7), and their distances (M,) from the part."""
+        model, count = self.model, len(chosen)
+        on = chosen.numpy()
+        part = Frames(self.part.rotation[on], self.part.translation[on])
+        turn = frames_of(goal).rotation
+        place, target = self.place[chosen].numpy().copy(), goal[:, :3].numpy()
+        normals, offsets = np.zeros((count, _PLANES, 3)), np.zeros((count, _PLANES))
+        seen = np.full((count, _PLANES, 3), np.inf)
+        distance = np.full(count, np.inf)
+        moving = np.arange(count)
+        for iteration in range(_ITERATIONS):
+            peg = Frames(turn[moving, None], place[moving, None])
+            gap, _, normal = model.gap.evaluate(Frames(*(each[moving] for each in part)), peg)
+            distance[moving] = gap[:, 0]
+            at_rest = np.zeros(len(moving), dtype=np.bool_)
+            _step(
+                moving,
+                place,
+                target,
+                gap[:, 0],
+                np.einsum("nij,nj->ni", part.rotation[moving], normal[:, 0]),
+                normals,
+                offsets,
+                seen,
+                model.step,
+                model.friction,
+                model.pressed,
+                _CONVERGED if iteration < _PATIENT else _ROUGHLY,
+                at_rest,
+            )
+            moving = moving[~at_rest]
+            if len(moving) == 0:
+                break
+        return torch.from_numpy(place), torch.from_numpy(distance)
+
+
+@compiled
+def _step(
+    moving: Indices,
+    place: Array,
+    target: Array,
+    distance: Array,
+    normal: Array,
+    normals: Array,
+    offsets: Array,
+    seen: Array,
+    longest: float,
+    friction: float,
+    pressed: float,
+    converged: float,
+    at_rest: Mask,
+) -> None:
+    """Move each peg by one step: out of the part where it penetrates it, otherwise towards its target."""
+    planes = normals.shape[1]
+    active = np.zeros(planes, np.bool_)
+    for k in range(len(moving)):
+        m, slot, least, same = moving[k], 0, np.inf, False
+        for p in range(planes):
+            # A plane approximates the part near where it was seen; a gap wider than it allows refutes it.
+            active[p] = ((place[m] - seen[m, p]) ** 2).sum() < 4.0 * longest * longest
+            active[p] &= (normals[m, p] * place[m]).sum() - offsets[m, p] > distance[k] - _REFUTED
+            # The newest replaces one like it, an inactive one, or the least tight.
+            tight = -np.inf
+            if active[p]:
+                tight = offsets[m, p] - (normals[m, p] * place[m]).sum()
+                if (normals[m, p] * normal[k]).sum() > _ALIKE:
+                    slot, same = p, True
+            if not same and tight < least:
+                slot, least = p, tight
+        normals[m, slot], seen[m, slot], active[slot] = normal[k], place[m], True
+        offsets[m, slot] = (normal[k] * place[m]).sum() - distance[k]
+        inside = distance[k] < -0.2 * converged
+        best = project_onto_half_spaces(place[m] if inside else target[m], normals[m], offsets[m], active)
+        step = best - place[m]
+        size = np.sqrt((step * step).sum())
+        if not inside and friction > 0.0 and distance[k] < _TOUCHES:
+            # The command draws the peg no farther than the rim of the friction cone.
+            held = friction * min(np.sqrt(((target[m] - best) ** 2).sum()), pressed)
+            step *= max(0.0, size - held) / max(size, 1e-300)
+            size = max(0.0, size - held)
+        if not inside and size > longest:
+            step *= longest / size
+        at_rest[k] = not inside and size <= converged
+        if not at_rest[k]:
+            place[m] += step
+
+
+def _thickness(part: Part) -> float:
+    """Thickness (m) of a part's thin walls: its 5 % quantile over the surface."""
+    mesh = part.mesh
+    points, faces = trimesh.sample.sample_surface(mesh, 2000, seed=0)
+    inward = -mesh.face_normals[faces]
+    places, rays, _ = mesh.ray.intersects_location(points + 1e-6 * inward, inward, multiple_hits=False)
+    if len(places) == 0:
+        return float(part.extent.min())
+    return float(np.quantile(np.linalg.norm(places - points[rays], axis=1), 0.05))
+
+
+def _angles(first: Tensor, second: Tensor) -> Tensor:
+    """Angles (...) between quaternions (..., 4)."""
+    return 2.0 * torch.acos((first * second).sum(dim=-1).abs().clamp(max=1.0))
+
+
+def _interpolated(first: Tensor, second: Tensor, share: float) -> Tensor:
+    """Poses (N, 7) between two: translations linear, rotations along the geodesic."""
+    if share == 1.0:
+        return second
+    place = torch.lerp(first[:, :3], second[:, :3], share)
+    if torch.equal(first[:, 3:], second[:, 3:]):
+        return torch.cat([place, first[:, 3:]], dim=1)
+    start, stop = poses.quaternion_xyzw(first), poses.quaternion_xyzw(second)
+    stop = torch.where((start * stop).sum(dim=-1, keepdim=True) < 0.0, -stop, stop)
+    step = share * quaternions.rotation_vector(quaternions.product(quaternions.conjugate(start), stop))
+    turned = quaternions.product(start, quaternions.from_rotation_vector(step))
+    return poses.from_translation_quaternion_xyzw(place, turned)

@@ -1,0 +1,79 @@
+"""Detection of contact and of its absence from the force, each where it is beyond doubt."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bcppl.arguments import number_within, whole_number
+from bcppl.errors import InputError
+from bcppl.robot.motion import ProbeWindow
+
+
+@dataclass(frozen=True)
+class ContactDetector:
+    """Force thresholds of contact and of free motion.
+
+    Between the two a stamp is undecided, as where a peg makes or breaks contact.
+
+    Attributes:
+        contact: N; there is contact above this, which exceeds the drift of the sensor's zero and the tool's
+            inertial force.
+        free: N; there is none below this.
+        mass: kg; `contact` grows by this for each m/s^2 of the tool's acceleration.
+        neighbours: samples to either side that must agree.
+
+    Raises:
+        InputError: a number is out of range.
+    """
+
+    contact: float = 1.5
+    free: float = 0.8
+    mass: float = 0.3
+    neighbours: int = 2
+
+    def __post_init__(self) -> None:
+        number_within("a contact detector has contact {} N", self.contact, above=0.0)
+        number_within("a contact detector has free {} N", self.free, above=0.0, most=self.contact)
+        number_within("a contact detector has mass {} kg", self.mass, least=0.0)
+        whole_number("a contact detector has neighbours {}", self.neighbours, least=0)
+
+    def __call__(self, force: Tensor, acceleration: Tensor | float = 0.0) -> Tensor:
+        """1 for contact, 0 for none and NaN for undecided, (T,), of tared forces (T, 3) in newtons.
+
+        A force that is NaN, as while taring, is undecided.
+
+        Args:
+            force: (T, 3).
+            acceleration: (T,) commanded acceleration of the tool, m/s^2.
+
+        Raises:
+            InputError: forces are not (T, 3).
+        """
+        if force.ndim != 2 or force.shape[1] != 3:
+            raise InputError(f"forces have shape {tuple(force.shape)}; give (T, 3), in newtons.")
+        if len(force) == 0:
+            return torch.empty(0, dtype=torch.float64)
+        size = force.norm(dim=1)
+        known = ~torch.isnan(size)
+        contact = self._unanimous(known & (size > self.contact + self.mass * acceleration))
+        free = self._unanimous(known & (size < self.free))
+        return torch.where(contact, 1.0, torch.where(free, 0.0, torch.nan)).to(torch.float64)
+
+    def _unanimous(self, flags: Tensor) -> Tensor:
+        padded = torch.nn.functional.pad(flags, (self.neighbours, self.neighbours), value=True)
+        return padded.unfold(0, 2 * self.neighbours + 1, 1).all(dim=1)
+
+
+def commanded_acceleration(windows: Sequence[ProbeWindow]) -> Tensor:
+    """The maximum commanded acceleration (T,), m/s^2, within 50 ms of the stamps of a probe's windows."""
+    probe = windows[0].probe
+    stamps = np.concatenate([probe.stamps[window.first : window.last] for window in windows])
+    near = stamps[:, None] + np.arange(-0.05, 0.051, 0.01)
+    place = np.stack([np.interp(near, probe.command_times, probe.command[:, axis]) for axis in range(3)])
+    speed = np.diff(place, axis=-1) / 0.01
+    return torch.from_numpy(np.linalg.norm(np.diff(speed, axis=-1) / 0.01, axis=0).max(axis=-1))
