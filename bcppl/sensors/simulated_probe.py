@@ -104,13 +104,17 @@ class SimulatedProbe:
         other.unknowns = unknowns
         return other
 
-    def observe(self, number: int, action: ProbeWindow, world_from_part: Tensor) -> None:
-        """Sample `contacts_*` and `peg_*`."""
-        settings, unknowns = self.settings, self.unknowns
+    def track(self, action: ProbeWindow, world_from_part: Tensor) -> ContactTrack:
+        """The rollout of a window's probe for parts at poses (N, 7), which all its windows share."""
+        unknowns = self.unknowns
         own = () if unknowns is None else (unknowns,)
         begin = partial(ContactTrack.start, self.physics, self.sensing, world_from_part, action.probe, *own)
-        track = carried(f"probe {action.probe.name}", begin)
-        window = (track, action.first, action.last)
+        return carried(f"probe {action.probe.name}", begin)
+
+    def observe(self, number: int, action: ProbeWindow, world_from_part: Tensor) -> None:
+        """Sample `contacts_*` and `peg_*`."""
+        settings = self.settings
+        window = (self.track(action, world_from_part), action.first, action.last)
         pyro.sample(
             f"contacts_{number}", ChamferContacts(*window, settings.contact_scale, settings.one_empty)
         )
