@@ -1,4 +1,4 @@
-"""Accuracy on the simulated 6 s probe, with a likelihood of the wrench beside contact locations or without."""
+"""Accuracy on the simulated 6 s probe, with or without a likelihood of the wrench beside contact locations."""
 
 from __future__ import annotations
 
