@@ -15,12 +15,12 @@ from scenes import (
     MISSED,
     VISION,
     Moment,
+    default_run,
     every,
     followed,
     moment_of,
     one_line,
     quantile,
-    taken_in,
     timed,
 )
 from scipy.stats import bootstrap
@@ -69,7 +69,7 @@ def walked(pose: str) -> Kernel:
 
 
 def by_walks(recording: Recording, particles: int, seed: int) -> Iterator[Step]:
-    """The same model, its measurements tempered in, its particles moved by random walks alone."""
+    """The same model, its likelihoods tempered, its particles moved by random walks alone."""
     model = look_and_touch.model
     step = tempered(walked(model.pose), sweeps=SWEEPS, resample=adaptive(systematic, 0.5))
     return smc(model, recording, step=step, particles=particles, seed=seed)
@@ -78,21 +78,21 @@ def by_walks(recording: Recording, particles: int, seed: int) -> Iterator[Step]:
 def of_touches(recording: Recording, particles: int, seed: int) -> Iterator[Step]:
     """The windows without the images."""
     touches = [m for m in recording.measurements if not isinstance(m.action, View)]
-    return taken_in(dataclasses.replace(recording, measurements=touches), particles, seed)
+    return default_run(dataclasses.replace(recording, measurements=touches), particles, seed)
 
 
 def by_contacts(recording: Recording, particles: int, seed: int) -> Iterator[Step]:
     """Where contact was felt, in the peg's frame, by simulated physics: `peg_in_hole` without peg poses."""
     model = peg_in_hole.model
-    # As wide as a room: where the peg was measured tells nothing.
+    # As wide as a room: the measured pose of the peg carries no information.
     scene = model.prepare(recording, translation_scale=10.0, rotation_scale=100.0)
     return tempered_smc.infer(model, recording, particles=particles, seed=seed, scene=scene)
 
 
 def without_free_space(recording: Recording, particles: int, seed: int) -> Iterator[Step]:
-    """Stamps at which nothing was felt say nothing."""
+    """Stamps without contact do not count."""
     scene = look_and_touch.prepare(recording, free_space=False)
-    return taken_in(recording, particles, seed, scene)
+    return default_run(recording, particles, seed, scene)
 
 
 Way = Callable[[Recording, int, int], Iterator[Step]]
@@ -105,7 +105,7 @@ def ways(particles: int, many: bool) -> dict[str, tuple[Way, int]]:
     found[FREE_SPACE] = without_free_space, particles
     found["random walks only"] = by_walks, particles
     for count in (25, 300, *([MANY] if many else [])):
-        found[f"N = {count}"] = taken_in, count
+        found[f"N = {count}"] = default_run, count
     return found
 
 

@@ -9,6 +9,7 @@ import itertools
 import statistics
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -27,10 +28,11 @@ from bcppl.contact.sensing.location import ContactSensing
 from bcppl.contact.stepping import WRENCH
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.inference.filters.tempered_smc import infer
-from bcppl.models.peg_in_hole import CONTACT, model
+from bcppl.models.peg_in_hole import model
 from bcppl.models.worlds.peg_in_hole import record
 from bcppl.recordings import Recording
 from bcppl.robot.motion import Probe, ProbeWindow
+from bcppl.sensors.simulated_probe import CONTACT
 
 PARTICLES = 75
 TOUCHING = 0.1  # N more or less than in free motion: what a wrist sensor's noise is
@@ -74,8 +76,7 @@ def bare(recording: Recording, probe: Probe, world_from_part: Tensor) -> tuple[C
 def after_vision(recording: Recording, particles: int) -> Tensor:
     """Equally weighted poses (N, 7) of the belief after the depth images."""
     views = [m for m in recording.measurements if m.kind == "view"]
-    seen = Recording(**{**recording.__dict__, "measurements": views})
-    *_, last = infer(model, seen, particles=particles, seed=1)
+    *_, last = infer(model, replace(recording, measurements=views), particles=particles, seed=1)
     chosen = torch.multinomial(last.belief.weights, particles, replacement=True)
     return last.belief.world_from_part[chosen]
 
@@ -238,7 +239,7 @@ def main() -> None:
         spent = {}
         for name, physics in (("whole", whole), ("skipping", skipping)):
             scene = model.prepare(recording)
-            scene = type(scene)(**{**scene.__dict__, "physics": physics})
+            scene.likelihoods["window"].physics = physics
             before = physics.effort.copy()
             for _ in infer(model, recording, particles=particles, seed=arguments.seed, scene=scene):
                 pass

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from report import Row, cores, finish, options, show
 from rich.console import Console
-from scenes import PARTICLES, every, gone_on, one_line, taken_in
+from scenes import PARTICLES, default_run, every, one_line
 from scipy.stats import binomtest
 
 from bcppl import poses
@@ -88,15 +88,15 @@ def attempts(task: Task) -> list[Outcome]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         look = scene.look()
-        looked, seen = model.prepare(look), None
+        seen = None
         for known in task.known:
             try:
                 if seen is None:
-                    *_, seen = taken_in(look, PARTICLES, task.seed, looked)
+                    *_, seen = default_run(look, PARTICLES, task.seed)
                 arm = BenchArm(scene)
                 if known == FIXED:
                     recording = scene.probe(three_two_one(seen.belief, scene.part, scene.peg))
-                    *_, last = gone_on(recording, looked, seen)
+                    *_, last = default_run(recording, PARTICLES, task.seed, start=seen)
                 else:
                     last = seen if known == VISION else _probed(scene, arm, seen)
                 outcomes.append(_attempt(scene, arm, last.belief, known, task.foretell))

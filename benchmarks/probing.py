@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from report import Row, cores, finish, options, show
 from rich.console import Console
-from scenes import PARTICLES, every, one_line, quantile, taken_in
+from scenes import PARTICLES, default_run, every, one_line, quantile
 
 from bcppl.beliefs import Belief
 from bcppl.contact.touch import Touch
@@ -129,7 +129,7 @@ def compared(
             scene = bench_scene(seed)
             found.name = scene.name
             look = scene.look()
-            *_, seen = taken_in(look, particles, seed)
+            *_, seen = default_run(look, particles, seed)
         except Exception as error:
             for course in found.courses.values():
                 course.failed = one_line(error)

@@ -29,10 +29,10 @@ from bcppl.inference.planning.candidate_list import candidates
 from bcppl.inference.population import Population
 from bcppl.inference.schemes import systematic
 from bcppl.models.look_and_touch import model
-from bcppl.models.look_and_touch_scene import Scene, touch_of
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.robot.plan import Plan, probe_of
 from bcppl.sensors.candidates import action_of
+from bcppl.sensors.scene import Scene
 from bcppl.traces import Trace
 
 PARTICLES, CANDIDATES = 75, 32
@@ -55,6 +55,11 @@ class Setting(NamedTuple):
         """The model's, once a plan is carried out as well."""
         return self.scene, [*self.done, action_of(plan)]
 
+    @property
+    def touches(self) -> Any:
+        """The likelihood of touches."""
+        return self.scene.likelihoods["window"]
+
 
 def after_vision(seed: int, particles: int) -> tuple[Setting, list[Plan]]:
     """A scene looked at, and candidates enough for all tables."""
@@ -64,7 +69,9 @@ def after_vision(seed: int, particles: int) -> tuple[Setting, list[Plan]]:
     *_, last = infer(model, recording, particles=particles, seed=seed, scene=scene)
     physics = PegPhysics(world.part, world.peg, ContactParameters(time_step=0.002), share_free_motion=False)
     asked = {"touch": 80, "slide": 48}
-    found = candidates(last.belief, world.part, world.peg, asked, gap=scene.gap, seed=seed)
+    found = candidates(
+        last.belief, world.part, world.peg, asked, gap=scene.likelihoods["window"].gap, seed=seed
+    )
     plans = [each for each in found if isinstance(each, Plan)]
     plans = [replace(each, times=each.times * (LASTING / each.times[-1])) for each in plans]
     order = np.random.default_rng(seed).permutation(len(plans))
@@ -74,7 +81,7 @@ def after_vision(seed: int, particles: int) -> tuple[Setting, list[Plan]]:
 
 def rolled_out(setting: Setting, plan: Plan, part: Tensor) -> Tensor:
     """What physics makes of a plan for poses (N, 7) of the part: (N, T, 8), without the sensors' noise."""
-    probe, every = probe_of(plan), setting.scene.settings.every
+    probe, every = probe_of(plan), setting.touches.settings.every
     rollout = setting.physics.start(part, probe).advance(len(probe.stamps))
     felt = np.linalg.norm(rollout.wrench[..., :3], axis=-1, keepdims=True) > FELT
     return torch.from_numpy(np.concatenate([rollout.world_from_peg, felt], axis=-1)[:, ::every])
@@ -95,7 +102,8 @@ class Physics:
         among = self.setting.population[ADDRESS]
         which = (part[:, None] == among).all(dim=2).to(torch.uint8).argmax(dim=1)
         rows = self.rows[id(plan)][which].clone()
-        noise = self.setting.scene.settings.gap_noise * torch.randn(*rows.shape[:2], 3, dtype=torch.float64)
+        sensor = self.setting.touches
+        noise = sensor.settings.gap_noise * torch.randn(*rows.shape[:2], 3, dtype=torch.float64)
         return torch.cat([rows[..., :3] + noise, rows[..., 3:]], dim=-1)
 
     def forecast(self, plan: Plan, trace: Trace) -> dict[str, Tensor]:
@@ -103,10 +111,10 @@ class Physics:
         return {f"touch_{len(self.setting.done)}": self.at(plan, trace[ADDRESS])}
 
     def information(self, plan: Plan, trace: Trace) -> Tensor:
-        """What that tells, for `linearised_information_gain`."""
+        """The information of that, for `linearised_information_gain`."""
         window, part = action_of(plan), trace[ADDRESS]
         torch.manual_seed(0)
-        return touch_of(self.setting.scene, window, part).quadratic(self.at(plan, part)).information
+        return self.setting.touches.site(window, part).quadratic(self.at(plan, part)).information
 
 
 def timed(work: Callable[[], Ranking]) -> tuple[Ranking, float]:

@@ -1,8 +1,8 @@
-"""One scene of the accuracy bench from its two images to the end of its probe, and how far off the belief is.
+"""One scene of the accuracy bench from its two images to the end of its probe, and the belief's errors.
 
-Vision first; from its belief a probe is planned by `three_two_one` and carried out; the touches are taken in
-from where vision left off, with the same particles and the same random state. The belief at the end is, to
-the bit, that of a run over the whole recording.
+From the belief after vision `three_two_one` plans a probe, which is carried out; its touches are assimilated
+by a run that is resumed from vision's last step. The belief at the end is, to the bit, that of a run over the
+whole recording.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Probed:
         curve: ADD over time.
         seconds: wall time of "vision", "planning" and "touch".
         efforts: by simulator, wall time (s) and what it made (images or gaps).
-        tempered: how many measurements were let in by tempering.
+        tempered: how many measurements were tempered.
         warned: whether a run would have said that a measurement does not fit (`bcppl.cli.surprises`).
         memory: most that the process ever held, GB.
     """
@@ -180,24 +180,11 @@ def regions_of(belief: Belief, scene: BenchScene) -> dict[tuple[str, float], boo
     }
 
 
-def taken_in(
+def default_run(
     recording: Recording, particles: int, seed: int, scene: Any = None, start: Step | None = None
 ) -> Iterator[Step]:
-    """The default inference, from the beginning or from a step."""
+    """The default inference, from the beginning or resumed from a step."""
     return infer(model, recording, particles=particles, seed=seed, scene=scene, start=start)
-
-
-def gone_on(recording: Recording, before: Any, start: Step) -> Iterator[Step]:
-    """The rest of a recording whose beginning was taken in.
-
-    Args:
-        recording: all of it.
-        before: the model's scene of its beginning: what was found out there about the images is kept.
-        start: the last step taken there.
-    """
-    scene = model.prepare(recording)
-    scene.fits.update(before.fits)
-    return taken_in(recording, len(start.population), 0, scene, start)
 
 
 def probed(seed: int, particles: int = PARTICLES, bench: Bench | None = None) -> Probed:
@@ -215,14 +202,13 @@ def followed(
         found.part, found.clearance = scene.kind.name, round(1e3 * scene.clearance, 6)
         look = scene.look()
         with timed(found.seconds, "vision"):
-            looked = model.prepare(look)
-            for step in taken_in(look, particles, seed, looked):
+            for step in default_run(look, particles, seed):
                 steps.append(step)
         with timed(found.seconds, "planning"):
             plan = three_two_one(steps[-1].belief, scene.part, scene.peg)
         recording = scene.probe(plan)
         with timed(found.seconds, "touch"):
-            for step in gone_on(recording, looked, steps[-1]):
+            for step in default_run(recording, particles, seed, start=steps[-1]):
                 steps.append(step)
     except Exception as error:
         found.missed = one_line(error)

@@ -26,9 +26,10 @@ from bcppl.contact.touch import Touch
 from bcppl.geometry.distance import SignedDistance
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.filters.tempered_smc import infer
-from bcppl.models.point_probe import Settings, felt, learn, model, registration_pose
+from bcppl.models.point_probe import learn, model
 from bcppl.recordings.importers.point_probe import command
 from bcppl.sensors import Push, Recording
+from bcppl.sensors.point_finger import FingerSettings, contact_of, registration_pose
 
 LOGS = DATA / "point_probe_pushes"
 OTHER = {"10_90": "10_130", "10_130": "10_90"}  # where the finger is learnt for the pushes of a log
@@ -51,8 +52,8 @@ def pushes(log: str, count: int, seed: int) -> Recording:
 
 
 @cache
-def learnt(log: str, calibrated: bool = True) -> Settings:
-    """Settings from all pushes of a log; without the calibration the finger touches where it says."""
+def learnt(log: str, calibrated: bool = True) -> FingerSettings:
+    """FingerSettings from all pushes of a log; without the calibration the finger touches where it says."""
     recording = pushes(log, PUSHES, 0)
     return learn(recording) if calibrated else learn(recording, finger=(0.0, 0.0, 0.0))
 
@@ -75,16 +76,16 @@ def explained(recording: Recording, seed: int, settings: dict[str, Any]) -> Iter
         idle += time.perf_counter() - now  # what is done with a step in between is not the run's
 
 
-def contacts(recording: Recording, settings: Settings) -> Tensor:
+def contacts(recording: Recording, settings: FingerSettings) -> Tensor:
     """Where the finger was, by its calibration, when contact was first felt (K, 3), in the world."""
     places = []
     for k, one in enumerate(recording.measurements):
         assert isinstance(one.action, Push) and isinstance(one.observation, Touch)
-        places.append(felt(one.action, one.observation, settings, f"push {k}").onset)
+        places.append(contact_of(one.action, one.observation, settings, f"push {k}").onset)
     return torch.stack(places)
 
 
-def fitted(recording: Recording, settings: Settings, registered: bool) -> Tensor:
+def fitted(recording: Recording, settings: FingerSettings, registered: bool) -> Tensor:
     """The pose (7,) of robust least squares on the contacts' depths, started at the truth.
 
     The residual is the depth of a contact less the offset of the settings; beyond a millimetre it counts by
@@ -106,7 +107,7 @@ def fitted(recording: Recording, settings: Settings, registered: bool) -> Tensor
     return tracked(pose(found.x), recording, settings) if registered else pose(found.x)
 
 
-def tracked(world_from_touched: Tensor, recording: Recording, settings: Settings) -> Tensor:
+def tracked(world_from_touched: Tensor, recording: Recording, settings: FingerSettings) -> Tensor:
     """The pose (7,) of the frame that the truth is stated in, of a part that was touched at a pose (7,)."""
     middle = torch.tensor(recording.part.mesh.centroid, dtype=torch.float64)
     registration = registration_pose(settings.registration, middle)

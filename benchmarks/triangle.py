@@ -37,9 +37,10 @@ from bcppl.inference.design import (
 )
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.filters.tempered_smc import infer
-from bcppl.models.point_probe import felt, model
+from bcppl.models.point_probe import model
 from bcppl.recordings.importers.point_probe import command
 from bcppl.sensors import Push, Recording
+from bcppl.sensors.point_finger import contact_of
 from bcppl.traces import Trace, extend
 
 LOG = "10_90"
@@ -82,7 +83,7 @@ def edge_of(recording: Recording, push: int, settings: Any) -> Tensor:
     """The outward normal (3,), in the part's frame, of the edge that a push met, by the true pose."""
     one, truth = recording.measurements[push], torch.as_tensor(recording.truth)
     assert isinstance(one.action, Push) and isinstance(one.observation, Touch)
-    onset = felt(one.action, one.observation, settings).onset
+    onset = contact_of(one.action, one.observation, settings).onset
     place = poses.transform(poses.inverse(truth), onset[None])
     return SignedDistance(recording.part)(place).normal[0]
 
@@ -110,17 +111,19 @@ def after(recording: Recording, numbers: Sequence[int], scene: Any, seed: int, s
     return last
 
 
-def told(arguments: Callable[[Any], tuple[Any, ...]], push: Push, trace: Trace) -> Tensor:
-    """What an onset tells of the pose, (H, 6, 6): the distance of the finger from the edge that it meets."""
+def information(arguments: Callable[[Any], tuple[Any, ...]], push: Push, trace: Trace) -> Tensor:
+    """The information (H, 6, 6) of an onset: of the distance of the finger from the edge that it meets."""
     scene, pushes = arguments(push)
     longer, _ = extend(trace, (scene, pushes), {})
     onset, part = longer[f"onset_{len(pushes) - 1}"], longer["part"]
     felt_at = torch.where(torch.isnan(onset), part[:, :3], onset)
     place = poses.transform(poses.inverse(part), felt_at[:, None])
-    near = scene.distance(place[:, 0])
-    slope = Gap(near.distance[:, None], place, near.normal[:, None]).gradient(part)
-    slope = torch.where(torch.isnan(onset).any(dim=1)[:, None, None], 0.0, slope) / scene.settings.spread
-    return slope.transpose(-1, -2) @ slope
+    finger = scene.sensor(push)
+    near = finger.distance(place[:, 0])
+    gradient = Gap(near.distance[:, None], place, near.normal[:, None]).gradient(part)
+    missed = torch.isnan(onset).any(dim=1)[:, None, None]
+    gradient = torch.where(missed, 0.0, gradient) / finger.settings.spread
+    return gradient.transpose(-1, -2) @ gradient
 
 
 def chosen(
@@ -157,7 +160,7 @@ def chosen(
             for entropy in (weight_entropy(), mode_entropy("part"))
         ),
         linearised_information_gain(
-            first.population, actions, arguments, information=partial(told, arguments), seed=seed
+            first.population, actions, arguments, information=partial(information, arguments), seed=seed
         ),
     ]
     for ranking in rankings:

@@ -1,12 +1,10 @@
-"""What the wrench itself adds to contact locations on the simulated 6 s probe: runs with and without it."""
+"""Accuracy on the simulated 6 s probe, with or without a likelihood of the wrench beside contact locations."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyro
@@ -17,91 +15,84 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.contact.mujoco_model import ContactParameters
-from bcppl.contact.probe_rollout import ProbeRollout
-from bcppl.contact.touch import Touch
 from bcppl.distributions.contact import ChamferContacts, PegPose
-from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.wrench import Wrench
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models import peg_in_hole
 from bcppl.models.worlds.peg_in_hole import record
 from bcppl.robot.motion import ProbeWindow
-from bcppl.sensors import Measurement, View
-from bcppl.traces import Model, carried
+from bcppl.sensors import Recording
+from bcppl.sensors.scene import Numbered, Scene
+from bcppl.sensors.simulated_probe import CONTACT, ProbeSettings, SimulatedProbe
 
 PARTICLES = 75
-# What inference believes of the contact when it is told what the world's is; the shipped model is not.
-TOLD = ContactParameters(time_step=0.0015, friction=0.2, time_constant=0.003)
+WORLD = ContactParameters(time_step=0.0015, friction=0.2, time_constant=0.003)  # the world's own friction
 
 
 @dataclass(frozen=True)
-class Feeling:
-    """The shipped program with a choice of what is made of a window.
+class Variant:
+    """Which sites a window has.
 
     Attributes:
-        contacts: whether contact locations count, by Chamfer.
-        scales: of the wrench's force (N) and torque (N m), and the share of both; None where it is not used.
-        contact: what inference believes of the contact.
+        contacts: whether it has `contacts_*`, by Chamfer.
+        scales: of the wrench's force (N) and torque (N m), and the share of both; None for no `wrench_*`.
+        contact: parameters of the physics.
     """
 
     contacts: bool = True
     scales: tuple[float, float, float] | None = None
-    contact: ContactParameters = peg_in_hole.CONTACT
+    contact: ContactParameters = CONTACT
 
-    def __call__(self, scene: Any, actions: Sequence[View | ProbeWindow]) -> None:
-        """The program."""
-        settings = scene.settings
-        hole = pyro.sample("hole", scene.prior)
-        for k, action in enumerate(actions):
-            if isinstance(action, View):
-                depth = RobustDepth(
-                    scene.renderer,
-                    action.camera,
-                    hole,
-                    scale=settings.depth_scale,
-                    outlier=settings.outlier,
-                    background=scene.background.get(action.camera.name),
-                    effective_pixels=settings.effective_pixels,
-                )
-                pyro.sample(f"depth_{k}", depth)
-                continue
-            begin = partial(ProbeRollout.start, scene.physics, scene.sensing, hole, action.probe)
-            window = (carried(f"probe {action.probe.name}", begin), action.first, action.last)
-            if self.contacts:
-                felt = ChamferContacts(*window, settings.contact_scale, settings.one_empty)
-                pyro.sample(f"contacts_{k}", felt)
-            scales = settings.translation_scale, settings.rotation_scale
-            pyro.sample(f"peg_{k}", PegPose(*window, *scales, every=settings.pose_every))
-            if self.scales is not None:
-                pyro.sample(f"wrench_{k}", Wrench(*window, *self.scales, every=settings.pose_every))
+    def prepare(self, recording: Recording) -> Scene:
+        """The scene of `peg_in_hole` with another likelihood of windows."""
+        scene = peg_in_hole.prepare(recording, contact=self.contact)
+        probe = WrenchProbe(recording, scene.likelihoods["window"].settings, self)
+        return replace(scene, likelihoods={**scene.likelihoods, "window": probe})
 
-    def observe(self, scene: Any, measurements: Sequence[Measurement]) -> Mapping[str, Tensor]:
-        """What the shipped model observes, and the tared wrench."""
-        values = dict(peg_in_hole.observe(scene, measurements))
-        touches = [(k, m.observation) for k, m in enumerate(measurements) if isinstance(m.observation, Touch)]
-        if touches and self.scales is not None:
-            tared = scene.sensing.tared([touch for _, touch in touches])
-            values |= {f"wrench_{k}": wrench for (k, _), wrench in zip(touches, tared, strict=True)}
-        return {a: v for a, v in values.items() if self.contacts or not a.startswith("contacts_")}
+
+class WrenchProbe(SimulatedProbe):
+    """Windows of a simulated probe with the sites of a variant."""
+
+    def __init__(self, recording: Recording, settings: ProbeSettings, variant: Variant) -> None:
+        super().__init__(recording, settings)
+        self.variant = variant
+
+    def observe(self, number: int, action: ProbeWindow, world_from_part: Tensor) -> None:
+        """Sample the variant's sites."""
+        settings, variant = self.settings, self.variant
+        window = (self.rollout(action, world_from_part), action.first, action.last)
+        if variant.contacts:
+            contacts = ChamferContacts(*window, settings.contact_scale, settings.one_empty)
+            pyro.sample(f"contacts_{number}", contacts)
+        scales = settings.translation_scale, settings.rotation_scale
+        pyro.sample(f"peg_{number}", PegPose(*window, *scales, every=settings.pose_every))
+        if variant.scales is not None:
+            pyro.sample(f"wrench_{number}", Wrench(*window, *variant.scales, every=settings.pose_every))
+
+    def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
+        """Contact locations, peg poses and tared wrenches, by address, as far as the variant has them."""
+        values = dict(super().observed(measurements))
+        if self.variant.scales is not None:
+            tared = self.sensing.tared([measurement.observation for _, measurement in measurements])
+            values |= {f"wrench_{n}": wrench for (n, _), wrench in zip(measurements, tared, strict=True)}
+        return {a: v for a, v in values.items() if self.variant.contacts or not a.startswith("contacts_")}
 
 
 TIGHT, LOOSE = (0.3, 0.02, 0.15), (4.0, 0.2, 0.3)
 VARIANTS = {
-    "contacts and pose": Feeling(),
-    "and wrench": Feeling(scales=TIGHT),
-    "and wrench, loose": Feeling(scales=LOOSE),
-    "wrench and pose, loose": Feeling(contacts=False, scales=LOOSE),
-    "contacts and pose, contact told": Feeling(contact=TOLD),
-    "and wrench, contact told": Feeling(scales=TIGHT, contact=TOLD),
+    "contacts and pose": Variant(),
+    "and wrench": Variant(scales=TIGHT),
+    "and wrench, loose": Variant(scales=LOOSE),
+    "wrench and pose, loose": Variant(contacts=False, scales=LOOSE),
+    "contacts and pose, the world's friction": Variant(contact=WORLD),
+    "and wrench, the world's friction": Variant(scales=TIGHT, contact=WORLD),
 }
 
 
 def run(task: tuple[str, int]) -> tuple[float, ...]:
-    """Finds the hole of a seed with what a variant makes of the touches."""
+    """The error and the spread of a variant's belief over the hole of a seed, and its cost."""
     name, seed = task
-    program = VARIANTS[name]
-    prepare = partial(peg_in_hole.prepare, contact=program.contact)
-    model = Model(program=program, prepare=prepare, observe=program.observe, pose="hole")
+    model = replace(peg_in_hole.model, prepare=VARIANTS[name].prepare)
     recording = record(seed)
     begun = time.perf_counter()
     *_, last = infer(model, recording, particles=PARTICLES, seed=seed)
@@ -155,7 +146,7 @@ def main() -> None:
         for column, value in zip(COLUMNS, median, strict=True):
             *what, unit = column.rpartition(" ") if " " in column else (column, "", "")
             rows.append(Row(f"{name}: {''.join(what).strip()}, median", float(value), unit))
-    show(f"simulated probe, {PARTICLES} particles, what is made of the touches", ["", *COLUMNS], lines)
+    show(f"simulated probe, {PARTICLES} particles", ["", *COLUMNS], lines)
     finish(rows, arguments.json)
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import pyro
 
+from bcppl.arguments import number_within
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.geometry.parts import Part
 from bcppl.rendering.part_renderer import PartRenderer
@@ -39,6 +40,9 @@ class DepthSettings:
     depth_scale: float = 0.003
     outlier: float = 0.1
     effective_pixels: float = 50.0
+
+    def __post_init__(self) -> None:
+        number_within("a site's spread must be positive and depth_scale is {}", self.depth_scale, above=0.0)
 
 
 def peg_in_hole(scene: Scene, actions: Sequence[Any]) -> None:

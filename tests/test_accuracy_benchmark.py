@@ -53,18 +53,16 @@ def test_hole_errors_are_those_that_were_put_in():
 
 @pytest.fixture(scope="module")
 def seen():
-    """A scene, the model's scene of its images, and the steps of vision."""
+    """A scene and the steps of vision."""
     scene = bench_scene(0)
-    look = scene.look()
-    looked = model.prepare(look)
-    return scene, looked, list(scenes.taken_in(look, FEW, 0, looked))
+    return scene, list(scenes.default_run(scene.look(), FEW, 0))
 
 
 def test_touches_after_vision_are_those_of_one_run_to_the_bit(seen):
-    scene, looked, vision = seen
+    scene, vision = seen
     whole = scene.probe(three_two_one(vision[-1].belief, scene.part, scene.peg))
     felt = replace(whole, measurements=whole.measurements[:9])  # 3.5 s: the first contacts are among them
-    touched = list(scenes.gone_on(felt, looked, vision[-1]))
+    touched = list(scenes.default_run(felt, FEW, 0, start=vision[-1]))
     straight = list(infer(model, felt, particles=FEW, seed=0))
     assert len(vision) + len(touched) == len(straight)
     for one, other in zip([*vision, *touched], straight, strict=True):

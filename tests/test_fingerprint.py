@@ -55,7 +55,9 @@ WHOLE = full()
 assert WHOLE.peg is not None
 OTHER = {
     "command": changed(1, "action", "probe", "command"),
+    "command times": changed(1, "action", "probe", "command_times"),
     "stiffness": changed(1, "action", "probe", "stiffness"),
+    "damping": changed(1, "action", "probe", "damping"),
     "stamps": changed(1, "action", "probe", "stamps"),
     "window": with_window(first=8),
     "path": changed(3, "action", "world_from_tip"),
@@ -69,6 +71,7 @@ OTHER = {
     "camera name": with_camera(name="right"),
     "camera device": with_camera(device="wrist"),
     "camera focal length": with_camera(fx=9.1),
+    "camera range": with_camera(far=9.1),
     "camera distortion": with_camera(distortion=(0.01, 0.0, 0.0, 0.0)),
     "background": replace(WHOLE, background={"left": WHOLE.background["left"] + 1e-4}),
     "background name": replace(WHOLE, background={"right": WHOLE.background["left"]}),

@@ -104,13 +104,17 @@ class SimulatedProbe:
         other.nuisances = nuisances
         return other
 
-    def observe(self, number: int, action: ProbeWindow, world_from_part: Tensor) -> None:
-        """Sample `contacts_*` and `peg_*`."""
-        settings, nuisances = self.settings, self.nuisances
+    def rollout(self, action: ProbeWindow, world_from_part: Tensor) -> ProbeRollout:
+        """The rollout of a window's probe for parts at poses (N, 7), which all its windows share."""
+        nuisances = self.nuisances
         own = () if nuisances is None else (nuisances,)
         begin = partial(ProbeRollout.start, self.physics, self.sensing, world_from_part, action.probe, *own)
-        track = carried(f"probe {action.probe.name}", begin)
-        window = (track, action.first, action.last)
+        return carried(f"probe {action.probe.name}", begin)
+
+    def observe(self, number: int, action: ProbeWindow, world_from_part: Tensor) -> None:
+        """Sample `contacts_*` and `peg_*`."""
+        settings = self.settings
+        window = (self.rollout(action, world_from_part), action.first, action.last)
         pyro.sample(
             f"contacts_{number}", ChamferContacts(*window, settings.contact_scale, settings.one_empty)
         )

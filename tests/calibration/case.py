@@ -42,7 +42,7 @@ class Case:
 
     Attributes:
         program: `program(count)` draws "pose", and "seen" where count is 1. Data are drawn from it.
-        center: (7,) where the coordinates are taken, which must not hang on particles or data.
+        center: (7,) where the coordinates are taken, which must not depend on particles or data.
         freedom: the free axes of the pose.
         kernel: moves the particles.
         believed: the program that inference runs; the same as `program` in all but mutants.
@@ -88,7 +88,7 @@ class Case:
             return population
         return rejuvenate(population, self.kernel, POSTERIOR, self.settling).population
 
-    def invent(self) -> tuple[Tensor, Tensor]:
+    def simulate_once(self) -> tuple[Tensor, Tensor]:
         """A pose (7,) from the prior, and data drawn there."""
         world = simulate(self.program, (1,), 1)
         return world["pose"][0], world["seen"][0]
@@ -104,7 +104,7 @@ class Drawn(NamedTuple):
 def draw(case: Case, seed: int) -> Drawn:
     """One round: draw, infer, rank."""
     torch.manual_seed(seed)
-    truth, seen = case.invent()
+    truth, seen = case.simulate_once()
     with case.patched():
         population = case.infer(seen)
     chosen = systematic(population.log_weights)[torch.randperm(len(population))[:DRAWS]]

@@ -147,7 +147,7 @@ def covered(seed: int) -> tuple[bool, bool]:
     """Whether regions of mass 0.5 and 0.9 by the Chamfer surrogate hold the truth, in one round."""
     torch.manual_seed(seed)
     case = touch.surrogate()
-    truth, seen = case.invent()
+    truth, seen = case.simulate_once()
     belief = case.infer(seen).belief("pose")
     inside = [bool(belief.credible_region(mass).contains(truth)) for mass in (0.5, 0.9)]
     return inside[0], inside[1]

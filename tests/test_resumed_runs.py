@@ -1,0 +1,202 @@
+"""Runs that are resumed, branched or repeated on one scene give the same bits."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from importlib.resources import as_file, files
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.geometry.guess import Guess
+from bcppl.inference.filters import bayes_contact, guided_smc, tempered_smc
+from bcppl.inference.filters.smc import Step
+from bcppl.inference.planning.metrology import three_two_one
+from bcppl.models import look_and_touch, peg_in_hole, point_probe
+from bcppl.models.worlds.bench import Bench, bench_scene
+from bcppl.recordings import Recording, load
+from bcppl.sensors.scene import Scene
+from bcppl.traces import Model
+
+PARTICLES = 6
+# Windows are left out of the recordings for the sake of time.
+pytestmark = pytest.mark.filterwarnings("ignore:.*leaves out stamps")
+
+FIRST, SECOND = 0, 1  # views of the bench
+TOP, LATER, ON = 8, 10, 11  # windows in which the peg feels the top, again farther on, and stays on it
+
+
+@functools.cache
+def probed() -> Recording:
+    """A scene of the bench with small images, probed by a plan laid out at the truth."""
+    scene = bench_scene(7, Bench(width=64, rows=48, focal=64.0), part="square 8 mm")
+    truth = torch.from_numpy(scene.truth)
+    certain = Belief(truth.expand(4, 7).clone(), torch.zeros(4, dtype=torch.float64))
+    whole = scene.probe(three_two_one(certain, scene.part, scene.peg))
+    near = poses.retract(truth, torch.tensor([1e-3, -2e-3, 1e-3, 0.01, -0.01, 0.02]).double()).numpy()
+    return replace(whole, guess=Guess(near, np.full(3, 0.005), 0.03, 0.06))
+
+
+def bench(*which: int) -> Recording:
+    return replace(probed(), measurements=[probed().measurements[k] for k in which])
+
+
+def precisely_known(*which: int) -> Recording:
+    """The same, the part known to half a millimetre: touches alone discriminate between particles."""
+    recording = bench(*which)
+    return replace(recording, guess=Guess(recording.truth, np.full(3, 0.0006), 0.01, 0.02))
+
+
+def shipped(name: str, *which: int) -> Recording:
+    with as_file(files("bcppl.models") / f"recordings/{name}.h5") as file:
+        whole = load(file)
+    return replace(whole, measurements=[whole.measurements[k] for k in which])
+
+
+def assert_same(first: Sequence[Step], second: Sequence[Step]) -> None:
+    """Equal to the bit, step by step."""
+    assert [one.taken for one in first] == [other.taken for other in second]
+    differing = [
+        f"{name} after {one.info.label}"
+        for one, other in zip(first, second, strict=True)
+        for name, value in state_of(one).items()
+        if not torch.equal(value, state_of(other)[name])
+    ]
+    assert not differing
+
+
+def state_of(step: Step) -> dict[str, torch.Tensor]:
+    return {
+        "poses": step.belief.world_from_part,
+        "log weights": step.belief.log_weights,
+        "log evidence": torch.tensor(step.population.log_evidence, dtype=torch.float64),
+        "random state": step.random_state,
+        **step.population.trace.choices,
+    }
+
+
+# ---------------------------------------------------------------- resumed from a step
+
+FEW_MOVES = functools.partial(tempered_smc.infer, sweeps=(2, 2))
+# The inference program, the model, the recording, and the steps to resume from.
+RUNS: dict[str, tuple[Callable[..., Any], Model, Callable[[], Recording], tuple[int, ...]]] = {
+    "guided, views and a touch": (
+        guided_smc.infer,
+        look_and_touch.model,
+        lambda: bench(FIRST, SECOND, TOP),
+        (1,),
+    ),
+    "guided, touches around a view": (
+        guided_smc.infer,
+        look_and_touch.model,
+        lambda: bench(TOP, FIRST, LATER),
+        (2,),
+    ),
+    "tempered, touches": (FEW_MOVES, look_and_touch.model, lambda: precisely_known(LATER, ON), (1,)),
+    "tempered, a view and windows": (
+        FEW_MOVES,
+        peg_in_hole.model,
+        lambda: shipped("peg_probe", 0, 2, 3),
+        (1, 2),
+    ),
+    "tempered, pushes": (
+        FEW_MOVES,
+        point_probe.model,
+        lambda: shipped("point_probe_10_pushes", 0, 1, 2),
+        (1, 2),
+    ),
+    "drifting, a view and windows": (
+        bayes_contact.infer,
+        peg_in_hole.model,
+        lambda: shipped("peg_probe", 0, 2, 3),
+        (1, 2),
+    ),
+    "drifting, pushes": (
+        bayes_contact.infer,
+        point_probe.model,
+        lambda: shipped("point_probe_10_pushes", 0, 1, 2),
+        (1, 2),
+    ),
+}
+
+
+@functools.cache
+def whole_run(name: str) -> list[Step]:
+    infer, model, recording, _ = RUNS[name]
+    return list(infer(model, recording(), particles=PARTICLES, seed=3))
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_resumed_run_is_the_uninterrupted_one(name: str) -> None:
+    """It is resumed from nothing but a step."""
+    infer, model, recording, starts = RUNS[name]
+    run = whole_run(name)
+    for taken in starts:
+        assert_same(run[taken + 1 :], list(infer(model, recording(), seed=3, start=run[taken])))
+
+
+@pytest.mark.parametrize("name", ["guided, touches around a view", "tempered, touches"])
+def test_a_run_is_resumed_on_a_new_scene(name: str) -> None:
+    infer, model, recording, (taken,) = RUNS[name]
+    run, scene = whole_run(name), model.prepare(recording())
+    assert_same(run[taken + 1 :], list(infer(model, recording(), seed=3, start=run[taken], scene=scene)))
+
+
+# ---------------------------------------------------------------- one scene for several runs
+
+
+def guided(recording: Recording, scene: Any, start: Step | None = None) -> list[Step]:
+    model = look_and_touch.model
+    return list(guided_smc.infer(model, recording, particles=PARTICLES, seed=1, scene=scene, start=start))
+
+
+def fresh() -> Scene:
+    """A scene that knows the cameras and the probe of all measurements."""
+    return look_and_touch.prepare(probed())
+
+
+@functools.cache
+def alone(*which: int) -> list[Step]:
+    return guided(bench(*which), fresh())
+
+
+@pytest.mark.parametrize(("one", "other"), [(TOP, LATER), (SECOND, TOP), (TOP, SECOND)])
+def test_two_branches_from_one_step_do_not_influence_each_other(one: int, other: int) -> None:
+    """After a view: two windows, a view and a window, and a window and a view."""
+    *_, start = guided(bench(FIRST), fresh())
+    scene = start.population.trace.args[0]
+    guided(bench(FIRST, one), scene, start)
+    assert_same(alone(FIRST, other)[2:], guided(bench(FIRST, other), scene, start))
+
+
+def test_another_image_with_the_same_number_is_fitted() -> None:
+    scene = fresh()
+    guided(bench(FIRST), scene)
+    assert_same(alone(SECOND), guided(bench(SECOND), scene))
+
+
+def test_a_run_in_another_order_on_the_same_scene_has_no_influence() -> None:
+    scene = fresh()
+    guided(bench(TOP, FIRST), scene)
+    assert_same(alone(FIRST, TOP), guided(bench(FIRST, TOP), scene))
+
+
+def test_a_run_by_another_inference_program_on_the_same_scene_has_no_influence() -> None:
+    """Guided runs fit images, tempered ones do not."""
+    scene, recording = fresh(), bench(FIRST, TOP)
+    other = tempered_smc.infer(
+        look_and_touch.model, recording, particles=PARTICLES, sweeps=(1, 1), scene=scene
+    )
+    assert [step.taken for step in other] == [0, 1, 2]
+    assert_same(alone(FIRST, TOP), guided(recording, scene))
+
+
+def test_a_second_run_on_the_same_scene_is_the_first() -> None:
+    first = alone(FIRST, TOP)
+    assert_same(first, guided(bench(FIRST, TOP), first[0].population.trace.args[0]))
