@@ -11,12 +11,10 @@ import hashlib
 import importlib.metadata
 import json
 import os
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -101,11 +99,9 @@ def decomposed(
     if not levels:
         raise InputError(f"{task} without thresholds; give at least one, such as 0.05.")
     seed = seed_number(seed)
-    hulls = [np.asarray(body.convex_hull.vertices) for body in bodies_of(part.mesh)]
-    whole = replace(part, pieces=tuple(Piece("hull", corners) for corners in hulls))
-    error = hausdorff_error(whole, seed=seed)
-    if error.largest <= bound:
-        return Decomposition(whole, error, 0.0)
+    whole = _measured(part, [np.asarray(b.convex_hull.vertices) for b in bodies_of(part.mesh)], 0.0, seed)
+    if whole.error.largest <= bound:
+        return whole
     results: list[Decomposition] = []
     with _progress(part, progress) as show:
         for threshold in levels:
@@ -150,7 +146,7 @@ def _progress(part: Part, progress: bool | None) -> Iterator[Callable[[str], Non
 
 
 def _cached(part: Part, threshold: float, seed: int, cache: str | Path | None) -> Decomposition:
-    """A decomposition from the cache, or computed and written to it."""
+    """A decomposition from the cache, measured again, or computed and written to the cache."""
     version = _version(part)
     # Not before: platformdirs is installed together with CoACD.
     folder = _user_cache() if cache is None else Path(cache)
@@ -159,13 +155,25 @@ def _cached(part: Part, threshold: float, seed: int, cache: str | Path | None) -
     for array in (part.vertices.astype("<f8"), part.faces.astype("<i8")):
         content.update(np.ascontiguousarray(array).tobytes())
     path = folder / f"{content.hexdigest()}.npz"
-    stored = _read(path)
-    hulls = _coacd(part, threshold, seed) if stored is None else stored[0]
-    made = replace(part, pieces=tuple(Piece("hull", hull) for hull in hulls))
-    error = hausdorff_error(made, seed=seed) if stored is None else stored[1]
-    if stored is None:
-        _write(path, hulls, error)
-    return Decomposition(made, error, threshold)
+    if path.is_file():
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                hulls = np.split(stored["corners"], np.cumsum(stored["counts"])[:-1])
+            return _measured(part, hulls, threshold, seed)
+        except Exception as damage:  # zip, numpy, the file system and convex hulls have errors of their own
+            warnings.warn(
+                f"the cached decomposition {path} is damaged ({damage}) and is computed again.",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+    hulls = _coacd(part, threshold, seed)
+    _write(path, hulls)
+    return _measured(part, hulls, threshold, seed)
+
+
+def _measured(part: Part, hulls: Sequence[Array], threshold: float, seed: int) -> Decomposition:
+    whole = replace(part, pieces=tuple(Piece("hull", hull) for hull in hulls))
+    return Decomposition(whole, hausdorff_error(whole, seed=seed), threshold)
 
 
 def _version(part: Part) -> str:
@@ -199,56 +207,20 @@ def _user_cache() -> Path:
     return platformdirs.user_cache_path("bcppl") / "decompositions"
 
 
-def _read(path: Path) -> tuple[list[Array], HausdorffError] | None:
-    """The hulls and the error of a cached file; None if it is missing or, with a warning, damaged."""
-    if not path.is_file():
-        return None
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            corners, counts, error = stored["corners"], stored["counts"], stored["error"]
-            checksum = stored["checksum"]
-        if not np.array_equal(checksum, _checksum(corners, counts, error)):
-            raise ValueError("its checksum is wrong")
-        hulls = np.split(corners, np.cumsum(counts)[:-1])
-        return hulls, HausdorffError(float(error[0]), float(error[1]))
-    except Exception as damage:  # zip, numpy and the file system each have errors of their own
-        warnings.warn(
-            f"the cached decomposition {path} is damaged ({damage}) and is computed again.",
-            RuntimeWarning,
-            stacklevel=5,
-        )
-        return None
-
-
-def _checksum(*arrays: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8]:
-    """SHA-256 (32,) of arrays with their shapes and types."""
-    content = hashlib.sha256()
-    for array in arrays:
-        content.update(f"{array.dtype.str} {array.shape} ".encode())
-        content.update(np.ascontiguousarray(array).tobytes())
-    return np.frombuffer(content.digest(), dtype=np.uint8)
-
-
-def _write(path: Path, hulls: list[Array], error: HausdorffError) -> None:
+def _write(path: Path, hulls: Sequence[Array]) -> None:
     """Write a cached file atomically."""
+    unfinished = path.with_name(f"{path.stem}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        stored: dict[str, Any] = {
-            "corners": np.concatenate(hulls),
-            "counts": np.array([len(hull) for hull in hulls]),
-            "error": np.array([error.added, error.lost]),
-        }
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-            try:
-                np.savez_compressed(file, checksum=_checksum(*stored.values()), **stored)
-                file.close()
-                os.replace(file.name, path)
-            except BaseException:
-                Path(file.name).unlink()
-                raise
+        with unfinished.open("wb") as file:
+            np.savez_compressed(file, corners=np.concatenate(hulls), counts=[len(hull) for hull in hulls])
+        os.replace(unfinished, path)
     except OSError as refusal:
         warnings.warn(
             f"the decomposition cannot be cached at {path} ({refusal}); it will be computed again next time.",
             RuntimeWarning,
-            stacklevel=5,
+            stacklevel=4,
         )
+    finally:
+        with contextlib.suppress(OSError):
+            unfinished.unlink()

@@ -95,25 +95,27 @@ def planes_of(solid: trimesh.Trimesh) -> Array:
 
 def _outside(points: Array, solids: list[trimesh.Trimesh]) -> Array:
     """Distances (P,) of points (P, 3) to the union of convex solids; 0 inside."""
-    beyond = np.full(len(points), np.inf)
+    points, beyond = np.asfortranarray(points), np.full(len(points), np.inf)
     for solid in solids:
-        close = np.flatnonzero(_beyond_box(points, solid) < beyond)
+        close = np.flatnonzero(_beyond_box(points.T, solid) < beyond)
         beyond[close] = np.minimum(beyond[close], _beyond_planes(points[close], solid))
     # The farthest plane decides between inside and outside, and bounds the distance to the surface below.
-    distance = np.where(beyond > 1e-9, np.inf, 0.0)
+    distance, outside = np.where(beyond > 1e-9, np.inf, 0.0), np.flatnonzero(beyond > 1e-9)
     for solid in solids:
-        close = np.flatnonzero(_beyond_box(points, solid) < np.minimum(distance, beyond + 1e-4))
+        least = np.minimum(distance, beyond + 1e-4)[outside]
+        close = outside[_beyond_box(points[outside].T, solid) < least]
         close = close[_beyond_planes(points[close], solid) < distance[close]]
         if len(close):
             corners, faces = np.array(solid.vertices), np.array(solid.faces, dtype=np.int64)
-            squared = igl.point_mesh_squared_distance(points[close], corners, faces)[0]
+            squared = igl.point_mesh_squared_distance(np.ascontiguousarray(points[close]), corners, faces)[0]
             distance[close] = np.minimum(distance[close], np.sqrt(squared))
     return np.where(np.isfinite(distance), distance, beyond)
 
 
-def _beyond_box(points: Array, solid: trimesh.Trimesh) -> Array:
-    """Lower bounds (P,) on the distances of points (P, 3) to a solid, from its bounding box."""
-    return np.asarray(np.maximum(solid.bounds[0] - points, points - solid.bounds[1]).max(axis=1))
+def _beyond_box(columns: Array, solid: trimesh.Trimesh) -> Array:
+    """Lower bounds (P,) on the distances of points (3, P) to a solid, from its bounding box."""
+    low, high = solid.bounds[..., None]
+    return np.asarray(np.maximum(low - columns, columns - high).max(axis=0))
 
 
 def _beyond_planes(points: Array, solid: trimesh.Trimesh) -> Array:
