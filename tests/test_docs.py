@@ -62,7 +62,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     monkeypatch.setattr(protocol, "_registered", dict(protocol._registered))
     monkeypatch.setattr(protocol, "_by_type", dict(protocol._by_type))
     yield
-    sys.modules.pop("tests.wrist_laser", None)
+    sys.modules.pop("bcppl.sensors.laser", None)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -137,6 +137,8 @@ def test_long_programs_of_a_page_run(page: str) -> None:
 
 @pytest.mark.long
 def test_commands_leave_figures() -> None:
-    command = next(b.text for b in blocks(ROOT / "docs/command_line.md") if b.language == "sh").splitlines()[0]
+    command = next(b.text for b in blocks(ROOT / "docs/command_line.md") if b.language == "sh").splitlines()[
+        0
+    ]
     CliRunner().invoke(app, shlex.split(command, comments=True)[1:], catch_exceptions=False)
     assert Path("runs/point_probe_10_pushes/add_over_time.png").stat().st_size > 10_000
