@@ -1,4 +1,4 @@
-"""Accuracy on the simulated 6 s probe, with or without a likelihood of the wrench beside contact locations."""
+"""Accuracy on the simulated 6 s probe, with and without a likelihood of the wrench beside contacts."""
 
 from __future__ import annotations
 

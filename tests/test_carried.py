@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.lazy import LazyDistribution
-from bcppl.traces import carried, extend, generate, simulate, update
+from bcppl.traces import extend, generate, simulate, update
+from bcppl.traces.carried import carried
 from tests.invariance import number
 from tests.small_programs import normal_log
 

@@ -23,7 +23,7 @@ from bcppl.errors import InputError
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Numbered
-from bcppl.traces import carried
+from bcppl.traces.carried import carried
 
 # The contact that inference assumes. Worlds that simulate recordings have parameters of their own.
 CONTACT = ContactParameters(time_step=0.004, friction=0.3, time_constant=0.008)

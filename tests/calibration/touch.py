@@ -18,7 +18,7 @@ from bcppl.distributions.poses import UniformPose
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.inference.filters.tempered_smc import kernel as shipped
 from bcppl.robot.motion import Probe
-from bcppl.traces import carried
+from bcppl.traces.carried import carried
 from tests.calibration.case import Case
 
 RATE, STAMPS, LENGTH = 100, 24, 0.05

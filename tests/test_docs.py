@@ -1,0 +1,144 @@
+"""The programs and commands of README.md and docs/*.md run as they stand; links lead somewhere.
+
+A block that starts with three backticks and `python` runs in every test run, in order, one namespace for each
+page. `python no-test` and `sh` blocks take long and run with the long tests alone. `python from FILE` quotes
+that file.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from typer.testing import CliRunner
+
+from bcppl.cli import app
+from bcppl.sensors import protocol
+
+ROOT = Path(__file__).resolve().parents[1]
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+FENCED = re.compile(r"^```(\w+)([^\n]*)\n(.*?)^```$", flags=re.DOTALL | re.MULTILINE)
+MOST_LINES = 150  # of the README
+
+
+class Block(NamedTuple):
+    """A fenced block: its language, what follows the language, and its lines."""
+
+    language: str
+    mark: str
+    text: str
+
+
+def blocks(page: Path) -> list[Block]:
+    return [Block(a, b.strip(), c) for a, b, c in FENCED.findall(page.read_text(encoding="utf-8"))]
+
+
+def run(page: Path, long: bool) -> dict[str, Any]:
+    names: dict[str, Any] = {}
+    for language, mark, text in blocks(page):
+        if language == "sh" and long:
+            for command in text.splitlines():
+                word, *arguments = shlex.split(command, comments=True)
+                assert word == "bcppl"
+                done = CliRunner().invoke(app, arguments, catch_exceptions=False)
+                assert done.exit_code == 0, f"{command}\n{done.output}"
+        if language == "python" and (mark == "" or (mark == "no-test" and long)):
+            if named := re.match(r"# (\w+\.py)\n", text):
+                Path(named[1]).write_text(text, encoding="utf-8")
+            exec(compile(text, f"{page.name}: {text.splitlines()[0]}", "exec"), names)
+    return names
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """An empty folder, and a registry of sensors of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(protocol, "_registered", dict(protocol._registered))
+    monkeypatch.setattr(protocol, "_by_type", dict(protocol._by_type))
+    yield
+    sys.modules.pop("bcppl.sensors.laser", None)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_programs_of_a_page_run(page: Path) -> None:
+    run(page, long=False)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_quotations_are_those_of_the_file(page: Path) -> None:
+    for language, mark, text in blocks(page):
+        if mark.startswith("from "):
+            assert language == "python"
+            assert text in (ROOT / mark.removeprefix("from ")).read_text(encoding="utf-8")
+        else:
+            assert mark in ("", "no-test"), f"{page.name} has a block marked {mark!r}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page: Path) -> None:
+    text = FENCED.sub("", page.read_text(encoding="utf-8"))
+    for target in re.findall(r"\]\(([^)]+)\)", text):
+        if target.startswith("https://"):
+            continue
+        place, _, anchor = target.partition("#")
+        linked = page if not place else page.parent / place
+        assert linked.is_file(), f"{page.name} links to {target}"
+        if anchor:
+            titles = re.findall(r"^#+ (.+)$", linked.read_text(encoding="utf-8"), flags=re.MULTILINE)
+            slugs = [re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles]
+            assert anchor in slugs, f"{page.name} links to {target}"
+
+
+def test_readme_is_short_and_links_every_page() -> None:
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= MOST_LINES
+    assert [page.name for page in PAGES[1:] if f"(docs/{page.name})" not in text] == []
+
+
+@pytest.mark.long
+def test_readme_ends_at_a_tenth_of_a_millimetre(capsys: pytest.CaptureFixture[str]) -> None:
+    run(README, long=True)
+    printed = re.findall(r"^(\S+(?: \d+)?) +ADD +([\d.]+) mm$", capsys.readouterr().out, flags=re.MULTILINE)
+    (stated,) = (text for language, _, text in blocks(README) if language == "text")
+    shown = re.findall(r"^(\S+(?: \d+)?) +ADD +([\d.]+) mm$", stated, flags=re.MULTILINE)
+    assert [label for label, _ in printed] == [label for label, _ in shown]
+    adds = [float(add) for _, add in printed]
+    assert adds == pytest.approx([float(add) for _, add in shown], abs=0.5)
+    assert adds[-1] < 0.2 < adds[2]
+
+
+@pytest.mark.long
+def test_getting_started_localises_the_part(capsys: pytest.CaptureFixture[str]) -> None:
+    run(ROOT / "docs/getting_started.md", long=True)
+    adds = [float(add) for add in re.findall(r"particles, ADD +([\d.]+) mm", capsys.readouterr().out)]
+    assert len(adds) == 11
+    assert adds[-1] < 2.0 < adds[0]
+    assert Path("belief.png").stat().st_size > 10_000
+
+
+@pytest.mark.long
+def test_own_model_localises_the_part() -> None:
+    names = run(ROOT / "docs/own_model.md", long=True)
+    belief, recording = names["last"].belief, names["recording"]
+    assert 1000.0 * belief.weighted_add(recording.part.surface_points(), recording.truth) < 3.0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", ["command_line", "inference", "insertion", "next_probe", "recordings"])
+def test_long_programs_of_a_page_run(page: str) -> None:
+    run(ROOT / f"docs/{page}.md", long=True)
+
+
+@pytest.mark.long
+def test_commands_leave_figures() -> None:
+    command = next(b.text for b in blocks(ROOT / "docs/command_line.md") if b.language == "sh").splitlines()[
+        0
+    ]
+    CliRunner().invoke(app, shlex.split(command, comments=True)[1:], catch_exceptions=False)
+    assert Path("runs/point_probe_10_pushes/add_over_time.png").stat().st_size > 10_000
