@@ -2,7 +2,7 @@
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-RECORDINGS := point_probe_10_pushes peg_probe
+RECORDINGS := peg_probe point_probe_10_pushes
 # Packages that the benchmarks measure beside bcppl; each gets an environment of its own.
 PEERS := particles blackjax open3d chsel
 # Test processes; each keeps to one thread.
@@ -13,7 +13,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make run          find the part in the shipped recordings; pictures and beliefs go to runs/"
+	@echo "make run          estimate the part's pose in the shipped recordings; beliefs and figures go to runs/"
 	@echo "make test         style, types and tests"
 	@echo "make long         the tests that take minutes"
 	@echo "make peers        environments of the packages that the benchmarks compare with, in benchmarks/.peers"

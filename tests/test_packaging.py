@@ -66,7 +66,7 @@ def test_sdist_and_wheel_hold_every_file_of_the_package_as_a_real_file(built: tu
     assert [n for n in names if not in_sdist[n].isfile()] == []
     assert [n for n in names if n not in in_wheel] == []
     # Nothing is there twice, and nothing that belongs to the checkout only.
-    assert {n.split("/")[0] for n in in_wheel} == {"bcppl", "bcppl-0.1.0.dist-info"}
+    assert {n.split("/")[0] for n in in_wheel} == {"bcppl", "bcppl-0.2.0.dist-info"}
     assert not any(n.startswith(("models/", "inference/", "tests/")) for n in in_sdist)
     for recording in SHIPPED:
         assert f"bcppl/models/recordings/{recording}.h5" in in_wheel
