@@ -35,7 +35,7 @@ from bcppl.beliefs.regions import (
     rotation_deviation,
     translation_deviation,
 )
-from bcppl.cli.surprises import MARK, Watch
+from bcppl.cli.predictive_checks import MARK, PredictiveChecks
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.metrology import three_two_one
@@ -100,7 +100,7 @@ class Probed:
         seconds: wall time of "vision", "planning" and "touch".
         efforts: by simulator, wall time (s) and what it made (images or gaps).
         tempered: how many measurements were tempered.
-        warned: whether a run would have said that a measurement does not fit (`bcppl.cli.surprises`).
+        warned: whether a run would have said that a measurement does not fit (`bcppl.cli.predictive_checks`).
         memory: most that the process ever held, GB.
     """
 
@@ -235,9 +235,9 @@ def judge(found: Probed, steps: Sequence[Step], scene: BenchScene) -> None:
         found.moments[name] = moment_of(step.belief, scene)
         if name in (VISION, END):
             found.holds[name] = regions_of(step.belief, scene)
-    watch = Watch()
-    marked = [watch.cell(step).endswith(MARK) for step in steps]
-    found.warned = any(marked) or watch.warning(steps[-1]) is not None
+    checks = PredictiveChecks()
+    marked = [checks.cell(step).endswith(MARK) for step in steps]
+    found.warned = any(marked) or checks.warning(steps[-1]) is not None
     found.memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
         1e6 if sys.platform != "darwin" else 1e9
     )
