@@ -1,4 +1,4 @@
-"""Calibration by a ball in sockets: the density of what is measured, and real recordings."""
+"""Calibration by a ball in sockets: the density of the measured angles, and real recordings."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ needed = pytest.mark.skipif(not DATA.is_dir(), reason=f"the ball-in-socket recor
 PLACES = {"panda_2_clean": ("front_left", "mid-high"), "panda_3": ("backcenter", "frontleft")}
 
 
-def wandering(robot: Robot, angles: Tensor) -> float:
-    """Root mean square distance of the ball from its mean place, mm."""
+def scatter(robot: Robot, angles: Tensor) -> float:
+    """Root mean square distance of the ball from its mean position, mm."""
     places = robot.position("ball_link", angles)
     return 1e3 * float((places - places.mean(dim=0)).square().sum(dim=1).mean().sqrt())
 
@@ -43,20 +43,20 @@ def apart(robot: Robot, pair: list[Tensor]) -> float:
 
 @needed
 @pytest.mark.parametrize("name", ["panda_2", "panda_3"])
-def test_recordings_read_as_they_were_described(name: str) -> None:
+def test_recordings_scatter_as_their_publication_reports(name: str) -> None:
     folder = DATA / "data" / {"panda_2": "panda_2_clean"}.get(name, name)
     pairs = [read_seatings(place) for place in sorted(folder.iterdir())]
     nominal = Robot(DATA / "urdf/panda.urdf", tip="ball_link")
     calibrated = Robot(DATA / f"calibrated_urdf/{name}/panda_calibrated.urdf", tip="ball_link")
-    assert min(wandering(nominal, q) for pair in pairs for q in pair) > 3.0
-    assert max(wandering(calibrated, q) for pair in pairs for q in pair) < 0.6
+    assert min(scatter(nominal, q) for pair in pairs for q in pair) > 3.0
+    assert max(scatter(calibrated, q) for pair in pairs for q in pair) < 0.6
     assert all(46.5 < apart(nominal, pair) < 53.0 for pair in pairs)
     assert np.mean([apart(calibrated, pair) for pair in pairs]) == pytest.approx(50.0, abs=0.1)
 
 
 @needed
 @pytest.mark.parametrize("name", PLACES)
-def test_two_positions_teach_the_distance_at_the_others(name: str) -> None:
+def test_two_positions_calibrate_the_distance_at_the_others(name: str) -> None:
     arm = Arm(Robot(DATA / "urdf/panda.urdf", tip="ball_link"))
     data = {p.name: read_seatings(p) for p in sorted((DATA / "data" / name).iterdir())}
     seen = [q for place in PLACES[name] for q in data[place]]
@@ -94,18 +94,18 @@ def test_the_volume_is_that_of_the_angles_jacobian() -> None:
         moved = step * torch.eye(7, dtype=torch.float64)[k]
         ahead, back = arm.places(values, angles + moved), arm.places(values, angles - moved)
         columns.append((ahead - back) / (2.0 * step))
-    slope = torch.stack(columns, dim=-1)
-    expected = torch.log(torch.linalg.svdvals(slope)).sum(dim=(1, 2))
+    jacobian = torch.stack(columns, dim=-1)
+    expected = torch.log(torch.linalg.svdvals(jacobian)).sum(dim=(1, 2))
     assert torch.allclose(arm.log_volume(values, angles), expected, atol=1e-6)
 
 
-def test_the_density_of_angles_does_not_hang_on_the_unit_of_places() -> None:
-    """An arm of twice the size with twice the noise says the same of its angles, but for the flat prior."""
+def test_the_density_of_angles_does_not_depend_on_the_unit_of_positions() -> None:
+    """An arm of twice the size with twice the noise has the same density, but for the flat prior."""
     arm, angles = arm_and_seating()
     robot = arm.robot
     values = {a: torch.zeros(1, *s.shape, dtype=torch.float64) for a, s in arm.spread.items()}
     reach = robot.position("panda_hand_tcp", angles)
-    # Every joint's origin once more as far: an arm of twice the size.
+    # Doubled joint origins: an arm of twice the size.
     shifts = torch.stack([torch.from_numpy(j.parent_from_child[:3, 3].copy()) for j in robot.joints])
     hand = torch.tensor([0.0, 0.0, 0.107 + 0.1034], dtype=torch.float64)
     twice = dict(values)
@@ -116,7 +116,7 @@ def test_the_density_of_angles_does_not_hang_on_the_unit_of_places() -> None:
     assert float(gain) == pytest.approx(3 * len(angles) * math.log(2.0))
 
 
-def test_a_turn_about_the_base_says_nothing() -> None:
+def test_a_rotation_about_the_base_is_not_identified() -> None:
     arm, angles = arm_and_seating()
     start = {a: torch.zeros(2, *s.shape, dtype=torch.float64) for a, s in arm.spread.items()}
     start["offsets"][1, 0] = 0.3
@@ -127,12 +127,12 @@ def test_a_turn_about_the_base_says_nothing() -> None:
     assert float(both[0]) == pytest.approx(float(both[1]), rel=1e-9)
 
 
-def test_offsets_that_are_made_up_are_found_again() -> None:
+def test_simulated_offsets_are_recovered() -> None:
     arm, angles = arm_and_seating()
     truth = torch.tensor([0.0, 0.01, -0.012, 0.008, -0.01, 0.012, 0.0], dtype=torch.float64)
     seatings = []
     for seed in range(3):
-        # Postures of one seat: Newton's steps along the least change of the angles.
+        # Postures in one socket: Newton's method with least-norm steps.
         q = (
             angles.repeat(4, 1)
             + 0.3 * torch.rand(24, 7, generator=torch.Generator().manual_seed(seed)).double()
@@ -151,15 +151,15 @@ def test_offsets_that_are_made_up_are_found_again() -> None:
         arm_calibration, (known, seatings), observations(seatings), 300, linearised(known, seatings)
     )
     weights = population.log_weights.softmax(dim=0)
-    found = (weights[:, None] * population["offsets"]).sum(dim=0)
+    mean = (weights[:, None] * population["offsets"]).sum(dim=0)
     assert population.effective_sample_size > 30.0
-    # The first is a turn about the base, the last one turns the ball about itself.
-    assert float((found - truth)[1:6].abs().max()) < 5e-4
-    spread = (weights[:, None] * (population["offsets"] - found) ** 2).sum(dim=0).sqrt()
+    # The first offset rotates the arm about the base, the last one the ball about itself.
+    assert float((mean - truth)[1:6].abs().max()) < 5e-4
+    spread = (weights[:, None] * (population["offsets"] - mean) ** 2).sum(dim=0).sqrt()
     assert float(spread[0]) > 0.01 > 20.0 * float(spread[1:6].max())
 
 
-def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
+def test_invalid_recordings_are_refused(tmp_path: Path) -> None:
     for text in (None, "1,2,x\n", "0.1,0.2,0.3\n"):
         if text is not None:
             (tmp_path / "hole_0.csv").write_text(text)
@@ -167,7 +167,7 @@ def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
             read_seatings(tmp_path)
 
 
-def test_seatings_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+def test_seatings_are_ordered_by_number(tmp_path: Path) -> None:
     for number in range(12):
         (tmp_path / f"hole_{number}.csv").write_text(f"{number},0\n{number},1\n")
     (tmp_path / "hole_notes.csv").write_text("a,b\n")

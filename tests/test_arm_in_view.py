@@ -1,4 +1,4 @@
-"""The camera from views of the arm: what is drawn, which way a bias goes, and real depth images."""
+"""Extrinsics from views of the arm: rendering, the sign of the range bias, and real depth images."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def near_the_truth(shift: float, angle: float) -> Guess:
 
 
 def drawn(added: float, masked: bool = False, **settings: float) -> tuple[Scene, dict[str, Tensor]]:
-    """A scene, and what its camera at the truth would see before a wall 3 m away, without noise."""
+    """A scene, and noise-free images of its camera at the true pose in front of a wall 3 m away."""
     robot = load_robot("panda", tip="panda_hand")
     prior = prior_from_guess(near_the_truth(0.03, 0.05))
     angles = [np.array(q) for q in POSTURES]
@@ -60,7 +60,7 @@ def drawn(added: float, masked: bool = False, **settings: float) -> tuple[Scene,
         renderer = RayCaster(robot.as_part(q))
         small = renderer.images(CAMERA.binned(2), poses.inverse(TRUTH)[None])[0]
         image = np.where(np.isfinite(small), small + added, 3.0)
-        images.append(np.kron(image, np.ones((2, 2))))  # read back by blocks
+        images.append(np.kron(image, np.ones((2, 2))))  # binned again by the scene
     masks = [image < 2.9 for image in images] if masked else None
     scene = prepare(robot, CAMERA, prior, angles, images, masks, bins=2, **settings)
     return scene, dict(observations(scene, images, masks))
@@ -76,12 +76,12 @@ def test_the_truth_is_the_likeliest_with_its_own_bias() -> None:
     scene, seen = drawn(0.02, widening=0.0)
     steps = torch.cat([torch.diag(torch.tensor([0.01] * 3 + [0.02] * 3)), torch.zeros(1, 6)]).double()
     moved = poses.retract(TRUTH, torch.cat([steps, -steps[:6]]))
-    found = log_likelihood(scene, seen, moved, 0.02)
-    assert int(found.argmax()) == 6
-    assert float(found[6]) > float(log_likelihood(scene, seen, TRUTH[None], 0.0))
+    likelihood = log_likelihood(scene, seen, moved, 0.02)
+    assert int(likelihood.argmax()) == 6
+    assert float(likelihood[6]) > float(log_likelihood(scene, seen, TRUTH[None], 0.0))
 
 
-def test_camera_and_bias_are_found_together() -> None:
+def test_camera_and_bias_are_estimated_jointly() -> None:
     scene, seen = drawn(0.012, widening=0.0, effective_pixels=1000.0)
     torch.manual_seed(0)
     moves = mixture([kernel("camera"), metropolis_hastings(along_the_view)], [0.6, 0.4])
@@ -95,7 +95,7 @@ def test_camera_and_bias_are_found_together() -> None:
 MASKED = {"mask_width": 2.0, "mask_temperature": 20.0, "inside": 0, "effective_inside": 10.0, "bias": 0.02}
 
 
-def test_masks_place_the_camera_whatever_the_ranges_have_in_common() -> None:
+def test_masks_locate_the_camera_whatever_the_range_bias() -> None:
     scene, seen = drawn(0.012, masked=True, **MASKED)
     assert set(seen) == {"depth_0", "depth_1", "mask_0", "mask_1"}
     steps = torch.diag(torch.tensor([0.02] * 3 + [0.02] * 3)).double()
@@ -105,7 +105,7 @@ def test_masks_place_the_camera_whatever_the_ranges_have_in_common() -> None:
     assert int(trace.log_prob("mask_0", "mask_1").argmax()) == 0
 
 
-def test_what_is_fitted_is_near_the_posterior() -> None:
+def test_the_fitted_proposal_is_near_the_posterior() -> None:
     scene, seen = drawn(0.012, masked=True, **MASKED)
     torch.manual_seed(0)
     population = importance_sampling(arm_in_view, (scene, 2), seen, 200, fitted(scene, seen, draws=200))
@@ -126,7 +126,7 @@ def test_masks_that_do_not_fit_are_refused() -> None:
         prepare(robot, CAMERA, scene.prior, angles, images, [images[0], images[0].T])
 
 
-def test_a_part_is_widened_on_all_sides() -> None:
+def test_a_part_is_dilated_on_all_sides() -> None:
     ball = trimesh.creation.icosphere(3, 0.1)
     loose = Part(
         "ball", ball.vertices[ball.faces].reshape(-1, 3), np.arange(3 * len(ball.faces)).reshape(-1, 3)
@@ -137,8 +137,8 @@ def test_a_part_is_widened_on_all_sides() -> None:
 
 
 @needed
-def test_real_images_say_that_the_sensor_widens_what_stands_in_front() -> None:
-    """At the reference pose every frame is likelier with the arm drawn half a matching window wider."""
+def test_real_images_are_likelier_with_a_dilated_foreground() -> None:
+    """At the reference pose, with the arm dilated by half a matching window of the stereo sensor."""
     optical = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     body = np.load(XARM / "HT_base_cam.npy").astype(np.float64)
     turn, _, back = np.linalg.svd(body[:3, :3] @ optical.T)
@@ -148,22 +148,22 @@ def test_real_images_say_that_the_sensor_widens_what_stands_in_front() -> None:
     angles = [np.load(XARM / f"joint_state_{k}.npy") for k in (0, 3)]
     images = [1e-3 * np.asarray(Image.open(XARM / f"depth_{k}.png")).astype(np.float64) for k in (0, 3)]
     prior = prior_from_guess(Guess(there.numpy(), np.full(3, 0.05), angle=0.09))
-    found = []
+    likelihood = []
     for by in (0.0, 0.0055):
         scene = prepare(robot, camera, prior, angles, images, widening=by, effective_pixels=None)
         seen = dict(observations(scene, images))
-        found.append(log_likelihood(scene, seen, there[None], 0.01))
-    assert float(found[1] - found[0]) > 50.0
+        likelihood.append(log_likelihood(scene, seen, there[None], 0.01))
+    assert float(likelihood[1] - likelihood[0]) > 50.0
 
 
-def test_what_stands_still_is_seen_by_the_other_views() -> None:
-    """Behind the arm stands what others see there, not what one of them misreads, nor what this view sees."""
+def test_the_static_background_is_estimated_from_the_other_views() -> None:
+    """The depth behind the arm is that of the other views, robust to one wrong reading."""
     views = [np.full((1, 4), 2.0) for _ in range(4)]
     views[0][0, 0] = 1.0  # the arm, here only
     views[1][0, 0] = 9.0  # a wrong reading
     views[2][0, 1] = views[3][0, 1] = 1.0  # the arm, in two of the others
     views[1][0, 2] = views[2][0, 2] = views[3][0, 2] = np.nan
     views[1][0, 3] = views[2][0, 3] = np.nan
-    found = still_behind(views, 0)
-    assert found[0, 0] == 2.0 and found[0, 1] == 1.0 and np.isnan(found[0, 2]) and found[0, 3] == 2.0
+    behind = still_behind(views, 0)
+    assert behind[0, 0] == 2.0 and behind[0, 1] == 1.0 and np.isnan(behind[0, 2]) and behind[0, 3] == 2.0
     assert np.isnan(still_behind(views[:1], 0)).all()

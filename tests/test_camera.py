@@ -1,4 +1,4 @@
-"""Where a camera looks, what its lens does, and what its regions and bins see."""
+"""Cameras: viewing direction, lens distortion, regions of interest and binning."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bcppl.geometry.camera import Camera, bin_depth, looking_at
 Array = npt.NDArray[np.float64]
 
 
-def test_the_point_is_straight_ahead_and_up_is_up() -> None:
+def test_the_point_is_on_the_optical_axis_and_up_is_up() -> None:
     eye, point = np.array([0.3, -0.2, 0.5]), np.array([0.05, 0.1, 0.02])
     world_from_camera = torch.from_numpy(looking_at(eye, point))
     seen = poses.transform(
@@ -50,8 +50,8 @@ def pixels(camera: Camera) -> Array:
 
 
 @pytest.mark.parametrize("distortion", LENSES)
-def test_a_point_is_seen_where_the_textbook_says(distortion: Sequence[float]) -> None:
-    """OpenCV's documentation of calib3d, written out for one point at a time."""
+def test_projections_are_those_of_opencvs_formula(distortion: Sequence[float]) -> None:
+    """The formula in OpenCV's documentation of calib3d, one point at a time."""
     camera = lens(distortion)
     k1, k2, p1, p2, k3 = (*distortion, 0.0)[:5]
     for point in np.random.default_rng(0).uniform([-0.4, -0.3, 0.7], [0.4, 0.3, 1.5], (40, 3)):
@@ -64,7 +64,7 @@ def test_a_point_is_seen_where_the_textbook_says(distortion: Sequence[float]) ->
 
 
 @pytest.mark.parametrize("distortion", [(), *LENSES])
-def test_rays_are_seen_at_their_pixels(distortion: Sequence[float]) -> None:
+def test_rays_project_to_their_pixels(distortion: Sequence[float]) -> None:
     camera = lens(distortion)
     rays = camera.rays()
     assert (rays[:, 2] == 1.0).all()
@@ -81,17 +81,17 @@ def test_a_lens_that_folds_the_image_is_refused() -> None:
         lens([0.1] * 8).rays()
 
 
-def test_what_is_beside_or_behind_the_camera_is_not_seen() -> None:
-    """Far to the side a barrel's polynomial turns back and would bring the point into the image again."""
+def test_points_beside_or_behind_the_camera_have_no_projection() -> None:
+    """Far off axis the polynomial of a barrel lens decreases and would fold the point into the image."""
     camera = lens((-0.3, 0.0, 0.0, 0.0))
     seen = camera.project([[0, 0, -1.0], [0, 0, 0.0], [1.8, 0, 1.0], [0.1, 0, 1.0]])
     assert np.isnan(seen[:3]).all() and np.isfinite(seen[3]).all()
     folded = 1.8 * (1 - 0.3 * 1.8**2)
-    assert abs(folded) < 0.1, "the formula alone would put it near the middle"
+    assert abs(folded) < 0.1, "the formula alone projects it near the centre"
 
 
 @pytest.mark.parametrize("distortion", [(), LENSES[0]])
-def test_a_region_sees_along_the_same_rays(distortion: Sequence[float]) -> None:
+def test_a_region_has_the_rays_of_the_image(distortion: Sequence[float]) -> None:
     camera = lens(distortion)
     region = camera.cropped(10, 7, 21, 16)
     whole = camera.rays().reshape(48, 64, 3)
@@ -102,8 +102,8 @@ def test_a_region_sees_along_the_same_rays(distortion: Sequence[float]) -> None:
 
 
 @pytest.mark.parametrize("k", [2, 3, 5])
-def test_a_binned_pixel_sees_along_the_middle_of_its_block(k: int) -> None:
-    """Without distortion its ray is the mean of the block's; with it, that of the pixel in the middle."""
+def test_a_binned_pixel_has_the_ray_of_its_blocks_centre(k: int) -> None:
+    """Without distortion the mean of the block's rays; with it, the ray of the pixel at the centre."""
     camera = lens(())
     binned = camera.binned(k)
     assert (binned.width, binned.height) == (64 // k, 48 // k)
@@ -118,7 +118,7 @@ def test_a_binned_pixel_sees_along_the_middle_of_its_block(k: int) -> None:
         )
 
 
-def test_binning_takes_what_was_read_and_nothing_between() -> None:
+def test_binned_depths_are_readings_and_no_means_across_edges() -> None:
     nan = np.nan
     depth = np.array(
         [
@@ -143,7 +143,7 @@ def test_binning_takes_what_was_read_and_nothing_between() -> None:
 # ---- the wrist
 
 
-def test_a_wrist_camera_goes_where_the_arm_goes() -> None:
+def test_a_wrist_camera_moves_with_the_arm() -> None:
     hand = np.array([0.05, 0.0, 0.08, np.cos(0.2), 0.0, np.sin(0.2), 0.0])
     camera = replace(lens(()), wrist_from_camera=hand)
     rng = np.random.default_rng(1)

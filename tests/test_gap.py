@@ -29,7 +29,7 @@ HIGH = np.array([HALF, HALF, 0.0])
 
 
 @functools.cache
-def measured() -> PegGap:
+def box_gap() -> PegGap:
     return PegGap(block(tuple(SIZE)), box_peg(2 * HALF, LENGTH))
 
 
@@ -65,35 +65,36 @@ def corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 def along_edges(apart: float) -> np.ndarray:
     """Points on the block's edges."""
     ends = corners(BASE, BASE + SIZE)
-    found = []
+    points = []
     for a in range(8):
         for b in range(a + 1, 8):
             if bin(a ^ b).count("1") == 1:
                 steps = int(np.linalg.norm(ends[b] - ends[a]) / apart) + 2
-                found.append(ends[a] + np.linspace(0, 1, steps)[:, None] * (ends[b] - ends[a]))
-    return np.concatenate(found)
+                points.append(ends[a] + np.linspace(0, 1, steps)[:, None] * (ends[b] - ends[a]))
+    return np.concatenate(points)
 
 
-def beside(count: int, seed: int, depth: float) -> list[Tensor]:
-    """Poses of a tilted peg whose tip, or side, is within `depth` of the block's top, or its top edge."""
-    rng, found = np.random.default_rng(seed), []
-    for k in range(count):
+@functools.cache
+def near_contact() -> Tensor:
+    """Poses (60, 7) of a tilted peg whose tip, or side, is within 1 mm of the block's top, or its edge."""
+    rng, chosen = np.random.default_rng(2), []
+    for k in range(60):
         turn = Rotation.from_rotvec([*rng.uniform(-0.4, 0.4, 2), rng.uniform(-3, 3)])
         if k % 2:  # pressed from the side, an upright edge on the block's top edge
             place = np.array([0.5 * SIZE[0] + HALF, rng.uniform(-0.01, 0.01), 0.5 * LENGTH])
         else:
             place = np.array([*rng.uniform(-0.035, 0.035, 2), LENGTH])
         direction = np.array([1.0, 0.0, 0.0]) if k % 2 else np.array([0.0, 0.0, 1.0])
-        # Along the way to the part until about `depth` deep, by the exact corners and edges.
+        # Shifted towards the part until up to 1 mm deep, by the exact vertices and edges.
         shifts = np.linspace(-0.012, 0.012, 41)
-        gaps = np.array([by_hand(pose(place + s * direction, turn), 1e-3) for s in shifts])
-        near = shifts[np.abs(gaps - rng.uniform(-depth, depth)).argmin()]
-        found.append(pose(place + (near + rng.uniform(-1e-4, 1e-4)) * direction, turn))
-    return found
+        gaps = np.array([brute_force(pose(place + s * direction, turn), 1e-3) for s in shifts])
+        near = shifts[np.abs(gaps - rng.uniform(-0.001, 0.001)).argmin()]
+        chosen.append(pose(place + (near + rng.uniform(-1e-4, 1e-4)) * direction, turn))
+    return torch.stack(chosen)
 
 
-def by_hand(world_from_peg: Tensor, apart: float = 2e-5) -> float:
-    """The least distance of the peg's corners to the block and of the block's edges to the peg's planes."""
+def brute_force(world_from_peg: Tensor, apart: float = 2e-5) -> float:
+    """The minimum distance of the peg's vertices to the block or of the block's edges to the peg's planes."""
     turn = Rotation.from_quat(world_from_peg[[4, 5, 6, 3]].numpy())
     place = world_from_peg[:3].numpy()
     ends = box_distance(turn.apply(corners(LOW, HIGH)) + place, BASE, BASE + SIZE).min()
@@ -110,48 +111,48 @@ def test_over_a_plane_it_is_the_height_of_the_lowest_corner(tilt: float) -> None
     peg = torch.stack([pose(np.array([0.003, -0.002, h - down]), turn) for h in heights])
     part = anyhow(3, 0)
     for n in range(3):
-        gap = measured()(part[n : n + 1], poses.compose(part[n], peg))
-        # 2 mm and more in, the grid's single precision is all there is.
+        gap = box_gap()(part[n : n + 1], poses.compose(part[n], peg))
+        # At 2 mm of penetration and more, distances have the grid's single precision.
         np.testing.assert_allclose(gap.distance[0].numpy(), heights, atol=2e-9)
         np.testing.assert_allclose(gap.normal[0, 1:4].numpy(), [[0.0, 0.0, 1.0]] * 3, atol=1e-6)
         np.testing.assert_allclose(gap.witness[0, :, 2].numpy(), heights, atol=1e-9)
 
 
-def test_corners_and_crossing_edges_are_those_of_brute_force() -> None:
-    peg = torch.stack(beside(40, 1, 0.0015))
-    gap = measured()(poses.identity(1), peg)
-    exact = np.array([by_hand(p) for p in peg])
-    touching, found = exact < 0.0, gap.distance[0].numpy()
+def test_vertices_and_crossing_edges_are_those_of_brute_force() -> None:
+    peg = near_contact()
+    gap = box_gap()(poses.identity(1), peg)
+    exact = np.array([brute_force(p) for p in peg])
+    touching, computed = exact < 0.0, gap.distance[0].numpy()
     crossing = (np.abs(gap.witness[0, :, :2].numpy()) - 0.5 * SIZE[:2]).max(axis=-1) > -1e-9
-    assert 10 < touching.sum() < 30 and (crossing & touching).sum() >= 5
-    # The grid rounds off the block's edges, so that once in fifty poses it takes another corner.
-    off = np.abs(found - exact)[~crossing]
+    assert 10 < touching.sum() < 50 and (crossing & touching).sum() >= 5
+    # Interpolation is inexact near the block's edges, so about once in fifty poses another vertex is chosen.
+    off = np.abs(computed - exact)[~crossing]
     assert (off > 1.2e-5).sum() <= 2 and off.max() < 2.5e-4
-    # Across two edges the depth is along the normal of both: up to the diagonal of what it is by one plane.
-    share = (found / exact)[crossing & touching & (exact < -1e-4)]
+    # Where edges cross the depth is along their common normal: up to the diagonal of the depth by one plane.
+    share = (computed / exact)[crossing & touching & (exact < -1e-4)]
     assert share.min() > 0.98 and share.max() < math.sqrt(2.0) + 0.02 and share.max() > 1.05
 
 
 def test_it_is_mujocos_contact_distance_between_boxes() -> None:
-    peg = torch.stack(beside(60, 2, 0.001))
-    model = build_model(measured().part, measured().peg, ContactParameters())
+    peg = near_contact()
+    model = build_model(box_gap().part, box_gap().peg, ContactParameters())
     data, theirs = mujoco.MjData(model), []
     geoms = [int(model.body_geomadr[model.body(name).id]) for name in ("part", "peg")]
     for p in peg.numpy():
         data.qpos[:] = p
         mujoco.mj_forward(model, data)
         theirs.append(mujoco.mj_geomDistance(model, data, *geoms, 0.1, None))
-    gap = measured()(poses.identity(1), peg)
+    gap = box_gap()(poses.identity(1), peg)
     ours, others = gap.distance[0].numpy(), np.array(theirs)
     clear = np.abs(others) > 2e-5
     assert np.all(np.sign(ours[clear]) == np.sign(others[clear])) and 10 < (others < 0).sum() < 50
     share = (ours / others)[clear & (others < 0)]
     assert (np.abs(share - 1.0) < 0.01).mean() > 0.8 and share.max() < 1.02
-    beside_it = clear & (others > 0) & (others < 0.0015)  # farther off edges are not looked at
+    beside_it = clear & (others > 0) & (others < 0.0015)  # farther edges are not evaluated
     assert beside_it.sum() > 5 and np.all(ours[beside_it] < others[beside_it] + 1e-5)
 
 
-@pytest.mark.parametrize("name", ["round tray", "rectangular tray", "hexagon 12 mm", "D 10 mm"])
+@pytest.mark.parametrize("name", ["round tray", "D 10 mm"])
 def test_pegs_in_and_over_the_holes_of_the_bench_touch_where_mujocos_do(name: str) -> None:
     """Part and peg in many convex pieces, near contact in the hole, on its rim and on the top."""
     kind, rng = bench_part(name), np.random.default_rng(3)
@@ -172,7 +173,7 @@ def test_pegs_in_and_over_the_holes_of_the_bench_touch_where_mujocos_do(name: st
     apart = np.isinf(theirs)
     assert 5 < apart.sum() < 35
     assert ours[apart].min() > -1e-5
-    # MuJoCo measures piece by piece: never deeper than the deepest corner by more than a crossing of edges.
+    # MuJoCo's depth is that of one piece: at most the deepest vertex's, but for a crossing of edges.
     np.testing.assert_array_less(ours[~apart], 2e-5)
     shallow = ~apart & (ours > -3e-4)
     np.testing.assert_allclose(ours[shallow], np.array(theirs)[shallow], atol=1.2e-4)
@@ -182,41 +183,32 @@ def test_centred_in_a_round_hole_it_is_half_the_clearance() -> None:
     gap, clearance = in_a_hole()
     off = np.array([0.0, 5e-5, -1e-4, 2e-4, 0.00025, 0.0003])
     peg = torch.stack([pose(np.array([0.007 + x, 0.005, 0.07]), Rotation.identity()) for x in off])
-    found = gap(poses.identity(1), peg).distance[0].numpy()
-    # Of 64 corners the grid may take one that is up to three sides (8.4 degrees) from the nearest.
-    assert np.all(np.abs(found - 0.5 * clearance + np.abs(off)) < 0.012 * np.abs(off) + 1e-8)
+    distance = gap(poses.identity(1), peg).distance[0].numpy()
+    # Of 64 vertices the grid may choose one up to three sides (8.4 degrees) from the closest.
+    assert np.all(np.abs(distance - 0.5 * clearance + np.abs(off)) < 0.012 * np.abs(off) + 1e-8)
 
 
-def off_slopes(pegs: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """How far slopes are from finite differences for each peg, and whether a corner of the peg is nearest."""
+def test_gradients_are_finite_differences() -> None:
+    turns = [Rotation.from_rotvec([0.1, 0.05, z]) for z in np.linspace(0, 1.5, 15)]
+    flat = torch.stack([pose(np.array([0.01, 0.0, LENGTH - 1e-3]), turn) for turn in turns])
+    pegs = torch.cat([flat, near_contact()])
     part, step = anyhow(1, 4, 0.02), 1e-7
     peg = poses.compose(part[0], pegs)
-    gap = measured()(part, peg)
+    gap = box_gap()(part, peg)
     numeric = torch.stack(
         [
-            measured()(poses.retract(part, step * axis), peg).distance[0]
-            - measured()(poses.retract(part, -step * axis), peg).distance[0]
+            box_gap()(poses.retract(part, step * axis), peg).distance[0]
+            - box_gap()(poses.retract(part, -step * axis), peg).distance[0]
             for axis in torch.eye(6, dtype=torch.float64)
         ],
         dim=-1,
     ) / (2 * step)
-    places = poses.transform(poses.inverse(pegs), gap.witness[0][:, None])[:, 0].numpy()
-    at_corner = np.abs(box_distance(places, LOW, HIGH)) < 1e-9
-    return (gap.gradient(part)[0] - numeric).abs().amax(dim=-1).numpy(), at_corner
-
-
-def test_slopes_are_finite_differences() -> None:
-    turns = [Rotation.from_rotvec([0.1, 0.05, z]) for z in np.linspace(0, 1.5, 15)]
-    flat = torch.stack([pose(np.array([0.01, 0.0, LENGTH - 1e-3]), turn) for turn in turns])
-    off, at_corner = off_slopes(torch.cat([flat, torch.stack(beside(30, 5, 0.0005))]))
-    assert at_corner.sum() > 25
-    assert np.quantile(off[at_corner], 0.9) < 1e-4
-
-
-def test_slopes_where_edges_cross_are_finite_differences() -> None:
-    off, at_corner = off_slopes(torch.stack(beside(40, 5, 0.0005))[1::2])
-    assert (~at_corner).sum() > 10
-    assert np.quantile(off[~at_corner], 0.8) < 1e-3
+    error = (gap.gradient(part)[0] - numeric).abs().amax(dim=-1).numpy()
+    witness = poses.transform(poses.inverse(pegs), gap.witness[0][:, None])[:, 0].numpy()
+    at_vertex = np.abs(box_distance(witness, LOW, HIGH)) < 1e-9
+    assert at_vertex.sum() > 25 and (~at_vertex).sum() > 10  # the others are where edges cross
+    assert np.quantile(error[at_vertex], 0.9) < 1e-4
+    assert np.quantile(error[~at_vertex], 0.8) < 1e-3
 
 
 def test_moving_part_and_peg_together_changes_nothing() -> None:
@@ -230,19 +222,19 @@ def test_moving_part_and_peg_together_changes_nothing() -> None:
         there = gap(poses.compose(motion, part), poses.compose(motion, peg))
         torch.testing.assert_close(there.distance, here.distance, atol=1e-9, rtol=0.0)
         torch.testing.assert_close(there.witness, here.witness, atol=1e-8, rtol=0.0)
-    # One particle, one stamp at a time gives the same.
+    # Evaluated one particle and one stamp at a time.
     each = torch.stack([torch.cat([gap(a[None], b[None]).distance[0] for b in peg]) for a in part])
     assert torch.equal(each, here.distance)
 
 
-def test_a_peg_deep_inside_and_none_at_all() -> None:
+def test_a_peg_in_deep_penetration_and_empty_batches() -> None:
     part, peg = (
         poses.identity(1),
         torch.stack(
             [pose(np.array([0.0, 0.0, LENGTH - d]), Rotation.identity()) for d in (0.003, 0.006, 0.012)]
         ),
     )
-    gap = measured()(part, peg)
+    gap = box_gap()(part, peg)
     np.testing.assert_allclose(gap.distance[0].numpy(), [-0.003, -0.006, -0.012], atol=1e-6)
     rng, turns = (
         np.random.default_rng(8),
@@ -250,11 +242,11 @@ def test_a_peg_deep_inside_and_none_at_all() -> None:
     )
     tips = rng.uniform([-0.02, -0.02, -0.011], [0.02, 0.02, -0.004], (30, 3))
     inside = torch.stack([pose(p - t.apply([0, 0, -LENGTH]), t) for p, t in zip(tips, turns, strict=True)])
-    exact = np.array([by_hand(p, 2e-4) for p in inside])
+    exact = np.array([brute_force(p, 2e-4) for p in inside])
     assert exact.max() < -0.004
-    assert np.abs(measured()(part, inside).distance[0].numpy() - exact).max() < 0.0009
+    assert np.abs(box_gap()(part, inside).distance[0].numpy() - exact).max() < 0.0009
     for n, t in ((0, 3), (2, 0), (0, 0)):
-        none = measured()(poses.identity(n), poses.identity(t))
+        none = box_gap()(poses.identity(n), poses.identity(t))
         assert none.distance.shape == (n, t) and none.witness.shape == none.normal.shape == (n, t, 3)
         assert none.gradient(poses.identity(n)).shape == (n, t, 6)
 

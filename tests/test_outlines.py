@@ -1,4 +1,4 @@
-"""Parts drawn from outlines and sections: exactly the solid, no seams, and one sentence for each mistake."""
+"""Parts from outlines and cross sections: exact solids without seams, and refusals in one sentence."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_the_stated_error_of_a_round_outline_is_its_error_either_way() -> None:
 
 
 def slide(part: Part, peg: Part) -> tuple[np.ndarray, np.ndarray]:
-    """A peg pressed on the top with 7.5 N and drawn across: the force and where it was, at each step."""
+    """The force and the position at each step of a peg that slides over the top, pressed on with 7.5 N."""
     track = np.array([(-0.021, -0.021), (0.021, -0.018), (0.021, 0.02), (-0.02, 0.021)])
     times = np.array([0.0, 0.3, 0.8, 1.3, 1.8])
     command = np.zeros((5, 7))
@@ -78,19 +78,19 @@ def slide(part: Part, peg: Part) -> tuple[np.ndarray, np.ndarray]:
     return force[700:], rollout.world_from_peg[0, 700:, :3]
 
 
-def test_a_peg_that_slides_over_the_top_feels_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_peg_that_slides_over_the_top_catches_on_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     peg = box_peg(0.004, 0.05)
     _, smooth = slide(block((0.06, 0.06, 0.025)), peg)
     for name in ("hexagon", "round"):
         force, where = slide(block_with_hole(named_outline(name, 0.0161)), peg)
         assert abs(where - smooth)[:, :2].max() < 6e-6 and abs(where - smooth)[:, 2].max() < 15e-6
         assert np.median(force[:, 2]) == pytest.approx(7.5, rel=0.02)
-    monkeypatch.setattr(extrusion, "BEVEL", 0.0)  # prisms that end in steps hold the peg back
+    monkeypatch.setattr(extrusion, "BEVEL", 0.0)  # the peg catches on prisms without a bevel
     _, caught = slide(block_with_hole(named_outline("hexagon", 0.0161)), peg)
     assert abs(caught - smooth)[:, :2].max() > 15e-6
 
 
-def test_a_stepped_part_with_a_chamfered_bore_is_its_layers_along_any_axis() -> None:
+def test_a_stepped_part_with_a_chamfered_bore_is_exactly_its_prisms_along_any_axis() -> None:
     cylinder, cone = trimesh.creation.cylinder, trimesh.creation.cone
     foot = trimesh.creation.box([0.05, 0.04, 0.005])
     post = trimesh.creation.box([0.03, 0.03, 0.02])
@@ -136,7 +136,7 @@ def test_an_open_hole_plate_is_refused_with_its_open_edges(kind: str, edges: int
         load_mesh(NIST / f"factory_{kind}_hole_8mm_subdiv_3x.obj")
 
 
-def test_a_mesh_in_millimetres_is_refused_and_scaled_on_request(tmp_path: Path) -> None:
+def test_a_mesh_in_millimetres_is_refused_unless_scaled(tmp_path: Path) -> None:
     path = tmp_path / "block.stl"
     trimesh.creation.box([60.0, 60.0, 25.0]).export(path)
     with pytest.raises(InputError, match="in millimetres"):
@@ -161,7 +161,7 @@ def test_a_mesh_in_millimetres_is_refused_and_scaled_on_request(tmp_path: Path) 
         load_mesh(tmp_path / "bad.obj")
 
 
-def test_outlines_that_cannot_be_drawn_are_refused_in_a_sentence() -> None:
+def test_invalid_outlines_are_refused_in_one_sentence() -> None:
     square = named_outline("square")
     cases = {
         "Self-intersection": lambda: extruded("bow", shapely.Polygon([(0, 0), (1, 1), (1, 0), (0, 1)]), 0, 1),
@@ -197,10 +197,10 @@ def test_outlines_that_cannot_be_drawn_are_refused_in_a_sentence() -> None:
         "no outline 'star'": lambda: named_outline("star"),
         "no insert tray": lambda: insert_tray("oval"),
     }
-    for words, draw in cases.items():
-        with pytest.raises(InputError, match=words) as told:
-            draw()
-        assert "\n" not in str(told.value) and str(told.value).endswith(".")
+    for words, call in cases.items():
+        with pytest.raises(InputError, match=words) as caught:
+            call()
+        assert "\n" not in str(caught.value) and str(caught.value).endswith(".")
 
 
 def test_a_moved_part_is_the_same_solid_in_another_frame() -> None:
@@ -217,12 +217,12 @@ def test_a_moved_part_is_the_same_solid_in_another_frame() -> None:
     assert [pegs[0].moved(p).pieces[0].kind for p in (quarter, askew)] == ["box", "hull"]
     with pytest.raises(InputError, match="cylinder among its pieces"):
         pegs[1].moved(askew)
-    raised = pegs[0].moved([0, 0, 0.05, 1, 0, 0, 0])  # as a file has it: its origin at the lower end
+    raised = pegs[0].moved([0, 0, 0.05, 1, 0, 0, 0])  # with its origin at the tip, as in many files
     with pytest.warns(RuntimeWarning, match=r"wholly above its origin.*Part\.moved"):
         PegPhysics(hole, raised)
 
 
-def test_contact_parameters_and_poses_that_are_no_numbers_are_refused() -> None:
+def test_contact_parameters_and_poses_that_are_not_finite_are_refused() -> None:
     for wrong in ({"friction": math.nan}, {"impedance": (math.nan,) * 5}, {"time_step": math.inf}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             ContactParameters(**wrong)
