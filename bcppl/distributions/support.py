@@ -21,6 +21,15 @@ def base(distribution: Any) -> Any:
     return distribution
 
 
+def masks(distribution: Any) -> bool:
+    """Whether a distribution leaves some values out of its log-probability (`.mask()`)."""
+    while isinstance(distribution, Independent | ExpandedDistribution | MaskedDistribution):
+        if isinstance(distribution, MaskedDistribution) and not torch.as_tensor(distribution._mask).all():
+            return True
+        distribution = distribution.base_dist
+    return False
+
+
 def freedom_of(distribution: Any) -> Freedom | None:
     """Which axes of the poses at a site are free; None where its values are no poses."""
     freedom: Freedom | None = getattr(base(distribution), "freedom", None)

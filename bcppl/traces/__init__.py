@@ -6,8 +6,8 @@ from bcppl.traces.model import Model
 from bcppl.traces.propose import Proposed, assess, propose
 from bcppl.traces.series import Series
 from bcppl.traces.trace import Trace
-from bcppl.traces.update import Regenerated, Update, regenerate, update
-from bcppl.traces.verbs import extend, generate, simulate
+from bcppl.traces.update import Regenerated, Update, extend, regenerate, update
+from bcppl.traces.verbs import generate, simulate
 
 __all__ = [
     "Model",

@@ -11,7 +11,6 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.series import Stage, taken
-from bcppl.traces.trace import Trace
 
 # More particles than a vector that was meant as one event is likely to have entries.
 FEW = 20
@@ -41,7 +40,7 @@ def refuse_coincidence(
     # and meant where it is large. A later step of a series goes on from the state, which has N.
     begins = particles <= FEW and (not isinstance(program, Stage) or program.before is None)
     suspects = ran.coincident | ran.whole if begins else ran.coincident
-    if not suspects.difference(old) or any(isinstance(arg, Trace) for arg in args):
+    if not suspects.difference(old) or any(hasattr(arg, "particles") for arg in args):
         return
     index = torch.cat([torch.arange(particles), torch.tensor([0])])
     given = {

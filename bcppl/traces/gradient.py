@@ -6,6 +6,7 @@ Traces are evaluated without gradients. Here a program is run again at values th
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial, wraps
 from typing import Any
 
@@ -28,6 +29,13 @@ def differentiable(program: Program) -> Program:
             return program(*args)
 
     return graded
+
+
+def with_gradients(trace: Trace, values: Mapping[str, Tensor]) -> Trace:
+    """The trace at values that ask for gradients, to which its distributions are attached."""
+    choices = {**trace.choices, **values}
+    program = differentiable(trace.program)
+    return replace(trace, program=program, choices=choices, carried=dict(trace.carried), known={})
 
 
 def result_with_grad(

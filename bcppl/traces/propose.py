@@ -14,7 +14,7 @@ from bcppl.traces.run import Program, Run, run
 from bcppl.traces.series import Series, runnable
 from bcppl.traces.shown import shapes
 from bcppl.traces.trace import Trace
-from bcppl.traces.verbs import refuse_unvisited, simulate, trace_of
+from bcppl.traces.verbs import kind_of, refuse_unvisited, simulate
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -84,4 +84,4 @@ def assessed(
         raise InputError(
             f"assess needs a value for address {missing[0]!r}; give one for every choice of the program."
         )
-    return trace_of(program, args, particles, ran, {})
+    return kind_of(program).of_run(program, args, particles, ran, {})

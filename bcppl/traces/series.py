@@ -233,9 +233,9 @@ class SeriesTrace(Trace):
         whole, index = self.origin
         return taken(whole.state, index, whole.particles)
 
-    def _ran(self, ran: Run) -> None:
+    def _keep_run(self, ran: Run) -> None:
         taken(ran.result, None, self.particles)
-        super()._ran(ran)
+        super()._keep_run(ran)
 
     def log_prob(self, *addresses: str | tuple[str, int]) -> Tensor:
         """Log-probability (N,) of sites, summed; of all sites of all steps where none is named.
@@ -354,8 +354,8 @@ class SeriesTrace(Trace):
         merged = super(SeriesTrace, first).where(mask, second)
         return replace(merged, program=first.stage.where(mask, second.stage))  # type: ignore[return-value]
 
-    def _moved(self, *args: Any) -> Trace:
-        return super(SeriesTrace, self.settled())._moved(*args)
+    def revised(self, *args: Any, **options: Any) -> Trace:  # noqa: D102
+        return super(SeriesTrace, self.settled()).revised(*args, **options)
 
     def next_stage(self) -> Stage:
         """The step that comes after this trace's, for its particles."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -12,7 +13,7 @@ import pyro
 import torch
 from torch import Tensor
 
-from bcppl.distributions.support import log_prob_inside
+from bcppl.distributions.support import log_prob_inside, masks, support_of
 from bcppl.errors import InputError, NotANumberError
 from bcppl.traces.carried import Entry
 from bcppl.traces.dependence import Comparison, equal
@@ -54,14 +55,32 @@ class Trace:
     def _run(self) -> Run:
         """The program run again at these values: that is cheap, and what sites compute is kept in `known`."""
         given = {**self.choices, **self.observations}
-        again = self._again(given)
+        again = run(self.program, self.args, self.particles, given, self.carried)
         self.carried_states().update(again.carried)
         return again
 
-    def _again(self, given: Mapping[str, Tensor]) -> Run:
-        return run(self.program, self.args, self.particles, given, self.carried)
+    @classmethod
+    def of_run(
+        cls,
+        program: Program,
+        args: tuple[Any, ...],
+        particles: int,
+        ran: Run,
+        observations: Mapping[str, Tensor],
+        hidden: frozenset[str] = frozenset(),
+    ) -> Trace:
+        """The trace of a run; what is neither observed nor fixed by the program is latent."""
+        choices = {
+            address: _of_each_particle(value, ran.distributions[address], particles)
+            for address, value in ran.values.items()
+            if address not in observations and address not in ran.fixed
+        }
+        ran.values.update(choices)
+        trace = cls(program, args, particles, choices, dict(observations), hidden=hidden)
+        trace._keep_run(ran)
+        return trace
 
-    def _ran(self, ran: Run) -> None:
+    def _keep_run(self, ran: Run) -> None:
         """Keep the run that these values come from, so that the program is not run again for them."""
         self.__dict__["_run"] = ran
         self.carried_states().update(ran.carried)
@@ -118,6 +137,8 @@ class Trace:
 
     def _evaluated(self, address: str) -> Tensor:
         distribution = self._run.distributions[address]
+        if address in self.choices:
+            refuse_masked(address, distribution)
         # A value that another one has moved out of the support is impossible, not a mistake.
         with torch.no_grad(), pyro.validation_enabled(False):
             value = log_prob_inside(narrowed(distribution), inward(self._run.values[address], distribution))
@@ -232,17 +253,73 @@ class Trace:
                 f"it visits {', '.join(self.addresses) or 'none'}."
             )
         secret = replace(self, known=dict(self.known), hidden=self.hidden | hidden)
-        secret._ran(self._run)
+        secret._keep_run(self._run)
         return secret
 
     def at(self, values: Mapping[str, Tensor]) -> Trace:
-        """The same run with other values at some latent addresses; what cannot have changed is kept.
+        """The trace at other values of some latent addresses; log-probabilities that stay are kept.
 
         Raises:
-            InputError: an address is not latent, or a value is no tensor or has the wrong shape, or reals are
-                given for whole numbers.
+            InputError: an address is not latent; a value is no tensor, has the wrong shape, or is real where
+                the old one is a whole number; or the values change which addresses the program visits.
         """
-        self._refuse_other_than_latent(values)
+        self.refuse_other_than_latent(values)
+        return self._at_same_addresses(self.as_replacing(values))
+
+    def regenerated(self, addresses: Collection[str]) -> Trace:
+        """The trace with some latent addresses sampled from the program, in its order, given the others.
+
+        Raises:
+            InputError: an address is not latent, or the values change which addresses the program visits.
+        """
+        self.refuse_other_than_latent(addresses)
+        return self._at_same_addresses({}, without=addresses)
+
+    def _at_same_addresses(self, values: Mapping[str, Tensor], without: Collection[str] = ()) -> Trace:
+        revised = self.revised(values, without=without)
+        if set(revised.addresses) != set(self.addresses):
+            raise InputError("new values changed which addresses the program visits; mask sites instead.")
+        return revised
+
+    def revised(
+        self,
+        values: Mapping[str, Tensor],
+        *,
+        without: Collection[str] = (),
+        args: tuple[Any, ...] | None = None,
+        observations: Mapping[str, Tensor] | None = None,
+        draws_lazy: bool = True,
+    ) -> Trace:
+        """The program run again; log-probabilities of sites that are the same are kept.
+
+        What `update` does, without its checks.
+
+        Args:
+            values: (N, ...) of latent addresses.
+            without: latent addresses whose values are sampled from the program.
+            args: its arguments; these by default.
+            observations: observed values, besides those that there are.
+            draws_lazy: whether lazy sites that have no value are sampled; else they are NaN.
+        """
+        kept = {a: v for a, v in self.choices.items() if a not in without}
+        args = self.args if args is None else args
+        observed = {**self.observations, **(observations or {})}
+        given = {**kept, **values, **observed}
+        ran = run(self.program, args, self.particles, given, self.carried, draws_lazy=draws_lazy)
+        observed = {a: v for a, v in observed.items() if a in ran.distributions}
+        revised = type(self).of_run(self.program, args, self.particles, ran, observed, self.hidden)
+        known = [a for a in self.known if a in ran.distributions]
+        lost = set(changed(self, revised, known))
+        revised.known.update({a: self.known[a] for a in known if a not in lost})
+        return revised
+
+    def as_replacing(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """New values of latent addresses, of the type of the old ones.
+
+        Raises:
+            InputError: a value is no tensor, has another shape, or is real where the old one is a whole
+                number.
+        """
         refuse_other_than_tensors(values)
         for address, value in values.items():
             if not torch.can_cast(value.dtype, self.choices[address].dtype):
@@ -255,21 +332,14 @@ class Trace:
                     f"the new value of {address!r} has shape {tuple(value.shape)}, "
                     f"the old one {tuple(self.choices[address].shape)}; give one for each particle."
                 )
-        new = {a: value.to(self.choices[a].dtype) for a, value in values.items()}
-        return self._moved({**self.choices, **new}, frozenset(new))
+        return {a: value.to(self.choices[a].dtype) for a, value in values.items()}
 
-    def regenerated(self, addresses: Collection[str]) -> Trace:
-        """The same run with some latent addresses drawn anew from the program, in its order.
+    def refuse_other_than_latent(self, addresses: Iterable[str]) -> None:
+        """Refuse addresses that are not latent.
 
         Raises:
-            InputError: an address is not latent, or the values drawn change which addresses are visited.
+            InputError: names one.
         """
-        self._refuse_other_than_latent(addresses)
-        held = {a: v for a, v in self.choices.items() if a not in addresses}
-        ran = self._again({**held, **self.observations})
-        return self._moved({a: ran.values.get(a, v) for a, v in self.choices.items()}, addresses, ran)
-
-    def _refuse_other_than_latent(self, addresses: Iterable[str]) -> None:
         for address in addresses:
             if address not in self.choices:
                 raise InputError(
@@ -277,28 +347,36 @@ class Trace:
                     f"latent are {', '.join(self.choices) or 'none'}."
                 )
 
-    def _moved(self, choices: Mapping[str, Tensor], new: Collection[str], ran: Run | None = None) -> Trace:
-        """This run at other choices, of which those at `new` differ; what cannot have changed is kept."""
-        moved = replace(self, choices=choices, carried=dict(self.carried), known={})
-        if ran is not None:
-            moved._ran(ran)
-        if set(moved.addresses) != set(self.addresses):
-            raise InputError("new values changed which addresses the program visits; mask sites instead.")
-        for address in unchanged(self, moved, [a for a in self.known if a not in new]):
-            moved.known[address] = self.known[address]
-        # A state that was thrown away must not be merged back in later.
-        for name in [n for n in moved.carried_states() if n not in moved._run.carried]:
-            del moved.carried_states()[name]
-        return moved
+
+def refuse_masked(address: str, distribution: Any) -> None:
+    """Refuse the distribution of a latent site that masks some of its values.
+
+    Raises:
+        InputError: names the address.
+    """
+    if masks(distribution):
+        raise InputError(
+            f"site {address!r} is latent and its distribution is masked, so that the target would be "
+            "improper; mask observed sites only."
+        )
 
 
-def unchanged(first: Trace, second: Trace, addresses: Iterable[str]) -> list[str]:
-    """Those of some addresses, of equal values in two traces, whose log-probability is the same in both."""
+def _of_each_particle(value: Tensor, site: Any, particles: int) -> Tensor:
+    """A latent value as a trace holds it: one for each particle, real where its site is."""
+    if value.ndim == len(site.batch_shape) - 1 + len(site.event_shape):
+        value = value.expand(particles, *value.shape).clone()
+    if not value.is_floating_point():
+        with suppress(NotImplementedError):
+            # Kernels would round what they move.
+            value = value if support_of(site).is_discrete else value.to(torch.float64)
+    return value
+
+
+def changed(first: Trace, second: Trace, addresses: Iterable[str]) -> Iterator[str]:
+    """Those of some addresses of two traces whose values or distributions differ."""
     same, then, now = Comparison(), first._run, second._run
-    return [
-        address
-        for address in addresses
-        if same(then.distributions[address], now.distributions[address])
-        # What a program observes itself (`obs=`) may depend on a latent value.
-        and (address not in now.fixed or equal(then.values[address], now.values[address]))
-    ]
+    for address in addresses:
+        if not equal(then.values[address], now.values[address]) or not same(
+            then.distributions[address], now.distributions[address]
+        ):
+            yield address

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from bcppl.traces.run import run
 from bcppl.traces.trace import Trace
-from bcppl.traces.verbs import trace_of
 
 
 def undrawn(trace: Trace, args: tuple[Any, ...]) -> Trace:
@@ -14,8 +12,4 @@ def undrawn(trace: Trace, args: tuple[Any, ...]) -> Trace:
 
     Several of them can then be sampled in one batch. Other new sites are drawn from the program.
     """
-    given = {**trace.choices, **trace.observations}
-    ran = run(trace.program, args, trace.particles, given, trace.carried, draws_lazy=False)
-    longer = trace_of(trace.program, args, trace.particles, ran, trace.observations)
-    longer.known.update(trace.known)
-    return longer
+    return trace.revised({}, args=args, draws_lazy=False)

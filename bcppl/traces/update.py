@@ -1,4 +1,4 @@
-"""The verbs that change values in a trace, Gen's: update takes new ones, regenerate draws them anew.
+"""The verbs that change a trace, Gen's: update takes new values, regenerate samples them from the program.
 
 Cusumano-Towner et al., Gen: a general-purpose probabilistic programming system with programmable inference,
 PLDI 2019, section 4.
@@ -9,11 +9,15 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from bcppl.traces.trace import Trace, unchanged
+from bcppl.errors import InputError
+from bcppl.traces.series import SeriesTrace
+from bcppl.traces.trace import Trace, changed
+from bcppl.traces.verbs import constrained, copied, log_weight, refuse_unfit, refuse_unvisited
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,30 +25,121 @@ class Update:
     """What `update` returns; its log ratio is evaluated when it is asked for.
 
     Attributes:
-        trace: at the new values.
+        trace: at the new values, arguments and observations.
         previous: the trace that was updated.
-        discarded: the values that were replaced, by address.
+        discarded: the values that were replaced, and those of addresses that are visited no more, by address.
+        drawn: the new latent addresses whose values were sampled from the program.
     """
 
     trace: Trace
     previous: Trace
     discarded: Mapping[str, Tensor] = field(repr=False)
+    drawn: frozenset[str] = frozenset()
 
     @cached_property
     def log_ratio(self) -> Tensor:
-        """Log p(new trace) - log p(old trace), (N,)."""
-        named = self.trace.addresses
-        return self.trace.log_prob(*named) - self.previous.log_prob(*named)
+        """Log p(new trace) - log p(old trace) - log q(drawn), (N,): Gen's weight of an update.
+
+        q is the program itself, so that the density of what was drawn cancels. Sites of both traces that are
+        the same cancel without being evaluated.
+        """
+        new, old = self.trace, self.previous
+        both = [a for a in new.addresses if a in old._run.distributions]
+        total = torch.zeros(new.particles, dtype=torch.float64)
+        if others := set(changed(old, new, both)):
+            named = [a for a in both if a in others or (a in old.known and a in new.known)]
+            total = total + (new.log_prob(*named) - old.log_prob(*named))
+        added = [a for a in new.addresses if a not in old._run.distributions and a not in self.drawn]
+        vanished = [a for a in old.addresses if a not in new._run.distributions]
+        total = total + new.log_prob(*added) if added else total
+        return total - old.log_prob(*vanished) if vanished else total
 
 
-def update(trace: Trace, values: Mapping[str, Tensor]) -> Update:
-    """Give some latent addresses new values (N, *event); the others and the arguments stay.
+def update(
+    trace: Trace,
+    values: Mapping[str, Tensor] | None = None,
+    *,
+    args: tuple[Any, ...] | None = None,
+    observations: Mapping[str, Tensor] | None = None,
+) -> Update:
+    """Change values, arguments and observations of a trace, all at once; what is not given stays.
+
+    New arguments may make the program visit new addresses and leave others out. New latent addresses that are
+    given no value are sampled from the program.
+
+    Args:
+        trace: what is changed; of a series its newest step.
+        values: (N, ...) of latent addresses, old ones or new.
+        args: the program's arguments.
+        observations: values of new addresses, or in place of old observations: one for all particles. They
+            are copied.
 
     Raises:
-        InputError: an address is not latent, or a value has the wrong shape.
+        InputError: a value is of an observed address, an observation of a latent one, or either of an address
+            that is never visited; one has the wrong shape or type; new values change which addresses are
+            visited, while the arguments stay; or a new latent pose lies in a plate.
     """
-    new = trace.at(values)
-    return Update(new, trace, {a: trace.choices[a] for a in values})
+    values, observations = values or {}, copied(observations or {})
+    old = {**trace.choices, **trace.observations}
+    replaced = {a: v for a, v in values.items() if a in old or args is None}
+    trace.refuse_other_than_latent(replaced)
+    for address in observations:
+        if address in values or address in trace.choices:
+            raise InputError(f"address {address!r} is latent and given an observation; give it a value.")
+    given = {**values, **trace.as_replacing(replaced)}
+    new = trace.revised(given, args=args, observations=observations)
+    refuse_unvisited((*values, *observations), new._run)
+    if args is None and set(new.addresses) != set(trace.addresses):
+        raise InputError("new values changed which addresses the program visits; mask sites instead.")
+    if args is not None or observations:
+        refuse_unfit(new, observations, old)
+    vanished = [a for a in old if a not in new._run.distributions]
+    drawn = frozenset(a for a in new.choices if a not in old and a not in values)
+    discarded = {a: old[a] for a in (*replaced, *(o for o in observations if o in old), *vanished)}
+    return Update(new, trace, discarded, drawn)
+
+
+def extend(
+    trace: Trace,
+    args: tuple[Any, ...],
+    observations: Mapping[str, Tensor],
+    choices: Mapping[str, Tensor] | None = None,
+) -> tuple[Trace, Tensor]:
+    """An update by new arguments that adds sites and changes no value, with its log weight.
+
+    New latent sites are sampled from the program. A series (`bcppl.traces.Series`) is run on by one step,
+    whose arguments and observations are given; then it is the step's sites that are new.
+
+    Args:
+        trace: what is extended.
+        args: the new arguments.
+        observations: values of new addresses; they are copied.
+        choices: values (N, ...) of new latent addresses, such as a proposal gave; those that are left out are
+            sampled from the program.
+
+    Returns:
+        The longer trace and its log weight (N,): the log-probability of the new observations and of the
+        choices that were given, and the log ratio of old sites that the new arguments change, if any.
+
+    Raises:
+        InputError: an address vanishes, or an observation or a choice is of an old address, of one never
+            visited, or of the wrong shape, or a new latent pose lies in a plate.
+    """
+    choices = choices or {}
+    if isinstance(trace, SeriesTrace):
+        stage = trace.next_stage()
+        longer, weighed = constrained(stage, args, trace.particles, observations, choices, trace.carried)
+        return longer, log_weight(longer, weighed)
+    again = [a for a in (*observations, *choices) if a in trace]
+    if again:
+        raise InputError(
+            f"address {again[0]!r} was observed or sampled before; extend takes new addresses only."
+        )
+    updated = update(trace, choices, args=args, observations=observations)
+    if updated.discarded:
+        lost = next(iter(updated.discarded))
+        raise InputError(f"with the new arguments the program no longer visits address {lost!r}.")
+    return updated.trace, updated.log_ratio
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +147,8 @@ class Regenerated:
     """What `regenerate` returns; its log weight is evaluated when it is asked for.
 
     Attributes:
-        trace: with the values drawn anew.
-        previous: the trace that they were drawn for.
+        trace: with the values that were sampled.
+        previous: the trace that was changed.
         discarded: the values that were replaced, by address.
     """
 
@@ -66,28 +161,26 @@ class Regenerated:
         """The Metropolis-Hastings log acceptance ratio (N,) of proposing from the program itself.
 
         It is log p(new trace) - log p(old trace) over the sites that were not regenerated: the others' cancel
-        against the proposal. A site whose inputs are unchanged is not evaluated.
+        against the proposal. Sites that are the same are not evaluated.
         """
         total = torch.zeros(self.trace.particles, dtype=torch.float64)
         others = [address for address in self.trace.addresses if address not in self.discarded]
-        same = unchanged(self.previous, self.trace, others)
-        for address in others:
-            if address not in same:
-                total = total + self.trace.log_prob(address) - self.previous.log_prob(address)
+        for address in changed(self.previous, self.trace, others):
+            total = total + self.trace.log_prob(address) - self.previous.log_prob(address)
         return total
 
 
 def regenerate(trace: Trace, addresses: str | Collection[str]) -> Regenerated:
-    """Draw some latent addresses anew from the program, given the others' values; the arguments stay.
+    """Sample some latent addresses from the program, given the others' values; the arguments stay.
 
-    Several are drawn in the order of the program: later ones are given the earlier ones' new values.
+    Several are sampled in the order of the program: later ones are given the earlier ones' new values.
 
     Args:
         trace: what is changed.
         addresses: one latent address or several.
 
     Raises:
-        InputError: an address is not latent, or the values drawn change which addresses are visited.
+        InputError: an address is not latent, or the values change which addresses are visited.
     """
     addresses = [addresses] if isinstance(addresses, str) else list(addresses)
     return Regenerated(trace.regenerated(addresses), trace, {a: trace.choices[a] for a in addresses})

@@ -13,8 +13,8 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.support import log_prob_inside
 from bcppl.errors import InferenceError
 from bcppl.traces import Trace
+from bcppl.traces.dependence import Comparison
 from bcppl.traces.run import inward
-from bcppl.traces.trace import unchanged
 
 # Numbers of observations times particles that are weighed together: they then stay in the cache.
 AT_ONCE = 1 << 18
@@ -56,7 +56,10 @@ def _independent(trace: Trace, observed: Sequence[str], values: Mapping[str, Ten
     for turn in (*turns, *(1 + turn for turn in turns[:1])):
         index = turn % count
         moved = trace.at({a: values[a][index] for a in observed})
-        fixed = [fixed[0], *unchanged(trace, moved, fixed[1:])]
+        same = Comparison()
+        fixed = [
+            a for k, a in enumerate(fixed) if k == 0 or same(trace.distributions[a], moved.distributions[a])
+        ]
     return fixed
 
 
@@ -64,11 +67,12 @@ def _at_one(trace: Trace, addresses: Sequence[str], values: Mapping[str, Tensor]
     """Log-probability (N,) of one observation at sites that hang on the observations before."""
     shared = {a: v[which] for a, v in values.items()}
     moved = trace.at({a: v.expand(trace.particles, *v.shape) for a, v in shared.items()})
-    same = unchanged(trace, moved, addresses)
+    same = Comparison()
     total = torch.zeros(trace.particles, dtype=torch.float64)
     for address in addresses:
+        before, site = trace.distributions[address], moved.distributions[address]
         # What was rendered or simulated for a site is kept by it.
-        site = (trace if address in same else moved).distributions[address]
+        site = before if same(before, site) else site
         total += _summed(_density(address, site, inward(shared[address], site)), site)
     return total
 

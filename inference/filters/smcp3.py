@@ -42,7 +42,8 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals import Fitted, Program, Proposal, program_of
 from bcppl.inference.resampling import Resample, adaptive, refuse_scheme
 from bcppl.traces import Trace, extend, simulate, update
-from bcppl.traces.gradient import differentiable, result_with_grad
+from bcppl.traces.anticipated import Anticipated
+from bcppl.traces.gradient import result_with_grad, with_gradients
 from bcppl.traces.propose import assessed
 from bcppl.traces.series import SeriesTrace
 
@@ -174,32 +175,20 @@ def moved_trace(
         InputError: see `moved`.
     """
     count = old.particles
-    shown = old if observed is None else _shown(old, observed)
-    # A series goes on from its values; only a program that is run on can have them changed.
-    on = isinstance(old, SeriesTrace) and observed is not None
-    latent: Values = {} if on else dict(old.choices)
+    shown = old if observed is None else Anticipated(old, *observed)
+    # The next step of a series begins from the values of the last, which stay.
+    latent: Values = {} if observed is not None and isinstance(old, SeriesTrace) else old.choices
     there = simulate(forward, (shown,), count)
     _refuse_observed("forward", there.choices, shown)
-    new, back = _read(there.result, there.choices, latent, lambda: _new_latent(old, shown, observed))
-    kept = {a: v for a, v in new.items() if a in latent}
-    fresh = {a: v for a, v in new.items() if a not in latent}
-    reached, log_factor = old, torch.zeros(count, dtype=torch.float64)
-    if kept:
-        updated = update(old, kept)
-        reached, log_factor = updated.trace, updated.log_ratio
-    if observed is not None:
-        reached, gained = extend(reached, observed.args, observed.observations, fresh)
-        log_factor = log_factor + gained
-    elif fresh:
-        raise InputError(
-            f"a forward program gives a value at {next(iter(fresh))!r}, which is no latent address; "
-            f"latent are {', '.join(latent) or 'none'}."
-        )
+    new, back = _read(there.result, there.choices, latent, lambda: _brought(shown))
+    reached, log_factor = _reached(old, new, observed)
+    fresh = [a for a in new if a not in latent]
     way_back = assessed(backward, (reached,), back, count)
     _refuse_observed("backward", way_back.choices, reached)
     inputs = charted(OLD, latent, old.distributions)
-    for address, value in kept.items():
-        refuse_leaving(address, inputs[OLD, address].chart, latent[address], value)
+    for address, value in new.items():
+        if address in latent:
+            refuse_leaving(address, inputs[OLD, address].chart, latent[address], value)
     inputs |= charted(FORWARD, there.choices, there.distributions)
     outputs = charted(NEW, {a: reached[a] for a in (*latent, *fresh)}, reached.distributions)
     outputs |= charted(BACKWARD, back, way_back.distributions)
@@ -207,15 +196,10 @@ def moved_trace(
     def again(values: dict[Key, Tensor]) -> dict[Key, Tensor]:
         before = {a: values[OLD, a] for a in latent}
         chosen = {a: values[FORWARD, a] for a in there.choices}
-        looked_at = replace(
-            shown,
-            program=differentiable(shown.program),
-            choices={**old.choices, **before},
-            carried=dict(shown.carried),
-            known={},
-        )
+        attached = with_gradients(old, before)
+        looked_at = attached if observed is None else Anticipated(attached, *observed)
         result = result_with_grad(forward, (looked_at,), chosen, count)
-        after, returned = _read(result, chosen, before, lambda: list(fresh))
+        after, returned = _read(result, chosen, before, lambda: fresh)
         return {(NEW, a): v for a, v in {**before, **after}.items()} | {
             (BACKWARD, a): v for a, v in returned.items()
         }
@@ -234,7 +218,7 @@ def moved_trace(
     return reached, torch.where(chosen == -torch.inf, -torch.inf, log_factor)
 
 
-def _refuse_observed(which: str, choices: Values, seen: Trace) -> None:
+def _refuse_observed(which: str, choices: Values, seen: Trace | Anticipated) -> None:
     for address in choices:
         if address in seen.observations:
             raise InputError(
@@ -243,25 +227,18 @@ def _refuse_observed(which: str, choices: Values, seen: Trace) -> None:
             )
 
 
-def _shown(old: Trace, observed: Observed) -> Trace:
-    """The old values with the new arguments and observations: what a forward program reads.
-
-    Asked for a distribution, it draws the new latent values that are not there.
-    """
-    seen = {**old.observations, **observed.observations}
-    if isinstance(old, SeriesTrace):
-        return replace(old, observations=seen, carried=dict(old.carried), known={})
-    return replace(old, args=observed.args, observations=seen, carried=dict(old.carried), known={})
+def _reached(old: Trace, new: Values, observed: Observed | None) -> tuple[Trace, Tensor]:
+    """The particles at new values and with a measurement, if there is one; with the log ratio (N,)."""
+    if observed is not None and isinstance(old, SeriesTrace):
+        return extend(old, observed.args, observed.observations, new)
+    args, observations = (None, None) if observed is None else observed
+    updated = update(old, new, args=args, observations=observations)
+    return updated.trace, updated.log_ratio
 
 
-def _new_latent(old: Trace, shown: Trace, observed: Observed | None) -> list[str]:
+def _brought(shown: Trace | Anticipated) -> list[str]:
     """The latent addresses that come with a measurement."""
-    if observed is None:
-        return []
-    if isinstance(old, SeriesTrace):
-        longer = Trace(old.next_stage(), observed.args, old.particles, {}, observed.observations)
-        return [a for a in longer.addresses if a not in observed.observations]
-    return [a for a in shown.addresses if a not in shown]
+    return shown.brought if isinstance(shown, Anticipated) else []
 
 
 def _read(
