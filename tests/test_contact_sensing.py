@@ -114,9 +114,9 @@ def test_a_leaning_peg_touches_with_its_lowest_edge(yaw: float) -> None:
     probe = lean(20.0, yaw)
     sensing = ContactSensing(PEG, rate=100.0, tare=10, cutoff=20.0)
     part = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64)
-    track = ProbeRollout.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
-    contacts, pose = track.window(130, 150)
-    local, _ = sensing.contacts(track.rollout.wrench, sensing.start(1))
+    rollout = ProbeRollout.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
+    contacts, pose = rollout.window(130, 150)
+    local, _ = sensing.contacts(rollout.wrench(0, 150).numpy(), sensing.start(1))
     # Turned by +20 degrees about y, the edge at x = +8 mm is the lowest.
     np.testing.assert_allclose(local[0, 130:], np.tile([0.008, 0.0, -0.05], (20, 1)), atol=1e-4)
     np.testing.assert_array_equal(local[:, 130:], contacts)
@@ -142,10 +142,10 @@ def test_a_measured_recording_is_read_by_the_same_code() -> None:
     probe = lean(10.0, 30.0)
     sensing = ContactSensing(PEG, rate=100.0)
     part = torch.tensor([[0.0, 0, 0.001, 1, 0, 0, 0]], dtype=torch.float64)
-    track = ProbeRollout.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
-    whole, pose = track.window(0, 150)
+    rollout = ProbeRollout.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
+    whole, pose = rollout.window(0, 150)
     touches = [
-        Touch(probe.stamps[a:b], track.rollout.wrench[0, a:b], track.rollout.world_from_peg[0, a:b])
+        Touch(probe.stamps[a:b], rollout.wrench(a, b)[0].numpy(), rollout.window(a, b)[1][0].numpy())
         for a, b in ((0, 40), (40, 90), (90, 150))
     ]
     measured = sensing.measure(touches)
@@ -219,12 +219,12 @@ def test_a_peg_may_be_doubled_at_its_seams_but_not_open() -> None:
 def test_contacts_are_those_of_the_window_s_wrench() -> None:
     probe, sensing = lean(20.0), ContactSensing(PEG, rate=100.0)
     part = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0], [0.0, 0, -1, 1, 0, 0, 0]], dtype=torch.float64)
-    track = ProbeRollout.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
-    late = track.wrench(100, 150)
-    assert late.shape == (2, 50, 6) and track.count == 150
-    whole = torch.cat([track.wrench(0, 100), late], dim=1)
+    rollout = ProbeRollout.start(PegPhysics(block((0.2, 0.2, 0.02)), PEG), sensing, part, probe)
+    late = rollout.wrench(100, 150)
+    assert late.shape == (2, 50, 6) and rollout.count == 150
+    whole = torch.cat([rollout.wrench(0, 100), late], dim=1)
     np.testing.assert_array_equal(
-        sensing.contacts(whole.numpy(), sensing.start(2))[0], track.window(0, 150)[0]
+        sensing.contacts(whole.numpy(), sensing.start(2))[0], rollout.window(0, 150)[0]
     )
     # The block pushes the peg up: along the world's z, which leans by 20 degrees in the peg's frame.
     force = late[0, -1, :3].numpy()
@@ -264,13 +264,13 @@ def test_the_truth_explains_its_own_recording_best() -> None:
     offsets = torch.tensor([[0.0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 0, 1], [0, 0, -1], [3, 0, 0], [0, 0, 3]])
     part = truth.repeat(len(offsets), 1)
     part[:, :3] += 0.001 * offsets
-    track = ProbeRollout.start(PegPhysics(hole, PEG), sensing, part, probe)
+    rollout = ProbeRollout.start(PegPhysics(hole, PEG), sensing, part, probe)
     # A flush touch looks the same in the peg's frame at any depth: contacts must not speak against the truth,
     # where the peg stood has to speak for it.
     for likelihood, value, margin in (
-        (ChamferContacts(track, 0, 350, 0.001, 18e-6), contacts, -1.0),
-        (ContactsInTime(track, 0, 350, 0.001), contacts, -1.0),
-        (PegPose(track, 0, 350, 0.0002, 0.001), pose, 0.1),
+        (ChamferContacts(rollout, 0, 350, 0.001, 18e-6), contacts, -1.0),
+        (ContactsInTime(rollout, 0, 350, 0.001), contacts, -1.0),
+        (PegPose(rollout, 0, 350, 0.0002, 0.001), pose, 0.1),
     ):
         log_prob = likelihood.log_prob(value)
         assert (log_prob[0] > log_prob[1:] + margin).all()

@@ -136,10 +136,10 @@ def test_a_pin_in_simulated_contact_is_located() -> None:
     stiffness, damping = np.repeat([1000.0, 500.0], 3), np.repeat([400.0, 18.0], 3)
     probe = Probe("pin", np.array([0, 0.7, 1.5]), command, stiffness, damping, np.arange(150) / 100.0)
     part = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]], dtype=torch.float64)
-    track = ProbeRollout.start(PegPhysics(pin, PEG), ContactSensing(PEG, rate=100.0), part, probe)
-    pose = track.window(0, 150)[1][0, -1]
+    rollout = ProbeRollout.start(PegPhysics(pin, PEG), ContactSensing(PEG, rate=100.0), part, probe)
+    pose = rollout.window(0, 150)[1][0, -1]
     truth = poses.transform(poses.inverse(pose), torch.zeros(1, 3, dtype=torch.float64))[0].numpy()
-    exact = track.wrench(149, 150)[0].numpy()
+    exact = rollout.wrench(149, 150)[0].numpy()
     assert np.linalg.norm(exact[0, :3]) > 3.0
     sensing = IntrinsicSensing(PEG, friction=0.5)
     candidates = sensing.candidates(exact, COVARIANCE)

@@ -235,13 +235,13 @@ def test_an_offset_in_the_hand_is_a_peg_whose_surface_is_elsewhere(twist: list[f
 def test_an_impossible_stiffness_diverges_alone_and_counts_as_impossible() -> None:
     part, sensing = poses.identity(4), ContactSensing(PEG, rate=100.0)
     factors = numbers(1.0, 1e7, 1.1, 1e9)
-    track = ProbeRollout.start(PegPhysics(TABLE, PEG), sensing, part, PRESS, Nuisances(stiffness=factors))
+    rollout = ProbeRollout.start(PegPhysics(TABLE, PEG), sensing, part, PRESS, Nuisances(stiffness=factors))
     with pytest.warns(RuntimeWarning, match="2 of 4 rollouts of probe 'probe' diverged"):
-        wrench = track.wrench(0, 150)
-    assert track.diverged.tolist() == [False, True, False, True]
+        wrench = rollout.wrench(0, 150)
+    assert rollout.diverged.tolist() == [False, True, False, True]
     assert torch.isnan(wrench[[1, 3], -1]).all() and torch.isfinite(wrench[[0, 2]]).all()
-    seen = track.window(100, 150)[0][0]
-    log_prob = ChamferContacts(track, 100, 150, 0.001, 1e-5).log_prob(seen)
+    seen = rollout.window(100, 150)[0][0]
+    log_prob = ChamferContacts(rollout, 100, 150, 0.001, 1e-5).log_prob(seen)
     assert log_prob[[1, 3]].tolist() == [-np.inf] * 2 and log_prob[0] == 0.0 and torch.isfinite(log_prob[2])
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -1,5 +1,6 @@
-from bcppl.contact.sensing.felt import Felt as Felt
+from bcppl.contact.sensing.contact_detection import ContactDetector as ContactDetector
 from bcppl.contact.sensing.intrinsic import IntrinsicSensing as IntrinsicSensing
 from bcppl.contact.sensing.load import ToolLoad as ToolLoad, identify_load as identify_load
+from bcppl.contact.sensing.location import ContactSensing as ContactSensing
 from bcppl.contact.sensing.noise import WrenchNoise as WrenchNoise, noise_at_rest as noise_at_rest
 from bcppl.contact.sensing.onset import OnsetDetector as OnsetDetector
