@@ -19,9 +19,8 @@ from bcppl import poses
 from bcppl.contact.peg_model import ContactParameters
 from bcppl.contact.touch import Touch
 from bcppl.contact.track import ContactTrack
-from bcppl.distributions.contact import ChamferContacts, PegPose
+from bcppl.distributions.contact import ChamferContacts, PegPose, Wrench
 from bcppl.distributions.depth import RobustDepth
-from bcppl.distributions.wrench import Wrench
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models import peg_in_hole
 from bcppl.models.worlds.peg_in_hole import record

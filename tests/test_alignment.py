@@ -15,9 +15,8 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.contact import ContactsInTime, PegPose
 from bcppl.distributions.depth import LaplaceDepth, RobustDepth
-from bcppl.distributions.path import Path
 from bcppl.distributions.poses import NormalPose, UniformPose
-from bcppl.distributions.touch import OnsetLocation
+from bcppl.distributions.touch import OnsetLocation, Path
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.distance import SignedDistance

@@ -161,7 +161,7 @@ def test_the_normalised_contact_likelihood_is_normalised() -> None:
     settings: dict[str, Any] = {
         "scale": 0.002,
         "missed": 0.1,
-        "invented": 0.2,
+        "false_alarm": 0.2,
         "outlier": 0.3,
         "reach": 0.03,
         "every": 1,
@@ -191,7 +191,7 @@ def test_the_normalised_contact_likelihood_samples_what_it_says() -> None:
     settings: dict[str, Any] = {
         "scale": 0.001,
         "missed": 0.1,
-        "invented": 0.2,
+        "false_alarm": 0.2,
         "outlier": 0.3,
         "reach": 0.05,
         "every": 1,
@@ -218,7 +218,7 @@ def test_locations_anywhere_are_in_the_pegs_frame_wherever_the_peg_is() -> None:
         0,
         1,
         0.001,
-        invented=0.9,
+        false_alarm=0.9,
     ).sample()
     assert float(drawn[..., 0].nanmean()) == pytest.approx(0.0, abs=0.01)
 

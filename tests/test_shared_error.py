@@ -9,9 +9,7 @@ import trimesh
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.path import Path
-from bcppl.distributions.shared_error import SharedError, SharedOnset
-from bcppl.distributions.touch import Placed
+from bcppl.distributions.touch import Path, Placed, SharedError, SharedOnset
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.parts import Part
 
@@ -40,9 +38,9 @@ def log_probs(pose: Tensor, touches: list[tuple[Path, Tensor]], outlier: float =
     sites = []
     for path, place in touches:
         shared.placed.expect(path.points)
-        shared.expect(path)
+        shared.add(path)
         sites.append(SharedOnset(shared, outlier))
-        shared.felt(place)
+        shared.condition_on(place)
     return [site.log_prob(place) for site, (_, place) in zip(sites, touches, strict=True)]
 
 
@@ -93,9 +91,9 @@ def test_samples_err_together() -> None:
     shared = SharedError(Placed(box(), pose), t(0.0, 0.0, 0.0), SHIFT, 0.0, OFFSET, SPREAD)
     drawn = []
     for y in (-0.08, 0.05):
-        shared.expect(towards(y))
+        shared.add(towards(y))
         drawn.append(SharedOnset(shared, 0.0).sample())
-        shared.felt(drawn[-1])
+        shared.condition_on(drawn[-1])
     inside = torch.stack(drawn)[..., 0] + 0.05
     covariance = torch.cov(inside)
     assert inside.mean(dim=1).tolist() == pytest.approx([OFFSET] * 2, abs=1.5e-5)

@@ -9,8 +9,7 @@ import trimesh
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.path import Path
-from bcppl.distributions.touch import ForceDirection, FreePath, OnsetLocation
+from bcppl.distributions.touch import ForceDirection, FreePath, OnsetLocation, Path
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.parts import Part

@@ -13,7 +13,7 @@ from torch import Tensor
 from bcppl.contact.physics import PegPhysics
 from bcppl.contact.track import ContactTrack
 from bcppl.contact.wrench import Sensing
-from bcppl.distributions.wrench import Wrench
+from bcppl.distributions.contact import Wrench
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.robot.motion import Probe

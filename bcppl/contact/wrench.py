@@ -292,7 +292,7 @@ class Sensing:
     def tared(self, touches: Sequence[Touch]) -> list[Tensor]:
         """The wrench (T, 6) of the same windows, free of the tool's weight and tared but not filtered.
 
-        NaN while taring: what `bcppl.distributions.wrench.Wrench` compares with the simulated one, and
+        NaN while taring: what `bcppl.distributions.contact.Wrench` compares with the simulated one, and
         `bcppl.contact.sensing.onset.OnsetDetector` passes over. A later wrench that is not finite stays
         so, for nothing carries it on.
 
