@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bcppl.distributions.mixture import MixturePose
+from bcppl.distributions.poses import MixturePose
 from bcppl.distributions.pose_normals import (
     GaussianMixture,
     PoseFactor,

@@ -18,7 +18,7 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from bcppl.distributions.path import Path
+from bcppl.distributions.touch import Path
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.mixture import MixturePose
+from bcppl.distributions.poses import MixturePose
 from bcppl.distributions.pose_normals import GaussianMixture, transport, widened_mixture
 from bcppl.distributions.poses import NormalPose
 from bcppl.inference.approximation import GaussianApproximation

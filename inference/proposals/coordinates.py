@@ -17,8 +17,7 @@ from torch.distributions.transforms import IndependentTransform, Transform, iden
 
 from bcppl import poses
 from bcppl.beliefs import Belief
-from bcppl.distributions.mixture import MixturePose
-from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.poses import MixturePose, NormalPose
 from bcppl.distributions.support import freedom_of, refuse_several_poses
 from bcppl.distributions.vectors import NormalStep
 from bcppl.errors import InputError

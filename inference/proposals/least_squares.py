@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.mixture import MixturePose
+from bcppl.distributions.poses import MixturePose
 from bcppl.poses import Freedom
 
 # What is proposed around an alignment: normals of so many of the fit's deviations, each with its share.

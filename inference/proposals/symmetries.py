@@ -14,8 +14,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within, whole_number
-from bcppl.distributions.mixture import MixturePose
-from bcppl.distributions.poses import HELD
+from bcppl.distributions.poses import HELD, MixturePose
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.poses import FREE

@@ -1,8 +1,9 @@
-"""What a depth camera measures of parts at their poses: likelihoods over whole depth images.
+"""Likelihoods of whole depth images of parts at their poses.
 
-A pixel's density hangs on what is rendered there: the depth of the part, or of the static background where
-that is nearer or the ray misses the part; where nothing is known to stand, the sensor's whole range. Missing
-pixels (0, NaN, out of range) never count, and which are missing depends on the observation only.
+A pixel's density depends on its rendered depth: that of the part, or of the static background where that is
+nearer or the ray misses the part; where the background is unknown, the density is uniform on the sensor's
+range. Missing pixels (0, NaN, out of range) never count, and which are missing depends on the observation
+only.
 """
 
 from bcppl.distributions.depth.cluttered import ClutteredDepth

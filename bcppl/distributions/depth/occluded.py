@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.depth.image import DepthDistribution
-from bcppl.distributions.depth.rendering import Array, Mask, RendersDepth
+from bcppl.distributions.depth.rendering import RendersDepth
+from bcppl.distributions.parameters import PROBABILITY
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,27 +18,30 @@ if TYPE_CHECKING:
 
 
 class OccludedDepth(DepthDistribution):
-    """Laplace noise, or something that stands in front, or any depth within the sensor's range.
+    """Laplace noise, or an occluder in front, or any depth within the sensor's range.
 
     p(o(u) | q) = (1 - occluder - outlier) exp(-|o(u) - r(u)| / b) / 2b
     + occluder [near < o(u) < r(u)] / (r(u) - near) + outlier / (far - near),
 
     so that a hand, a cable or a bin's wall before the part costs little, and seeing through the part costs
-    more. It is the beam model of range finders with its short readings spread evenly (Thrun, Burgard and Fox,
+    more. It is the beam model of range finders with uniform short readings (Thrun, Burgard and Fox,
     Probabilistic Robotics, 6.3.1, has them decay with range: there people stand near the robot). Where the
-    surface is nearer to the sensor's limit than b, so that nothing fits in between, the occluder's share
-    goes to the outliers; a surface beyond the range may be hidden within all of it. Where the ray misses the
-    part and the background is unknown, the uniform alone. It integrates to one over all depths, and over the
-    sensor's range but for the Laplace noise that leaves it, as `LaplaceDepth` does.
+    surface is nearer to the sensor's limit than b, so that no occluder fits in between, its share goes to the
+    outliers; a surface beyond the range may be hidden within all of it. Where the ray misses the part and the
+    background is unknown, the uniform alone. It integrates to one over all depths, and over the sensor's
+    range but for the Laplace noise beyond it, as `LaplaceDepth` does.
 
     Args:
-        occluder: the probability that something stands in front, between 0 and 1.
-        outlier: the probability of any other depth, between 0 and 1; together they stay below 1.
-        **others: those of `DepthDistribution`.
+        occluder: the probability of an occluder in front, above 0 and below 1.
+        outlier: the probability of any other depth, above 0 and below 1; their sum is below 1.
+        *others: those of `DepthDistribution`, in its order.
+        **named: those of `DepthDistribution`, by name.
 
     Raises:
-        InputError: as `DepthDistribution`, or the probabilities are not positive, or add up to 1 or more.
+        InputError: as `DepthDistribution`, or a probability is out of range, or their sum is 1 or more.
     """
+
+    parameters = DepthDistribution.parameters | {"occluder": PROBABILITY, "outlier": PROBABILITY}
 
     def __init__(
         self,
@@ -45,28 +49,21 @@ class OccludedDepth(DepthDistribution):
         camera: Camera,
         pose: Tensor,
         scale: float,
-        background: Array | Tensor | None = None,
-        effective_pixels: float | None = None,
-        region: Mask | Tensor | None = None,
+        *others: Any,
         occluder: float = 0.1,
         outlier: float = 0.05,
-        **others: Any,
+        **named: Any,
     ) -> None:
-        if not (occluder > 0.0 and outlier > 0.0 and occluder + outlier < 1.0):
+        self.occluder, self.outlier = occluder, outlier
+        super().__init__(renderer, camera, pose, scale, *others, **named)
+        if occluder + outlier >= 1.0:
             raise InputError(
-                f"the probabilities of an occluder and an outlier are {occluder} and {outlier}; "
-                "give positive numbers that add up to less than 1."
+                f"OccludedDepth has occluder = {occluder} and outlier = {outlier}; "
+                "give probabilities that add up to less than 1."
             )
-        self.occluder = float(occluder)
-        self.outlier = float(outlier)
-        super().__init__(renderer, camera, pose, scale, background, effective_pixels, region, **others)
-
-    @property
-    def _parameters(self) -> tuple[Any, ...]:
-        return (*super()._parameters, self.occluder, self.outlier)
 
     def _room(self, rendered: Tensor) -> Tensor:
-        """How much of the sensor's range lies before the surface, metres; 0 where nothing fits in."""
+        """The part of the sensor's range before the surface, metres; 0 where no occluder fits in."""
         room = rendered.clamp(max=self.camera.far) - self.camera.near
         return torch.where(room > self.scale, room, 0.0)
 

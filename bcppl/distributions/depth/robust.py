@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.depth.image import DepthDistribution
-from bcppl.distributions.depth.rendering import Array, Mask, RendersDepth
-from bcppl.errors import InputError
+from bcppl.distributions.depth.rendering import RendersDepth
+from bcppl.distributions.parameters import PROBABILITY
 
 if TYPE_CHECKING:
     from bcppl.geometry.camera import Camera
@@ -19,18 +19,21 @@ if TYPE_CHECKING:
 class RobustDepth(DepthDistribution):
     """Laplace noise on every pixel, or, with probability `outlier`, any depth within the sensor's range.
 
-    p(o(u) | q) = (1 - outlier) exp(-|o(u) - r(u)| / b) / 2b + outlier / (far - near), so that what the model
-    does not know (clutter, flying pixels) costs a bounded amount. Where the ray misses the part and the
-    background is unknown, the uniform alone. The rest is as in `LaplaceDepth`. Beam models of range finders
-    mix the same way: Thrun, Burgard and Fox, Probabilistic Robotics, 6.3.
+    p(o(u) | q) = (1 - outlier) exp(-|o(u) - r(u)| / b) / 2b + outlier / (far - near), so that the cost of
+    what is not modelled (clutter, flying pixels) is bounded. Where the ray misses the part and the background
+    is unknown, the uniform alone. The rest is as in `LaplaceDepth`. Beam models of range finders are such
+    mixtures: Thrun, Burgard and Fox, Probabilistic Robotics, 6.3.
 
     Args:
-        outlier: the probability of an outlier, between 0 and 1.
-        **others: those of `DepthDistribution`.
+        outlier: the probability of an outlier, above 0 and below 1.
+        *others: those of `DepthDistribution`, in its order.
+        **named: those of `DepthDistribution`, by name.
 
     Raises:
-        InputError: as `DepthDistribution`, or the outlier's probability is not between 0 and 1.
+        InputError: as `DepthDistribution`, or the outlier's probability is out of range.
     """
+
+    parameters = DepthDistribution.parameters | {"outlier": PROBABILITY}
 
     def __init__(
         self,
@@ -38,20 +41,12 @@ class RobustDepth(DepthDistribution):
         camera: Camera,
         pose: Tensor,
         scale: float,
-        background: Array | Tensor | None = None,
-        effective_pixels: float | None = None,
-        region: Mask | Tensor | None = None,
+        *others: Any,
         outlier: float = 0.1,
-        **others: Any,
+        **named: Any,
     ) -> None:
-        if not 0.0 < outlier < 1.0:
-            raise InputError(f"the probability of an outlier is {outlier}; give a number between 0 and 1.")
-        self.outlier = float(outlier)
-        super().__init__(renderer, camera, pose, scale, background, effective_pixels, region, **others)
-
-    @property
-    def _parameters(self) -> tuple[Any, ...]:
-        return (*super()._parameters, self.outlier)
+        self.outlier = outlier
+        super().__init__(renderer, camera, pose, scale, *others, **named)
 
     def _log_density(self, depth: Tensor, rendered: Tensor) -> Tensor:
         residual = (depth - rendered).abs_()
