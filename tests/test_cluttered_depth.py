@@ -180,10 +180,11 @@ def test_a_real_part_is_not_mistaken_for_the_tool_before_it(
     truth = torch.as_tensor(recording.truth)
     step = [1e-3 * x for x in millimetres] + [math.radians(x) for x in degrees]
     both = torch.stack([truth, poses.retract(truth, torch.tensor(step, dtype=torch.float64))])
-    image = torch.from_numpy(recording.measurements[0].observation.depth)
+    view, observation = recording.measurements[0].action, recording.measurements[0].observation
     gains = []
     for settings in ({}, {"clutter": False, "effective_pixels": None}):
         prepared = part_in_view.prepare(recording, **settings)
-        said = part_in_view.depth(prepared, recording.measurements[0].action.camera, both).log_prob(image)
-        gains.append(float(said[0] - said[1]))
+        likelihood = prepared.sensor(view).image(view.camera, both)
+        log_prob = likelihood.log_prob(torch.from_numpy(observation.depth))
+        gains.append(float(log_prob[0] - log_prob[1]))
     assert gains[0] > 40.0 and gains[1] < -200.0

@@ -284,5 +284,5 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match="shape"):
         distribution(True, good).log_prob(torch.zeros(CAMERA.width, CAMERA.height))
     for name in ("background", "region"):
-        with pytest.raises(InputError, match=rf"camera 'front' has a {name} of shape \(2, 2\); give \(18, 24\)"):
+        with pytest.raises(InputError, match=rf"'front' has a {name} of shape \(2, 2\); give \(18, 24\)"):
             distribution(True, good, **{name: np.zeros((2, 2))})

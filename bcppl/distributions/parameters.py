@@ -28,6 +28,7 @@ class Range:
         least: a lower bound that is included.
         below: an upper bound that is excluded.
         most: an upper bound that is included.
+        unit: written behind a value that is refused.
         whole: whether the numbers are whole ones; only `least` bounds these.
         optional: whether None may be given.
         latent: whether a tensor (N,), a value for each particle, may be given. It is not checked: a proposed
@@ -38,6 +39,7 @@ class Range:
     least: float = -math.inf
     below: float = math.inf
     most: float = math.inf
+    unit: str = ""
     whole: bool = False
     optional: bool = False
     latent: bool = False
@@ -73,7 +75,8 @@ def check_parameters(distribution: Any) -> None:
     kind = type(distribution)
     for name, allowed in kind.parameters.items():
         value = getattr(distribution, name)
-        setattr(distribution, name, allowed.checked(f"{kind.__name__} has {name} = {{}}", value))
+        what = f"{kind.__name__} has {name} = {{}} {allowed.unit}".rstrip()
+        setattr(distribution, name, allowed.checked(what, value))
 
 
 def check_shape(

@@ -14,9 +14,7 @@ import torch
 from torch import Tensor
 
 from bcppl.contact.touch import Touch
-from bcppl.distributions.touch import Path
-from bcppl.distributions.touch import SharedError, SharedOnset
-from bcppl.distributions.touch import ForceDirection, FreePath, Placed
+from bcppl.distributions.touch import ForceDirection, FreePath, Path, Placed, SharedError, SharedOnset
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance

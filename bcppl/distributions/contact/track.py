@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.lazy import LazyDistribution
-from bcppl.distributions.parameters import COUNT, Range
+from bcppl.distributions.parameters import COUNT, Range, check_parameters
 from bcppl.errors import InputError
 
 S = TypeVar("S", float, Tensor)
@@ -58,11 +58,12 @@ class TrackDistribution(LazyDistribution):
 
     def __init__(self, track: Track, first: int, last: int, entries: int) -> None:
         self.track, self.first, self.last = track, first, last
-        super().__init__(len(track), (last - first, entries))
+        check_parameters(self)
         if first >= last:
             raise InputError(
                 f"{type(self).__name__} has first = {first} and last = {last}; give first before last."
             )
+        super().__init__(len(track), (self.last - self.first, entries))
 
     @property
     def thinned(self) -> slice:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bcppl.distributions.depth.rendering import Array, Mask, RendersDepth
+from bcppl.distributions.depth.rendering import Mask, RendersDepth
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.parameters import check_shape
 from bcppl.errors import InputError
@@ -64,7 +65,9 @@ class CameraImage(LazyDistribution):
     def _where(self) -> str:
         return f"{type(self).__name__} of camera {self.camera.name!r}"
 
-    def _check_shape(self, name: str, value: Array | Tensor | float | None, *shapes: tuple[int, ...]) -> None:
+    def _check_shape(
+        self, name: str, value: npt.NDArray[Any] | Tensor | float | None, *shapes: tuple[int, ...]
+    ) -> None:
         check_shape(self._where, name, value, *(tuple(shape) for shape in shapes))
 
     def _check_image(self, value: Tensor) -> None:

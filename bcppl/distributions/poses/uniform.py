@@ -16,7 +16,7 @@ from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
 
-ANGLE = Range(least=0.0, most=math.pi)
+ANGLE = Range(least=0.0, most=math.pi, unit="rad")
 
 
 class _BoxPose(PoseDistribution):
