@@ -174,7 +174,7 @@ def test_depth_alignment_refuses_what_is_no_image_of_the_part() -> None:
     for sites, message in (
         ("depth_*", "renders another pose"),
         ("felt", "no depth image"),
-        ("touch_*", "fits no address"),
+        ("touch_*", "match no address"),
     ):
         program = program_of(depth_alignment("part", sites), (), equal_weights(trace))
         with pytest.raises(InputError, match=message):
@@ -278,7 +278,7 @@ def test_contact_alignment_is_assessed_as_it_is_proposed(case: str) -> None:
 
 def test_contact_alignment_refuses_what_was_not_felt_of_the_part() -> None:
     trace = simulate(seen, (), 3)
-    for sites, message in ((("depth_*",), "is a RobustDepth"), (("touch_*",), "fit no address")):
+    for sites, message in ((("depth_*",), "is a RobustDepth"), (("touch_*",), "match no address")):
         program = program_of(contact_alignment("part", sites), (), equal_weights(trace))
         with pytest.raises(InputError, match=message):
             propose(program, (trace,), 3)

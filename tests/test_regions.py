@@ -63,7 +63,7 @@ def test_quantiles_by_hand() -> None:
         even = torch.arange(1, count + 1, dtype=torch.float64)
         exact = weighted_quantiles(even, torch.full((count,), 1 / count, dtype=torch.float64), [0.3, 0.7])
         torch.testing.assert_close(exact, column(0.3 * count + 0.5, 0.7 * count + 0.5))
-    with pytest.raises(InputError, match="probabilities from 0 to 1"):
+    with pytest.raises(InputError, match="give numbers from 0 to 1"):
         weighted_quantiles(values, weights, 1.2)
 
 

@@ -130,7 +130,7 @@ def test_what_cannot_be_resampled(name: str) -> None:
         SCHEMES[name](torch.full((4,), -torch.inf, dtype=torch.float64))
     with pytest.raises(NotANumberError, match="not a number"):
         SCHEMES[name](torch.tensor([0.0, torch.nan], dtype=torch.float64))
-    with pytest.raises(InputError, match="0 particles are to be resampled"):
+    with pytest.raises(InputError, match="the count 0"):
         SCHEMES[name](torch.zeros(4, dtype=torch.float64), 0)
 
 

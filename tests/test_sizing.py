@@ -139,7 +139,7 @@ def test_every_value_of_a_discrete_choice_is_represented(monkeypatch: pytest.Mon
     weights = torch.softmax(population.log_weights, 0)
     exact = float(torch.softmax(population.log_weights, 0) @ (population.trace["part"] == 2).double())
     assert 0.0 < exact < 1.0 and float(weights.sum()) == pytest.approx(1.0)
-    with pytest.raises(InputError, match="2 particles are to represent 3 strata"):
+    with pytest.raises(InputError, match="2 particles cannot represent 3 strata"):
         generate_stratified(which_one, (0,), {}, 2)
     # Mutant: the strata's shares are forgotten.
     monkeypatch.setattr(strata.torch, "bincount", lambda s: torch.full((3,), 31).long())

@@ -134,7 +134,7 @@ class Silhouette(CameraImage):
         if not np.isin(mask[known], (0.0, 1.0)).all():
             raise InputError(
                 f"a mask of camera {self.camera.name!r} has other values than 0 and 1; "
-                "give 1 where the part is shown, 0 elsewhere, and NaN where it is not known."
+                "give 1 where the part is shown, 0 elsewhere, and NaN where unknown."
             )
         if self.region is not None:
             known &= np.asarray(self.region, dtype=bool)

@@ -1,10 +1,11 @@
-"""Proposals: programs that choose new values at latent addresses."""
+"""Proposals: programs that sample new values at latent addresses."""
 
 from bcppl.inference.proposals.ancestral import prior
 from bcppl.inference.proposals.contact_points import contact_alignment
 from bcppl.inference.proposals.density import independent
 from bcppl.inference.proposals.depth_points import depth_alignment
 from bcppl.inference.proposals.differences import differential_evolution
+from bcppl.inference.proposals.joint_drift import joint_drift
 from bcppl.inference.proposals.proposal import Fitted, Program, Proposal, program_of
 from bcppl.inference.proposals.spread import spread_of
 from bcppl.inference.proposals.symmetries import Continuous, rotations, symmetry
@@ -20,6 +21,7 @@ __all__ = [
     "differential_evolution",
     "drift",
     "independent",
+    "joint_drift",
     "prior",
     "program_of",
     "rotations",

@@ -1,4 +1,4 @@
-"""Drift: a random walk shaped by the particles' own spread."""
+"""Drift: a random walk whose covariance is the particles'."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from bcppl.traces import Trace
 
 
 def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fitted:
-    """A random walk shaped by the weighted covariance of the particles, its scale drawn anew for each move.
+    """A random walk with the weighted covariance of the particles and a random scale.
 
-    Poses are moved in their tangent space along the free axes, other values in unbounded coordinates of their
-    support (logarithms of positive numbers), as vectors.
+    Poses are moved in their tangent space along the free axes, other values as vectors in unbounded
+    coordinates of their support (logarithms of positive numbers).
 
     Args:
-        address: which latent value to move.
-        scales: the step's scale is log-uniform between these, times 2.38 / sqrt(d) times the particles' own
-            spread (Roberts and Rosenthal, Optimal scaling for various Metropolis-Hastings algorithms,
-            Statistical Science 16, 2001).
+        address: of the latent value.
+        scales: the step's scale is log-uniform between these, times 2.38 / sqrt(d) times the particles'
+            standard deviations (Roberts and Rosenthal, Optimal scaling for various Metropolis-Hastings
+            algorithms, Statistical Science 16, 2001).
 
     Raises:
         InputError: the scales are not two positive numbers, the smaller first; when it is fitted: the address

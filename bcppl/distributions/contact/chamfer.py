@@ -57,7 +57,7 @@ class ChamferContacts(TrackDistribution):
         first: the first stamp.
         last: the stamp after the last.
         scale: sigma, metres.
-        one_empty: D_ch where one set is empty and the other is not, square metres: 2 (3 scale)^2, say.
+        one_empty: D_ch where one set is empty and the other is not, square metres; for example 2 (3 scale)^2.
         noise: of `sample` alone: the standard deviation of a location along each axis (m), and the
             probability that a contact is missed.
     """

@@ -1,4 +1,4 @@
-"""Several latent values moved at once, along what ties them to one another."""
+"""Joint drift: a random walk over several latent values with their joint covariance."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
-from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
+from bcppl.inference.proposals.coordinates import Coordinates
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import FLOOR, covariance_of, learned_from
+from bcppl.inference.proposals.spread import FLOOR, covariance_of, weighted_places
 from bcppl.traces import Trace
 
-# A ridge a tenth as wide as it is long is still followed.
+# Shrinkage of correlations: a ridge a tenth as wide as it is long is still followed.
 SHRUNK = 0.01
 
 
-def drift_together(*addresses: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fitted:
-    """A random walk over several latent values, shaped by the covariance of all of them together.
+def joint_drift(*addresses: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fitted:
+    """A random walk over several latent values with their joint covariance.
 
-    Where measurements tell a difference (where a part is, seen from a camera that may stand elsewhere), each
-    value alone can hardly move: the particles lie on a ridge, and this walks along it. The first address is
-    drawn from its normal, every further one from its normal given the steps before it.
+    Where measurements inform a difference (the pose of a part in the frame of a camera whose own pose is
+    uncertain), the particles lie on a ridge: each value alone can hardly move, but all can together. The
+    first value is drawn from its normal, every further one from its normal given the steps before it.
 
     Args:
-        *addresses: which latent values to move, two or more.
-        scales: as `drift`.
+        *addresses: of the latent values, two or more.
+        scales: as for `drift`.
 
     Raises:
         InputError: fewer than two addresses, or one twice; when it is fitted: an address is not latent, or is
@@ -39,7 +39,7 @@ def drift_together(*addresses: str, scales: tuple[float, float] = (0.05, 1.0)) -
     """
     if len(set(addresses)) != len(addresses) or len(addresses) < 2:
         raise InputError(
-            f"drift_together is given the addresses {addresses!r}; give two or more, each once; "
+            f"joint_drift is given the addresses {addresses!r}; give two or more, each once; "
             "use drift for one."
         )
     smallest, largest = (torch.tensor(math.log(s), dtype=torch.float64) for s in scales)
@@ -64,13 +64,13 @@ def drift_together(*addresses: str, scales: tuple[float, float] = (0.05, 1.0)) -
 
 
 class _Link(NamedTuple):
-    """One address: how its step hangs on the steps before it.
+    """The normal of one address's step, given the steps before it.
 
     Attributes:
-        address: which.
-        coordinates: its own.
-        gain: (d, D) of the steps before it (D,), its mean given them.
-        covariance: (d, d) of what is left.
+        address: of the latent value.
+        coordinates: of the latent value.
+        gain: (d, D) regression of its mean on the steps before it (D,).
+        covariance: (d, d) given them.
     """
 
     address: str
@@ -82,11 +82,11 @@ class _Link(NamedTuple):
 def _links(population: Population, addresses: tuple[str, ...]) -> list[_Link]:
     steps, known = [], []
     for address in addresses:
-        coordinates, places, weights = learned_from(population, address)
+        coordinates, places, weights = weighted_places(population, address)
         if len(places) < len(population):
             raise InputError(
-                f"drift_together is to move {address!r}, of which some particles are at the edge of the "
-                "support, 0 or infinite; give its prior less spread."
+                f"joint_drift moves {address!r}, of which some particles are at the edge of the support, "
+                "0 or infinite; give its prior less spread."
             )
         known.append(coordinates)
         steps.append(coordinates.steps(coordinates.mean(places, weights), places))
@@ -102,15 +102,3 @@ def _links(population: Population, addresses: tuple[str, ...]) -> list[_Link]:
         links.append(_Link(address, coordinates, gain, 0.5 * (left + left.T)))
         end += coordinates.dimension
     return links
-
-
-def continuous(trace: Trace) -> list[str]:
-    """The latent addresses of a trace that can be moved by small steps."""
-    movable = []
-    for address in trace.choices:
-        try:
-            coordinates_of(trace, address)
-        except InputError:
-            continue
-        movable.append(address)
-    return movable
