@@ -34,13 +34,20 @@ def shown() -> Tensor:
 
 
 def test_all_masks_together_have_probability_one() -> None:
+    torch.manual_seed(0)
     small = Camera("s", 4, 3, 8.0, 8.0, 1.5, 1.0, looking_at([0.0, -0.02, 0.4], [0.05, 0.0, 0.0]))
     pose = poses.retract(poses.identity(), torch.randn(3, 6).double() * 0.03)
     masks = torch.tensor(list(itertools.product([0.0, 1.0], repeat=12))).double().reshape(-1, 3, 4)
-    likelihood = Silhouette(RENDERER, small, pose, 0.7, 0.1, rim=torch.tensor([0.4, -0.8, 0.0]).double())
+    rim = torch.tensor([0.4, -0.8, 0.0]).double()
+    likelihood = Silhouette(RENDERER, small, pose, 0.7, 0.1, rim=rim)
     assert 0.1 < float(likelihood.probabilities().min()) + 0.05 < float(likelihood.probabilities().max())
-    total = torch.logsumexp(torch.stack([likelihood.log_prob(mask) for mask in masks]), dim=0)
+    count = len(masks)
+    every = Silhouette(
+        RENDERER, small, pose.repeat_interleave(count, 0), 0.7, 0.1, rim=rim.repeat_interleave(count)
+    )
+    total = every.log_prob(masks.repeat(3, 1, 1)).reshape(3, count).logsumexp(dim=1)
     assert torch.allclose(total, torch.zeros(3).double(), atol=1e-5)
+    torch.testing.assert_close(every.log_prob(masks[7])[::count], likelihood.log_prob(masks[7]))
 
 
 def test_draws_are_those_of_the_density() -> None:

@@ -81,7 +81,7 @@ VERBS: dict[str, Callable[[Population], Population]] = {
 
 @pytest.mark.parametrize("name", VERBS)
 def test_evidence_stays_unbiased(name: str) -> None:
-    assert standard_errors(estimates(VERBS[name])) < 4
+    assert standard_errors(estimates(VERBS[name], 130)) < 4
 
 
 def test_mutants_that_lose_weight() -> None:
@@ -94,7 +94,7 @@ def test_mutants_that_lose_weight() -> None:
         once = merged(chosen)
         return Population(once.trace, torch.zeros_like(once.log_weights), chosen.log_evidence)
 
-    assert standard_errors(estimates(grown_by_copies_of_equal_weight)) > 8
+    assert standard_errors(estimates(grown_by_copies_of_equal_weight, 20)) > 8
     assert standard_errors(estimates(first_copy_only)) > 4
 
 
@@ -195,7 +195,7 @@ def test_a_pose_by_strata_of_ones_own(candidates: int) -> None:
     population = make()
     counts = torch.bincount(turned(population.trace["pose"]), minlength=8)
     assert len(population) == 40 and (counts == 5).all()
-    found = started(make, exact, 200)
+    found = started(make, exact, 120)
     assert standard_errors(found) < 4
     with pytest.raises(InputError, match=r"no inverse distribution function; give strata as a function"):
         generate_stratified(program, (1,), observed, 40)
