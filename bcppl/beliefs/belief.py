@@ -206,8 +206,7 @@ class Belief:
         It overestimates the entropy of several modes: use `entropy_of_modes`. -inf where the particles do not
         span the free axes.
         """
-        whole = self.merged
-        return entropy.gaussian_entropy(whole.world_from_part, whole.weights, self.mean, self.freedom)
+        return entropy.gaussian_entropy(self)
 
     def nearest_neighbour_entropy(self, neighbours: int = 3) -> float:
         """The nearest-neighbour estimate of the entropy in nats, against the base measure.
@@ -218,10 +217,7 @@ class Belief:
         Raises:
             InputError: `neighbours` is below 1.
         """
-        whole = self.merged
-        return entropy.nearest_neighbour_entropy(
-            whole.world_from_part, whole.weights, self.mean, self.freedom, neighbours
-        )
+        return entropy.nearest_neighbour_entropy(self, neighbours)
 
     def add(self, points: np.ndarray | Tensor, truth: np.ndarray | Tensor) -> Tensor:
         """ADD (N,) of every particle, metres: the mean distance of model points from their true positions.

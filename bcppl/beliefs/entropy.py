@@ -9,6 +9,7 @@ Copies are merged first, so doubling every particle changes nothing.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,24 +21,21 @@ from bcppl import poses
 from bcppl.arguments import whole_number
 from bcppl.poses import Freedom
 
+if TYPE_CHECKING:
+    from bcppl.beliefs.belief import Belief
+
 
 def weight_entropy(weights: Tensor) -> float:
     """-sum w log w of normalised weights (K,): log K where they are equal."""
     return float(torch.special.entr(weights).sum())
 
 
-def gaussian_entropy(world_from_part: Tensor, weights: Tensor, mean: Tensor, freedom: Freedom) -> float:
-    """Entropy of the Gaussian in the tangent space at a mean that has the particles' covariance.
+def gaussian_entropy(belief: Belief) -> float:
+    """Entropy of the Gaussian in the tangent space at a belief's mean that has the particles' covariance.
 
     1/2 log det(2 pi e covariance), plus the mean of log J; -inf where the particles do not span the axes.
-
-    Args:
-        world_from_part: (K, 7) distinct poses.
-        weights: (K,) normalised.
-        mean: (7,).
-        freedom: which axes are free.
     """
-    tangent = poses.local(mean, world_from_part)
+    tangent, weights, freedom = _merged(belief)
     factor = _cholesky(freedom.coordinates(tangent), weights)
     if factor is None:
         return -math.inf
@@ -46,10 +44,8 @@ def gaussian_entropy(world_from_part: Tensor, weights: Tensor, mean: Tensor, fre
     return gaussian + _mean_log_base_density(tangent, weights, freedom)
 
 
-def nearest_neighbour_entropy(
-    world_from_part: Tensor, weights: Tensor, mean: Tensor, freedom: Freedom, neighbours: int
-) -> float:
-    """The k-nearest-neighbour estimate of the entropy, for a belief of any shape.
+def nearest_neighbour_entropy(belief: Belief, neighbours: int) -> float:
+    """The k-nearest-neighbour estimate of the entropy of a belief of any shape.
 
     Kozachenko and Leonenko, Sample estimate of the entropy of a random vector, Problems of Information
     Transmission 23, 1987, for k neighbours as in Kraskov, Stögbauer and Grassberger, Physical Review E 69,
@@ -60,18 +56,11 @@ def nearest_neighbour_entropy(
     It is biased upwards where the density varies within that distance: with few particles and many axes by
     tenths of a nat and more.
 
-    Args:
-        world_from_part: (K, 7) distinct poses.
-        weights: (K,) normalised.
-        mean: (7,).
-        freedom: which axes are free.
-        neighbours: k.
-
     Raises:
         InputError: k is no whole number, 1 or more.
     """
     neighbours = whole_number("nearest_neighbour_entropy is given {} neighbours", neighbours)
-    tangent = poses.local(mean, world_from_part)
+    tangent, weights, freedom = _merged(belief)
     coordinates = freedom.coordinates(tangent)
     count, dimension = coordinates.shape
     factor = _cholesky(coordinates, weights)
@@ -86,6 +75,11 @@ def nearest_neighbour_entropy(
     white_entropy = -float(weights @ (particles_density + (count * local).log()))
     volume_ratio = float(factor.diagonal().log().sum())
     return white_entropy + volume_ratio + _mean_log_base_density(tangent, weights, freedom)
+
+
+def _merged(belief: Belief) -> tuple[Tensor, Tensor, Freedom]:
+    """Tangents (K, 6) at the mean and weights (K,) of the distinct particles, and the free axes."""
+    return poses.local(belief.mean, belief.merged.world_from_part), belief.merged.weights, belief.freedom
 
 
 def _cholesky(coordinates: Tensor, weights: Tensor) -> Tensor | None:

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import reduce
 from operator import add
 from typing import Any
 
-import pyro
 import torch
 from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose
-from bcppl.distributions.support import freedom_of
 from bcppl.distributions.touch import OnsetLocation
 from bcppl.errors import InputError
-from bcppl.inference.population import Population
-from bcppl.inference.proposals.least_squares import Equations, aligned, matching
+from bcppl.inference.proposals.least_squares import (
+    Alignment,
+    Equations,
+    aligned,
+    alignment_proposal,
+    matching,
+)
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import spread_of
-from bcppl.poses import FREE
+from bcppl.poses import Freedom
 from bcppl.traces import Trace
 
 SITES = ("contacts_*", "peg_*", "onset_*")
@@ -50,22 +52,13 @@ def contact_alignment(address: str, sites: Sequence[str] = SITES, *, reach: floa
             of another pose than that at `address`.
     """
     reach = number_within("contact_alignment is given reach {}", reach, above=0.0)
-    spread = spread_of(address)
 
-    def fit(population: Population) -> Callable[[Trace], None]:
-        damping = torch.linalg.inv(reach**2 * spread(population))
+    def align(trace: Trace, damping: Tensor, freedom: Freedom) -> Alignment:
+        matched = matching(trace, "contact_alignment", sites)
+        each, information = zip(*(_equations(trace, address, site) for site in matched), strict=True)
+        return aligned(trace[address], reduce(add, each), damping, freedom, reduce(add, information))
 
-        def towards_contacts(trace: Trace) -> None:
-            matched = matching(trace, "contact_alignment", sites)
-            freedom = freedom_of(trace.distributions[address]) or FREE
-            pose = trace[address]
-            each, information = zip(*(_equations(trace, address, site) for site in matched), strict=True)
-            alignment = aligned(pose, reduce(add, each), damping, freedom, reduce(add, information))
-            pyro.sample(address, alignment.proposal(freedom))
-
-        return towards_contacts
-
-    return Fitted(fit)
+    return alignment_proposal(address, reach, align)
 
 
 def _equations(trace: Trace, address: str, measured: str) -> tuple[Equations, Tensor]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import reduce
 from operator import add
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pyro
 import torch
 from torch import Tensor
 
@@ -19,11 +17,15 @@ from bcppl.distributions.depth import ClutteredDepth, LaplaceDepth, RobustDepth
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
-from bcppl.inference.population import Population
-from bcppl.inference.proposals.least_squares import Alignment, Equations, aligned, matching
+from bcppl.inference.proposals.least_squares import (
+    Alignment,
+    Equations,
+    aligned,
+    alignment_proposal,
+    matching,
+)
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import spread_of
-from bcppl.poses import FREE
+from bcppl.poses import FREE, Freedom
 from bcppl.rendering.renderer import Hits
 from bcppl.traces import Trace
 
@@ -57,19 +59,11 @@ def depth_alignment(address: str, sites: str = "depth_*", *, steps: int = 1, rea
     """
     steps = whole_number("depth_alignment is given {} steps", steps)
     reach = number_within("depth_alignment is given reach {}", reach, above=0.0)
-    spread = spread_of(address)
 
-    def fit(population: Population) -> Callable[[Trace], None]:
-        damping = torch.linalg.inv(reach**2 * spread(population))
+    def align(trace: Trace, damping: Tensor, freedom: Freedom) -> Alignment:
+        return depth_aligned(trace, address, damping, sites, steps=steps)
 
-        def towards_depth(trace: Trace) -> None:
-            freedom = freedom_of(trace.distributions[address]) or FREE
-            alignment = depth_aligned(trace, address, damping, sites, steps=steps)
-            pyro.sample(address, alignment.proposal(freedom))
-
-        return towards_depth
-
-    return Fitted(fit)
+    return alignment_proposal(address, reach, align)
 
 
 def depth_aligned(

@@ -8,17 +8,22 @@ Computing 10, 1992.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
+import pyro
 import torch
 from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.poses import MixturePose
+from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
-from bcppl.poses import Freedom
+from bcppl.inference.population import Population
+from bcppl.inference.proposals.proposal import Fitted
+from bcppl.inference.proposals.spread import spread_of
+from bcppl.poses import FREE, Freedom
 from bcppl.traces import Trace
 
 # The components of a proposal about an alignment: widths in standard deviations of the fit, and weights. The
@@ -87,6 +92,30 @@ class Alignment:
             widths[:, None, None] ** 2 * self.covariance[:, None],
             freedom,
         )
+
+
+def alignment_proposal(
+    address: str, reach: float, align: Callable[[Trace, Tensor, Freedom], Alignment]
+) -> Fitted:
+    """A proposal about the alignment of each particle.
+
+    Args:
+        address: of the pose.
+        reach: the alignment is damped by a normal prior at the old pose, with the particles' covariance times
+            this squared.
+        align: the alignment of a trace's particles, given the damping (d, d) and the free axes.
+    """
+
+    def fit(population: Population) -> Callable[[Trace], None]:
+        damping = torch.linalg.inv(reach**2 * spread_of(address)(population))
+
+        def towards_alignment(trace: Trace) -> None:
+            freedom = freedom_of(trace.distributions[address]) or FREE
+            pyro.sample(address, align(trace, damping, freedom).proposal(freedom))
+
+        return towards_alignment
+
+    return Fitted(fit)
 
 
 def matching(trace: Trace, name: str, patterns: Sequence[str]) -> list[str]:

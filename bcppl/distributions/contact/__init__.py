@@ -3,8 +3,7 @@
 Each compares a window of a recording with the tracks that a simulator predicts for the particles' poses.
 """
 
-from bcppl.distributions.contact.chamfer import ChamferContacts, chamfer
-from bcppl.distributions.contact.locations import ContactsInTime
+from bcppl.distributions.contact.locations import ChamferContacts, ContactsInTime, chamfer
 from bcppl.distributions.contact.peg_pose import PegPose
 from bcppl.distributions.contact.track import Track, TrackDistribution
 from bcppl.distributions.contact.wrench import Wrench

@@ -31,13 +31,10 @@ class PegPose(TrackDistribution):
     The event is (last - first, 7), `world_from_peg`.
 
     Args:
-        track: the simulated probe.
-        first: the first stamp.
-        last: the stamp after the last.
+        track, first, last: as for `TrackDistribution`.
         translation_scale: metres, along each axis.
         rotation_scale: radians, about each axis.
-        every: the stamps whose number is a multiple of this enter the density, since errors are correlated
-            in time.
+        every: as for `TrackDistribution`.
     """
 
     broadcasts = True

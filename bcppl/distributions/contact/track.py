@@ -46,7 +46,8 @@ class TrackDistribution(LazyDistribution):
         entries: the number of entries measured at a stamp.
 
     Attributes:
-        every: the stamps whose number is a multiple of this enter the density.
+        every: the stamps whose number is a multiple of this enter the density, since errors are correlated
+            in time.
 
     Raises:
         InputError: a parameter is out of its range, or `first` is not before `last`.

@@ -34,15 +34,12 @@ class Wrench(TrackDistribution):
     correlate the errors of neighbouring stamps. A row that is not finite is missing and does not count.
 
     Args:
-        track: the simulated probe.
-        first: the first stamp.
-        last: the stamp after the last.
+        track, first, last: as for `TrackDistribution`.
         force_scale: newtons, along each axis.
         torque_scale: newton metres, about each axis.
         relative: standard deviation of force and torque as a share of the simulated ones.
         outlier: weight of the wide component.
-        every: the stamps whose number is a multiple of this enter the density, since errors are correlated
-            in time.
+        every: as for `TrackDistribution`.
         bias: (N, 6) the sensor's reading without contact; None for zero. It may be latent, and differ from
             window to window where the sensor drifts.
 

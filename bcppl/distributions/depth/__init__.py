@@ -8,11 +8,9 @@ only.
 
 from bcppl.distributions.depth.cluttered import ClutteredDepth
 from bcppl.distributions.depth.image import DepthDistribution
-from bcppl.distributions.depth.laplace import LaplaceDepth
+from bcppl.distributions.depth.noise import LaplaceDepth, OccludedDepth, RobustDepth
 from bcppl.distributions.depth.observed import Observed
-from bcppl.distributions.depth.occluded import OccludedDepth
 from bcppl.distributions.depth.rendering import PixelHits, RendersDepth
-from bcppl.distributions.depth.robust import RobustDepth
 
 __all__ = [
     "ClutteredDepth",

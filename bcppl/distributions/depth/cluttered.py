@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from bcppl.distributions.depth.camera_image import CameraImage
+from bcppl.distributions.depth.noise import RobustDepth
 from bcppl.distributions.depth.observed import Observed
 from bcppl.distributions.depth.rendering import Array, Mask, RendersDepth
-from bcppl.distributions.depth.robust import RobustDepth
 from bcppl.distributions.depth.scanlines import Chain, Line, Lines, draw, gains, scan
 from bcppl.distributions.parameters import COUNT, POSITIVE, PROBABILITY, Range
 

@@ -56,6 +56,7 @@ class DepthDistribution(CameraImage):
         bias: (N,) or one for all, metres that are added to every rendered depth, the background's too.
         background_is_measured: whether the same sensor measured the background, whose depths then contain the
             bias already; otherwise they are true depths.
+        **own: parameters of the subclass, which it declares with their defaults.
 
     Raises:
         InputError: a shape does not fit; a parameter or the sensor's range is out of range; both
@@ -83,10 +84,15 @@ class DepthDistribution(CameraImage):
         camera_error: Tensor | None = None,
         bias: Tensor | float = 0.0,
         background_is_measured: bool = False,
+        **own: float,
     ) -> None:
         self.scale, self.effective_pixels, self.temperature = scale, effective_pixels, temperature
         self.background, self.background_is_measured = background, background_is_measured
         self.camera_error, self.bias = camera_error, bias
+        for name, value in own.items():
+            if name not in self.parameters:
+                raise TypeError(f"{type(self).__name__} has no parameter {name!r}")
+            setattr(self, name, value)
         super().__init__(renderer, camera, pose, region)
         each = self.batch_shape
         self._check_shape("a background", background, self.event_shape)

@@ -139,8 +139,14 @@ def gain(
 ) -> float:
     """The log-likelihood ratio of a line with the part, rendered at (H * W,), +inf where absent, to none.
 
-    `first` and `last` are the first and last pixel of the line that see the part.
+    Only pixels from `first` to `last` see the part.
     """
+    while first <= last and not rendered[line.base + first * line.stride] < np.inf:
+        first += 1
+    while last >= first and not rendered[line.base + last * line.stride] < np.inf:
+        last -= 1
+    if first > last:
+        return 0.0
     uniform = 1.0 / (chain.far - chain.near)
     seen, hidden, total = 0.0, 1.0, 0.0
     was_inside, error_before, at_before = False, 0.0, -2
@@ -212,24 +218,11 @@ def gains(
     of_rows = of_columns = 0.0
     for v in range(top, bottom + 1):
         if v % spacing == spacing // 2:
-            line = Line(v * width, 1, width)
-            first, last = left, right
-            while first <= last and not rendered[v * width + first] < np.inf:
-                first += 1
-            while last >= first and not rendered[v * width + last] < np.inf:
-                last -= 1
-            if first <= last:
-                of_rows += gain(depth, valid, rendered, line, first, last, chain, rows)
+            of_rows += gain(depth, valid, rendered, Line(v * width, 1, width), left, right, chain, rows)
     for u in range(left, right + 1):
         if u % spacing == spacing // 2:
             line = Line(u, width, height)
-            first, last = top, bottom
-            while first <= last and not rendered[first * width + u] < np.inf:
-                first += 1
-            while last >= first and not rendered[last * width + u] < np.inf:
-                last -= 1
-            if first <= last:
-                of_columns += gain(depth, valid, rendered, line, first, last, chain, columns)
+            of_columns += gain(depth, valid, rendered, line, top, bottom, chain, columns)
     for k in range(len(pixel)):
         rendered[pixel[k]] = np.inf
     return of_rows, of_columns

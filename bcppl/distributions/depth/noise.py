@@ -1,20 +1,60 @@
-"""A depth image before which something unknown may stand."""
+"""Depth images with independent noise on every pixel: Laplace, with outliers, with occluders."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from bcppl.distributions.depth.image import DepthDistribution
-from bcppl.distributions.depth.rendering import RendersDepth
 from bcppl.distributions.parameters import PROBABILITY
 from bcppl.errors import InputError
 
-if TYPE_CHECKING:
-    from bcppl.geometry.camera import Camera
+
+class LaplaceDepth(DepthDistribution):
+    """Independent Laplace noise on every pixel.
+
+    log p(o | q) = sum over the valid pixels u of -|o(u) - r(u)| / b - log 2b, with r rendered at pose q and
+    b the scale. Where the ray misses the part, r is the background; where that is unknown, the pixel's
+    density is uniform over the sensor's range. A wrong pixel costs without bound: see `RobustDepth`.
+
+    Arguments and errors are those of `DepthDistribution`.
+    """
+
+    def _log_density(self, depth: Tensor, rendered: Tensor) -> Tensor:
+        return -(depth - rendered).abs() / self.scale - math.log(2.0 * self.scale)
+
+
+class RobustDepth(DepthDistribution):
+    """Laplace noise on every pixel, or, with probability `outlier`, any depth within the sensor's range.
+
+    p(o(u) | q) = (1 - outlier) exp(-|o(u) - r(u)| / b) / 2b + outlier / (far - near), so that the cost of
+    what is not modelled (clutter, flying pixels) is bounded. Where the ray misses the part and the background
+    is unknown, the uniform alone. The rest is as in `LaplaceDepth`. Beam models of range finders are such
+    mixtures: Thrun, Burgard and Fox, Probabilistic Robotics, 6.3.
+
+    Args:
+        outlier: the probability of an outlier, above 0 and below 1.
+        *others, **named: those of `DepthDistribution`.
+
+    Raises:
+        InputError: as `DepthDistribution`, or the outlier's probability is out of range.
+    """
+
+    outlier: float = 0.1
+    parameters = DepthDistribution.parameters | {"outlier": PROBABILITY}
+
+    def _log_density(self, depth: Tensor, rendered: Tensor) -> Tensor:
+        residual = (depth - rendered).abs_()
+        inlier = residual.mul_(-1.0 / self.scale).exp_().mul_((1.0 - self.outlier) / (2.0 * self.scale))
+        return inlier.add_(self.outlier * math.exp(self._log_uniform)).log_()
+
+    def _noisy(self, rendered: Tensor) -> Tensor:
+        return torch.where(
+            torch.rand_like(rendered) < self.outlier, self._uniform(rendered), super()._noisy(rendered)
+        )
 
 
 class OccludedDepth(DepthDistribution):
@@ -34,31 +74,21 @@ class OccludedDepth(DepthDistribution):
     Args:
         occluder: the probability of an occluder in front, above 0 and below 1.
         outlier: the probability of any other depth, above 0 and below 1; their sum is below 1.
-        *others: those of `DepthDistribution`, in its order.
-        **named: those of `DepthDistribution`, by name.
+        *others, **named: those of `DepthDistribution`.
 
     Raises:
         InputError: as `DepthDistribution`, or a probability is out of range, or their sum is 1 or more.
     """
 
+    occluder: float = 0.1
+    outlier: float = 0.05
     parameters = DepthDistribution.parameters | {"occluder": PROBABILITY, "outlier": PROBABILITY}
 
-    def __init__(
-        self,
-        renderer: RendersDepth,
-        camera: Camera,
-        pose: Tensor,
-        scale: float,
-        *others: Any,
-        occluder: float = 0.1,
-        outlier: float = 0.05,
-        **named: Any,
-    ) -> None:
-        self.occluder, self.outlier = occluder, outlier
-        super().__init__(renderer, camera, pose, scale, *others, **named)
-        if occluder + outlier >= 1.0:
+    def __init__(self, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        if self.occluder + self.outlier >= 1.0:
             raise InputError(
-                f"OccludedDepth has occluder = {occluder} and outlier = {outlier}; "
+                f"OccludedDepth has occluder = {self.occluder} and outlier = {self.outlier}; "
                 "give probabilities that add up to less than 1."
             )
 
