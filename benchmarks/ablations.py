@@ -33,7 +33,7 @@ from bcppl.inference.kernels.kernel import Move
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.proposals.coordinates import continuous_addresses
-from bcppl.inference.proposals.joint_drift import joint_drift
+from bcppl.inference.proposals.walk import joint_drift
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.models import look_and_touch, peg_in_hole
 from bcppl.models.worlds.bench import bench_scene

@@ -14,7 +14,7 @@ from bcppl.errors import InputError
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.proposals import Proposal, drift
 from bcppl.inference.proposals.coordinates import continuous_addresses
-from bcppl.inference.proposals.joint_drift import joint_drift
+from bcppl.inference.proposals.walk import joint_drift
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, simulate
 from tests.exact_targets import CENTER

@@ -26,7 +26,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals import Program, drift, independent, prior, spread_of
 from bcppl.inference.proposals.climbing import Modes, jumps, modes
 from bcppl.inference.proposals.coordinates import continuous_addresses
-from bcppl.inference.proposals.joint_drift import joint_drift
+from bcppl.inference.proposals.walk import joint_drift
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.traces import Model, Series, Trace, generate
 

@@ -5,11 +5,10 @@ from bcppl.inference.proposals.contact_points import contact_alignment
 from bcppl.inference.proposals.density import independent
 from bcppl.inference.proposals.depth_points import depth_alignment
 from bcppl.inference.proposals.differences import differential_evolution
-from bcppl.inference.proposals.joint_drift import joint_drift
 from bcppl.inference.proposals.proposal import Fitted, Program, Proposal, program_of
 from bcppl.inference.proposals.spread import spread_of
 from bcppl.inference.proposals.symmetries import Continuous, rotations, symmetry
-from bcppl.inference.proposals.walk import drift
+from bcppl.inference.proposals.walk import drift, joint_drift
 
 __all__ = [
     "Continuous",
