@@ -278,5 +278,5 @@ def test_a_new_kind_is_ranked_and_laid_out_beside_others(laser: Any) -> None:
     *_, last = guided_smc.infer(look_and_touch.model, recording, particles=40, seed=1)
     found = candidates(last.belief, recording.part, None, {"laser": 5, "view": 1}, seed=3)
     scene = look_and_touch.prepare(with_candidates(recording, found))
-    ranking = by_linearised_gain("part", hypotheses=8, seed=0)(last.population, found, scene)
+    ranking = by_linearised_gain("part", outer_samples=8, seed=0)(last.population, found, scene)
     assert len(ranking) == 6 and all(each.information_gain > 0.0 for each in ranking)

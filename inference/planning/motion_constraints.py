@@ -173,8 +173,8 @@ def within_reach(arm: ArmWithPeg, *, seed: int = 0) -> Constraint:
                 path = poses.compose(base_from_world, wrist)[None, None].numpy()
                 reached[k] = np.isfinite(joint_paths(arm.robot, arm.link, path, seed=seed)).all()
         for which in groups.values():
-            path = torch.from_numpy(np.stack([paths[k] for k in which]))
-            path = poses.compose(base_from_world, path).numpy()
+            stacked = torch.from_numpy(np.stack([paths[k] for k in which]))
+            path = poses.compose(base_from_world, stacked).numpy()
             joints = joint_paths(arm.robot, arm.link, path, arm.link_from_peg, seed=seed)
             reached[which] = np.isfinite(joints).all(axis=(1, 2))
         return reached.tolist()
