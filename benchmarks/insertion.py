@@ -22,22 +22,22 @@ from bcppl.beliefs import Belief
 from bcppl.contact.physics import PegPhysics
 from bcppl.geometry.gap import PegGap
 from bcppl.inference.design.loop import probing_loop
-from bcppl.inference.design.rules import by_information
+from bcppl.inference.design.rules import by_linearised_gain
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.planning.candidate_list import MIXED, candidates
-from bcppl.inference.planning.chance import chance_of_success
-from bcppl.inference.planning.filters import Candidate
+from bcppl.inference.planning.candidates import MIXED, plan_candidates
 from bcppl.inference.planning.insertion import insertion_plan
 from bcppl.inference.planning.metrology import three_two_one
+from bcppl.inference.planning.success import success_probability
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
+from bcppl.sensors.candidates import Candidate
 
 CLEARANCES = Bench().clearances
 VISION, FIXED, CHOSEN = "vision", "3-2-1 probe", "chosen probes"
 KNOWN = (VISION, FIXED, CHOSEN)
 SECONDS, PROBES = 6.0, 6  # that probes may last altogether, and their number
-HYPOTHESES = 25
+OUTER_SAMPLES = 25
 CONFIDENCE = 0.95
 OVERALL, TIGHTEST = 0.97, 0.94  # shares that are to succeed
 CHANCES = 12  # particles by which the chance of an attempt is foretold
@@ -110,9 +110,9 @@ def _probed(scene: BenchScene, arm: BenchArm, seen: Step) -> Step:
     gap, last = PegGap(scene.part, scene.peg), seen
 
     def asked(belief: Belief, number: int) -> Sequence[Candidate]:
-        return candidates(belief, scene.part, scene.peg, MIXED, gap=gap, seed=number)
+        return plan_candidates(belief, scene.part, scene.peg, MIXED, gap=gap, seed=number)
 
-    rank = by_information(model.pose, hypotheses=HYPOTHESES, seed=scene.seed)
+    rank = by_linearised_gain(model.pose, outer_samples=OUTER_SAMPLES, seed=scene.seed)
     for made in probing_loop(
         model, scene.look(), arm, asked, rank, start=seen, probes=PROBES, seconds=SECONDS
     ):
@@ -126,7 +126,7 @@ def _attempt(scene: BenchScene, arm: BenchArm, belief: Belief, known: str, foret
     chance = math.nan
     if foretell:
         physics = PegPhysics(scene.part, scene.peg)
-        chance = chance_of_success(belief, plan, physics, particles=CHANCES, seed=scene.seed).success
+        chance = success_probability(belief, plan, physics, particles=CHANCES, seed=scene.seed).success
     hole = torch.from_numpy(scene.kind.part_from_hole)
     world_from_hole = poses.compose(torch.from_numpy(scene.truth), hole)
     off = poses.compose(poses.inverse(world_from_hole), poses.compose(belief.mean, hole))

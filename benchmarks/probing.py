@@ -24,13 +24,19 @@ from scenes import PARTICLES, default_run, every, one_line, quantile
 from bcppl.beliefs import Belief
 from bcppl.contact.touch import Touch
 from bcppl.geometry.gap import PegGap
-from bcppl.inference.design import mode_entropy
+from bcppl.inference.design import mixture_entropy
 from bcppl.inference.design.loop import Round, probing_loop
-from bcppl.inference.design.rules import Rank, at_random, by_information, by_largest_variance, in_order
+from bcppl.inference.design.rules import (
+    AcquisitionRule,
+    at_random,
+    by_linearised_gain,
+    by_surface_variance,
+    in_given_order,
+)
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.planning.candidate_list import MIXED, candidates
-from bcppl.inference.planning.faces import sides, spots_on_top
-from bcppl.inference.planning.touching import Spot, touch
+from bcppl.inference.planning.candidates import MIXED, plan_candidates
+from bcppl.inference.planning.faces import points_on_top, sides
+from bcppl.inference.planning.touching import SurfacePoint, touch
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
@@ -86,10 +92,12 @@ def scripted(scene: BenchScene) -> Callable[[Belief, int], list[Candidate]]:
     height = top - min(SIDE, 0.5 * float(part.extent[2]))
     faces = sides(part, height)
     across = next((f for f in faces if abs(float(f.normal @ faces[0].normal)) < 0.5), faces[-1])
-    spots = [Spot(np.array([*spots_on_top(part, peg, ROOM).places[0], top]), np.array([0.0, 0.0, 1.0]))]
+    spots = [
+        SurfacePoint(np.array([*points_on_top(part, peg, ROOM).positions[0], top]), np.array([0.0, 0.0, 1.0]))
+    ]
     for face in (faces[0], across):
         place = np.array([*(0.5 * (face.start + face.stop)), height])
-        spots.append(Spot(place, np.array([*face.normal, 0.0])))
+        spots.append(SurfacePoint(place, np.array([*face.normal, 0.0])))
 
     def asked(belief: Belief, number: int) -> list[Candidate]:
         return [touch(belief, part, peg, spots[number % len(spots)], name=f"script {number + 1}")]
@@ -102,24 +110,24 @@ def planned(scene: BenchScene) -> Callable[[Belief, int], Sequence[Candidate]]:
     gap = PegGap(scene.part, scene.peg)
 
     def asked(belief: Belief, number: int) -> Sequence[Candidate]:
-        return candidates(belief, scene.part, scene.peg, MIXED, gap=gap, seed=number)
+        return plan_candidates(belief, scene.part, scene.peg, MIXED, gap=gap, seed=number)
 
     return asked
 
 
-def way_of(name: str, scene: BenchScene, hypotheses: int | None) -> tuple[Any, Rank]:
+def way_of(name: str, scene: BenchScene, outer_samples: int | None) -> tuple[Any, AcquisitionRule]:
     """What may be done, and how it is chosen."""
     if name == "script":
-        return scripted(scene), lambda population, found, known: in_order(found)
+        return scripted(scene), lambda population, found, known: in_given_order(found)
     if name == "random":
         return planned(scene), at_random(scene.seed)
     if name == "variance":
-        return planned(scene), by_largest_variance(scene.peg, model.pose)
-    return planned(scene), by_information(model.pose, hypotheses=hypotheses, seed=scene.seed)
+        return planned(scene), by_surface_variance(scene.peg, model.pose)
+    return planned(scene), by_linearised_gain(model.pose, outer_samples=outer_samples, seed=scene.seed)
 
 
 def compared(
-    seed: int, particles: int = PARTICLES, ways: Sequence[str] = WAYS, hypotheses: int | None = None
+    seed: int, particles: int = PARTICLES, ways: Sequence[str] = WAYS, outer_samples: int | None = None
 ) -> Compared:
     """One scene by each way, whatever happens."""
     found = Compared(seed, courses={way: Course() for way in ways})
@@ -136,13 +144,13 @@ def compared(
             return found
         for way, course in found.courses.items():
             try:
-                follow(course, scene, seen, *way_of(way, scene, hypotheses))
+                follow(course, scene, seen, *way_of(way, scene, outer_samples))
             except Exception as error:
                 course.failed = one_line(error)
     return found
 
 
-def follow(course: Course, scene: BenchScene, seen: Step, asked: Any, rank: Rank) -> None:
+def follow(course: Course, scene: BenchScene, seen: Step, asked: Any, rank: AcquisitionRule) -> None:
     """The loop from vision on, put down as it goes."""
     judge(course, scene, seen)
     begun = [time.perf_counter()]
@@ -168,7 +176,7 @@ def judge(course: Course, scene: BenchScene, step: Step) -> None:
     add = step.belief.weighted_add(scene.part.surface_points(), scene.truth)
     course.adds.append(1e3 * add)
     weights = torch.softmax(step.population.log_weights, 0)
-    course.entropies.append(float(mode_entropy(model.pose)(step.population)(weights[None])[0]))
+    course.entropies.append(float(mixture_entropy(model.pose)(step.population)(weights[None])[0]))
 
 
 def touched(each: Round) -> bool:
@@ -263,12 +271,14 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=cores(), help="scenes at a time")
     parser.add_argument("--particles", type=int, default=PARTICLES)
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
-    parser.add_argument("--hypotheses", type=int, help="particles that play the truth; all by default")
+    parser.add_argument("--outer-samples", type=int, help="true values; all by default")
     arguments = parser.parse_args()
     count = 2 if arguments.quick else arguments.scenes
     seeds = range(arguments.seed, arguments.seed + count)
     ways = arguments.ways
-    function = partial(compared, particles=arguments.particles, ways=ways, hypotheses=arguments.hypotheses)
+    function = partial(
+        compared, particles=arguments.particles, ways=ways, outer_samples=arguments.outer_samples
+    )
     found = list(all_scenes(seeds, arguments.jobs, function, partial(lost, ways=ways)))
     found.sort(key=lambda one: one.seed)
     tables(found, ways)

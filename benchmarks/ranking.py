@@ -25,7 +25,7 @@ from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
 from bcppl.inference.design import Ranking, expected_information_gain, linearised_information_gain
 from bcppl.inference.filters.guided_smc import infer
-from bcppl.inference.planning.candidate_list import candidates
+from bcppl.inference.planning.candidates import plan_candidates
 from bcppl.inference.population import Population
 from bcppl.inference.schemes import systematic
 from bcppl.models.look_and_touch import model
@@ -37,7 +37,7 @@ from bcppl.traces import Trace
 
 PARTICLES, CANDIDATES = 75, 32
 LASTING = 2.0  # s
-BUDGET = 16  # hypotheses of Algorithm 1, and of the small budget
+BUDGET = 16  # outer samples of Algorithm 1, and of the small budget
 FELT = 1.5  # N
 MOST = 1.25  # times the bare rollouts
 ADDRESS = "part"
@@ -69,7 +69,7 @@ def after_vision(seed: int, particles: int) -> tuple[Setting, list[Plan]]:
     *_, last = infer(model, recording, particles=particles, seed=seed, scene=scene)
     physics = PegPhysics(world.part, world.peg, ContactParameters(time_step=0.002), share_free_motion=False)
     asked = {"touch": 80, "slide": 48}
-    found = candidates(
+    found = plan_candidates(
         last.belief, world.part, world.peg, asked, gap=scene.likelihoods["window"].gap, seed=seed
     )
     plans = [each for each in found if isinstance(each, Plan)]
@@ -106,7 +106,7 @@ class Physics:
         noise = sensor.settings.gap_noise * torch.randn(*rows.shape[:2], 3, dtype=torch.float64)
         return torch.cat([rows[..., :3] + noise, rows[..., 3:]], dim=-1)
 
-    def forecast(self, plan: Plan, trace: Trace) -> dict[str, Tensor]:
+    def predict(self, plan: Plan, trace: Trace) -> dict[str, Tensor]:
         """What would be observed, for `expected_information_gain`."""
         return {f"touch_{len(self.setting.done)}": self.at(plan, trace[ADDRESS])}
 
@@ -125,14 +125,14 @@ def timed(work: Callable[[], Ranking]) -> tuple[Ranking, float]:
 
 def reweighed(setting: Setting, plans: Sequence[Plan], physics: Physics | None) -> Ranking:
     """Algorithm 1."""
-    forecast = None if physics is None else physics.forecast
+    predictive = None if physics is None else physics.predict
     return expected_information_gain(
-        setting.population, plans, setting.arguments, hypotheses=BUDGET, forecast=forecast, seed=0
+        setting.population, plans, setting.arguments, outer_samples=BUDGET, predictive=predictive, seed=0
     )
 
 
 def added_up(
-    setting: Setting, plans: Sequence[Plan], physics: Physics | None = None, hypotheses: int | None = None
+    setting: Setting, plans: Sequence[Plan], physics: Physics | None = None, outer_samples: int | None = None
 ) -> Ranking:
     information = None if physics is None else physics.information
     return linearised_information_gain(
@@ -140,7 +140,7 @@ def added_up(
         plans,
         setting.arguments,
         ADDRESS,
-        hypotheses=hypotheses,
+        outer_samples=outer_samples,
         information=information,
         seed=0,
     )
@@ -182,8 +182,8 @@ def main() -> None:
         "physics, added up": (timed(lambda: added_up(setting, some, physics)), physics.seconds),
         "quasi-static, reweighed": (timed(lambda: reweighed(setting, some, None)), 0.0),
         "quasi-static, added up": (timed(lambda: added_up(setting, some)), 0.0),
-        f"quasi-static, added up, {BUDGET} hypotheses": (
-            timed(lambda: added_up(setting, some, hypotheses=BUDGET)),
+        f"quasi-static, added up, {BUDGET} outer samples": (
+            timed(lambda: added_up(setting, some, outer_samples=BUDGET)),
             0.0,
         ),
     }

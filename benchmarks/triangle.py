@@ -32,7 +32,7 @@ from bcppl.geometry.gap import Gap
 from bcppl.inference.design import (
     expected_information_gain,
     linearised_information_gain,
-    mode_entropy,
+    mixture_entropy,
     weight_entropy,
 )
 from bcppl.inference.filters.smc import Step
@@ -45,7 +45,7 @@ from bcppl.traces import Trace, extend
 
 LOG = "10_90"
 YAW = 3.0  # degrees; with more, another contact on the same edge is worth as much as one on another
-PARTICLES, CANDIDATES, HYPOTHESES = 75, 32, 16
+PARTICLES, CANDIDATES, OUTER_SAMPLES = 75, 32, 16
 GONE = 1.0 / 3.0  # of how far it could slide
 WAYS = ("entropy of weights", "entropy of the pose", "information added up")
 
@@ -127,7 +127,7 @@ def information(arguments: Callable[[Any], tuple[Any, ...]], push: Push, trace: 
 
 
 def chosen(
-    seed: int, candidates: int = CANDIDATES, hypotheses: int = HYPOTHESES, every: bool = False
+    seed: int, candidates: int = CANDIDATES, outer_samples: int = OUTER_SAMPLES, every: bool = False
 ) -> list[Chosen]:
     """One draw, each way, from so many pushes; `every` one of them is tried as well."""
     logs = sorted(LOGS.glob(f"{LOG}_10_10*"))
@@ -155,9 +155,9 @@ def chosen(
     rankings = [
         *(
             expected_information_gain(
-                first.population, actions, arguments, entropy, hypotheses=hypotheses, seed=seed
+                first.population, actions, arguments, entropy, outer_samples=outer_samples, seed=seed
             )
-            for entropy in (weight_entropy(), mode_entropy("part"))
+            for entropy in (weight_entropy(), mixture_entropy("part"))
         ),
         linearised_information_gain(
             first.population, actions, arguments, information=partial(information, arguments), seed=seed
@@ -176,7 +176,7 @@ def main() -> None:
     parser: argparse.ArgumentParser = options(__doc__ or "")
     parser.add_argument("--jobs", type=int, default=cores(), help="processes, of one thread each if several")
     parser.add_argument("--candidates", type=int, default=CANDIDATES, help="pushes to choose from")
-    parser.add_argument("--hypotheses", type=int, default=HYPOTHESES, help="particles that play the truth")
+    parser.add_argument("--outer-samples", type=int, default=OUTER_SAMPLES, help="true values")
     parser.add_argument("--every", action="store_true", help="say what every candidate would have left")
     arguments = parser.parse_args()
     if arguments.candidates < 1:
@@ -188,7 +188,7 @@ def main() -> None:
     choose = partial(
         chosen,
         candidates=arguments.candidates,
-        hypotheses=arguments.hypotheses,
+        outer_samples=arguments.outer_samples,
         every=arguments.every,
     )
     results = each(choose, range(arguments.seed, arguments.seed + draws), arguments.jobs)

@@ -17,7 +17,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.outlines import check_fit
 from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
 from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, bench_part
-from bcppl.models.worlds.guarded_motion import CarriedOut, command_of
+from bcppl.models.worlds.guarded_motion import Execution, command_of
 from bcppl.recordings import Recording
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.robot.motion import Probe
@@ -55,8 +55,8 @@ def scene(seed: int = 0, part: str = "square 8 mm") -> BenchScene:
 
 
 @functools.cache
-def carried(seed: int = 0, part: str = "square 8 mm") -> CarriedOut:
-    return scene(seed, part).carried_out(plan_of(scene(seed, part)))[0]
+def carried(seed: int = 0, part: str = "square 8 mm") -> Execution:
+    return scene(seed, part).executed(plan_of(scene(seed, part)))[0]
 
 
 @functools.cache
@@ -68,7 +68,7 @@ def between(first: float, last: float) -> slice:
     return slice(round(100 * first), round(100 * last))
 
 
-def force(motion: CarriedOut, rows: slice) -> np.ndarray:
+def force(motion: Execution, rows: slice) -> np.ndarray:
     return np.linalg.norm(motion.wrench[rows, :3], axis=1)
 
 
@@ -132,7 +132,7 @@ def test_the_truth_is_not_what_inference_draws_from_the_same_seed() -> None:
 
 def test_the_measured_wrench_has_the_stated_errors() -> None:
     one = scene()
-    motion, wrench, world_from_peg = one.carried_out(plan_of(one))
+    motion, wrench, world_from_peg = one.executed(plan_of(one))
     error = wrench - motion.wrench
     # White noise doubles in differences; the walk adds 0.3 N / sqrt(600) to each, which is nothing.
     spread = np.diff(error, axis=0).std(axis=0) / np.sqrt(2.0)
@@ -145,7 +145,7 @@ def test_the_measured_wrench_has_the_stated_errors() -> None:
     start, end = [], []
     for seed in range(16):
         other = bench_scene(seed, Bench(force_noise=0.0), part="square 8 mm")
-        motion, wrench, _ = other.carried_out(still)
+        motion, wrench, _ = other.executed(still)
         start.append(wrench[0, :3])
         end.append(wrench[-1, :3] - wrench[0, :3])
     assert 0.7 < np.std(start) < 1.3 and 0.2 < np.std(end) < 0.4
@@ -160,7 +160,7 @@ def test_free_motion_is_not_felt_and_stops_no_guarded_motion() -> None:
     raised.world_from_peg[:, 2] += 0.05
     guarded = replace(raised, manners=("guarded",) * 5)
     freely = replace(raised, manners=("free",) * 5)
-    one, other = scene().carried_out(guarded)[0], scene().carried_out(freely)[0]
+    one, other = scene().executed(guarded)[0], scene().executed(freely)[0]
     assert not one.stops
     np.testing.assert_array_equal(one.probe.command, other.probe.command)
 
@@ -170,7 +170,7 @@ def test_a_guarded_press_ends_at_its_force_and_a_held_slide_goes_on_from_there(p
     one, plan = scene(0, part), plan_of(scene(0, part))
     if part == "rectangular tray":  # its top is 25 mm wide
         plan = _narrowed(one, plan, 0.5)
-    motion = one.carried_out(plan)[0]
+    motion = one.executed(plan)[0]
     assert set(motion.stops) == {1, 5}
     for first, last in ((0.9, 1.0), (2.8, 3.1)):
         assert abs(force(motion, between(first, last)).mean() / FORCE - 1.0) < 0.5

@@ -20,21 +20,19 @@ from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
 from bcppl.inference.design.rules import surface_variance
-from bcppl.inference.planning.candidate_list import candidates
-from bcppl.inference.planning.filters import (
-    Candidates,
-    Filter,
-    Mounted,
-    clear_of_part,
-    clear_of_table,
-    filtered,
-    from_within,
-    meeting,
-    no_harder_than,
-    pressing_force,
+from bcppl.inference.planning.candidates import plan_candidates
+from bcppl.inference.planning.constraints import Candidates, Constraint, feasible, require_candidates
+from bcppl.inference.planning.motion_constraints import (
+    ArmWithPeg,
+    above_table,
+    approach_within,
+    collision_free,
+    contact_at_mid_stroke,
+    force_at_most,
     within_reach,
 )
-from bcppl.inference.planning.touching import Spot, Touching, face_of, middles_of_strokes, slide, touch
+from bcppl.inference.planning.motions import expected_contacts, pressing_force
+from bcppl.inference.planning.touching import SurfacePoint, TouchParameters, face_name, slide, touch
 from bcppl.models.robots import load_robot
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.recordings.action_file import load_actions, save_actions
@@ -62,7 +60,7 @@ def about(scene: BenchScene, spread: float) -> Belief:
 def planned(seed: int) -> tuple[BenchScene, PegGap, Candidates]:
     scene = bench_scene(seed)
     gap = PegGap(scene.part, scene.peg)
-    found = candidates(
+    found = plan_candidates(
         about(scene, 0.001), scene.part, scene.peg, KINDS, gap=gap, like=[View(scene.cameras[0])]
     )
     return scene, gap, found
@@ -77,7 +75,7 @@ def test_candidates_touch_the_faces_they_name_and_nothing_on_their_way(seed: int
     for plan in found:
         if not isinstance(plan, Plan) or plan.name.split()[0] not in ("touch", "slide", "pair"):
             continue
-        carried, wrench, world_from_peg = scene.carried_out(plan)
+        carried, wrench, world_from_peg = scene.executed(plan)
         force = np.linalg.norm(wrench[:, :3] - wrench[:10, :3].mean(axis=0), axis=1)
         met = gap(truth, torch.from_numpy(world_from_peg))
         strokes = [k for k, manner in enumerate(plan.manners) if manner == "guarded"]
@@ -92,9 +90,9 @@ def test_candidates_touch_the_faces_they_name_and_nothing_on_their_way(seed: int
             # Half of the stroke is over where the mean has the surface, which here is the truth.
             assert abs(carried.stops[k] - 0.5 * (plan.times[k] + plan.times[k + 1])) < 0.12
             normals = met.normal[0, pressed].numpy()
-            along = middles_of_strokes(plan)[strokes.index(k)][1]
+            along = expected_contacts(plan)[strokes.index(k)][1]
             outward = -poses.rotation_matrix(truth[0]).numpy().T @ along
-            assert face_of(outward) == face
+            assert face_name(outward) == face
             assert np.median(normals @ outward) > 0.95, (plan.name, np.median(normals @ outward))
 
 
@@ -106,7 +104,7 @@ def test_a_slide_stays_on_its_face_and_an_attempt_ends_in_the_hole() -> None:
     for plan in found:
         if not isinstance(plan, Plan) or plan.name.startswith(("touch", "pair")):
             continue
-        _, wrench, world_from_peg = scene.carried_out(plan)
+        _, wrench, world_from_peg = scene.executed(plan)
         force = np.linalg.norm(wrench[:, :3] - wrench[:10, :3].mean(axis=0), axis=1)
         if plan.name.startswith("slide"):
             pressed = world_from_peg[force > 1.5]
@@ -133,11 +131,11 @@ def test_the_same_seed_plans_the_same_and_strokes_grow_with_the_spread() -> None
     scene, gap, _ = planned(5)
     kinds, belief = {"touch": 4, "slide": 2}, about(scene, 0.001)
     first, again, other = (
-        candidates(belief, scene.part, scene.peg, kinds, gap=gap, seed=seed) for seed in (1, 1, 2)
+        plan_candidates(belief, scene.part, scene.peg, kinds, gap=gap, seed=seed) for seed in (1, 1, 2)
     )
     assert all(np.array_equal(a.world_from_peg, b.world_from_peg) for a, b in zip(first, again, strict=True))
     assert not np.array_equal(first[0].world_from_peg, other[0].world_from_peg)
-    spot, lengths = Spot(np.zeros(3), UP), []
+    spot, lengths = SurfacePoint(np.zeros(3), UP), []
     for spread in (0.0001, 0.002, 0.02):
         plan = touch(about(scene, spread), scene.part, scene.peg, spot)
         lengths.append(np.linalg.norm(plan.world_from_peg[3, :3] - plan.world_from_peg[2, :3]))
@@ -148,9 +146,12 @@ def test_the_same_seed_plans_the_same_and_strokes_grow_with_the_spread() -> None
 def test_filters_say_how_many_they_remove_and_why() -> None:
     scene, gap, _ = planned(5)
     belief = about(scene, 0.001)
-    top, side = Spot(np.array([-0.02, -0.02, 0.0]), UP), Spot(np.array([0.03, 0.0, -0.01]), np.eye(3)[0])
-    bottom = Spot(np.array([0.0, 0.0, -0.025]), -UP)
-    inside = Spot(np.array([0.0114, 0.005, -0.01]), -np.eye(3)[0])  # the hole's own wall, from within
+    top, side = (
+        SurfacePoint(np.array([-0.02, -0.02, 0.0]), UP),
+        SurfacePoint(np.array([0.03, 0.0, -0.01]), np.eye(3)[0]),
+    )
+    bottom = SurfacePoint(np.array([0.0, 0.0, -0.025]), -UP)
+    inside = SurfacePoint(np.array([0.0114, 0.005, -0.01]), -np.eye(3)[0])  # the hole's own wall, from within
     plans = [
         touch(belief, scene.part, scene.peg, spot, name=name)
         for name, spot in (("top", top), ("side", side), ("bottom", bottom), ("inside", inside))
@@ -158,40 +159,40 @@ def test_filters_say_how_many_they_remove_and_why() -> None:
     down = (0.0, 0.0, -1.0)
 
     def left(*filters: object) -> list[str]:
-        return [name_of(c) for c in filtered(plans, filters)]  # type: ignore[arg-type]
+        return [name_of(c) for c in feasible(plans, filters)]  # type: ignore[arg-type]
 
-    assert left(from_within(down, math.radians(30.0))) == ["top"]
-    assert left(from_within(down, math.radians(120.0))) == ["top", "side", "inside"]
-    assert set(left(clear_of_part(gap, scene.truth))) == {"top", "side"}
-    assert "inside" not in left(clear_of_part(gap, scene.truth), meeting(gap, scene.truth))
+    assert left(approach_within(down, math.radians(30.0))) == ["top"]
+    assert left(approach_within(down, math.radians(120.0))) == ["top", "side", "inside"]
+    assert set(left(collision_free(gap, scene.truth))) == {"top", "side"}
+    assert "inside" not in left(collision_free(gap, scene.truth), contact_at_mid_stroke(gap, scene.truth))
     lowest = scene.truth[2] - 0.012 + 0.005
-    assert left(clear_of_table(scene.peg, lowest)) == ["top"]
+    assert left(above_table(scene.peg, lowest)) == ["top"]
     hard = dataclasses.replace(plans[0], name="hard", force=20.0)
     assert pressing_force(plans[0]) == pytest.approx(4.0 + 2500.0 * 0.0015, rel=0.01)
-    found = filtered([*plans, hard], [no_harder_than(10.0), from_within(down, 0.5, "come from aside")])
-    assert found.removed == {"press with more than 10 N": 1, "come from aside": 3}
-    assert str(found) == "1 candidate; left out those that press with more than 10 N (1), come from aside (3)"
+    found = feasible([*plans, hard], [force_at_most(10.0), approach_within(down, 0.5, "come from aside")])
+    assert found.excluded == {"press with more than 10 N": 1, "come from aside": 3}
+    assert str(found) == "1 candidate; excluded those that press with more than 10 N (1), come from aside (3)"
 
 
 def test_what_an_arm_does_not_reach_is_left_out() -> None:
     arm = load_robot("panda", tip="panda_hand_tcp")
     held = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])  # the hand's z axis points down, the peg's up
     scene, _, _ = planned(5)
-    plan = touch(about(scene, 0.001), scene.part, scene.peg, Spot(np.array([-0.02, -0.02, 0.0]), UP))
+    plan = touch(about(scene, 0.001), scene.part, scene.peg, SurfacePoint(np.array([-0.02, -0.02, 0.0]), UP))
     far = dataclasses.replace(plan, name="far", world_from_peg=plan.world_from_peg + np.eye(7)[0])
     here = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    found = filtered([plan, far], [within_reach(Mounted(arm, "panda_hand_tcp", held, here))])
+    found = feasible([plan, far], [within_reach(ArmWithPeg(arm, "panda_hand_tcp", held, here))])
     assert [c.name for c in found] == [plan.name]
-    assert found.removed == {"are out of panda's reach": 1}
+    assert found.excluded == {"are out of panda's reach": 1}
     angles = joint_paths(arm, "panda_hand_tcp", plan.world_from_peg[None], held)[0]
     reached = arm.base_from_link("panda_hand_tcp", angles, link_from_tool=held)
     assert poses.local(torch.from_numpy(plan.world_from_peg), reached).abs().max() < 0.01
     limits = np.array([[joint.lower, joint.upper] for joint in arm.joints])
     assert (angles >= limits[:, 0] - 1e-9).all() and (angles <= limits[:, 1] + 1e-9).all()
     with pytest.raises(
-        InputError, match=r"none of 1 candidate is left .* they are out of panda's reach \(1\)"
+        InputError, match=r"none of 1 candidate is feasible: they are out of panda's reach \(1\)"
     ) as caught:
-        filtered([far], [within_reach(Mounted(arm, "panda_hand_tcp", held, here))])
+        require_candidates(feasible([far], [within_reach(ArmWithPeg(arm, "panda_hand_tcp", held, here))]))
     assert_one_sentence(str(caught.value))
 
 
@@ -204,7 +205,7 @@ def test_the_largest_variance_is_of_the_surface_along_the_stroke() -> None:
     away[:, :3] = away[:, :3] @ turned.T  # along the part's x axis
     belief = Belief(poses.retract(torch.from_numpy(scene.truth), away), torch.zeros(400).double())
     spots = [np.eye(3)[0], np.eye(3)[1], UP]
-    plans = [touch(belief, scene.part, scene.peg, Spot(0.025 * n, n)) for n in spots]
+    plans = [touch(belief, scene.part, scene.peg, SurfacePoint(0.025 * n, n)) for n in spots]
     found = [math.sqrt(surface_variance(belief, scene.peg, plan)) for plan in plans]
     np.testing.assert_allclose(found, [0.003, 0.0003, 0.0003], rtol=0.15)
 
@@ -216,25 +217,30 @@ def test_what_leaves_no_choice_is_refused_in_a_sentence() -> None:
     nothing = Belief(belief.world_from_part, torch.full((40,), -torch.inf, dtype=torch.float64))
     unknown = Belief(belief.world_from_part, torch.full((40,), torch.nan, dtype=torch.float64))
     calls = {
-        "there are no candidates": lambda: filtered([], []),
-        "no candidates of kind 'poke'": lambda: candidates(belief, scene.part, scene.peg, {"poke": 1}),
-        "collapsed to a point": lambda: candidates(point, scene.part, scene.peg),
-        "has no weight": lambda: candidates(nothing, scene.part, scene.peg),
-        "weight that is no number": lambda: candidates(unknown, scene.part, scene.peg),
-        "say how many of each": lambda: candidates(belief, scene.part, scene.peg, ["touch"]),  # type: ignore[arg-type]
-        "probably in millimetres": lambda: candidates(
+        "there are no candidates": lambda: require_candidates(feasible([], [])),
+        "no candidates of kind 'poke'": lambda: plan_candidates(belief, scene.part, scene.peg, {"poke": 1}),
+        "collapsed to a point": lambda: plan_candidates(point, scene.part, scene.peg),
+        "has no weight": lambda: plan_candidates(nothing, scene.part, scene.peg),
+        "weight that is no number": lambda: plan_candidates(unknown, scene.part, scene.peg),
+        "give a number of each": lambda: plan_candidates(belief, scene.part, scene.peg, ["touch"]),  # type: ignore[arg-type]
+        "probably in millimetres": lambda: plan_candidates(
             belief,
             scene.part,
             dataclasses.replace(scene.peg, vertices=1000.0 * scene.peg.vertices),
             {"touch": 1},
         ),
-        "no peg to touch the part": lambda: candidates(belief, scene.part, None, {"touch": 1}),
-        "out of|beside the direction": lambda: candidates(
-            belief, scene.part, scene.peg, {"touch": 2}, gap=gap, filters=[from_within((0, 0, 1.0), 0.1)]
+        "no peg to touch the part": lambda: plan_candidates(belief, scene.part, None, {"touch": 1}),
+        "approach at more than": lambda: plan_candidates(
+            belief,
+            scene.part,
+            scene.peg,
+            {"touch": 2},
+            gap=gap,
+            constraints=[approach_within((0, 0, 1.0), 0.1)],
         ),
-        "a filter is a function": lambda: filtered(planned(5)[2], [lambda found: [True]]),  # type: ignore[list-item]
-        "candidates that are dull does not say of each": lambda: filtered(
-            planned(5)[2], [Filter("are dull", lambda found: [True])]
+        "a constraint is a function": lambda: feasible(planned(5)[2], [lambda found: [True]]),  # type: ignore[list-item]
+        "candidates that are dull gives no boolean for each": lambda: feasible(
+            planned(5)[2], [Constraint("are dull", lambda found: [True])]
         ),
     }
     for says, call in calls.items():
@@ -242,22 +248,22 @@ def test_what_leaves_no_choice_is_refused_in_a_sentence() -> None:
             call()
         assert_one_sentence(str(caught.value))
     for says in (["no"] * len(planned(5)[2]), [math.nan] * len(planned(5)[2]), torch.tensor(True), [[True]]):
-        with pytest.raises(InputError, match="does not say of each"):
-            filtered(planned(5)[2], [Filter("are dull", lambda found, says=says: says)])  # type: ignore[misc]
-    with pytest.raises(InputError, match=r"a touch has press 1\.5"):
-        touch(belief, scene.part, scene.peg, Spot(np.zeros(3), UP), Touching(press=1.5))
+        with pytest.raises(InputError, match="gives no boolean for each"):
+            feasible(planned(5)[2], [Constraint("are dull", lambda found, says=says: says)])  # type: ignore[misc]
+    with pytest.raises(InputError, match=r"a touch has press_depth 1\.5"):
+        touch(belief, scene.part, scene.peg, SurfacePoint(np.zeros(3), UP), TouchParameters(press_depth=1.5))
 
 
 def test_a_motion_that_is_held_before_anything_was_met_is_looked_at_as_well() -> None:
     scene, gap, _ = planned(5)
-    plan = touch(about(scene, 0.001), scene.part, scene.peg, Spot(np.array([-0.02, -0.02, 0.0]), UP))
+    plan = touch(about(scene, 0.001), scene.part, scene.peg, SurfacePoint(np.array([-0.02, -0.02, 0.0]), UP))
     through = plan.world_from_peg.copy()
     through[3:5, 2] -= 0.05
     manners = tuple("held" if manner == "guarded" else manner for manner in plan.manners)
     held = dataclasses.replace(plan, world_from_peg=through, manners=manners)
     assert pressing_force(held) > 100.0
-    for each in (no_harder_than(10.0), clear_of_part(gap, scene.truth)):
-        assert list(filtered([plan, held], [each])) == [plan]
+    for each in (force_at_most(10.0), collision_free(gap, scene.truth)):
+        assert list(feasible([plan, held], [each])) == [plan]
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".json"])
@@ -371,7 +377,9 @@ def test_a_damaged_file_of_actions_says_which_of_them_it_is(tmp_path: Path) -> N
 def test_a_slide_goes_as_far_as_it_is_asked_to() -> None:
     scene, _, _ = planned(5)
     way = np.array([0.0, 0.01, 0.0])
-    plan = slide(about(scene, 0.001), scene.part, scene.peg, Spot(np.array([-0.02, -0.02, 0.0]), UP), way)
+    plan = slide(
+        about(scene, 0.001), scene.part, scene.peg, SurfacePoint(np.array([-0.02, -0.02, 0.0]), UP), way
+    )
     led = plan.world_from_peg[6, :3] - plan.world_from_peg[5, :3]
     turned = poses.rotation_matrix(torch.from_numpy(plan.world_from_peg[0])).numpy()
     np.testing.assert_allclose(led, turned @ way, atol=1e-12)

@@ -70,7 +70,7 @@ def ranked(ran: Ran) -> list[tuple[str, float]]:
 
 
 def test_a_recording_is_run_ranked_and_its_best_action_written(bcppl: Callable[..., Ran], here: Path) -> None:
-    words = ("--candidates", KINDS, "--particles", 30, "--hypotheses", 4, "--top", 3)
+    words = ("--candidates", KINDS, "--particles", 30, "--outer-samples", 4, "--top", 3)
     ran = bcppl("probe", "look.h5", *words, "--output", "next.h5")
     assert ran.code == 0, ran.err
     table = ranked(ran)
@@ -80,7 +80,7 @@ def test_a_recording_is_run_ranked_and_its_best_action_written(bcppl: Callable[.
     assert isinstance(best, Plan) and best.name == table[0][0]
     assert (here / "next.png").stat().st_size > 10_000
     # The belief that a run left ranks as the run does, and a file of one's own is taken.
-    own = bcppl("probe", "runs/belief_002.h5", "--candidates", "next.h5", "--hypotheses", 4)
+    own = bcppl("probe", "runs/belief_002.h5", "--candidates", "next.h5", "--outer-samples", 4)
     assert own.code == 0, own.err
     ((name, gain),) = ranked(own)
     assert name == best.name and gain == pytest.approx(table[0][1], abs=0.02)
@@ -88,10 +88,10 @@ def test_a_recording_is_run_ranked_and_its_best_action_written(bcppl: Callable[.
     assert np.array_equal(again.world_from_peg, best.world_from_peg)
 
 
-def test_views_and_touches_are_ranked_together_and_other_models_by_reweighing(
+def test_views_and_touches_are_ranked_together_and_other_models_by_reweighting(
     bcppl: Callable[..., Ran], here: Path
 ) -> None:
-    words = ("--candidates", "touch:1,view:2", "--hypotheses", 4)
+    words = ("--candidates", "touch:1,view:2", "--outer-samples", 4)
     table = dict(ranked(bcppl("probe", "runs/belief_002.h5", *words)))
     views = [gain for name, gain in table.items() if name.startswith("view")]
     (touched,) = (gain for name, gain in table.items() if name.startswith("touch"))
@@ -105,7 +105,7 @@ def test_views_and_touches_are_ranked_together_and_other_models_by_reweighing(
         refused(bcppl("probe", "push.h5", "--candidates", f"{kind}:1", "--particles", 6), says)
     refused(
         bcppl("probe", "runs/belief_002.h5", "--by", "luck"),
-        "'luck' is not one of 'linearised', 'reweighing'",
+        "'luck' is not one of 'linearised', 'reweighted'",
     )
 
 
@@ -128,7 +128,7 @@ WRONG = {
     "output": (["--output", "next.txt"], "ends in .h5 or .json"),
     "folder": (["--output", "nowhere/next.h5"], "no folder nowhere"),
     "force": (["--force", "3"], "press with more than 3 N"),
-    "below": (["--above", "0", "--candidates", "slide:1"], "beside straight above"),
+    "below": (["--above", "0", "--candidates", "slide:1"], "from straight above"),
     "table": (["--table", "0.5"], "lead into the table"),
     "robot": (["--robot", "panda"], "without --link"),
     "robot's name": (["--robot", "hal", "--link", "x"], "no URDF file and no shipped robot"),
@@ -139,12 +139,12 @@ WRONG = {
         "out of panda's reach",
     ),
     "link": (["--link", "panda_hand"], "give it with --robot"),
-    "depth": (["--depth", "3"], "'--depth'"),
+    "horizon": (["--horizon", "3"], "'--horizon'"),
     "seconds": (["--seconds", "0.5"], "last longer than 0.5 s"),
     "itself": (["--output", "runs/belief_002.h5"], "would overwrite runs/belief_002.h5"),
     "folder's name": (["--output", "folder.json"], "is a directory"),
     "many": (["--candidates", "touch:" + "9" * 5000], "10000 at most"),
-    "hypotheses": (["--hypotheses", "1"], "'--hypotheses'"),
+    "outer samples": (["--outer-samples", "1"], "'--outer-samples'"),
     "table's height": (["--table", "nan"], "--table is nan"),
     "inference": (["--inference", "guided_smc"], "--inference is given with"),
     "of": (["--of", "nothing"], "there is no recording 'nothing'"),

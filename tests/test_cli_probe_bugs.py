@@ -19,7 +19,7 @@ from bcppl.recordings import save
 from bcppl.recordings.beliefs import save_belief
 from tests.command_line import Ran
 
-WORDS = "probe", "belief.h5", "--of", "look.h5", "--candidates", "touch:1", "--hypotheses", 2
+WORDS = "probe", "belief.h5", "--of", "look.h5", "--candidates", "touch:1", "--outer-samples", 2
 
 
 @functools.cache
@@ -69,7 +69,7 @@ def assert_reported_as_a_bug(message: str, error: Exception) -> None:
 def test_a_bug_in_the_ranking_is_no_unsuitable_model(
     error: Exception, error_of: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for way in ("by_information", "by_reweighing"):
+    for way in ("by_linearised_gain", "by_reweighted_gain"):
         monkeypatch.setattr(rules, way, lambda *_, **__: functools.partial(raising, error=error))
     assert_reported_as_a_bug(error_of(), error)
 

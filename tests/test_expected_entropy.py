@@ -15,11 +15,11 @@ from torch import Tensor
 
 from bcppl.inference.design import (
     Ranking,
+    discrete_entropy,
     expected_entropy,
     expected_information_gain,
-    mode_entropy,
+    mixture_entropy,
     neighbour_entropy,
-    value_entropy,
     weight_entropy,
 )
 from bcppl.inference.population import Population
@@ -59,7 +59,7 @@ def exact_entropy(prior: Tensor, *tables: Tensor) -> float:
 
 
 def rank(prior: Tensor, tables: list[Tensor], **options: Any) -> Ranking:
-    options = {"seed": 0, "hypotheses": 600, **options}
+    options = {"seed": 0, "outer_samples": 600, **options}
     return expected_information_gain(
         states(prior, []), tables, lambda table: (prior, [table]), options.pop("entropy", None), **options
     )
@@ -95,7 +95,7 @@ def line_prior() -> Tensor:
 def worst_z(ranking: Ranking, prior: Tensor, tables: list[Tensor]) -> float:
     """How many standard errors the estimates are off, at most."""
     return max(
-        abs(p.entropy - exact_entropy(prior, tables[p.number])) / p.standard_error for p in ranking.prospects
+        abs(p.entropy - exact_entropy(prior, tables[p.number])) / p.standard_error for p in ranking.utilities
     )
 
 
@@ -105,9 +105,9 @@ def test_on_a_line_it_is_the_sum(noise: float) -> None:
     ranking = rank(line_prior(), tables)
     assert ranking.entropy == pytest.approx(float(entropy(line_prior())))
     assert worst_z(ranking, line_prior(), tables) < 3.0
-    assert all(p.standard_error < 0.03 for p in ranking.prospects)
+    assert all(p.standard_error < 0.03 for p in ranking.utilities)
     # Every particle once: six draws tell little, but they are right on average.
-    everyone = [rank(line_prior(), tables, hypotheses=None, seed=seed) for seed in range(100)]
+    everyone = [rank(line_prior(), tables, outer_samples=None, seed=seed) for seed in range(100)]
     assert len(everyone[0].best.gains) == 6
     for k, table in enumerate(tables):
         found = torch.tensor([ranking.of(k).entropy for ranking in everyone], dtype=torch.float64)
@@ -123,26 +123,26 @@ def test_in_a_plane_it_is_the_sum() -> None:
 
 def test_the_standard_error_is_that_of_repeated_estimates_or_a_little_more() -> None:
     tables = line_tables(1.0)
-    found = [rank(line_prior(), tables, hypotheses=60, seed=seed).of(0) for seed in range(60)]
+    found = [rank(line_prior(), tables, outer_samples=60, seed=seed).of(0) for seed in range(60)]
     spread = float(torch.tensor([p.information_gain for p in found]).std())
     stated = sum(p.standard_error for p in found) / len(found)
     assert 0.8 < stated / spread < 2.0
 
 
 def test_a_flipped_sign_or_forgotten_weights_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    tables, right = line_tables(1.0), expected_entropy.entropies
+    tables, right = line_tables(1.0), expected_entropy.posterior_entropies
     mutants: list[Callable[..., Tensor]] = [
         lambda weights, likelihoods, of: right(weights, -likelihoods, of),
         lambda weights, likelihoods, of: right(torch.zeros_like(weights), likelihoods, of),
         lambda weights, likelihoods, of: -right(weights, likelihoods, of),
     ]
     for mutant in mutants:
-        monkeypatch.setattr(expected_entropy, "entropies", mutant)
+        monkeypatch.setattr(expected_entropy, "posterior_entropies", mutant)
         assert worst_z(rank(line_prior(), tables), line_prior(), tables) > 5.0
-    monkeypatch.setattr(expected_entropy, "entropies", right)
+    monkeypatch.setattr(expected_entropy, "posterior_entropies", right)
     unweighted = Population(states(line_prior(), []).trace, torch.zeros(6, dtype=torch.float64))
     ranking = expected_information_gain(
-        unweighted, tables, lambda table: (line_prior(), [table]), hypotheses=600, seed=0
+        unweighted, tables, lambda table: (line_prior(), [table]), outer_samples=600, seed=0
     )
     assert worst_z(ranking, line_prior(), tables) > 5.0
 
@@ -157,7 +157,7 @@ def test_the_choice_is_right_in_100_of_100_instances() -> None:
         if float(exact.sort().values.diff()[0]) < 0.1:
             continue
         done += 1
-        right += rank(prior, tables, hypotheses=300, seed=done).best.number == int(exact.argmin())
+        right += rank(prior, tables, outer_samples=300, seed=done).best.number == int(exact.argmin())
     assert right == 100
 
 
@@ -167,24 +167,24 @@ def test_it_rises_with_the_noise_and_what_tells_nothing_gains_nothing() -> None:
     gains = [rank(line_prior(), tables).of(k).information_gain for k in range(len(noises))]
     assert gains == sorted(gains, reverse=True)
     nothing = matrix([[0.2, 0.5, 0.3]]).expand(6, 3)
-    prospect = rank(line_prior(), [*tables, nothing]).of(len(tables))
-    assert abs(prospect.information_gain) < 1e-12 and prospect.standard_error < 1e-12
-    assert prospect.number == rank(line_prior(), [*tables, nothing])[-1].number
+    utility = rank(line_prior(), [*tables, nothing]).of(len(tables))
+    assert abs(utility.information_gain) < 1e-12 and utility.standard_error < 1e-12
+    assert utility.number == rank(line_prior(), [*tables, nothing])[-1].number
 
 
 def test_information_is_never_lost_in_expectation() -> None:
     torch.manual_seed(3)
     for seed in range(20):
         prior = torch.softmax(2.0 * torch.randn(5, dtype=torch.float64), 0)
-        prospect = rank(prior, [random_table(5, 3, 0.5)], seed=seed).best
-        assert prospect.information_gain > -3.0 * prospect.standard_error
+        utility = rank(prior, [random_table(5, 3, 0.5)], seed=seed).best
+        assert utility.information_gain > -3.0 * utility.standard_error
 
 
 def test_common_random_numbers_sharpen_the_difference() -> None:
     # Two rulers that differ a little.
     tables = [line_tables(0.8)[0], line_tables(0.9)[0]]
-    pairs = [rank(line_prior(), tables, hypotheses=50, seed=seed) for seed in range(40)]
-    others = [rank(line_prior(), tables[1:], hypotheses=50, seed=100 + seed).best for seed in range(40)]
+    pairs = [rank(line_prior(), tables, outer_samples=50, seed=seed) for seed in range(40)]
+    others = [rank(line_prior(), tables[1:], outer_samples=50, seed=100 + seed).best for seed in range(40)]
     common = torch.tensor([r.of(0).information_gain - r.of(1).information_gain for r in pairs])
     apart = torch.tensor(
         [r.of(0).information_gain - o.information_gain for r, o in zip(pairs, others, strict=True)]
@@ -207,14 +207,16 @@ def test_a_linear_gaussian_program_has_the_closed_form(measure: str) -> None:
     torch.manual_seed(4)
     population = equal_weights(simulate(linear, ([],), 3000))
     rows = [matrix([1.0, 0.0]), matrix([0.0, 1.0]), matrix([0.6, 0.8])]
-    kind = mode_entropy("x") if measure == "modes" else neighbour_entropy("x", 5)
-    ranking = expected_information_gain(population, rows, lambda row: ([row],), kind, hypotheses=200, seed=0)
+    kind = mixture_entropy("x") if measure == "modes" else neighbour_entropy("x", 5)
+    ranking = expected_information_gain(
+        population, rows, lambda row: ([row],), kind, outer_samples=200, seed=0
+    )
     covariance = torch.cov(population["x"].T)
     for k, row in enumerate(rows):
-        prospect = ranking.of(k)
+        utility = ranking.of(k)
         # 1/2 log det of the covariance before over that after.
         exact = 0.5 * math.log1p(float(row @ covariance @ row) / 0.49)
-        assert prospect.information_gain == pytest.approx(exact, abs=3 * prospect.standard_error + 0.02)
+        assert utility.information_gain == pytest.approx(exact, abs=3 * utility.standard_error + 0.02)
 
 
 def test_the_gain_of_a_discrete_value_is_that_of_its_marginal() -> None:
@@ -229,8 +231,8 @@ def test_the_gain_of_a_discrete_value_is_that_of_its_marginal() -> None:
         Population(trace, shares.log()),
         tables,
         lambda table: (prior, [table]),
-        value_entropy("x"),
-        hypotheses=600,
+        discrete_entropy("x"),
+        outer_samples=600,
         seed=0,
     )
     assert ranking.entropy == pytest.approx(float(entropy(prior)))
@@ -269,23 +271,23 @@ def after(prior: Tensor, table: Tensor) -> list[tuple[float, Tensor]]:
 def test_two_steps_ahead_are_the_sum_and_right_where_greedy_is_wrong() -> None:
     torch.manual_seed(6)
     prior, tables = torch.softmax(0.3 * torch.randn(16, dtype=torch.float64), 0), bits_tables()
-    greedy = rank(prior, tables, hypotheses=400)
-    ahead = rank(prior, tables, hypotheses=400, depth=2, shortlist=3)
+    greedy = rank(prior, tables, outer_samples=400)
+    ahead = rank(prior, tables, outer_samples=400, horizon=2, shortlist=3)
     exact = [best_of_two(prior, tables, k) for k in range(3)]
     assert greedy.best.number == 0 and max(exact[1:]) < exact[0] - 0.15
     assert ahead.best.number in (1, 2)
-    for prospect in ahead:
-        assert abs(prospect.entropy - exact[prospect.number]) < 3.0 * prospect.standard_error < 0.2
-    then = ahead.of(1).then
+    for utility in ahead:
+        assert abs(utility.entropy - exact[utility.number]) < 3.0 * utility.standard_error < 0.2
+    then = ahead.of(1).second
     assert then is not None and bool((then == 2).all()), "after one half, the other"
     # With three on the list and one looked at, the others stay at one step and behind.
-    short = rank(prior, tables, hypotheses=100, depth=2, shortlist=1)
-    assert [p.steps for p in short] == [2, 1, 1] and short.best.number == 0
+    short = rank(prior, tables, outer_samples=100, horizon=2, shortlist=1)
+    assert [p.horizon for p in short] == [2, 1, 1] and short.best.number == 0
 
 
 def test_reading_twice_has_noise_of_its_own_each_time() -> None:
     prior, table = line_prior(), line_tables(1.0)[0]
-    ahead = rank(prior, [table], hypotheses=600, depth=2).best
+    ahead = rank(prior, [table], outer_samples=600, horizon=2).best
     assert abs(ahead.entropy - exact_entropy(prior, table, table)) < 3.0 * ahead.standard_error
 
 
@@ -310,8 +312,8 @@ def test_costs_are_traded_against_information() -> None:
     )
     assert both.of(0).cost == pytest.approx(10.0 * rate + 0.2)
     # A second step is taken only where it is worth its cost.
-    never = rank(prior, tables, cost=lambda t: 50.0, depth=2, hypotheses=50)
-    then = never.best.then
+    never = rank(prior, tables, cost=lambda t: 50.0, horizon=2, outer_samples=50)
+    then = never.best.second
     assert then is not None and bool((then == -1).all())
     assert never.best.cost == 50.0
     by_name = expected_information_gain(
@@ -320,7 +322,7 @@ def test_costs_are_traded_against_information() -> None:
         lambda name: (prior, [tables[0 if name == "ruler" else 1]]),
         cost={"ruler": 10.0, "side": 1.0},
         rate=1.01 * rate,
-        hypotheses=600,
+        outer_samples=600,
         seed=0,
     )
     assert by_name.best.candidate == "side"
@@ -347,7 +349,7 @@ def test_measurements_that_were_made_stay() -> None:
         [ruler, side],
         lambda table: (prior, [side, table]),
         weight_entropy(),
-        hypotheses=600,
+        outer_samples=600,
         seed=0,
     )
     posterior = prior * side[:, 0] / (prior @ side[:, 0])

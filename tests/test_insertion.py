@@ -19,8 +19,8 @@ from bcppl.geometry.extrusion import block, extruded
 from bcppl.geometry.holes import Hole, fit_in, hole_of
 from bcppl.geometry.outlines import rectangular_outline
 from bcppl.geometry.parts import Part
-from bcppl.inference.planning.chance import chance_of_success
-from bcppl.inference.planning.insertion import Attempt, insertion_plan
+from bcppl.inference.planning.insertion import InsertionParameters, insertion_plan
+from bcppl.inference.planning.success import success_probability
 from bcppl.inference.schemes import systematic
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, bench_part
@@ -116,8 +116,8 @@ def test_a_peg_with_a_tenth_of_clearance_goes_in_and_the_chance_says_so(part: st
     assert result.found <= plan.search.times[-1] and result.time < 8.0
     assert scene.insert(plan) == result
     if part == "square 8 mm":
-        chance = chance_of_success(touched(part), plan, PegPhysics(scene.part, scene.peg), particles=8)
-        assert chance.success > 0.7 and chance.success <= chance.found
+        chance = success_probability(touched(part), plan, PegPhysics(scene.part, scene.peg), particles=8)
+        assert chance.success > 0.7 and chance.success <= chance.hole_found
 
 
 def test_the_search_is_what_finds_it() -> None:
@@ -125,7 +125,9 @@ def test_the_search_is_what_finds_it() -> None:
     scene = tight()
     off = believed(scene, 1, 0.0002, 0.0005, off=(0.0003, 0.0, 0.0, 0.0, 0.0, 0.0))
     assert scene.insert(insertion_plan(off, scene.part, scene.peg)).inserted
-    blind = insertion_plan(off, scene.part, scene.peg, attempt=Attempt(widest=0.0001, longest=1.0))
+    blind = insertion_plan(
+        off, scene.part, scene.peg, parameters=InsertionParameters(maximum_radius=0.0001, search_time=1.0)
+    )
     result = scene.insert(blind)
     assert not result.inserted and np.isnan(result.found) and result.depth < 0.001
     assert result.peak_press < 30.0
@@ -136,8 +138,8 @@ def test_the_chance_is_the_arms_rises_with_the_clearance_and_is_nothing_without_
     for clearance, shift in ((0.0001, 0.001), (0.001, 0.001), (0.001, 0.0002)):
         scene = bench_scene(3, part="square 8 mm", clearance=clearance)
         belief = believed(scene, 3, shift, np.radians(0.3))
-        plan = insertion_plan(belief, scene.part, scene.peg, attempt=Attempt(longest=3.0))
-        chances.append(chance_of_success(belief, plan, PegPhysics(scene.part, scene.peg), particles=12))
+        plan = insertion_plan(belief, scene.part, scene.peg, parameters=InsertionParameters(search_time=3.0))
+        chances.append(success_probability(belief, plan, PegPhysics(scene.part, scene.peg), particles=12))
         if len(chances) == 1:
             # Pegs that find nothing are pushed as well, and some slip over the chamfer into the hole.
             torch.manual_seed(0)
@@ -146,20 +148,22 @@ def test_the_chance_is_the_arms_rises_with_the_clearance_and_is_nothing_without_
             inserted = float(np.mean([arm.insert(plan).inserted for arm in arms]))
             assert 0.3 < inserted < 0.8 and chances[0].success == pytest.approx(inserted, abs=0.26)
     assert chances[0].success < chances[2].success > 0.9
-    assert chances[0].found < chances[1].found <= chances[2].found
+    assert chances[0].hole_found < chances[1].hole_found <= chances[2].hole_found
     elsewhere = belief.world_from_part.clone()
     elsewhere[:, 0] += 0.015
     away = Belief(elsewhere, belief.log_weights)
-    assert chance_of_success(away, plan, PegPhysics(scene.part, scene.peg), particles=4).success == 0.0
+    assert success_probability(away, plan, PegPhysics(scene.part, scene.peg), particles=4).success == 0.0
     # A peg that sinks beside the part has found no hole.
     elsewhere[:, 0] += 0.5
-    beside = chance_of_success(Belief(elsewhere, belief.log_weights), plan, PegPhysics(scene.part, scene.peg))
-    assert beside.success == 0.0 and beside.found == 0.0
+    beside = success_probability(
+        Belief(elsewhere, belief.log_weights), plan, PegPhysics(scene.part, scene.peg)
+    )
+    assert beside.success == 0.0 and beside.hole_found == 0.0
 
 
 def test_a_search_that_has_found_its_hole_leaves_the_rest_undone() -> None:
     scene, plan = tight(), plan_of()
-    whole = scene.carried_out(plan.search)[0]
+    whole = scene.executed(plan.search)[0]
     (stopped,) = [t for k, t in whole.stops.items() if plan.search.manners[k] == "searching"]
     after = whole.probe.command[whole.probe.command_times > stopped + 0.05]
     assert np.ptp(after, axis=0).max() < 1e-9
@@ -193,15 +197,19 @@ def test_what_cannot_be_inserted_is_refused_in_one_sentence() -> None:
         hole_of(_two_holes(), inside=(0.0, 0.0))
     with pytest.raises(InputError, match="does not fit the hole"):
         fit_in(hole, bench_part("round 16 mm").peg(0.0001))
-    with pytest.raises(InputError, match="the insertion has press 0"):
-        insertion_plan(touched(), scene.part, scene.peg, attempt=Attempt(press=0.0))
+    with pytest.raises(InputError, match="the insertion has press_depth 0"):
+        insertion_plan(touched(), scene.part, scene.peg, parameters=InsertionParameters(press_depth=0.0))
     with pytest.raises(InputError, match=r"search_stiffness .*; give six numbers"):
-        insertion_plan(touched(), scene.part, scene.peg, attempt=Attempt(search_stiffness=(4000.0, 150.0)))
+        insertion_plan(
+            touched(), scene.part, scene.peg, parameters=InsertionParameters(search_stiffness=(4000.0, 150.0))
+        )
     with pytest.raises(InputError, match="search_stiffness with 0"):
-        insertion_plan(touched(), scene.part, scene.peg, attempt=Attempt(search_stiffness=(0.0,) * 6))
+        insertion_plan(
+            touched(), scene.part, scene.peg, parameters=InsertionParameters(search_stiffness=(0.0,) * 6)
+        )
     with pytest.raises(InputError, match="searches until the peg has sunk by 0 m"):
         replace(plan.search, sink=0.0)
     with pytest.raises(InputError, match="has no searching motion"):
         replace(plan, search=plan.push)
-    with pytest.raises(InputError, match="chance of an insertion is asked for"):
-        chance_of_success(touched(), plan, PegPhysics(scene.part, scene.peg), particles=0)
+    with pytest.raises(InputError, match="success of an insertion is to be simulated for 0 particles"):
+        success_probability(touched(), plan, PegPhysics(scene.part, scene.peg), particles=0)

@@ -18,8 +18,8 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.gap import PegGap
-from bcppl.inference.design import linearised_information_gain, mode_entropy
-from bcppl.inference.design.gaussians import Gaussians, right_jacobian
+from bcppl.inference.design import linearised_information_gain, mixture_entropy
+from bcppl.inference.design.tangent_mixture import TangentMixture, right_jacobian
 from bcppl.inference.population import Population
 from bcppl.robot.motion import ProbeWindow
 from bcppl.robot.plan import Plan
@@ -90,14 +90,14 @@ def test_it_is_the_closed_form_of_a_linear_reading() -> None:
     for k, (row, noise) in enumerate(ASKED):
         h = torch.tensor(row, dtype=torch.float64)
         exact = 0.5 * math.log1p(float(h @ covariance @ h) / noise**2)
-        prospect = ranking.of(k)
+        utility = ranking.of(k)
         # A single particle's floor makes the covariance larger by n^(-1 - 1/3).
-        assert prospect.information_gain == pytest.approx(exact, abs=2e-3)
-        assert prospect.standard_error < 2e-3
-        assert prospect.entropy == pytest.approx(ranking.entropy - prospect.information_gain)
+        assert utility.information_gain == pytest.approx(exact, abs=2e-3)
+        assert utility.standard_error < 2e-3
+        assert utility.entropy == pytest.approx(ranking.entropy - utility.information_gain)
     assert ranking.best.number == 2 and ranking[-1].number == 3
     assert ranking.entropy == pytest.approx(
-        float(mode_entropy("part")(population)(torch.full((1, 300), 1 / 300).double())[0])
+        float(mixture_entropy("part")(population)(torch.full((1, 300), 1 / 300).double())[0])
     )
 
 
@@ -105,7 +105,7 @@ def test_copies_of_particles_change_nothing_nor_does_a_budget() -> None:
     population = drawn(60, 1)
     once = linearised_information_gain(population, ASKED, arguments, seed=0)
     twice = linearised_information_gain(doubled(population), ASKED, arguments, seed=0)
-    few = linearised_information_gain(population, ASKED, arguments, hypotheses=10, seed=0)
+    few = linearised_information_gain(population, ASKED, arguments, outer_samples=10, seed=0)
     for k in range(len(ASKED)):
         assert twice.of(k).information_gain == pytest.approx(once.of(k).information_gain, abs=1e-9)
         assert few.of(k).information_gain == pytest.approx(once.of(k).information_gain, abs=2e-3)
@@ -118,15 +118,15 @@ def test_costs_and_two_steps() -> None:
         population, ASKED, arguments, cost=lambda one: 100.0 * one[0][1], seed=0
     )
     assert dear.best.number == 0
-    both = linearised_information_gain(population, ASKED, arguments, depth=2, seed=0)
+    both = linearised_information_gain(population, ASKED, arguments, horizon=2, seed=0)
     h = torch.tensor([ASKED[k][0] for k in (0, 2)], dtype=torch.float64)
     noise = torch.diag(torch.tensor([ASKED[k][1] for k in (0, 2)], dtype=torch.float64) ** 2)
     covariance = torch.cov(poses.local(CENTER, population["part"]).T, correction=0)
     exact = 0.5 * float(torch.logdet(noise + h @ covariance @ h.T) - torch.logdet(noise))
     for k, other in ((2, 0), (0, 2)):
-        prospect = both.of(k)
-        assert prospect.information_gain == pytest.approx(exact, abs=4e-3)
-        assert prospect.then is not None and int(prospect.then[0]) == other
+        utility = both.of(k)
+        assert utility.information_gain == pytest.approx(exact, abs=4e-3)
+        assert utility.second is not None and int(utility.second[0]) == other
 
 
 def test_a_second_step_that_is_lost_for_some_adds_what_it_adds_for_the_others() -> None:
@@ -141,7 +141,12 @@ def test_a_second_step_that_is_lost_for_some_adds_what_it_adds_for_the_others() 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of the lost ones
             ranking = linearised_information_gain(
-                population, candidates, lambda c: (SPREADS, []), information=information, depth=depth, seed=0
+                population,
+                candidates,
+                lambda c: (SPREADS, []),
+                information=information,
+                horizon=depth,
+                seed=0,
             )
         return ranking.of(0).information_gain
 
@@ -153,18 +158,18 @@ def test_a_second_step_that_is_lost_for_some_adds_what_it_adds_for_the_others() 
 def test_of_two_orders_the_one_that_tells_more_at_once_comes_first() -> None:
     population = drawn(200, 2)
     for asked in (ASKED, ASKED[::-1]):
-        ranking = linearised_information_gain(population, asked, arguments, depth=2, seed=0)
+        ranking = linearised_information_gain(population, asked, arguments, horizon=2, seed=0)
         alone = linearised_information_gain(population, asked, arguments, seed=0)
         assert ranking.best.number == alone.best.number
         assert ranking[0].value == pytest.approx(ranking[1].value, abs=1e-9)
-        assert ranking.best.immediate == pytest.approx(alone.best.value)
+        assert ranking.best.myopic == pytest.approx(alone.best.value)
 
 
 def test_what_tells_two_modes_apart_is_worth_that_as_well() -> None:
     centers = torch.zeros(2, 6, dtype=torch.float64)
     centers[:, 0] = torch.tensor([-0.05, 0.05])
     population = drawn(200, 3, centers)
-    belief = Gaussians.fitted(population, "part")
+    belief = TangentMixture.fit(population, "part")
     assert len(belief) == 2 and float(belief.mass[0]) == pytest.approx(0.5)
     asked: list[Reading] = [((1.0, 0, 0, 0, 0, 0), 1e-3), ((0, 1.0, 0, 0, 0, 0), 1e-3)]
     ranking = linearised_information_gain(population, asked, arguments, seed=0)
@@ -193,11 +198,11 @@ def test_information_that_is_given_is_taken() -> None:
     uneven = torch.triu(torch.ones(6, 6, dtype=torch.float64)) * 1e4
     for wrong, says in (
         (-known.expand(100, 6, 6), "check the sign"),
-        (uneven.expand(100, 6, 6), "to be symmetric"),
+        (uneven.expand(100, 6, 6), "not symmetric"),
         (known, r"has shape \(6, 6\)"),
         ("much", "is a str"),
     ):
-        with pytest.raises(InputError, match=f"what candidate 0 is said to tell .*{says}"):
+        with pytest.raises(InputError, match=f"the information of candidate 0 .*{says}"):
             linearised_information_gain(
                 population,
                 ["view"],
@@ -211,7 +216,7 @@ def test_what_given_information_leaves_out_of_several_modes_is_said() -> None:
     centers = torch.zeros(2, 6, dtype=torch.float64)
     centers[:, 0] = torch.tensor([-0.05, 0.05])
     known = 1e6 * torch.eye(6, dtype=torch.float64).expand(200, 6, 6)
-    with pytest.warns(UserWarning, match="has 2 modes, and what 1 of 1 candidates"):
+    with pytest.warns(UserWarning, match="has 2 modes, and the gain of 1 of 1 candidates"):
         linearised_information_gain(
             drawn(200, 3, centers), ["view"], lambda c: (SPREADS, []), information=lambda *now: known, seed=0
         )
@@ -268,7 +273,7 @@ def test_what_cannot_be_ranked_is_refused_in_a_sentence() -> None:
         lost = Population(population.trace, torch.full((50,), -torch.inf, dtype=torch.float64))
         linearised_information_gain(lost, ASKED, arguments)
     for name in ("translation", "rotation"):
-        with pytest.raises(InputError, match="modes are to be parted by 0"):
+        with pytest.raises(InputError, match="modes are to be separated by 0"):
             linearised_information_gain(population, ASKED, arguments, **{name: 0.0})  # type: ignore[arg-type]
     with pytest.raises(InputError, match="a rate of 5 is given without a cost"):
         linearised_information_gain(population, ASKED, arguments, rate=5)

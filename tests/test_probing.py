@@ -15,12 +15,12 @@ from bcppl import poses
 from bcppl.beliefs import Belief, entropy_of_modes
 from bcppl.errors import InputError
 from bcppl.inference.design import (
-    EntropyOf,
+    EntropyOfWeights,
     Ranking,
+    discrete_entropy,
     expected_information_gain,
-    mode_entropy,
+    mixture_entropy,
     neighbour_entropy,
-    value_entropy,
     weight_entropy,
 )
 from bcppl.inference.population import Population
@@ -42,7 +42,7 @@ def test_under_its_own_weights_a_belief_has_the_entropies_that_it_says(freedom: 
     tilted = population.log_weights - 0.5 * ((population["part"][:, 0] - 0.1) / 0.002) ** 2
     belief = Belief(population["part"], tilted, freedom)
     even = torch.full((1, 1500), 1.0 / 1500, dtype=torch.float64)
-    modes, near = mode_entropy("part")(population), neighbour_entropy("part")(population)
+    modes, near = mixture_entropy("part")(population), neighbour_entropy("part")(population)
     weights = torch.softmax(tilted, 0)[None]
     assert float(modes(even)) == pytest.approx(population.belief("part").gaussian_entropy, abs=0.01)
     assert float(modes(weights)) == pytest.approx(belief.gaussian_entropy, abs=0.02)
@@ -51,7 +51,7 @@ def test_under_its_own_weights_a_belief_has_the_entropies_that_it_says(freedom: 
 
 
 @pytest.mark.parametrize(
-    "measure", [mode_entropy("part"), neighbour_entropy("part"), mode_entropy("part", 0.001, 0.01)]
+    "measure", [mixture_entropy("part"), neighbour_entropy("part"), mixture_entropy("part", 0.001, 0.01)]
 )
 def test_copies_count_once(measure: Any) -> None:
     population, weights = particles(300), some_weights(5, 300)
@@ -67,10 +67,10 @@ def test_copies_count_once(measure: Any) -> None:
 
 def test_a_ranking_does_not_change_when_every_particle_is_doubled() -> None:
     population = particles(100, PLANAR)
-    for measure in (mode_entropy("part"), neighbour_entropy("part")):
+    for measure in (mixture_entropy("part"), neighbour_entropy("part")):
         once, twice = (
             expected_information_gain(
-                each, [0, 1], lambda axis: (PLANAR, [axis]), measure, hypotheses=400, seed=1
+                each, [0, 1], lambda axis: (PLANAR, [axis]), measure, outer_samples=400, seed=1
             )
             for each in (population, doubled(population))
         )
@@ -85,7 +85,7 @@ def test_what_is_left_of_a_belief_is_never_less_than_a_particle_stands_for() -> 
     population = particles(200)
     alone = torch.eye(200, dtype=torch.float64)
     even = torch.full((1, 200), 1.0 / 200, dtype=torch.float64)
-    fall = mode_entropy("part")(population)(even) - mode_entropy("part")(population)(alone)
+    fall = mixture_entropy("part")(population)(even) - mixture_entropy("part")(population)(alone)
     # The base measure's density at a particle differs a little from its mean.
     torch.testing.assert_close(
         fall, torch.full((200,), math.log(200), dtype=torch.float64), atol=0.05, rtol=0
@@ -110,7 +110,7 @@ def test_modes_are_those_that_are_left() -> None:
     population = two_places()
     even = torch.full((1, 200), 1.0 / 200, dtype=torch.float64)
     first = torch.cat([torch.full((1, 100), 0.01), torch.zeros(1, 100)], dim=1).double()
-    entropy = mode_entropy("part")(population)
+    entropy = mixture_entropy("part")(population)
     belief = population.belief("part")
     assert float(entropy(even)) == pytest.approx(entropy_of_modes(belief.modes()), abs=0.03)
     assert float(entropy(even) - entropy(first)) == pytest.approx(math.log(2), abs=0.2)
@@ -119,7 +119,7 @@ def test_modes_are_those_that_are_left() -> None:
     bridged = two_places(between=True)
     whole = torch.full((1, 220), 1.0 / 220, dtype=torch.float64)
     apart = torch.cat([even, torch.full((1, 20), 1e-7, dtype=torch.float64)], dim=1)
-    entropy = mode_entropy("part")(bridged)
+    entropy = mixture_entropy("part")(bridged)
     assert float(entropy(whole)) == pytest.approx(bridged.belief("part").gaussian_entropy, abs=0.05)
     assert float(entropy(apart)) == pytest.approx(entropy_of_modes(belief.modes()), abs=0.25)
 
@@ -129,7 +129,7 @@ def test_a_sparse_belief_is_one_mode() -> None:
     population = particles(75)
     even = torch.full((1, 75), 1.0 / 75, dtype=torch.float64)
     assert len(population.belief("part").modes(0.001, 0.01)) > 50
-    assert float(mode_entropy("part", 0.001, 0.01)(population)(even)) == pytest.approx(
+    assert float(mixture_entropy("part", 0.001, 0.01)(population)(even)) == pytest.approx(
         population.belief("part").gaussian_entropy, abs=0.3
     )
 
@@ -140,17 +140,17 @@ def test_places_that_differ_by_a_symmetry_are_one() -> None:
     turned = poses.compose(population["part"], half_turn)
     mixed = at(torch.where((torch.arange(200) % 2 == 0)[:, None], population["part"], turned))
     even = torch.full((1, 200), 1.0 / 200, dtype=torch.float64)
-    expected = float(mode_entropy("part")(population)(even))
-    assert float(mode_entropy("part", symmetries=half_turn[None])(mixed)(even)) == pytest.approx(
+    expected = float(mixture_entropy("part")(population)(even))
+    assert float(mixture_entropy("part", symmetries=half_turn[None])(mixed)(even)) == pytest.approx(
         expected, abs=1e-6
     )
-    assert float(mode_entropy("part")(mixed)(even)) > expected + 0.5
+    assert float(mixture_entropy("part")(mixed)(even)) > expected + 0.5
 
 
 # ---- refused
 
 
-def fitted(measure: Any, population: Population) -> EntropyOf:
+def fitted(measure: Any, population: Population) -> EntropyOfWeights:
     return measure(population)
 
 
@@ -172,16 +172,19 @@ def test_bad_input_is_one_sentence() -> None:
         (lambda: rank(population, []), "no candidates"),
         (lambda: rank(without), "every particle's is zero"),
         (lambda: rank(point), "collapsed to a point"),
-        (lambda: rank(point, measure=mode_entropy("part")), "collapsed to a point"),
+        (lambda: rank(point, measure=mixture_entropy("part")), "collapsed to a point"),
         (lambda: rank(point, measure=neighbour_entropy("part")), "collapsed to a point"),
         (lambda: rank(single), "collapsed to a point"),
-        (lambda: rank(single, measure=mode_entropy("part")), "collapsed to a point"),
-        (lambda: rank(at(line, freedom=PLANAR), measure=mode_entropy("part")), "do not span its 3 free axes"),
+        (lambda: rank(single, measure=mixture_entropy("part")), "collapsed to a point"),
+        (
+            lambda: rank(at(line, freedom=PLANAR), measure=mixture_entropy("part")),
+            "do not span its 3 free axes",
+        ),
         (lambda: rank(population, measure=neighbour_entropy("part", 60)), "too few for an entropy by 60"),
-        (lambda: rank(population, measure=mode_entropy("hole")), "no latent address"),
+        (lambda: rank(population, measure=mixture_entropy("hole")), "no latent address"),
         (lambda: rank(population, [0, None]), "candidate 1 adds no site"),
-        (lambda: rank(population, depth=3), "looked ahead by 3 steps"),
-        (lambda: rank(population, hypotheses=1), "1 hypotheses"),
+        (lambda: rank(population, horizon=3), "a horizon of 3 steps"),
+        (lambda: rank(population, outer_samples=1), "1 outer samples"),
         (lambda: rank(population, cost={1: 2.0}), "candidate 0 has no cost"),
         (lambda: rank(population, cost=lambda c: {"time": 2.0}), "'time', which has no rate"),
         (lambda: rank(population, cost=lambda c: 2.0, rate={"time": 2.0}), "costs a single number"),
@@ -194,8 +197,8 @@ def test_bad_input_is_one_sentence() -> None:
         text = str(caught.value)
         assert said in text and text.endswith(".") and "\n" not in text, text
     discrete = equal_weights(simulate(lambda: pyro.sample("k", dist.Categorical(torch.ones(3))), (), 20))
-    with pytest.raises(InputError, match="whole numbers, which have no density; use value_entropy"):
-        fitted(mode_entropy("k"), discrete)
+    with pytest.raises(InputError, match="whole numbers, which have no density; use discrete_entropy"):
+        fitted(mixture_entropy("k"), discrete)
     same = generate(discrete.trace.program, (), {}, 20, choices={"k": torch.zeros(20, dtype=torch.int64)})[0]
     with pytest.raises(InputError, match="collapsed to a point"):
-        fitted(value_entropy("k"), equal_weights(same))
+        fitted(discrete_entropy("k"), equal_weights(same))

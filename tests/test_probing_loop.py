@@ -16,10 +16,10 @@ from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
 from bcppl.inference.design.loop import Round, named_apart, probing_loop
-from bcppl.inference.design.rules import at_random, by_information, in_order
+from bcppl.inference.design.rules import at_random, by_linearised_gain, in_given_order
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.planning.candidate_list import candidates
+from bcppl.inference.planning.candidates import plan_candidates
 from bcppl.inference.planning.insertion import insertion_plan
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import BenchScene, bench_scene
@@ -42,13 +42,13 @@ def seen() -> tuple[BenchScene, Recording, Step, PegGap]:
 
 def asked(belief: Belief, number: int) -> list[Candidate]:
     scene, _, _, gap = seen()
-    return list(candidates(belief, scene.part, scene.peg, {"touch": 3, "pair": 4}, gap=gap, seed=number))
+    return list(plan_candidates(belief, scene.part, scene.peg, {"touch": 3, "pair": 4}, gap=gap, seed=number))
 
 
 @functools.cache
 def followed() -> list[Round]:
     scene, look, last, _ = seen()
-    rank = by_information(model.pose, hypotheses=6, seed=0)
+    rank = by_linearised_gain(model.pose, outer_samples=6, seed=0)
     return list(probing_loop(model, look, BenchArm(scene), asked, rank, start=last, probes=2))
 
 
@@ -100,31 +100,33 @@ def test_the_loop_ends_by_gain_by_chance_and_by_number() -> None:
         )
 
     assert rounds(probes=1) == 1
-    with pytest.raises(InputError, match="foretells no gains"):
-        rounds(probes=3, least_gain=0.1)  # an order that is drawn
-    with pytest.warns(UserWarning, match="before its first probe: an insertion succeeds with a chance of 1"):
-        assert rounds(probes=3, chance=lambda belief: 1.0) == 0
-    with pytest.raises(InputError, match="from a chance of 2 on"):
-        rounds(enough=2)
+    with pytest.raises(InputError, match="expects no gains"):
+        rounds(probes=3, minimum_gain=0.1)  # an order that is drawn
+    with pytest.warns(
+        UserWarning, match="before its first probe: an insertion succeeds with a probability of 1"
+    ):
+        assert rounds(probes=3, success_probability=lambda belief: 1.0) == 0
+    with pytest.raises(InputError, match="at a success probability of 2"):
+        rounds(sufficient=2)
     asked_of: list[Belief] = []
 
     def surer(belief: Belief) -> float:
         asked_of.append(belief)
         return 1.0 if len(asked_of) == 2 else 0.5
 
-    assert rounds(probes=3, chance=surer, enough=0.9) == 1
+    assert rounds(probes=3, success_probability=surer, sufficient=0.9) == 1
     assert asked_of[0] is last.belief and asked_of[1] is not last.belief
     with pytest.warns(UserWarning, match="all candidates last longer than 0.5 s"):
         assert rounds(probes=3, seconds=0.5) == 0
-    with pytest.warns(UserWarning, match="is expected to tell .* nats, too few"):
+    with pytest.warns(UserWarning, match="has an expected utility of .* nats"):
         loop = probing_loop(
             model,
             look,
             BenchArm(scene),
             asked,
-            by_information(model.pose, hypotheses=4, seed=0),
+            by_linearised_gain(model.pose, outer_samples=4, seed=0),
             start=last,
-            least_gain=50.0,
+            minimum_gain=50.0,
         )
         assert not list(loop)
 
@@ -139,8 +141,8 @@ def test_what_the_world_measured_is_to_be_what_was_asked_for_and_to_fit() -> Non
         def __init__(self, change: Callable[[list[Any]], list[Any]]) -> None:
             self.change = change
 
-        def carry_out(self, candidate: Any) -> list[Any]:
-            return self.change(BenchArm(scene).carry_out(candidate))
+        def execute(self, candidate: Any) -> list[Any]:
+            return self.change(BenchArm(scene).execute(candidate))
 
     def millimetres(windows: list[Any]) -> list[Any]:
         scale = np.array([1e3, 1e3, 1e3, 1.0, 1.0, 1.0, 1.0])
@@ -149,33 +151,38 @@ def test_what_the_world_measured_is_to_be_what_was_asked_for_and_to_fit() -> Non
         return [dataclasses.replace(w, observation=t) for w, t in zip(windows, told, strict=True)]
 
     for says, change in (
-        ("asked for 'touch 1.*' and gave a measurement of 'camera_0'", lambda w: [look.measurements[0]]),
-        ("for 'touch 1.*' does not fit: .*millimetres", millimetres),
-        ("for 'touch 1.*' does not fit", lambda w: w[len(w) // 2 :]),
-        ("for 'touch 1.*' does not fit", lambda w: w[::-1]),
+        ("to execute 'touch 1.*' and gave a measurement of 'camera_0'", lambda w: [look.measurements[0]]),
+        ("of 'touch 1.*' does not fit: .*millimetres", millimetres),
+        ("of 'touch 1.*' does not fit", lambda w: w[len(w) // 2 :]),
+        ("of 'touch 1.*' does not fit", lambda w: w[::-1]),
     ):
         loop = probing_loop(
-            model, look, Twisted(change), lambda *now: [plan], lambda p, found, s: in_order(found), start=last
+            model,
+            look,
+            Twisted(change),
+            lambda *now: [plan],
+            lambda p, found, s: in_given_order(found),
+            start=last,
         )
         with pytest.raises(InputError, match=says) as caught:
             next(loop)
         assert_one_sentence(str(caught.value))
     for says, settings in (
         ("candidates_from is a list", {"candidates_from": [plan]}),
-        ("rank is a str", {"rank": "information"}),
-        ("rank gives a list", {"rank": lambda *now: []}),
+        ("rule is a str", {"rule": "information"}),
+        ("rule gives a list", {"rule": lambda *now: []}),
         ("yields no step", {"infer": lambda *now, **more: iter([])}),
     ):
         given = {
             "candidates_from": lambda *now: [plan],
-            "rank": lambda p, found, s: in_order(found),
+            "rule": lambda p, found, s: in_given_order(found),
         } | settings
         with pytest.raises(InputError, match=says) as caught:
             next(probing_loop(model, look, BenchArm(scene), start=last, **given))  # type: ignore[arg-type]
         assert_one_sentence(str(caught.value))
     for what in (scene, insertion_plan(last.belief, scene.part, scene.peg)):
         with pytest.raises(InputError, match=f"{type(what).__name__} is no known kind of action"):
-            BenchArm(scene).carry_out(what)  # type: ignore[arg-type]
+            BenchArm(scene).execute(what)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="asked to insert by a Plan"):
         BenchArm(scene).insert(plan)  # type: ignore[arg-type]
 
@@ -205,11 +212,11 @@ def test_a_probe_that_is_chosen_twice_gets_a_name_of_its_own_and_an_arm_goes_on(
     scene, look, _, _ = seen()
     plan = asked(seen()[2].belief, 0)[0]
     arm, recording = BenchArm(scene), look
-    first = arm.carry_out(named_apart(plan, recording))
+    first = arm.execute(named_apart(plan, recording))
     recording = dataclasses.replace(recording, measurements=[*recording.measurements, *first])
     again = named_apart(plan, recording)
     assert name_of(again) == f"{name_of(plan)} (2)"
-    second = arm.carry_out(again)
+    second = arm.execute(again)
     whole = scene.probe(plan)  # the first plan is felt as the scene alone has it
     for ours, theirs in zip(first, whole.measurements[2:], strict=True):
         assert np.array_equal(ours.observation.wrench, theirs.observation.wrench)
@@ -221,7 +228,7 @@ def test_a_probe_that_is_chosen_twice_gets_a_name_of_its_own_and_an_arm_goes_on(
     moved = named_apart(view, recording)
     assert isinstance(moved, View) and moved.camera.name == "camera_0 (2)"
     assert moved.camera.instrument == "camera_0"
-    image = arm.carry_out(moved)[0].observation.depth
+    image = arm.execute(moved)[0].observation.depth
     # The same camera looks from the same place once more: only its noise is new.
     before = look.measurements[0].observation.depth
     assert abs(np.nanmedian(image - before)) < 0.001 and not np.array_equal(image, before)
@@ -232,7 +239,7 @@ def test_a_view_may_be_chosen_and_is_taken_in() -> None:
 
     def views(belief: Belief, number: int) -> list[Candidate]:
         return list(
-            candidates(belief, scene.part, None, {"view": 1}, like=[View(scene.cameras[0])], seed=number)
+            plan_candidates(belief, scene.part, None, {"view": 1}, like=[View(scene.cameras[0])], seed=number)
         )
 
     (only,) = probing_loop(
@@ -240,7 +247,7 @@ def test_a_view_may_be_chosen_and_is_taken_in() -> None:
         look,
         BenchArm(scene),
         views,
-        lambda population, found, known: in_order(found),
+        lambda population, found, known: in_given_order(found),
         start=last,
         probes=1,
     )
@@ -253,27 +260,32 @@ def test_a_loop_without_candidates_or_world_says_so() -> None:
     scene, look, last, _ = seen()
 
     class Silent:
-        def carry_out(self, candidate: object) -> list[object]:
+        def execute(self, candidate: object) -> list[object]:
             return []
 
     class Junk:
-        def carry_out(self, candidate: object) -> list[object]:
+        def execute(self, candidate: object) -> list[object]:
             return [1]
 
     for says, world, source in (
         ("there are no candidates", BenchArm(scene), lambda belief, number: []),
-        ("measured nothing when it was asked for 'touch 1", Silent(), asked),
-        ("gave a int when it was asked for 'touch 1", Junk(), lambda *now: (c for c in asked(*now))),
+        ("gave no measurement of 'touch 1", Silent(), asked),
+        ("gave a int for 'touch 1", Junk(), lambda *now: (c for c in asked(*now))),
         ("candidates are given as a NoneType", BenchArm(scene), lambda belief, number: None),
         ("str is no known kind of action", BenchArm(scene), lambda belief, number: ["touch"]),
-        ("no peg to carry out 'touch 1", BenchArm(scene), asked),
+        ("no peg to execute 'touch 1", BenchArm(scene), asked),
         ("world is a int", 1, asked),
     ):
         known = dataclasses.replace(look, peg=None) if "no peg" in says else look
         with pytest.raises(InputError, match=says) as caught:
             list(
                 probing_loop(
-                    model, known, world, source, lambda population, found, known: in_order(found), start=last
+                    model,
+                    known,
+                    world,
+                    source,
+                    lambda population, found, known: in_given_order(found),
+                    start=last,
                 )
             )
         assert_one_sentence(str(caught.value))
@@ -288,8 +300,8 @@ def test_a_chance_that_is_none_is_refused(chance: object) -> None:
         BenchArm(scene),
         asked,
         start=last,
-        chance=lambda belief: chance,  # type: ignore[arg-type, return-value]
+        success_probability=lambda belief: chance,  # type: ignore[arg-type, return-value]
     )
-    with pytest.raises(InputError, match="the chance of an insertion is said to be") as caught:
+    with pytest.raises(InputError, match="the success probability of an insertion is") as caught:
         next(loop)
     assert_one_sentence(str(caught.value))

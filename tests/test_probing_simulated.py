@@ -23,13 +23,13 @@ from bcppl.errors import InferenceError, InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
 from bcppl.inference.design import (
-    Batched,
+    BatchedArguments,
     Ranking,
     expected_information_gain,
-    mode_entropy,
+    mixture_entropy,
 )
-from bcppl.inference.design.observations import simulated
-from bcppl.inference.design.weighing import weighed
+from bcppl.inference.design.likelihoods import log_likelihoods
+from bcppl.inference.design.observations import simulate_candidates
 from bcppl.inference.population import Population
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import Series, Trace, carried, extend, generate, simulate
@@ -104,7 +104,12 @@ def test_each_candidate_is_simulated_once_for_all_particles_whatever_the_hypothe
     for hypotheses in (None, 25, 100):
         Track.runs = []
         expected_information_gain(
-            population, CANDIDATES, lambda gain: ([*before, gain],), hypotheses=hypotheses, depth=2, seed=0
+            population,
+            CANDIDATES,
+            lambda gain: ([*before, gain],),
+            outer_samples=hypotheses,
+            horizon=2,
+            seed=0,
         )
         assert Track.runs == [40, 40, 40]
 
@@ -117,26 +122,26 @@ def test_a_batch_of_candidates_and_particles_is_simulated_at_once_and_tells_the_
 
     def rank(arguments: Any) -> Ranking:
         Track.runs = []
-        return expected_information_gain(population, CANDIDATES, arguments, hypotheses=30, seed=0)
+        return expected_information_gain(population, CANDIDATES, arguments, outer_samples=30, seed=0)
 
     apart = rank(one)
-    batched = rank(Batched(one, lambda gains: ([*before, torch.stack(gains)],)))
+    batched = rank(BatchedArguments(one, lambda gains: ([*before, torch.stack(gains)],)))
     assert Track.runs == [120]
-    parts = rank(Batched(one, lambda gains: ([*before, torch.stack(gains)],), at_once=2))
+    parts = rank(BatchedArguments(one, lambda gains: ([*before, torch.stack(gains)],), at_once=2))
     assert Track.runs == [80, 40]
     for other in (batched, parts):
         for k in range(3):
             assert torch.equal(other.of(k).gains, apart.of(k).gains), "the noise is the same too"
     with pytest.raises(InputError, match=r"candidate 0 adds the addresses .* make both arguments visit"):
-        rank(Batched(one, lambda gains: ([*before, torch.stack(gains), number(1.0)],)))
+        rank(BatchedArguments(one, lambda gains: ([*before, torch.stack(gains), number(1.0)],)))
 
 
 def test_what_is_weighed_is_what_inference_would_weigh() -> None:
     # Among the new sites one hangs on what another observes, and one lies in a plate.
     population, before = done()
-    one = next(simulated(population.trace, [number(2.0)], lambda g: ([*before, g],), (), 0))
-    values = one.drawn(torch.arange(40), 1)
-    found = weighed(one.trace, one.observed, values)
+    one = next(simulate_candidates(population.trace, [number(2.0)], lambda g: ([*before, g],), (), 0))
+    values = one.draw(torch.arange(40), 1)
+    found = log_likelihoods(one.trace, one.observed, values)
     for h in (0, 7, 39):
         _, expected = extend(
             population.trace, ([*before, number(2.0)],), {a: v[h] for a, v in values.items()}
@@ -159,11 +164,11 @@ def test_an_image_is_rendered_no_more_often_than_four_times() -> None:
     torch.manual_seed(0)
     mask = torch.rand(18, 24) < 0.6
     population = equal_weights(simulate(seen, (0, mask), 20))
-    one = next(simulated(population.trace, [1], lambda views: (views, mask), (), 0))
+    one = next(simulate_candidates(population.trace, [1], lambda views: (views, mask), (), 0))
     before = renderer.effort.items
-    values = one.drawn(torch.arange(20), 1)
+    values = one.draw(torch.arange(20), 1)
     values = {"depth_0": torch.where(torch.rand(20, 18, 24) < 0.1, torch.nan, values["depth_0"])}
-    found = weighed(one.trace, one.observed, values)
+    found = log_likelihoods(one.trace, one.observed, values)
     assert renderer.effort.items - before == 3 * 20
     for h in range(20):
         _, expected = extend(population.trace, (1, mask), {"depth_0": values["depth_0"][h]})
@@ -231,7 +236,7 @@ def test_a_site_that_hangs_on_another_is_weighed_so_also_by_what_each_particle_d
     torch.manual_seed(2)
     trace = simulate(twice, (), 6)
     drawn = {address: trace[address] for address in ("first", "second")}
-    found = weighed(trace, ("first", "second"), drawn)
+    found = log_likelihoods(trace, ("first", "second"), drawn)
     first, second = drawn["first"][:, None], drawn["second"][:, None]
     exact = dist.Normal(trace["x"], 0.5).log_prob(first)
     exact = exact + dist.Normal(trace["x"] - first, 0.2).log_prob(second)
@@ -260,21 +265,29 @@ def test_a_forecast_stands_in_for_sites_that_cannot_be_sampled() -> None:
     torch.manual_seed(0)
     population = equal_weights(simulate(unforeseen, (0,), 800))
 
-    def forecast(touch: int, trace: Trace) -> dict[str, Tensor]:
+    def predict(touch: int, trace: Trace) -> dict[str, Tensor]:
         return {"y_0": trace["x"][:, None] + 0.2 * torch.randn(len(trace), 2, dtype=torch.float64)}
 
     ranking = expected_information_gain(
-        population, [1], lambda touch: (touch,), mode_entropy("x"), forecast=forecast, hypotheses=150, seed=0
+        population,
+        [1],
+        lambda touch: (touch,),
+        mixture_entropy("x"),
+        predictive=predict,
+        outer_samples=150,
+        seed=0,
     )
     exact = 0.5 * math.log1p(2.0 * float(population["x"].var()) / 0.04)
     assert ranking.best.information_gain == pytest.approx(exact, abs=3.0 * ranking.best.standard_error + 0.02)
-    with pytest.raises(InputError, match="gives no 30 values at 'y_0'; give tensors by address"):
+    with pytest.raises(
+        InputError, match="gives for candidate 0 no 30 values at 'y_0'; give tensors by address"
+    ):
         expected_information_gain(
             population,
             [1],
             lambda touch: (touch,),
-            forecast=lambda touch, trace: {"y_0": number(0.0).expand(3)},
-            hypotheses=30,
+            predictive=lambda touch, trace: {"y_0": number(0.0).expand(3)},
+            outer_samples=30,
         )
 
 
@@ -291,15 +304,15 @@ def test_new_latent_values_are_not_observed() -> None:
         population,
         [0.01, 2.0],
         lambda spread: ([spread],),
-        mode_entropy("x"),
+        mixture_entropy("x"),
         latent=["bias_*"],
-        hypotheses=150,
+        outer_samples=150,
         seed=0,
     )
     for k, spread in enumerate((0.01, 2.0)):
         exact = 0.5 * math.log1p(float(population["x"].var()) / (0.09 + spread**2))
-        prospect = ranking.of(k)
-        assert prospect.information_gain == pytest.approx(exact, abs=3.0 * prospect.standard_error + 0.03)
+        utility = ranking.of(k)
+        assert utility.information_gain == pytest.approx(exact, abs=3.0 * utility.standard_error + 0.03)
 
 
 def test_a_series_is_run_on_by_a_step() -> None:
@@ -313,7 +326,12 @@ def test_a_series_is_run_on_by_a_step() -> None:
     torch.manual_seed(0)
     start, _ = generate(Series(init, step), (), {}, 300)
     ranking = expected_information_gain(
-        equal_weights(start), [5.0, 0.3], lambda noise: (noise,), mode_entropy("x"), hypotheses=40, seed=0
+        equal_weights(start),
+        [5.0, 0.3],
+        lambda noise: (noise,),
+        mixture_entropy("x"),
+        outer_samples=40,
+        seed=0,
     )
     assert ranking.best.candidate == 0.3
 
@@ -337,9 +355,9 @@ def test_hypotheses_whose_simulation_failed_are_left_out_and_counted() -> None:
     torch.manual_seed(0)
     population = equal_weights(simulate(fragile, (0,), 60))
     failed = int((population["x"] > 1.0).sum())
-    with pytest.warns(UserWarning, match=f"{failed} of 60 hypotheses are left out of what candidate 0"):
+    with pytest.warns(UserWarning, match=f"candidate 0 leaves out {failed} of 60 outer samples"):
         ranking = expected_information_gain(population, [1], lambda touch: (touch,), seed=0)
     assert int(torch.isnan(ranking.best.gains).sum()) == failed and ranking.best.information_gain > 0.5
     Fragile.limit = -10.0
-    with pytest.raises(InferenceError, match="simulated at 'y_0' has no log-probability at any"):
+    with pytest.raises(InferenceError, match="at 'y_0' have no log-probability at any"):
         expected_information_gain(population, [1], lambda touch: (touch,), seed=0)

@@ -21,7 +21,7 @@ from bcppl.figures import action_in_3d
 from bcppl.geometry.camera import looking_at
 from bcppl.geometry.extrusion import block
 from bcppl.geometry.guess import Guess
-from bcppl.inference.design.rules import by_information
+from bcppl.inference.design.rules import by_linearised_gain
 from bcppl.inference.filters import guided_smc, tempered_smc
 from bcppl.inference.planning import candidates
 from bcppl.models import look_and_touch
@@ -278,5 +278,5 @@ def test_a_new_kind_is_ranked_and_laid_out_beside_others(laser: Any) -> None:
     *_, last = guided_smc.infer(look_and_touch.model, recording, particles=40, seed=1)
     found = candidates(last.belief, recording.part, None, {"laser": 5, "view": 1}, seed=3)
     scene = look_and_touch.prepare(with_candidates(recording, found))
-    ranking = by_information("part", hypotheses=8, seed=0)(last.population, found, scene)
+    ranking = by_linearised_gain("part", outer_samples=8, seed=0)(last.population, found, scene)
     assert len(ranking) == 6 and all(each.information_gain > 0.0 for each in ranking)

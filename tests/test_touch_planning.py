@@ -17,11 +17,11 @@ from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, round_peg
 from bcppl.geometry.gap import PegGap
-from bcppl.inference.planning.faces import section, sides, spots_on_top
-from bcppl.inference.planning.metrology import Pace, three_two_one
+from bcppl.inference.planning.faces import points_on_top, section, sides
+from bcppl.inference.planning.metrology import MetrologyParameters, three_two_one
 from bcppl.models.parts import insert_peg, insert_tray
 from bcppl.models.worlds.bench import BenchScene, bench_scene
-from bcppl.models.worlds.guarded_motion import CarriedOut
+from bcppl.models.worlds.guarded_motion import Execution
 from bcppl.robot.plan import Plan
 from tests.made_recordings import assert_one_sentence
 
@@ -33,7 +33,7 @@ NAN = float("nan")
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.007, 0.005), (-0.008, 0.004)])
 def test_spots_and_the_ways_between_them_keep_their_margins(offset: tuple[float, float]) -> None:
     part, peg, margin = block_with_square_hole(hole=0.0105, offset=offset), round_peg(0.005, 0.08), 0.004
-    spots, lifted = spots_on_top(part, peg, margin)
+    spots, lifted = points_on_top(part, peg, margin)
     assert not lifted
     way = shapely.LineString(spots)
     hole = shapely.box(-0.00525, -0.00525, 0.00525, 0.00525)
@@ -47,7 +47,7 @@ def test_spots_and_the_ways_between_them_keep_their_margins(offset: tuple[float,
 
 def test_on_a_narrow_rim_the_peg_is_lifted_to_the_third_spot() -> None:
     part, peg = insert_tray("rectangular"), insert_peg("rectangular")
-    spots, lifted = spots_on_top(part, peg, 0.003)
+    spots, lifted = points_on_top(part, peg, 0.003)
     assert lifted
     assert 0.5 * abs(np.linalg.det(spots[1:] - spots[0])) > 80e-6  # slides alone reach 12 mm2
     belief = Belief(poses.identity(8), torch.full((8,), 0.125, dtype=torch.float64))
@@ -74,7 +74,7 @@ def test_sides_of_a_block_are_its_four_faces() -> None:
 
 def test_a_top_without_room_and_a_height_outside_are_refused() -> None:
     part = block((0.01, 0.01, 0.02))
-    for call in (lambda: spots_on_top(part, round_peg(0.012, 0.05), 0.004), lambda: section(part, 0.5)):
+    for call in (lambda: points_on_top(part, round_peg(0.012, 0.05), 0.004), lambda: section(part, 0.5)):
         with pytest.raises(InputError) as caught:
             call()
         assert_one_sentence(str(caught.value))
@@ -117,7 +117,7 @@ def plan_of(**changed: Any) -> Plan:
         ({"times": ["a", "b", "c"]}, "times that are no array of numbers"),
         ({"world_from_peg": [[0.0], [0.0, 1.0], []]}, "world_from_peg that are no array"),
         ({"times": np.array([0.0, 900.0, 2000.0])}, "lasts 2000 s: .* milliseconds"),
-        ({"world_from_peg": poses.identity(3).numpy() + 10.0 * np.eye(3, 7)}, "spans 10 m .* millimetres"),
+        ({"world_from_peg": poses.identity(3).numpy() + 10.0 * np.eye(3, 7)}, "spans 10 m.* millimetres"),
         ({"world_from_peg": poses.identity(3).numpy() + 506.0 * np.eye(1, 7)}, "to 506 m .* millimetres"),
     ],
 )
@@ -183,11 +183,11 @@ def about(scene: BenchScene, spread: float) -> Belief:
 
 
 @functools.cache
-def carried(seed: int) -> tuple[BenchScene, Plan, CarriedOut]:
+def carried(seed: int) -> tuple[BenchScene, Plan, Execution]:
     """A plan for a belief that is the truth, as the bench carries it out."""
     scene = bench_scene(seed)
     plan = three_two_one(about(scene, 0.0), scene.part, scene.peg)
-    return scene, plan, scene.carried_out(plan)[0]
+    return scene, plan, scene.executed(plan)[0]
 
 
 SEEDS = (5, 7, 11)  # a square and a D-shaped hole in blocks, a round tray
@@ -227,8 +227,8 @@ def test_no_free_motion_touches_the_part_and_every_guarded_one_does(seed: int) -
 def test_the_first_contact_is_near_3_s_and_the_plan_ends_at_6(seed: int) -> None:
     scene, plan, motion = carried(seed)
     _, truly = gaps(seed)
-    assert plan.times[-1] == pytest.approx(Pace().last) and plan.times[0] == 0.0
-    assert abs(motion.probe.stamps[np.argmax(truly < 0.0)] - Pace().first) < 0.1
+    assert plan.times[-1] == pytest.approx(MetrologyParameters().duration) and plan.times[0] == 0.0
+    assert abs(motion.probe.stamps[np.argmax(truly < 0.0)] - MetrologyParameters().first_contact) < 0.1
     assert truly.min() > -0.0003  # nothing is pressed farther in than steel would let it
     # It is felt on the top, on one side and on the next: three directions of the part's frame.
     turn = poses.rotation_matrix(torch.from_numpy(scene.truth)).numpy()
@@ -245,7 +245,10 @@ def test_strokes_are_as_long_as_the_belief_is_unsure() -> None:
         strokes = [k for k, manner in enumerate(plan.manners) if manner == "guarded"]
         ways = np.linalg.norm(np.diff(plan.world_from_peg[:, :3], axis=0)[strokes], axis=1)
         lengths.append((ways.min(), ways.max()))
-    shortest, longest = 2 * Pace().shortest, 2 * Pace().longest
+    shortest, longest = (
+        2 * MetrologyParameters().shortest_half_stroke,
+        2 * MetrologyParameters().longest_half_stroke,
+    )
     assert lengths[0] == pytest.approx((shortest, shortest))
     assert lengths[2] == pytest.approx((longest, longest))
     assert shortest < lengths[1][1] < longest

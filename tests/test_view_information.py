@@ -12,7 +12,7 @@ import torch
 from bcppl import poses
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.extrusion import block
-from bcppl.inference.design.rules import by_information
+from bcppl.inference.design.rules import by_linearised_gain
 from bcppl.inference.population import Population
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import bench_scene
@@ -95,7 +95,7 @@ def test_views_and_touches_stand_in_one_ranking() -> None:
     plan = _down(world)
     scene = model.prepare(with_candidates(recording, [View(blind)]))
     candidates = [plan, recording.measurements[0].action, View(blind)]
-    ranking = by_information("part", seed=0)(population, candidates, scene)
+    ranking = by_linearised_gain("part", seed=0)(population, candidates, scene)
     gain = [ranking.of(k).information_gain for k in range(3)]
     assert gain[0] > 2.0 and gain[1] > 1.0
     assert 0.0 <= gain[2] < gain[1]

@@ -14,21 +14,18 @@ from bcppl.arguments import number_within
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
-from bcppl.inference.planning.candidate_list import MIXED, candidates
-from bcppl.inference.planning.filters import (
-    Candidates,
-    Filter,
-    Mounted,
-    clear_of_part,
-    clear_of_table,
-    filtered,
-    from_within,
-    no_harder_than,
-    no_longer_than,
-    refuse_none,
+from bcppl.inference.planning.candidates import MIXED, plan_candidates
+from bcppl.inference.planning.constraints import Candidates, Constraint, feasible, require_candidates
+from bcppl.inference.planning.generators import MOTIONS, candidate_kinds
+from bcppl.inference.planning.motion_constraints import (
+    ArmWithPeg,
+    above_table,
+    approach_within,
+    collision_free,
+    duration_at_most,
+    force_at_most,
     within_reach,
 )
-from bcppl.inference.planning.kinds import SOURCES, kinds
 from bcppl.models.robots import load_robot
 from bcppl.recordings import Recording
 from bcppl.recordings.action_file import SUFFIXES, load_actions
@@ -39,7 +36,7 @@ MOST = 10_000  # of a kind: more fit no memory, and are ranked in hours
 NUMBERS = "x y z qw qx qy qz"
 ORIGIN = "0 0 0 1 0 0 0"
 
-# A user's own candidates, or how many of each kind are to be laid out.
+# A user's own candidates, or how many of each kind are to be planned.
 Asked = Sequence[Candidate] | Mapping[str, int]
 
 
@@ -53,7 +50,7 @@ def asked_for(words: str | None) -> Asked:
         return dict(MIXED)
     if Path(words).suffix in SUFFIXES or "/" in words:
         own = load_actions(words)
-        refuse_none(Candidates(tuple(own)))
+        require_candidates(Candidates(tuple(own)))
         names = [name_of(each) for each in own]
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
@@ -62,10 +59,10 @@ def asked_for(words: str | None) -> Asked:
     counts: dict[str, int] = {}
     for word in filter(None, (each.strip() for each in words.split(","))):
         kind, _, count = word.partition(":")
-        if kind not in kinds() or (count and not count.isdecimal()):
+        if kind not in candidate_kinds() or (count and not count.isdecimal()):
             raise InputError(
-                f"--candidates has {word!r}; give kinds ({', '.join(kinds())}), each with a number if you "
-                "like (touch:20,slide:12), or a file that ends in .h5 or .json."
+                f"--candidates has {word!r}; give kinds ({', '.join(candidate_kinds())}), each with a number "
+                "if you like (touch:20,slide:12), or a file that ends in .h5 or .json."
             )
         if len(count) > len(str(MOST)) or int(count or COUNT) > MOST:
             raise InputError(f"--candidates asks for {count[:20]} of {kind}; give {MOST} at most.")
@@ -85,7 +82,7 @@ def refuse_without_peg(asked: Asked, recording: Recording) -> None:
         InputError: there is none; names the candidate or its kind.
     """
     if isinstance(asked, Mapping):
-        needing = [kind for kind, count in asked.items() if count and kind in SOURCES]
+        needing = [kind for kind, count in asked.items() if count and kind in MOTIONS]
     else:
         needing = [name_of(each) for each in asked if planner_of(each).needs_peg]
     if needing and recording.peg is None:
@@ -95,21 +92,21 @@ def refuse_without_peg(asked: Asked, recording: Recording) -> None:
         )
 
 
-def filters(force: float | None, seconds: float | None, above: float | None) -> list[Filter]:
-    """The filters of candidates by force (N), duration (s) and angle from straight above (degrees)."""
-    chosen = [] if seconds is None else [no_longer_than(seconds)]
+def constraints(force: float | None, seconds: float | None, above: float | None) -> list[Constraint]:
+    """The constraints on candidates by force (N), duration (s) and angle from straight above (degrees)."""
+    chosen = [] if seconds is None else [duration_at_most(seconds)]
     if force is not None:
-        chosen.append(no_harder_than(force))
+        chosen.append(force_at_most(force))
     if above is not None:
-        removes = f"come from more than {above:g}° beside straight above"
-        chosen.append(from_within((0.0, 0.0, -1.0), math.radians(above), removes))
+        violation = f"approach at more than {above:g}° from straight above"
+        chosen.append(approach_within((0.0, 0.0, -1.0), math.radians(above), violation))
     return chosen
 
 
 def reach(
     robot: str | None, link: str | None, link_from_peg: str | None, world_from_base: str | None, seed: int
-) -> list[Filter]:
-    """The filter of candidates by the reach of an arm, where one is given.
+) -> list[Constraint]:
+    """The constraint on candidates by the reach of an arm, where one is given.
 
     Raises:
         InputError: an option is missing, superfluous or no pose, or there is no such arm.
@@ -132,7 +129,7 @@ def reach(
         _pose("--link-from-peg", link_from_peg),
         _pose("--world-from-base", world_from_base or ORIGIN),
     )
-    return [within_reach(Mounted(arm, link, held, base), seed=seed)]
+    return [within_reach(ArmWithPeg(arm, link, held, base), seed=seed)]
 
 
 def _pose(option: str, words: str) -> Any:
@@ -145,26 +142,28 @@ def _pose(option: str, words: str) -> Any:
     return poses.as_pose(numbers, option).numpy()
 
 
-def laid_out(
+def planned(
     asked: Asked,
     belief: Belief,
     recording: Recording,
-    filters: Sequence[Filter],
+    constraints: Sequence[Constraint],
     table: float | None,
     seed: int,
 ) -> Candidates:
-    """The candidates that pass the filters, a table's height (m) among them.
+    """The candidates that satisfy the constraints, a table's height (m) among them.
 
     Raises:
-        InputError: none is left.
+        InputError: none is feasible.
     """
     if table is not None:
         number_within("--table is {}", table)
         if recording.peg is not None:
-            filters = [clear_of_table(recording.peg, table), *filters]
+            constraints = [above_table(recording.peg, table), *constraints]
     if isinstance(asked, Mapping):
         like = [m.action for m in recording.measurements]
-        return candidates(belief, recording.part, recording.peg, asked, filters=filters, like=like, seed=seed)
+        return plan_candidates(
+            belief, recording.part, recording.peg, asked, constraints=constraints, like=like, seed=seed
+        )
     if recording.peg is not None and any(planner_of(each).needs_peg for each in asked):
-        filters = [clear_of_part(PegGap(recording.part, recording.peg), belief.mean), *filters]
-    return filtered(asked, filters)
+        constraints = [collision_free(PegGap(recording.part, recording.peg), belief.mean), *constraints]
+    return require_candidates(feasible(asked, constraints))

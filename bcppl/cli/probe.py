@@ -50,16 +50,16 @@ def probe(
     ] = None,
     particles: Annotated[int, typer.Option(min=2, help="How many particles; a belief has its own.")] = 75,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same ranking.")] = 0,
-    hypotheses: Annotated[
+    outer_samples: Annotated[
         int | None,
-        typer.Option(min=2, help="How many particles serve as the truth in turn; all by default."),
+        typer.Option(min=2, help="How many particles serve as the true value in turn; all by default."),
     ] = None,
     by: Annotated[
-        Literal["linearised", "reweighing"] | None,
-        typer.Option(help="How gains are predicted; linearised by default where the model's sensors can be."),
+        Literal["linearised", "reweighted"] | None,
+        typer.Option(help="How gains are estimated; linearised by default where the model's sensors can be."),
     ] = None,
     rate: Annotated[float, typer.Option(min=0.0, help="Nats that a second of the arm's time costs.")] = 0.0,
-    depth: Annotated[
+    horizon: Annotated[
         int, typer.Option(min=1, max=2, help="1, or 2: the best probe after it counts as well.")
     ] = 1,
     force: Annotated[float | None, typer.Option(help="N; plans that press harder are left out.")] = None,
@@ -91,15 +91,15 @@ def probe(
         str | None, typer.Option(help=f"Where the arm stands: {NUMBERS}; at the world's origin by default.")
     ] = None,
 ) -> None:
-    """Rank candidates for the next touch or view by their expected entropy reduction, in nats."""
+    """Rank candidates for the next touch or view by their expected information gain, in nats."""
     from rich.console import Console
     from rich.markup import escape
 
     from bcppl.cli import candidates as options
     from bcppl.cli.posterior import posterior
     from bcppl.figures import action_in_3d
-    from bcppl.inference.design.rules import by_information, by_reweighing, can_be_linearised
-    from bcppl.inference.planning.candidate_list import refuse_settled
+    from bcppl.inference.design.rules import by_linearised_gain, by_reweighted_gain, can_be_linearised
+    from bcppl.inference.planning.candidates import require_uncertain
     from bcppl.recordings.action_file import save_actions
     from bcppl.sensors import sensor_of
     from bcppl.sensors.candidates import duration_of, name_of, named_apart, planner_of, with_candidates
@@ -107,8 +107,8 @@ def probe(
     output = Path(f"{Path(recording).stem}_next.json") if output is None else output
     picture = _picture(output, [recording, *filter(None, (candidates, of, model, inference))])
     asked = options.asked_for(candidates)
-    filters = options.filters(force, seconds, above)
-    filters += options.reach(robot, link, link_from_peg, world_from_base, seed)
+    constraints = options.constraints(force, seconds, above)
+    constraints += options.reach(robot, link, link_from_peg, world_from_base, seed)
     console = Console(highlight=False)
     now = posterior(
         recording,
@@ -121,17 +121,24 @@ def probe(
         lambda whole: options.refuse_without_peg(asked, whole),
     )
     belief = now.population.belief(now.model.pose)
-    refuse_settled(belief)
-    listed = options.laid_out(asked, belief, now.recording, filters, table, seed)
+    require_uncertain(belief)
+    listed = options.planned(asked, belief, now.recording, constraints, table, seed)
     console.print(escape(str(listed)), soft_wrap=True)
     scene = now.model.prepare(with_candidates(now.recording, listed))
     linearised = can_be_linearised(scene, listed)
     if by == "linearised" and not linearised:
         raise InputError("--by linearised needs a model whose sensors can be linearised; leave it out.")
-    rule = by_information if linearised and by != "reweighing" else by_reweighing
-    rank = rule(now.model.pose, hypotheses=hypotheses, cost=duration_of, rate=rate, depth=depth, seed=seed)
+    kind = by_linearised_gain if linearised and by != "reweighted" else by_reweighted_gain
+    rule = kind(
+        now.model.pose,
+        outer_samples=outer_samples,
+        cost=duration_of,
+        rate=rate,
+        horizon=horizon,
+        seed=seed,
+    )
     with console.status("ranking"):
-        ranking = rank(now.population, listed, scene)
+        ranking = rule(now.population, listed, scene)
     console.width = max(console.width, 100)  # no number is cut, also where the output is no terminal
     console.print(_table(ranking, top))
     best = named_apart(ranking.best.candidate, now.recording)
@@ -166,7 +173,7 @@ def _table(ranking: Ranking, top: int) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
-    from bcppl.inference.planning.filters import pressing_force
+    from bcppl.inference.planning.motions import pressing_force
     from bcppl.sensors.candidates import duration_of, motion_of, name_of
 
     table = Table(

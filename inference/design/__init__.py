@@ -1,4 +1,4 @@
-"""Where to touch next: candidates ranked by their expected entropy reduction."""
+"""Bayesian experimental design: candidates for the next measurement, ranked by expected information gain."""
 
 from bcppl.exports import exported
 

@@ -1,171 +1,134 @@
-"""Where to touch next: the entropy that a candidate is expected to leave.
+"""Expected information gain by nested Monte Carlo over weighted particles.
 
-Algorithm 1 of BayesContact. Every candidate is simulated once for all particles. Then particles play the
-truth in turn: what a particle would observe is drawn from its own likelihood, sensor noise included, all are
-reweighed by it as inference would reweigh them, and the entropy of what results is averaged by the weights of
-those that played the truth.
+Algorithm 1 of BayesContact. Every candidate is simulated once at all particles. Then particles serve as the
+true value in turn (the outer samples): an observation is drawn from the particle's likelihood, sensor noise
+included, all particles are reweighted by it as in inference, and the entropy of the result is averaged by the
+weights of the outer samples.
 """
 
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from bcppl.arguments import LARGEST_SEED, seed_number, whole_number
-from bcppl.errors import InputError
+from bcppl.arguments import LARGEST_SEED, whole_number
 from bcppl.inference.design.entropies import Entropy, weight_entropy
-from bcppl.inference.design.hypotheses import chosen_hypotheses, mean_and_error
-from bcppl.inference.design.lookahead import Following, Step, entropies, following
+from bcppl.inference.design.look_ahead import (
+    EvaluatedCandidate,
+    SecondStep,
+    best_second_step,
+    posterior_entropies,
+)
 from bcppl.inference.design.observations import (
     Arguments,
-    Batched,
-    Forecast,
-    Forecasted,
-    Simulated,
-    forecasted,
+    BatchedArguments,
+    PredictedCandidate,
+    PredictiveSampler,
+    SimulatedCandidate,
     seeded,
-    simulated,
+    simulate_candidates,
 )
-from bcppl.inference.design.ranking import Price, Prospect, Ranking, costs_in_nats, ranked
+from bcppl.inference.design.outer_samples import draw_outer_samples, mean_and_error, warn_of_failures
+from bcppl.inference.design.ranking import Cost, Costs, Ranking, Utility, checked, rank
 from bcppl.inference.population import Population
 
 
 def expected_information_gain(
     population: Population,
     candidates: Iterable[Any],
-    extend_args: Arguments | Batched,
+    extend_args: Arguments | BatchedArguments,
     entropy: Entropy | None = None,
     *,
-    hypotheses: int | None = None,
+    outer_samples: int | None = None,
     latent: Collection[str] = (),
-    forecast: Forecast | None = None,
-    cost: Callable[[Any], Price] | Mapping[Any, Price] | None = None,
-    rate: Price = 1.0,
-    depth: int = 1,
+    predictive: PredictiveSampler | None = None,
+    cost: Costs | None = None,
+    rate: Cost = 1.0,
+    horizon: int = 1,
     shortlist: int = 8,
     seed: int | None = None,
 ) -> Ranking:
-    """Candidates ranked by how many nats each is expected to tell, less what it costs.
+    """Candidates ranked by expected information gain (the expected entropy reduction, nats) less cost.
 
         ranking = expected_information_gain(population, touches, lambda touch: (scene, [*done, touch]))
         ranking.best.candidate, ranking.best.information_gain, ranking.best.standard_error
 
-    All sites that a candidate's arguments add are what it would observe. Observations are drawn by the sites'
-    `sample` and weighed by their `log_prob`. The work is C candidates simulated for N particles, and C H N
-    log-probabilities for H hypotheses; fewer hypotheses make it cheaper, or a smaller population
-    (`population.selected(systematic(population.log_weights, n))`). All candidates have the same hypotheses
-    and the same seed of the noise, so that their differences are told more sharply than their gains
+    All sites that a candidate's arguments add are observations, drawn by the sites' `sample` and evaluated by
+    their `log_prob`. The work is C candidates simulated at N particles, and C S N log-probabilities for S
+    outer samples. Fewer outer samples make it cheaper, or a smaller population
+    (`population.selected(systematic(population.log_weights, n))`). All candidates share the outer samples and
+    the seed of the noise, so that differences of gains have smaller errors than gains
     (`Ranking.difference`).
 
-    With `depth=2` the best `shortlist` candidates are looked at again, and ranked before the others: each
-    gains what it tells and what the best candidate after it, chosen by what was observed, is expected to
-    tell, if that is worth its cost. Observations of two candidates are taken as independent given the
-    particle, so that nothing is simulated again: it suits parts that stay where they are. It costs another
-    C H N log-probabilities, and shortlist x H rankings of C candidates, each H entropies of N weights: keep H
-    small. Being the best of several estimates, what comes after is estimated a little too high.
+    With `horizon=2` the best `shortlist` candidates are evaluated again and ranked before the others: each
+    gain includes the expected gain of the best candidate after it, chosen by the first observation, if that
+    is worth its cost. Observations of two candidates are taken as independent given the particle, so that
+    nothing is simulated again; this suits parts that do not move. It takes another C S N log-probabilities,
+    and shortlist x S rankings of C candidates, each S entropies of N weights: keep S small. The second gain
+    is a maximum over estimates and so biased a little upwards.
 
     Args:
         population: weighted particles.
-        candidates: what may be done next; anything that `extend_args` understands.
-        extend_args: the program's arguments once a candidate is done as well, those of all measurements so
-            far included; for a `Series`, those of its next step. `Batched` simulates several at once. A
-            `Plan` is no action yet: `bcppl.sensors.candidates.action_of(plan)` is.
-        entropy: what is to fall: `weight_entropy()` (the default, the paper's), `mode_entropy(address)`,
-            `neighbour_entropy(address)`, `value_entropy(address)`, or what answers alike.
-        hypotheses: how many play the truth, drawn systematically by weight; None: every particle, once.
-        latent: new addresses that are not observed, with wildcards: each particle keeps what it drew there.
-        forecast: for programs whose likelihood weighs what was measured and cannot say what will be (its
-            sites have no `sample`): `forecast(candidate, trace)` gives what would be observed at the
-            particles of a trace, noise included, as (H, *event) by address, drawn from torch's generator.
-            Then only hypotheses are simulated; with `depth=2`, twice.
-        cost: of a candidate, in any unit: a function of it or a mapping, giving a number or several by name.
-        rate: nats that one unit of cost is worth; by name where costs are.
-        depth: 1, or 2 to look ahead.
-        shortlist: how many candidates are looked ahead from.
+        candidates: anything that `extend_args` understands.
+        extend_args: the program's arguments once a candidate is measured as well, those of all measurements
+            so far included; for a `Series`, those of its next step. `BatchedArguments` simulates several
+            candidates at once. A `Plan` is no action: `bcppl.sensors.candidates.action_of(plan)` is.
+        entropy: the entropy to be reduced: `weight_entropy()` (the default, the paper's),
+            `mixture_entropy(address)`, `neighbour_entropy(address)`, `discrete_entropy(address)`, or a
+            function of the same signature.
+        outer_samples: how many particles serve as the true value, drawn systematically by weight; None: every
+            particle, once.
+        latent: new addresses that are not observed, with wildcards: each particle keeps its draw there.
+        predictive: for programs whose sites have no `sample`: `predictive(candidate, trace)` draws
+            observations, noise included, at the particles of a trace from torch's generator, (S, *event) by
+            address. Then only outer samples are simulated; with `horizon=2`, twice.
+        cost: of a candidate, in any unit: a function of it or a mapping, with a number or several by name.
+        rate: nats for one unit of cost; by name where costs are.
+        horizon: 1, or 2 for two-step look-ahead.
+        shortlist: how many candidates are evaluated two steps ahead.
         seed: None draws it from torch's generator.
 
     Raises:
         InputError: there are no candidates; the population has no weight, or has collapsed to a point; a
             candidate adds nothing to observe; a cost, a rate or a setting is out of range.
-        InferenceError: nothing that was simulated for a candidate has a log-probability.
+        InferenceError: no simulated observation of a candidate has a log-probability.
     """
-    candidates = list(candidates)
-    if not candidates:
-        raise InputError("there are no candidates to choose from; give one action or more.")
-    depth = whole_number("probes are to be looked ahead by {} steps", depth, most=2)
     shortlist = whole_number("a shortlist of {} candidates was asked for", shortlist)
-    costs = costs_in_nats(candidates, cost, rate)
-    seed = int(torch.randint(LARGEST_SEED, ())) if seed is None else seed_number(seed)
+    candidates, costs, seed = checked(candidates, cost, rate, horizon, seed)
     with seeded(seed):
-        truths = chosen_hypotheses(population, hypotheses)
+        outer = draw_outer_samples(population, outer_samples)
         entropy_of = (weight_entropy() if entropy is None else entropy)(population)
         seeds = [int(each) for each in torch.randint(LARGEST_SEED, (3,))]
     now = float(entropy_of(torch.softmax(population.log_weights, 0)[None])[0])
 
-    steps: list[Step] = []
-    prospects: list[Prospect] = []
-    trace = population.trace
-    each: Iterator[Simulated | Forecasted] = (
-        simulated(trace, candidates, extend_args, latent, seeds[0])
-        if forecast is None
-        else forecasted(trace, candidates, extend_args, forecast, seeds[0])
-    )
-    for k, one in enumerate(each):
-        first = one.log_likelihoods(one.drawn(truths.particles, seeds[1]))
-        second = one.log_likelihoods(one.drawn(truths.particles, seeds[2])) if depth == 2 else None
-        after = entropies(population.log_weights, first, entropy_of)
-        warn_of_lost(k, torch.isnan(after))
-        steps.append(Step(first, second, after, costs[k]))
-        gain, error = mean_and_error(now - after, truths.weights)
-        prospects.append(
-            Prospect(
-                candidates[k],
-                k,
-                gain,
-                error,
-                now - gain,
-                costs[k],
-                1,
-                gains=now - after,
-                weights=truths.weights,
-            )
+    trace, evaluated, utilities = population.trace, list[EvaluatedCandidate](), list[Utility]()
+    predicted: Iterator[SimulatedCandidate | PredictedCandidate] = (
+        simulate_candidates(trace, candidates, extend_args, latent, seeds[0])
+        if predictive is None
+        else (
+            PredictedCandidate(trace, k, candidate, extend_args(candidate), predictive, seeds[0])
+            for k, candidate in enumerate(candidates)
         )
-    if depth == 2:
-        for ahead in ranked(prospects, now)[:shortlist]:
-            then = following(ahead.number, steps, population.log_weights, truths, entropy_of)
-            prospects[ahead.number] = _after_both(ahead, then)
-    return ranked(prospects, now)
+    )
+    for k, each in enumerate(predicted):
+        first = each.log_likelihoods(each.draw(outer.particles, seeds[1]))
+        second = each.log_likelihoods(each.draw(outer.particles, seeds[2])) if horizon == 2 else None
+        after = posterior_entropies(population.log_weights, first, entropy_of)
+        warn_of_failures(k, torch.isnan(after))
+        evaluated.append(EvaluatedCandidate(first, second, after, costs[k]))
+        utilities.append(Utility.of(candidates[k], k, now - after, outer, now, costs[k]))
+    if horizon == 2:
+        for best in rank(utilities, now)[:shortlist]:
+            then = best_second_step(best.number, evaluated, population.log_weights, outer, entropy_of)
+            utilities[best.number] = _after_both(best, then)
+    return rank(utilities, now)
 
 
-def _after_both(first: Prospect, then: Following) -> Prospect:
-    """A prospect that holds what the best second step is expected to tell, and its expected cost."""
-    gains = first.gains + then.gains
+def _after_both(first: Utility, second: SecondStep) -> Utility:
+    gains = first.gains + second.gains
     gain, error = mean_and_error(gains, first.weights)
-    paid, _ = mean_and_error(then.costs, first.weights)
-    return replace(
-        first,
-        information_gain=gain,
-        standard_error=math.hypot(error, then.standard_error),
-        entropy=first.entropy + first.information_gain - gain,
-        cost=first.cost + paid,
-        steps=2,
-        immediate=first.value,
-        gains=gains,
-        then=then.numbers,
-    )
-
-
-def warn_of_lost(number: int, lost: Tensor) -> None:
-    """Says how many hypotheses (H,) tell nothing of a candidate."""
-    if bool(lost.any()):
-        warnings.warn(
-            f"{int(lost.sum())} of {len(lost)} hypotheses are left out of what candidate {number} is "
-            "expected to tell: their simulation failed, or no particle can explain what it gave.",
-            stacklevel=3,
-        )
+    cost, _ = mean_and_error(second.costs, first.weights)
+    return first.with_second_step(gains, gain, math.hypot(error, second.standard_error), cost, second.numbers)

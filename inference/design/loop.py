@@ -1,11 +1,11 @@
-"""The loop: look where to touch, touch there, take in what was felt, until it is enough; then insert.
+"""Sequential design: plan candidates, rank them, execute the best, assimilate the measurement, and repeat.
 
-In short, with any robot or world that carries out plans:
+In short, with any robot or world that executes plans:
 
     arm = BenchArm(scene)
     *_, last = guided_smc.infer(model, scene.look())
-    asked = lambda belief, number: candidates(belief, scene.part, scene.peg, seed=number)
-    for each in probing_loop(model, scene.look(), arm, asked, start=last, probes=3):
+    planned = lambda belief, number: plan_candidates(belief, scene.part, scene.peg, seed=number)
+    for each in probing_loop(model, scene.look(), arm, planned, start=last, probes=3):
         print(each.chosen.name, each.ranking.best.information_gain)
         last = each.step
     print(arm.insert(insertion_plan(last.belief, scene.part, scene.peg)))
@@ -23,16 +23,12 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.inference.design.ranking import Ranking
-from bcppl.inference.design.rules import Rank, by_information
+from bcppl.inference.design.rules import AcquisitionRule, by_linearised_gain
 from bcppl.inference.filters import guided_smc
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.planning.candidate_list import refuse_settled
-from bcppl.inference.planning.filters import (
-    Candidates,
-    no_longer_than,
-    refuse_none,
-    sifted,
-)
+from bcppl.inference.planning.candidates import require_uncertain
+from bcppl.inference.planning.constraints import Candidates, feasible, require_candidates
+from bcppl.inference.planning.motion_constraints import duration_at_most
 from bcppl.recordings.check import problems
 from bcppl.sensors import Measurement, Recording
 from bcppl.sensors.candidates import (
@@ -50,10 +46,10 @@ CandidatesFrom = Callable[[Belief, int], Sequence[Candidate]]
 
 
 class World(Protocol):
-    """What plays the robot: a simulation such as `bcppl.models.worlds.bench_arm.BenchArm`, or a real one."""
+    """A robot, or a simulation of one such as `bcppl.models.worlds.bench_arm.BenchArm`."""
 
-    def carry_out(self, candidate: Candidate) -> Sequence[Measurement]:
-        """Do what is asked, and say what was measured.
+    def execute(self, candidate: Candidate) -> Sequence[Measurement]:
+        """Execute a candidate and return its measurements.
 
         The windows of one probe with the plan's name, or an image of the view's camera.
         """
@@ -61,17 +57,17 @@ class World(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """One probe of the loop.
+    """One round of the loop.
 
     Attributes:
         number: from 0.
-        candidates: among which was chosen.
+        candidates: that were ranked.
         ranking: of them.
-        chosen: what was carried out, under a name that nothing before it has.
-        recording: all that was measured so far.
-        before: the last step before it.
-        step: the last step after it.
-        chance: of an insertion after it; NaN where it was not asked for.
+        chosen: the candidate that was executed, under a name that no measurement before it has.
+        recording: all measurements so far.
+        before: the inference step before its measurements.
+        step: the inference step after them.
+        success_probability: of an insertion after it; NaN where it was not asked for.
     """
 
     number: int
@@ -81,7 +77,7 @@ class Round:
     recording: Recording
     before: Step
     step: Step
-    chance: float = math.nan
+    success_probability: float = math.nan
 
 
 def probing_loop(
@@ -89,7 +85,7 @@ def probing_loop(
     recording: Recording,
     world: World,
     candidates_from: CandidatesFrom,
-    rank: Rank | None = None,
+    rule: AcquisitionRule | None = None,
     *,
     infer: Callable[..., Iterator[Step]] = guided_smc.infer,
     particles: int = 75,
@@ -97,87 +93,93 @@ def probing_loop(
     start: Step | None = None,
     probes: int = 3,
     seconds: float | None = None,
-    least_gain: float | None = None,
-    chance: Callable[[Belief], float] | None = None,
-    enough: float = 0.95,
+    minimum_gain: float | None = None,
+    success_probability: Callable[[Belief], float] | None = None,
+    sufficient: float = 0.95,
 ) -> Iterator[Round]:
-    """Choose, carry out, take in: yields after each probe.
+    """Yields a round after each probe: candidates, the chosen one, its measurements and the posterior.
 
-    What was taken in is not computed again: inference goes on from the last step. Where it is over before the
-    first probe a warning says why.
+    Inference continues from the last step; nothing that was assimilated is computed again. Where the loop
+    ends before the first probe, a warning gives the reason.
 
     Args:
-        model: what explains the recording; its program's arguments are its scene and the actions.
-        recording: what was measured before the first probe.
-        world: carries out what is chosen.
-        candidates_from: what may be done next, for a belief and the round's number.
-        rank: puts candidates in order; None: `by_information` of the model's pose.
-        infer: takes measurements in, from a step on, such as `bcppl.inference.filters.guided_smc.infer`.
-        particles: how many, where there is no `start`.
-        seed: of inference, where there is no `start`.
-        start: a step that has taken in some or all of the recording.
-        probes: at most so many.
-        seconds: that all plans together last at most; those that last longer than what is left are not
-            ranked, and where none is left it is over.
-        least_gain: nats; where the best candidate is expected to tell less, less its cost, it is over.
-        chance: of an insertion under a belief, such as `chance_of_success(...).success`; asked before the
-            first probe and after each. Of few particles it errs by more than `enough` leaves: take its
-            `error` off.
-        enough: it is over once that chance reaches so much.
+        model: its program's arguments are its scene and the actions.
+        recording: the measurements before the first probe.
+        world: executes the chosen candidates.
+        candidates_from: candidates for a belief and the round's number.
+        rule: ranks candidates; None: `by_linearised_gain` of the model's pose.
+        infer: assimilates measurements, such as `bcppl.inference.filters.guided_smc.infer`.
+        particles: how many, without `start`.
+        seed: of inference, without `start`.
+        start: a step that has assimilated some or all of the recording.
+        probes: the largest number of rounds.
+        seconds: the largest duration of all plans together; plans that last longer than the time left are
+            not ranked, and the loop ends where none is left.
+        minimum_gain: nats; the loop ends where the best utility is smaller.
+        success_probability: of an insertion under a belief, such as
+            `bcppl.inference.planning.success.success_probability(...).success`; computed before the first
+            probe and after each. Its error with few particles is larger than `1 - sufficient`: subtract its
+            `standard_error`.
+        sufficient: the success probability at which the loop ends.
 
     Raises:
-        InputError: there are no candidates, or what is given as one is none, or a plan needs a peg that the
+        InputError: there are no candidates, or one is of no known type, or a plan needs a peg that the
             recording lacks; the belief has no weight or has collapsed to a point; a number is out of range;
-            the world cannot carry out anything, or measured nothing, something else than was asked for or
-            what does not fit the recording; inference took nothing in; a chance is no number from 0 to 1;
-            `least_gain` is given with a rule that foretells no gains.
+            the world cannot execute, or gives no measurements, those of something else, or some that do not
+            fit the recording; inference yields no step; a success probability is no number from 0 to 1;
+            `minimum_gain` is given with a rule without expected gains.
     """
-    whole_number("the loop is to make {} probes at most", probes)
-    number_within("an insertion is tried from a chance of {} on", enough, least=0.0, most=1.0)
+    whole_number("the loop is to make at most {} probes", probes)
+    number_within("the loop is to end at a success probability of {}", sufficient, least=0.0, most=1.0)
     left = math.inf if seconds is None else number_within("the loop is given {} s", seconds, least=0.0)
-    if least_gain is not None:
-        number_within("the loop ends below a gain of {}", least_gain)
-    if not callable(getattr(world, "carry_out", None)):
+    if minimum_gain is not None:
+        number_within("the loop is to end below a gain of {}", minimum_gain)
+    if not callable(getattr(world, "execute", None)):
         raise InputError(
-            f"the loop's world is a {type(world).__name__}, which cannot carry out anything; give one with "
-            "`carry_out(candidate)`, such as bcppl.models.worlds.bench_arm.BenchArm."
+            f"the loop's world is a {type(world).__name__}, which cannot execute candidates; give one with "
+            "`execute(candidate)`, such as bcppl.models.worlds.bench_arm.BenchArm."
         )
-    rank = by_information(model.pose) if rank is None else rank
-    for what, given in (("candidates_from", candidates_from), ("rank", rank), ("infer", infer)):
+    rule = by_linearised_gain(model.pose) if rule is None else rule
+    for what, given in (("candidates_from", candidates_from), ("rule", rule), ("infer", infer)):
         if not callable(given):
             raise InputError(f"the loop's {what} is a {type(given).__name__}; give a function.")
+
+    def success(belief: Belief) -> float:
+        if success_probability is None:
+            return math.nan
+        what = "the success probability of an insertion is {}"
+        return number_within(what, success_probability(belief), least=0.0, most=1.0)
+
     scene = model.prepare(recording)
     step = _last(infer(model, recording, particles=particles, seed=seed, scene=scene, start=start), start)
-    if chance is not None and (likely := _likely(chance, step.belief)) >= enough:
-        _nothing_done(f"an insertion succeeds with a chance of {likely:.3g} as it is")
+    if (probability := success(step.belief)) >= sufficient:
+        _ends_at_once(f"an insertion succeeds with a probability of {probability:.3g} as it is")
         return
     for number in range(probes):
-        refuse_settled(step.belief)
-        found = _listed(candidates_from(step.belief, number), recording)
+        require_uncertain(step.belief)
+        candidates = _checked_candidates(candidates_from(step.belief, number), recording)
         if math.isfinite(left):
-            found = sifted(found, [no_longer_than(left)])
-            if not found:
+            candidates = feasible(candidates, [duration_at_most(left)])
+            if not candidates:
                 if number == 0:
-                    _nothing_done(f"all candidates last longer than {left:.3g} s")
+                    _ends_at_once(f"all candidates last longer than {left:.3g} s")
                 return
-        scene = model.prepare(with_candidates(recording, found))
-        ranking = _ranked(rank(step.population, found, scene), least_gain is not None)
-        if least_gain is not None and ranking.best.value < least_gain:
+        scene = model.prepare(with_candidates(recording, candidates))
+        ranking = _checked_ranking(rule(step.population, candidates, scene), minimum_gain is not None)
+        if minimum_gain is not None and ranking.best.value < minimum_gain:
             if number == 0:
-                _nothing_done(
-                    f"the best candidate is expected to tell {ranking.best.value:.3g} nats, too few"
-                )
+                _ends_at_once(f"the best candidate has an expected utility of {ranking.best.value:.3g} nats")
             return
         chosen = named_apart(ranking.best.candidate, recording)
-        measured = _measured(world.carry_out(chosen), chosen)
+        measurements = _checked_measurements(world.execute(chosen), chosen)
         left = max(0.0, left - duration_of(chosen))
-        recording = _going_on(recording, measured, chosen)
+        recording = _extended(recording, measurements, chosen)
         scene, before = model.prepare(recording), step
         count = len(before.population)
         step = _last(infer(model, recording, particles=count, seed=seed, scene=scene, start=before), None)
-        likely = math.nan if chance is None else _likely(chance, step.belief)
-        yield Round(number, found, ranking, chosen, recording, before, step, likely)
-        if likely >= enough:
+        probability = success(step.belief)
+        yield Round(number, candidates, ranking, chosen, recording, before, step, probability)
+        if probability >= sufficient:
             return
 
 
@@ -185,74 +187,65 @@ def _last(steps: Iterator[Step], before: Step | None) -> Step:
     for each in steps:
         before = each
     if before is None:
-        raise InputError(
-            "the loop's inference yields no step, so that nothing was taken in; give one that yields a step "
-            "for each measurement."
-        )
+        raise InputError("the loop's inference yields no step; give one that yields a step per measurement.")
     return before
 
 
-def _nothing_done(why: str) -> None:
-    warnings.warn(f"the loop is over before its first probe: {why}.", stacklevel=3)
+def _ends_at_once(reason: str) -> None:
+    warnings.warn(f"the loop ends before its first probe: {reason}.", stacklevel=3)
 
 
-def _ranked(ranking: object, foretold: bool) -> Ranking:
+def _checked_ranking(ranking: object, needs_gains: bool) -> Ranking:
     if not isinstance(ranking, Ranking) or not len(ranking):
         raise InputError(
-            f"the loop's rank gives a {type(ranking).__name__} that ranks nothing; give a function that "
-            "returns a Ranking of the candidates, such as by_information(pose)."
+            f"the loop's rule gives a {type(ranking).__name__} that ranks nothing; give a function that "
+            "returns a Ranking of the candidates, such as by_linearised_gain(pose)."
         )
-    if foretold and math.isnan(ranking.best.value):
+    if needs_gains and math.isnan(ranking.best.value):
         raise InputError(
-            "the loop is to end below a least_gain, and its rank foretells no gains; leave least_gain out, "
-            "or rank by information."
+            "the loop is to end below a minimum_gain, and its rule expects no gains; leave minimum_gain out, "
+            "or rank by information gain."
         )
     return ranking
 
 
-def _likely(chance: Callable[[Belief], float], belief: Belief) -> float:
-    return number_within("the chance of an insertion is said to be {}", chance(belief), least=0.0, most=1.0)
-
-
-def _listed(found: object, recording: Recording) -> Sequence[Candidate]:
-    """Candidates that may be indexed and gone through as often as is needed."""
-    if not isinstance(found, Iterable) or isinstance(found, str):
-        raise InputError(f"candidates are given as a {type(found).__name__}; give a list of plans and views.")
-    listed = found if isinstance(found, Candidates) else tuple(found)
-    for each in listed:
+def _checked_candidates(given: object, recording: Recording) -> Candidates:
+    if not isinstance(given, Iterable) or isinstance(given, str):
+        raise InputError(f"candidates are given as a {type(given).__name__}; give a list of plans and views.")
+    candidates = given if isinstance(given, Candidates) else Candidates(tuple(given))
+    for each in candidates:
         if planner_of(each).needs_peg and recording.peg is None:
             raise InputError(
-                f"there is no peg to carry out {name_of(each)!r} with; add the peg to the recording, or "
+                f"there is no peg to execute {name_of(each)!r} with; add the peg to the recording, or "
                 "ask for views."
             )
-    refuse_none(Candidates(tuple(listed)))
-    return listed
+    return require_candidates(candidates)
 
 
-def _measured(given: object, chosen: Candidate) -> list[Measurement]:
-    measured: list[Any] = list(given) if isinstance(given, Iterable) else [given]
-    if given is None or not measured:
-        raise InputError(f"the world measured nothing when it was asked for {name_of(chosen)!r}.")
-    for each in measured:
+def _checked_measurements(given: object, chosen: Candidate) -> list[Measurement]:
+    measurements: list[Any] = list(given) if isinstance(given, Iterable) else [given]
+    if given is None or not measurements:
+        raise InputError(f"the world gave no measurement of {name_of(chosen)!r}.")
+    for each in measurements:
         if not isinstance(each, Measurement):
             raise InputError(
-                f"the world gave a {type(each).__name__} when it was asked for {name_of(chosen)!r}; give "
-                "measurements, each an action and what was observed."
+                f"the world gave a {type(each).__name__} for {name_of(chosen)!r}; give measurements, each an "
+                "action and an observation."
             )
         name = name_of(each.action)
         if name != name_of(chosen):
             raise InputError(
-                f"the world was asked for {name_of(chosen)!r} and gave a measurement of {name!r}; give the "
+                f"the world was to execute {name_of(chosen)!r} and gave a measurement of {name!r}; give the "
                 "windows of a probe with the plan's name, or an image of the view's camera."
             )
-    return measured
+    return measurements
 
 
-def _going_on(recording: Recording, measured: Sequence[Measurement], chosen: Candidate) -> Recording:
-    """The recording with what was measured, which must leave it as sound as it was."""
-    longer = replace(recording, measurements=[*recording.measurements, *measured])
-    found = set(problems(recording))
+def _extended(recording: Recording, measurements: Sequence[Measurement], chosen: Candidate) -> Recording:
+    """The recording with measurements, which must not add problems."""
+    longer = replace(recording, measurements=[*recording.measurements, *measurements])
+    known = set(problems(recording))
     for problem in problems(longer):
-        if problem not in found:
-            raise InputError(f"what the world measured for {name_of(chosen)!r} does not fit: {problem}")
+        if problem not in known:
+            raise InputError(f"the world's measurement of {name_of(chosen)!r} does not fit: {problem}")
     return longer

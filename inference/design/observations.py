@@ -1,9 +1,11 @@
-"""What a robot would see and feel: simulated once, drawn with noise, weighed at all particles.
+"""Simulated observations of candidates at outer samples, and their likelihoods at all particles.
 
-Three steps, written with the verbs: a population's trace is extended by a candidate's arguments, its new
-sites free (the simulator runs, once for each particle); they are drawn anew at the hypotheses; and what
-was drawn is weighed at every particle. Where simulators are carried by the trace or held by a lazy site, none
-of them runs a second time.
+Three steps, written with the verbs. A population's trace is extended by a candidate's arguments with its new
+sites latent: the simulator runs once for each particle. The new sites are redrawn at the outer samples. Their
+values are evaluated at every particle. Simulators that the trace carries or a lazy site holds run only once.
+
+Where the sites have no `sample`, a sampler of the predictive distribution takes the place of the first two
+steps.
 """
 
 from __future__ import annotations
@@ -19,16 +21,18 @@ from torch import Tensor
 
 from bcppl.arguments import whole_number
 from bcppl.errors import InferenceError, InputError
-from bcppl.inference.design.weighing import refuse_all_lost, weighed
+from bcppl.inference.design.likelihoods import log_likelihoods, mark_failures
 from bcppl.traces import Trace, extend, regenerate
 
 Arguments = Callable[[Any], tuple[Any, ...]]
-# What hypotheses would observe, (H, *event) by address.
-Values = Mapping[str, Tensor]
+# Observations at outer samples, (S, *event) by address.
+Observations = Mapping[str, Tensor]
+# Draws a candidate's observations from their predictive distribution at the particles of a trace.
+PredictiveSampler = Callable[[Any, Trace], Observations]
 
 
 @dataclass(frozen=True)
-class Batched:
+class BatchedArguments:
     """Arguments for a program that takes an action for each particle: candidates x particles in one batch.
 
     Attributes:
@@ -55,8 +59,8 @@ class Batched:
 
 
 @dataclass(frozen=True, eq=False)
-class Simulated:
-    """A candidate as all particles would feel it.
+class SimulatedCandidate:
+    """A candidate, simulated at all particles.
 
     Attributes:
         trace: of N particles, extended by the candidate; its new sites are latent.
@@ -66,47 +70,51 @@ class Simulated:
     trace: Trace
     observed: list[str]
 
-    def drawn(self, hypotheses: Tensor, seed: int) -> Values:
-        """What would be observed if particles (H,) were the truth, with sensor noise."""
+    def draw(self, particles: Tensor, seed: int) -> Observations:
+        """Observations, with sensor noise, if particles (S,) were the true value."""
         trace = self.trace
-        if not torch.equal(hypotheses, torch.arange(trace.particles)):
-            trace = trace.chosen(hypotheses)
+        if not torch.equal(particles, torch.arange(trace.particles)):
+            trace = trace.chosen(particles)
         with seeded(seed):
             trace = regenerate(trace, self.observed).trace
         return {address: trace[address] for address in self.observed}
 
-    def log_likelihoods(self, values: Values) -> Tensor:
-        """Log-probability (H, N) of every observation at every particle.
+    def log_likelihoods(self, values: Observations) -> Tensor:
+        """Log-likelihood (S, N) of every observation at every particle.
 
-        A row is NaN where the observation has no probability anywhere: the simulation of that hypothesis
+        A row is NaN where the observation has no probability anywhere: the simulation of that outer sample
         failed, or no particle can explain it.
 
         Raises:
             InferenceError: a log-probability is +inf, or all rows are NaN.
         """
-        return refuse_all_lost(self.observed, weighed(self.trace, self.observed, values))
+        return mark_failures(self.observed, log_likelihoods(self.trace, self.observed, values))
 
 
-def simulated(
-    trace: Trace, candidates: Sequence[Any], arguments: Arguments, latent: Collection[str], seed: int
-) -> Iterator[Simulated]:
-    """Every candidate, simulated once for all particles; the noise has the same seed for each.
+def simulate_candidates(
+    trace: Trace,
+    candidates: Sequence[Any],
+    arguments: Arguments | BatchedArguments,
+    latent: Collection[str],
+    seed: int,
+) -> Iterator[SimulatedCandidate]:
+    """Every candidate, simulated once at all particles; the noise has the same seed for each.
 
     Args:
         trace: of N particles.
-        candidates: what may be done next.
-        arguments: the program's arguments after a candidate, or `Batched`.
+        candidates: those to choose from.
+        arguments: the program's arguments after a candidate, or `BatchedArguments`.
         latent: new addresses that would not be observed, with wildcards ("bias_*").
         seed: of new latent values.
 
     Raises:
         InputError: a candidate adds nothing to observe, or a batch visits other addresses than a candidate.
     """
-    if not isinstance(arguments, Batched):
+    if not isinstance(arguments, BatchedArguments):
         for k, candidate in enumerate(candidates):
             with seeded(seed):
                 longer, _ = extend(trace, arguments(candidate), {})
-            yield Simulated(longer, _observed(k, longer, trace, latent))
+            yield SimulatedCandidate(longer, observed_addresses(k, longer, trace, latent))
         return
     for first in range(0, len(candidates), arguments.at_once):
         together = candidates[first : first + arguments.at_once]
@@ -124,10 +132,15 @@ def simulated(
                     f"a batch of candidates {', '.join(sorted(added)) or 'none'}; "
                     "make both arguments visit the same."
                 )
-            yield Simulated(own, _observed(first + k, own, trace, latent))
+            yield SimulatedCandidate(own, observed_addresses(first + k, own, trace, latent))
 
 
-def _observed(number: int, longer: Trace, trace: Trace, latent: Collection[str]) -> list[str]:
+def observed_addresses(number: int, longer: Trace, trace: Trace, latent: Collection[str] = ()) -> list[str]:
+    """The addresses that a candidate adds to a trace, without those that are latent.
+
+    Raises:
+        InputError: there are none.
+    """
     added = longer.since(trace)
     observed = [
         a for a in added if a in longer.choices and not any(fnmatchcase(a, pattern) for pattern in latent)
@@ -142,25 +155,22 @@ def _observed(number: int, longer: Trace, trace: Trace, latent: Collection[str])
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Draws within start from a seed, and leave the generator as it was."""
+    """Draws within start from a seed; the generator's state is restored afterwards."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         yield
 
 
-Forecast = Callable[[Any, Trace], Values]
-
-
 @dataclass(frozen=True, eq=False)
-class Forecasted:
-    """A candidate of which a forecast says what it would give; sites are asked for log-probabilities alone.
+class PredictedCandidate:
+    """A candidate whose observations come from a predictive sampler; its sites need only `log_prob`.
 
     Attributes:
-        trace: of the N particles as they are.
+        trace: of the N particles, not extended.
         number: of the candidate.
-        candidate: what may be done.
-        args: the program's arguments once it is done.
-        forecast: what it would give at the particles of a trace.
+        candidate: as it was given.
+        args: the program's arguments once it is measured.
+        predictive: the sampler.
         seed: of new latent values.
     """
 
@@ -168,50 +178,42 @@ class Forecasted:
     number: int
     candidate: Any
     args: tuple[Any, ...]
-    forecast: Forecast
+    predictive: PredictiveSampler
     seed: int
 
-    def drawn(self, hypotheses: Tensor, seed: int) -> Values:
-        """What would be observed if particles (H,) were the truth.
+    def draw(self, particles: Tensor, seed: int) -> Observations:
+        """Observations if particles (S,) were the true value.
 
         Raises:
-            InputError: the forecast is empty, or not one value for each of these particles.
+            InputError: the sampler gives nothing, or not one value for each of these particles.
         """
         with seeded(seed):
-            values = self.forecast(self.candidate, self.trace.chosen(hypotheses))
-        wrong = [a for a, v in values.items() if not isinstance(v, Tensor) or len(v) != len(hypotheses)]
+            values = self.predictive(self.candidate, self.trace.chosen(particles))
+        wrong = [a for a, v in values.items() if not isinstance(v, Tensor) or len(v) != len(particles)]
         if wrong or not values:
             raise InputError(
-                f"the forecast for candidate {self.number} gives "
-                f"{f'no {len(hypotheses)} values at {wrong[0]!r}' if wrong else 'nothing'}; "
+                f"the predictive sampler gives for candidate {self.number} "
+                f"{f'no {len(particles)} values at {wrong[0]!r}' if wrong else 'nothing'}; "
                 "give tensors by address, one value for each particle of the trace that it is given."
             )
         return values
 
-    def log_likelihoods(self, values: Values) -> Tensor:
-        """Log-probability (H, N) of every observation at every particle, as `extend` weighs it.
+    def log_likelihoods(self, values: Observations) -> Tensor:
+        """Log-likelihood (S, N) of every observation at every particle, as `extend` evaluates it.
 
         Raises:
             InputError: the program does not visit an address, or a value has the wrong shape.
-            InferenceError: no row could be weighed.
+            InferenceError: no row could be evaluated.
         """
         rows, failure = [], None
-        for h in range(len(next(iter(values.values())))):
+        for k in range(len(next(iter(values.values())))):
             try:
                 with seeded(self.seed):
-                    _, row = extend(self.trace, self.args, {a: v[h] for a, v in values.items()})
+                    _, row = extend(self.trace, self.args, {a: v[k] for a, v in values.items()})
             except InferenceError as error:
                 row, failure = torch.full((self.trace.particles,), torch.nan, dtype=torch.float64), error
             rows.append(row)
-        found = torch.stack(rows)
-        if failure is not None and bool(torch.isnan(found).all()):
+        total = torch.stack(rows)
+        if failure is not None and bool(torch.isnan(total).all()):
             raise failure
-        return refuse_all_lost(values, found)
-
-
-def forecasted(
-    trace: Trace, candidates: Sequence[Any], arguments: Arguments, forecast: Forecast, seed: int
-) -> Iterator[Forecasted]:
-    """Every candidate, with a forecast of what it would give."""
-    for k, candidate in enumerate(candidates):
-        yield Forecasted(trace, k, candidate, arguments(candidate), forecast, seed)
+        return mark_failures(values, total)

@@ -1,42 +1,45 @@
-"""What candidates are expected to tell, put in order."""
+"""The expected utility of candidates, and their ranking by it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from bcppl.arguments import number_within
+from bcppl.arguments import LARGEST_SEED, number_within, seed_number, whole_number
 from bcppl.errors import InputError
-from bcppl.inference.design.hypotheses import mean_and_error
+from bcppl.inference.design.outer_samples import OuterSamples, mean_and_error
 
-Price = float | Mapping[str, float]
+Cost = float | Mapping[str, float]
+# The cost of a candidate in any unit: a function of it or a mapping, with a number or several by name.
+Costs = Callable[[Any], Cost] | Mapping[Any, Cost]
 
-_ALIKE = 6  # decimals of a nat, beyond which is rounding
+_ALIKE = 6  # decimals of a nat; differences beyond are rounding
 
 
 @dataclass(frozen=True, eq=False)
-class Prospect:
-    """What one candidate is expected to tell.
+class Utility:
+    """The expected utility of a candidate: its expected information gain less its cost, nats.
 
     Attributes:
-        candidate: as it was given.
-        number: its place in the list that was given, from 0.
-        information_gain: nats by which the entropy is expected to fall.
-        standard_error: of that, over the hypotheses.
-        entropy: expected afterwards, nats.
-        cost: of the candidate, in nats, and what a second step is expected to cost.
-        steps: how many steps it is looked ahead, this one included.
-        gains: (H,) the gain under every hypothesis, NaN where it could not be simulated. The k-th is the same
-            truth with the same noise for every candidate.
-        weights: (H,) of the hypotheses.
-        immediate: nats that it tells by itself less its own cost; of candidates that are worth the same it
-            comes first that has more of it. NaN where nothing was looked ahead: `value` says it.
-        then: (H,) int64 the number of the best candidate after this one, under every hypothesis; -1 where
-            none is worth its cost. None where nothing was looked ahead.
+        candidate: the candidate.
+        number: its place in the list of candidates, from 0.
+        information_gain: the expected reduction of the entropy, nats.
+        standard_error: of the gain, over the outer samples.
+        entropy: expected after the measurement, nats.
+        cost: nats; with a horizon of 2 the expected cost of the second step is included.
+        horizon: the number of steps that are planned, this one included.
+        gains: (S,) the gain under each outer sample, NaN where its simulation failed. The k-th one is the
+            same true value with the same noise for every candidate.
+        weights: (S,) of the outer samples.
+        myopic: with a horizon of 2, the utility of the candidate alone; of candidates of equal utility the
+            one with the larger myopic utility ranks first. NaN with a horizon of 1.
+        second: (S,) int64 the number of the best candidate for the second step under each outer sample, -1
+            where none is worth its cost; None with a horizon of 1.
     """
 
     candidate: Any
@@ -45,93 +48,129 @@ class Prospect:
     standard_error: float
     entropy: float
     cost: float
-    steps: int
+    horizon: int
     gains: Tensor = field(repr=False)
     weights: Tensor = field(repr=False)
-    then: Tensor | None = field(default=None, repr=False)
-    immediate: float = math.nan
+    second: Tensor | None = field(default=None, repr=False)
+    myopic: float = math.nan
+
+    @classmethod
+    def of(
+        cls, candidate: Any, number: int, gains: Tensor, outer: OuterSamples, entropy: float, cost: float
+    ) -> Utility:
+        """That of one step, given the gains (S,) under outer samples and the present entropy."""
+        gain, error = mean_and_error(gains, outer.weights)
+        return cls(candidate, number, gain, error, entropy - gain, cost, 1, gains, outer.weights)
+
+    def with_second_step(
+        self, gains: Tensor, gain: float, error: float, cost: float, second: Tensor
+    ) -> Utility:
+        """That of two steps, given the gains (S,) of both, their mean and error, and the second's cost."""
+        return replace(
+            self,
+            information_gain=gain,
+            standard_error=error,
+            entropy=self.entropy + self.information_gain - gain,
+            cost=self.cost + cost,
+            horizon=2,
+            gains=gains,
+            second=second,
+            myopic=self.value,
+        )
 
     @property
     def value(self) -> float:
-        """Information less cost, nats: what candidates are ranked by."""
+        """Information gain less cost, nats."""
         return self.information_gain - self.cost
 
 
 @dataclass(frozen=True, eq=False)
-class Ranking(Sequence[Prospect]):
-    """Candidates, the best first: by value, those that were looked ahead farthest before the others.
+class Ranking(Sequence[Utility]):
+    """Candidates by their expected utility, the best first; those with the longer horizon precede the others.
 
     Attributes:
-        prospects: in that order.
+        utilities: in that order.
         entropy: of the population now, nats.
     """
 
-    prospects: tuple[Prospect, ...]
+    utilities: tuple[Utility, ...]
     entropy: float
 
     @property
-    def best(self) -> Prospect:
+    def best(self) -> Utility:
         """The first."""
-        return self.prospects[0]
+        return self.utilities[0]
 
     def __len__(self) -> int:
-        return len(self.prospects)
+        return len(self.utilities)
 
     def __getitem__(self, index: Any) -> Any:
-        return self.prospects[index]
+        return self.utilities[index]
 
-    def of(self, number: int) -> Prospect:
-        """What is expected of the candidate that was given at a place, from 0."""
-        return next(each for each in self.prospects if each.number == number)
+    def of(self, number: int) -> Utility:
+        """The utility of the candidate at a place in the list of candidates, from 0."""
+        return next(each for each in self.utilities if each.number == number)
 
-    def difference(self, first: Prospect, second: Prospect) -> tuple[float, float]:
-        """By how many nats the gain of one exceeds that of another, and the standard error of that.
+    def difference(self, first: Utility, second: Utility) -> tuple[float, float]:
+        """The difference of two information gains, nats, and its standard error.
 
-        The hypotheses and the noise's seed are the same for both, so it is smaller than the two errors
-        together. It counts one step of look-ahead's error only. (nan, inf) where no hypothesis told of both.
+        The outer samples and the seed of the noise are the same for both, so the error is smaller than those
+        of the two gains together. It is the error of one step alone. (nan, inf) where no outer sample is
+        valid for both.
         """
         return mean_and_error(first.gains - second.gains, first.weights)
 
     def __str__(self) -> str:
         rows = [f"entropy now {self.entropy:.3f} nats", "number   gain (nats)    error     cost    value"]
         rows += [
-            f"{p.number:6d} {p.information_gain:13.3f} {p.standard_error:8.3f} {p.cost:8.3f} {p.value:8.3f}"
-            f"  {_named(p.candidate)}".rstrip()
-            for p in self.prospects
+            f"{u.number:6d} {u.information_gain:13.3f} {u.standard_error:8.3f} {u.cost:8.3f} {u.value:8.3f}"
+            f"  {_name(u.candidate)}".rstrip()
+            for u in self.utilities
         ]
         return "\n".join(rows)
 
 
-def _named(candidate: Any) -> str:
+def _name(candidate: Any) -> str:
     """A candidate's name, or its camera's; empty where it has none."""
     return str(getattr(getattr(candidate, "camera", candidate), "name", ""))
 
 
-def ranked(prospects: Sequence[Prospect], entropy: float) -> Ranking:
-    """Prospects in order; of equal ones those first that tell more at once, then as they were given.
+def rank(utilities: Sequence[Utility], entropy: float) -> Ranking:
+    """Utilities in order; of equal ones those first with the larger myopic utility, then as they were given.
 
-    Two touches tell as much in either order, and the rest of a plan may never be carried out.
+    Two touches are equally informative in either order, and the second may never be executed.
     """
 
-    def place(one: Prospect) -> tuple[float, ...]:
-        at_once = one.value if math.isnan(one.immediate) else one.immediate
-        return -one.steps, -round(one.value, _ALIKE), -at_once, one.number
+    def key(one: Utility) -> tuple[float, ...]:
+        myopic = one.value if math.isnan(one.myopic) else one.myopic
+        return -one.horizon, -round(one.value, _ALIKE), -myopic, one.number
 
-    return Ranking(tuple(sorted(prospects, key=place)), entropy)
+    return Ranking(tuple(sorted(utilities, key=key)), entropy)
 
 
-def costs_in_nats(
-    candidates: Sequence[Any],
-    cost: Callable[[Any], Price] | Mapping[Any, Price] | None,
-    rate: Price,
-) -> list[float]:
-    """The cost of every candidate in nats.
+def checked(
+    candidates: Iterable[Any], cost: Costs | None, rate: Cost, horizon: int, seed: int | None
+) -> tuple[list[Any], list[float], int]:
+    """The candidates, the cost of each in nats, and the seed; None draws one from torch's generator.
+
+    Raises:
+        InputError: there are no candidates, or a cost, a rate, the horizon or the seed is out of range.
+    """
+    candidates = list(candidates)
+    if not candidates:
+        raise InputError("there are no candidates to choose from; give one action or more.")
+    whole_number("a horizon of {} steps was asked for", horizon, most=2)
+    costs = costs_in_nats(candidates, cost, rate)
+    return candidates, costs, int(torch.randint(LARGEST_SEED, ())) if seed is None else seed_number(seed)
+
+
+def costs_in_nats(candidates: Sequence[Any], cost: Costs | None, rate: Cost) -> list[float]:
+    """The cost of each candidate in nats.
 
     Args:
-        candidates: what may be done next.
-        cost: of a candidate, as a function or by candidate: a number, or several by name ({"time": 2.0,
-            "force": 5.0}). None: all are free.
-        rate: nats for one unit of it; by name where costs are.
+        candidates: those to choose from.
+        cost: of a candidate: a number, or several by name ({"time": 2.0, "force": 5.0}). None: all are free.
+        rate: nats for one unit of cost; by name where costs are.
 
     Raises:
         InputError: a candidate has no cost, a cost has no rate or a rate no cost, or one of them is no finite
@@ -143,30 +182,29 @@ def costs_in_nats(
         )
     if not (cost is None or callable(cost) or isinstance(cost, Mapping)):
         raise InputError(
-            f"the cost is a {type(cost).__name__}; give a function of a candidate, or what maps candidates "
-            "to costs."
+            f"the cost is a {type(cost).__name__}; give a function of a candidate, or a mapping from "
+            "candidates to costs."
         )
     return [0.0 if cost is None else _cost(k, one, cost, rate) for k, one in enumerate(candidates)]
 
 
-def _cost(number: int, candidate: Any, cost: Any, rate: Price) -> float:
-    if isinstance(cost, Mapping):
-        try:
-            price = cost[candidate]
-        except (KeyError, TypeError):
-            raise InputError(
-                f"candidate {number} has no cost in what maps candidates to costs; "
-                "add it, or give a function of the candidate."
-            ) from None
-    else:
-        price = cost(candidate)
+def _cost(number: int, candidate: Any, cost: Any, rate: Cost) -> float:
+    try:
+        price = cost[candidate] if isinstance(cost, Mapping) else cost(candidate)
+    except (KeyError, TypeError):
+        if not isinstance(cost, Mapping):
+            raise
+        raise InputError(
+            f"candidate {number} has no cost in the mapping from candidates to costs; "
+            "add it, or give a function of the candidate."
+        ) from None
     if not isinstance(price, Mapping):
         if isinstance(rate, Mapping):
             raise InputError(
                 f"candidate {number} costs a single number and the rates are {', '.join(rate)}; "
                 "give one rate in nats per unit, or costs by these names."
             )
-        return _number(number, price) * _rate("the cost", rate)
+        price, rate = {"": price}, {"": rate}
     total = 0.0
     for name, amount in price.items():
         if not isinstance(rate, Mapping) or name not in rate:
@@ -174,13 +212,8 @@ def _cost(number: int, candidate: Any, cost: Any, rate: Price) -> float:
                 f"candidate {number} costs {name!r}, which has no rate; "
                 f'give nats per unit for each, rate={{"{name}": ...}}.'
             )
-        total += _number(number, amount) * _rate(f"{name!r}", rate[name])
+        what = repr(name) if name else "the cost"
+        total += number_within(f"candidate {number} costs {{}}", amount) * number_within(
+            f"the rate of {what} is {{}} nats per unit", rate[name], least=0.0
+        )
     return total
-
-
-def _number(number: int, price: Any) -> float:
-    return number_within(f"candidate {number} costs {{}}", price)
-
-
-def _rate(name: str, rate: Any) -> float:
-    return number_within(f"the rate of {name} is {{}} nats per unit", rate, least=0.0)

@@ -1,4 +1,4 @@
-"""Planning: touches, slides, searches and insertions that an arm can carry out."""
+"""Motion planning of touches, searches and insertions around a belief over the part's pose."""
 
 from bcppl.exports import exported
 

@@ -1,22 +1,35 @@
-from bcppl.inference.planning.candidate_list import candidates as candidates
-from bcppl.inference.planning.chance import chance_of_success as chance_of_success
-from bcppl.inference.planning.filters import (
+from bcppl.inference.planning.candidates import plan_candidates as plan_candidates
+from bcppl.inference.planning.constraints import (
     Candidates as Candidates,
-    Filter as Filter,
-    Mounted as Mounted,
-    clear_of_part as clear_of_part,
-    clear_of_table as clear_of_table,
-    from_within as from_within,
-    meeting as meeting,
-    no_harder_than as no_harder_than,
-    no_longer_than as no_longer_than,
+    Constraint as Constraint,
+    feasible as feasible,
+)
+from bcppl.inference.planning.insertion import (
+    InsertionParameters as InsertionParameters,
+    insertion_plan as insertion_plan,
+)
+from bcppl.inference.planning.metrology import (
+    MetrologyParameters as MetrologyParameters,
+    three_two_one as three_two_one,
+)
+from bcppl.inference.planning.motion_constraints import (
+    ArmWithPeg as ArmWithPeg,
+    above_table as above_table,
+    approach_within as approach_within,
+    collision_free as collision_free,
+    contact_at_mid_stroke as contact_at_mid_stroke,
+    duration_at_most as duration_at_most,
+    force_at_most as force_at_most,
     not_from_below as not_from_below,
     within_reach as within_reach,
 )
-from bcppl.inference.planning.insertion import Attempt as Attempt, insertion_plan as insertion_plan
-from bcppl.inference.planning.metrology import Pace as Pace, three_two_one as three_two_one
+from bcppl.inference.planning.success import (
+    SuccessProbability as SuccessProbability,
+    success_probability as success_probability,
+)
 from bcppl.inference.planning.touching import (
-    Touching as Touching,
+    SurfacePoint as SurfacePoint,
+    TouchParameters as TouchParameters,
     pair as pair,
     slide as slide,
     touch as touch,

@@ -1,4 +1,4 @@
-"""Where a part can be touched from above and from its sides, from its mesh."""
+"""The faces of a part that can be touched from above and from its sides, from its mesh."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ Array = npt.NDArray[np.float64]
 
 _BELOW = 0.0002  # m below the top at which its outline is taken
 _HOLE = 0.002  # m
-_TRIES = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the margin that is asked for
+_TRIES = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the margin that was asked for
 _CANDIDATES = 60
-_WORTH_A_LIFT = 2.0  # times as large must the triangle be that a lift makes possible
+_WORTH_A_LIFT = 2.0  # a lift is worth it for a triangle so many times as large
 
 
 class Side(NamedTuple):
@@ -41,15 +41,15 @@ class Side(NamedTuple):
         return float(np.linalg.norm(self.stop - self.start))
 
 
-class Spots(NamedTuple):
-    """Where a top is touched, in the part's x-y plane.
+class TopPoints(NamedTuple):
+    """Points of contact on a top, in the part's x-y plane.
 
     Attributes:
-        places: (3, 2) metres; a peg can slide from the first to the second.
-        lifted: whether the peg must be lifted from the second to the third; else it can slide there too.
+        positions: (3, 2) metres; a peg can slide from the first to the second.
+        lifted: whether the peg must be lifted from the second to the third; otherwise it can slide.
     """
 
-    places: Array
+    positions: Array
     lifted: bool
 
 
@@ -65,17 +65,17 @@ def section(part: Part, height: float) -> shapely.Polygon:
             f"part {part.name!r} has no cross section at z = {height:g} m; give a height within it."
         )
     planar, to_3d = path.to_2D(normal=[0.0, 0.0, 1.0])
-    found = [translate(p, to_3d[0, 3], to_3d[1, 3]) for p in planar.polygons_full]
-    pieces = [p for each in found for p in polygons_of(each)]
+    polygons = [translate(p, to_3d[0, 3], to_3d[1, 3]) for p in planar.polygons_full]
+    pieces = [p for each in polygons for p in polygons_of(each)]
     return shapely.simplify(max(pieces, key=lambda p: p.area), 1e-5)
 
 
-def spots_on_top(part: Part, peg: Part, margin: float) -> Spots:
-    """Three spots on a part's top, far apart, between which a peg can slide on it, in that order.
+def points_on_top(part: Part, peg: Part, margin: float) -> TopPoints:
+    """Three points on a part's top, far apart, between which a peg can slide on it, in that order.
 
     The peg's whole cross section stays on the top, `margin` metres from its outer edge where there is room
-    for so much, and 2 mm from holes. Of all such triples of candidates, the one whose triangle is largest;
-    where slides lead nowhere, as on a narrow rim, the peg is lifted to the third.
+    for that, and 2 mm from holes. Of all such triples of candidates, the one with the largest triangle; where
+    slides cannot lead far, as on a narrow rim, the peg is lifted to the third.
 
     Raises:
         InputError: the top has no room for the peg.
@@ -100,7 +100,7 @@ def spots_on_top(part: Part, peg: Part, margin: float) -> Spots:
     candidates = _boundary_points(room)
     reachable = _straight_ways(room, candidates)
     from_middle = candidates[None] - candidates[:, None]
-    sizes = np.abs(  # (M, M, M): twice the area, by the second spot, the first and the third
+    sizes = np.abs(  # (M, M, M): twice the area, by the second point, the first and the third
         from_middle[:, :, None, 0] * from_middle[:, None, :, 1]
         - from_middle[:, :, None, 1] * from_middle[:, None, :, 0]
     )
@@ -109,20 +109,20 @@ def spots_on_top(part: Part, peg: Part, margin: float) -> Spots:
         for ways in (reachable[:, :, None] & reachable[:, None, :], reachable[:, :, None])
     )
     worth = bool(lifted.max() > _WORTH_A_LIFT * slid.max())
-    found = lifted if worth else slid
-    second, first, third = np.unravel_index(int(found.argmax()), found.shape)
-    return Spots(candidates[[first, second, third]], worth)
+    areas = lifted if worth else slid
+    second, first, third = np.unravel_index(int(areas.argmax()), areas.shape)
+    return TopPoints(candidates[[first, second, third]], worth)
 
 
 def sides(part: Part, height: float) -> list[Side]:
     """The upright faces that a part's cross section at a height z has on its outside, the longest first."""
     ring = shapely.geometry.polygon.orient(section(part, height).convex_hull).exterior
     corners = np.asarray(shapely.simplify(ring, 1e-4).coords)
-    found = []
+    faces = []
     for start, stop in pairwise(corners):
         along = (stop - start) / np.linalg.norm(stop - start)
-        found.append(Side(start, stop, np.array([along[1], -along[0]])))
-    return sorted(found, key=lambda side: -side.length)
+        faces.append(Side(start, stop, np.array([along[1], -along[0]])))
+    return sorted(faces, key=lambda side: -side.length)
 
 
 def _spread(room: shapely.Geometry) -> float:
@@ -133,7 +133,7 @@ def _spread(room: shapely.Geometry) -> float:
 
 
 def _boundary_points(room: shapely.Geometry) -> Array:
-    """Points (M, 2) along the outer boundaries: three points far apart lie there."""
+    """Points (M, 2) along the outer boundaries, where the vertices of the largest triangle lie."""
     pieces = [shapely.Polygon(piece.exterior) for piece in polygons_of(room)]
     whole = sum(piece.length for piece in pieces)
     points = []
@@ -147,6 +147,7 @@ def _boundary_points(room: shapely.Geometry) -> Array:
 
 
 def _straight_ways(room: shapely.Geometry, points: Array) -> npt.NDArray[np.bool_]:
+    """Whether (M, M) the straight way between two points stays within the room."""
     count = len(points)
     i, j = np.meshgrid(np.arange(count), np.arange(count), indexing="ij")
     ways = shapely.linestrings(np.stack([points[i.ravel()], points[j.ravel()]], axis=1))

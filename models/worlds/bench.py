@@ -26,7 +26,7 @@ from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
 from bcppl.models.worlds.bench_parts import PARTS, BenchPart, bench_part
 from bcppl.models.worlds.bench_sensors import SensorErrors
-from bcppl.models.worlds.guarded_motion import CarriedOut, carry_out, stamps_of
+from bcppl.models.worlds.guarded_motion import Execution, execute, stamps_of
 from bcppl.models.worlds.inserting import InsertionResult, insert, samples_of
 from bcppl.models.worlds.occlusion import occluder
 from bcppl.rendering.depth_noise import DepthNoise
@@ -169,7 +169,7 @@ class BenchScene:
 
     def felt(self, plan: Plan, sensors: SensorErrors | None = None) -> list[Measurement]:
         """The windows of a plan carried out; with the sensors' next errors, or those of their first use."""
-        carried, wrench, world_from_peg = self.carried_out(plan, sensors)
+        carried, wrench, world_from_peg = self.executed(plan, sensors)
         probe, step = carried.probe, max(1, round(self.bench.window * plan.rate))
         windows = []
         for first in range(0, len(probe.stamps), step):
@@ -178,10 +178,10 @@ class BenchScene:
             windows.append(Measurement(ProbeWindow(probe, rows.start, rows.stop), touch))
         return windows
 
-    def carried_out(self, plan: Plan, sensors: SensorErrors | None = None) -> tuple[CarriedOut, Array, Array]:
+    def executed(self, plan: Plan, sensors: SensorErrors | None = None) -> tuple[Execution, Array, Array]:
         """A plan as it was truly carried out, and the wrench (T, 6) and peg poses (T, 7) measured then."""
         error, wobble = (sensors or self.sensors()).drawn(len(stamps_of(plan)), plan.rate)
-        carried = carry_out(plan, self.part, self.peg, self.contact, self.truth, error)
+        carried = execute(plan, self.part, self.peg, self.contact, self.truth, error)
         there = torch.from_numpy(carried.world_from_peg)
         return carried, carried.wrench + error, poses.retract(there, torch.from_numpy(wobble)).numpy()
 

@@ -47,7 +47,7 @@ class BenchArm:
             off = poses.local(torch.from_numpy(camera.world_from_camera), torch.from_numpy(stands))
             self._off[camera.instrument] = off.numpy(), float(bias)
 
-    def carry_out(self, candidate: Candidate) -> list[Measurement]:
+    def execute(self, candidate: Candidate) -> list[Measurement]:
         """What is measured: the windows of a plan, on a clock that goes on, or an image.
 
         Raises:

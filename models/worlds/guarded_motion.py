@@ -29,7 +29,7 @@ FELT = 2  # samples in a row: an impact, over within one, is no press
 
 
 @dataclass(frozen=True, eq=False)
-class CarriedOut:
+class Execution:
     """A plan as it was carried out.
 
     Attributes:
@@ -99,7 +99,7 @@ def command_of(plan: Plan, stops: Mapping[int, float]) -> Probe:
     return Probe(plan.name, fine, mean, plan.stiffness, plan.damping, stamps_of(plan))
 
 
-def carry_out(
+def execute(
     plan: Plan,
     part: Part,
     peg: Part,
@@ -108,9 +108,9 @@ def carry_out(
     error: Array,
     *,
     until_found: bool = False,
-    following: CarriedOut | None = None,
+    following: Execution | None = None,
     zero: Array | None = None,
-) -> CarriedOut:
+) -> Execution:
     """Simulate an arm that carries out a plan.
 
     From 10 to 40 mm/s a motion guarded at 4 N ended at 3.0 to 5.9 N (it goes on for up to 60 ms and the
@@ -172,7 +172,7 @@ def carry_out(
             stepper = Stepper(model, probe, contact.time_step)
     rows = rows[:done]
     probe = replace(probe, stamps=stamps[:done])
-    return CarriedOut(probe, stops, rows[:, WRENCH].copy(), rows[:, POSE].copy(), met, state)
+    return Execution(probe, stops, rows[:, WRENCH].copy(), rows[:, POSE].copy(), met, state)
 
 
 def _sunk(probe: Probe, world_from_peg: Array, time: float, met: Array | None) -> float:

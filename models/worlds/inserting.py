@@ -11,7 +11,7 @@ import torch
 from bcppl import poses
 from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.geometry.parts import Part
-from bcppl.models.worlds.guarded_motion import TARE, carry_out, stamps_of
+from bcppl.models.worlds.guarded_motion import TARE, execute, stamps_of
 from bcppl.robot.insertion_plan import InsertionPlan
 
 Array = npt.NDArray[np.float64]
@@ -65,11 +65,11 @@ def insert(
         error: (T, 6) what the sensor adds to the wrench, N and N m; T as `samples_of` the plan.
         wobble: (T, 6) what the measured pose of the peg is off by, m and radians, in the peg's axes.
     """
-    search = carry_out(plan.search, part, peg, contact, world_from_part, error, until_found=True)
+    search = execute(plan.search, part, peg, contact, world_from_part, error, until_found=True)
     done = len(search.wrench)
     zero = (search.wrench[:TARE, :3] + error[:TARE, :3]).mean(axis=0)
     seen = poses.retract(torch.from_numpy(search.world_from_peg[-1]), torch.from_numpy(wobble[done - 1]))
-    push = carry_out(
+    push = execute(
         plan.push_from(seen.numpy(), _below(search.met, seen)),
         part,
         peg,

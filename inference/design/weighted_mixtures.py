@@ -1,4 +1,4 @@
-"""Gaussian mixtures fitted to many reweighings of the same points, and their entropies."""
+"""Gaussian mixtures fitted to the same points under many sets of weights, and their entropies."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from torch import Tensor
 from bcppl.beliefs import effective_sample_size
 from bcppl.errors import InputError
 
-# Of an even share of the weight: particles below it link no modes and are left out. Together they have less
-# than a thousandth.
+# Of an even share of the weight: lighter particles link no modes and are left out. Together they have less
+# than a thousandth of the weight.
 NEGLIGIBLE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Mixtures:
-    """Distinct points and what links them.
+class WeightedMixtures:
+    """Distinct points, and which of them are neighbours.
 
     Attributes:
         coordinates: (K, d) of each point about the mean of its mode in the belief.
-        log_base: (K,) log of the base measure's density there.
-        floor: (d, d) the covariance that a single particle stands for.
+        log_base: (K,) log-density of the base measure there.
+        floor: (d, d) the covariance of a mode that consists of a single particle.
         linked: (K, K) float32, 1 where two points are neighbours; None where all are.
     """
 
@@ -33,7 +33,7 @@ class Mixtures:
     linked: Tensor | None
 
     @classmethod
-    def fitted(
+    def fit(
         cls,
         address: str,
         coordinates: Tensor,
@@ -41,8 +41,8 @@ class Mixtures:
         weights: Tensor,
         label: Tensor,
         linked: Tensor | None,
-    ) -> Mixtures:
-        """The mixtures of points whose belief has weights (K,), and whose modes are labelled (K,) from 0.
+    ) -> WeightedMixtures:
+        """Of points whose belief has weights (K,) and modes that are labelled (K,) from 0.
 
         Raises:
             InputError: the points do not span the axes within the modes.
@@ -54,14 +54,14 @@ class Mixtures:
         mean = mean.index_add_(0, label, weights[:, None] * coordinates) / mass[:, None]
         coordinates = coordinates - mean[label]
         within = (weights[:, None] * coordinates).T @ coordinates
-        spanning_factor(address, within)
+        cholesky_factor(address, within)
         floor = within * effective_sample_size(weights.log()) ** (-2.0 / dimension)
         if linked is None or bool(linked.all()):
             return cls(coordinates, log_base, floor, None)
         return cls(coordinates, log_base, floor, linked.to(torch.float32))
 
     def entropy(self, weights: Tensor) -> Tensor:
-        """Entropies (M,) in nats against the base measure, under weights (M, K).
+        """Entropies (M,) in nats with respect to the base measure, under weights (M, K).
 
         The entropy of the masses plus the mean entropy of the Gaussians (Huber et al., On entropy
         approximation for Gaussian mixture random vectors, MFI 2008, eq. 8): exact where they do not overlap.
@@ -69,7 +69,7 @@ class Mixtures:
         count, dimension = self.coordinates.shape
         kept = torch.where(weights > NEGLIGIBLE / count, weights, 0.0)
         kept = kept / kept.sum(dim=1, keepdim=True)
-        rows, each = self._parted(kept)
+        rows, each = self._modes(kept)
         mass = each.sum(dim=1)
         share = each / mass[:, None]
         mean = share @ self.coordinates
@@ -77,33 +77,33 @@ class Mixtures:
         covariance = (share @ squares).reshape(-1, dimension, dimension)
         covariance = covariance - mean[:, :, None] * mean[:, None, :]
         alone = share.square().sum(dim=1)  # 1 / effective sample size
-        # Scaled to numbers about 1: axes are metres and radians.
+        # Axes are metres and radians: scaled, the determinant is of numbers about 1.
         scale = self.floor.diagonal().sqrt()
         scaled = (covariance + alone[:, None, None] * self.floor) / torch.outer(scale, scale)
         determinant = torch.linalg.slogdet(scaled).logabsdet + 2.0 * scale.log().sum()
         gaussian = 0.5 * (dimension * math.log(2.0 * math.pi * math.e) + determinant) + share @ self.log_base
-        parts = mass * gaussian + torch.special.entr(mass)
-        return torch.zeros(len(weights), dtype=torch.float64).index_add_(0, rows, parts)
+        terms = mass * gaussian + torch.special.entr(mass)
+        return torch.zeros(len(weights), dtype=torch.float64).index_add_(0, rows, terms)
 
-    def _parted(self, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Weights (Q, K) of the modes of every row of weights (M, K), and which row each is of (Q,)."""
+    def _modes(self, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights (Q, K) within each mode of every row of weights (M, K), and the row (Q,) of each mode."""
         if self.linked is None:
             return torch.arange(len(weights)), weights
-        rows, parts = [], []
-        left = weights > 0
-        # The heaviest point that is left, and all that chains of links lead to, are a mode of their row.
-        while bool((unfinished := left.any(dim=1)).any()):
+        rows, modes = [], []
+        remaining = weights > 0
+        # The heaviest remaining point, and all points that chains of links lead to, are a mode of their row.
+        while bool((unfinished := remaining.any(dim=1)).any()):
             row = unfinished.nonzero().flatten()
-            among, own = left[row], weights[row]
+            among, own = remaining[row], weights[row]
             start = torch.where(among, own, -1.0).argmax(dim=1, keepdim=True)
-            mode = self._reached(torch.zeros_like(among).scatter_(1, start, True), among)
+            mode = self._connected(torch.zeros_like(among).scatter_(1, start, True), among)
             rows.append(row)
-            parts.append(torch.where(mode, own, 0.0))
-            left[row] = among & ~mode
-        return torch.cat(rows), torch.cat(parts)
+            modes.append(torch.where(mode, own, 0.0))
+            remaining[row] = among & ~mode
+        return torch.cat(rows), torch.cat(modes)
 
-    def _reached(self, start: Tensor, among: Tensor) -> Tensor:
-        """The points (M, K) that links lead to from those where `start` (M, K) is true, through `among`."""
+    def _connected(self, start: Tensor, among: Tensor) -> Tensor:
+        """The points (M, K) that links through `among` (M, K) connect to those in `start` (M, K)."""
         assert self.linked is not None
         reached, count = start, -1
         while count != (count := int(reached.sum())):
@@ -111,8 +111,8 @@ class Mixtures:
         return reached
 
 
-def spanning_factor(address: str, covariance: Tensor) -> Tensor:
-    """The lower factor of a covariance (d, d).
+def cholesky_factor(address: str, covariance: Tensor) -> Tensor:
+    """The lower Cholesky factor of a covariance (d, d) of particles.
 
     Raises:
         InputError: it is singular.

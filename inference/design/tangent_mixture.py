@@ -1,0 +1,131 @@
+"""A belief over a pose as a mixture of Gaussians, one in the tangent space at each of its modes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.beliefs import Belief, effective_sample_size
+from bcppl.errors import InputError
+from bcppl.inference.design.distinct import DistinctParticles, separate_modes
+from bcppl.inference.design.weighted_mixtures import cholesky_factor
+from bcppl.inference.population import Population
+from bcppl.inference.summaries import is_pose
+from bcppl.poses import Freedom
+
+
+@dataclass(frozen=True, eq=False)
+class TangentMixture:
+    """A Gaussian for each of K modes.
+
+    Attributes:
+        freedom: the d free axes.
+        label: (N,) the mode of each particle; -1 without weight.
+        mean: (K, 7) world_from_part.
+        mass: (K,) probabilities of the modes.
+        factor: (K, d, d) lower Cholesky factors of the covariances.
+        log_base: (K,) the mean log-density of the base measure.
+    """
+
+    freedom: Freedom
+    label: Tensor
+    mean: Tensor
+    mass: Tensor
+    factor: Tensor
+    log_base: Tensor
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+    @classmethod
+    def fit(
+        cls, population: Population, address: str, translation: float = 0.01, rotation: float = 0.2
+    ) -> TangentMixture:
+        """The Gaussians of `mixture_entropy`: copies are merged, each mode has its particles' covariance.
+
+        Raises:
+            InputError: the address is of no pose, all particles are the same, or they do not span its axes.
+        """
+        if not is_pose(population, address):
+            raise InputError(
+                f"{address!r} holds no poses, in whose tangent space information could be summed; "
+                "use expected_information_gain."
+            )
+        freedom = population.belief(address).freedom
+        particles = DistinctParticles.of(population, address)
+        distinct, share = particles.values, particles.weights
+        own, _ = separate_modes(distinct, translation, rotation)
+        label = torch.full((len(population),), -1)
+        label[particles.particles] = own[particles.index]
+        means, covariances, masses, bases, sizes = [], [], [], [], []
+        for mode in range(int(own.max()) + 1):
+            inside = own == mode
+            mass = share[inside].sum()
+            weights = share[inside] / mass
+            mean = Belief(distinct[inside], weights.log()).mean
+            tangent = poses.local(mean, distinct[inside])
+            coordinates = freedom.coordinates(tangent)
+            away = coordinates - weights @ coordinates
+            means.append(mean)
+            masses.append(mass)
+            covariances.append((weights[:, None] * away).T @ away)
+            bases.append(weights @ freedom.log_base_density(tangent[:, 3:].norm(dim=-1)))
+            sizes.append(1.0 / weights.square().sum())
+        mass, covariance = torch.stack(masses), torch.stack(covariances)
+        within = (mass[:, None, None] * covariance).sum(dim=0)
+        cholesky_factor(address, within)
+        floor = within * effective_sample_size(share.log()) ** (-2.0 / freedom.dimension)
+        factor = [cholesky_factor(address, c + floor / n) for c, n in zip(covariance, sizes, strict=True)]
+        return cls(freedom, label, torch.stack(means), mass, torch.stack(factor), torch.stack(bases))
+
+    @property
+    def entropies(self) -> Tensor:
+        """(K,) nats of each Gaussian with respect to the base measure."""
+        log_volume = self.factor.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
+        return 0.5 * self.freedom.dimension * math.log(2.0 * math.pi * math.e) + log_volume + self.log_base
+
+    @property
+    def entropy(self) -> float:
+        """Nats of the mixture: exact where modes do not overlap."""
+        return float(torch.special.entr(self.mass).sum() + self.mass @ self.entropies)
+
+    def whiten(self, information: Tensor, world_from_part: Tensor, mode: Tensor) -> Tensor:
+        """Information matrices (S, 6, 6) at poses (S, 7), as (S, d, d) in the whitened axes of modes (S,)."""
+        turn = poses.local(self.mean[mode], world_from_part)[:, 3:]
+        jacobian = torch.eye(6, dtype=torch.float64).repeat(len(turn), 1, 1)
+        jacobian[:, 3:, 3:] = right_jacobian(turn)
+        white = jacobian[:, :, list(self.freedom.axes)] @ self.factor[mode]
+        return white.transpose(-1, -2) @ information @ white
+
+    def white_coordinates(self, mode: int, world_from_part: Tensor) -> Tensor:
+        """The whitened tangent coordinates (d, S) of poses (S, 7) at a mode's mean."""
+        away = self.freedom.coordinates(poses.local(self.mean[mode], world_from_part))
+        return torch.linalg.solve_triangular(self.factor[mode], away.T, upper=False)
+
+
+def entropy_reduction(information: Tensor) -> Tensor:
+    """The entropy reduction (...) of a standard normal by information matrices (..., d, d), nats.
+
+    NaN where the information is not finite.
+    """
+    eye = torch.eye(information.shape[-1], dtype=torch.float64)
+    failed = ~torch.isfinite(information).all(dim=-1).all(dim=-1)
+    valid = torch.where(failed[..., None, None], 0.0, information)
+    return torch.where(failed, torch.nan, 0.5 * torch.linalg.slogdet(eye + valid).logabsdet)
+
+
+def right_jacobian(turn: Tensor) -> Tensor:
+    """The right Jacobian (..., 3, 3) of SO(3) at rotation vectors (..., 3): Exp(w + d) = Exp(w) Exp(J d).
+
+    Chirikjian, Stochastic Models, Information Theory, and Lie Groups, vol. 2, 10.86.
+    """
+    angle = turn.norm(dim=-1)[..., None, None].clamp(min=1e-6)
+    x, y, z = turn.unbind(dim=-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*turn.shape, 3)
+    first, second = (1.0 - angle.cos()) / angle**2, (angle - angle.sin()) / angle**3
+    return torch.eye(3, dtype=torch.float64) - first * cross + second * (cross @ cross)

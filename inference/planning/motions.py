@@ -1,0 +1,88 @@
+"""Properties of a planned motion: where it is expected to make contact, its free path, its pressing force."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.spatial.transform import Rotation, Slerp
+
+from bcppl import poses
+from bcppl.robot.plan import Plan
+
+Array = npt.NDArray[np.float64]
+
+_SPACING = 0.002  # m between poses of a free path
+
+
+def expected_contacts(plan: Plan) -> list[tuple[Array, Array]]:
+    """The middle of each guarded stroke, where contact is expected.
+
+    Returns:
+        For each guarded motion, the peg's pose (7,) in the middle of it, and its direction (3,) in the world.
+    """
+    contacts = []
+    for k, manner in enumerate(plan.manners):
+        way = plan.world_from_peg[k + 1, :3] - plan.world_from_peg[k, :3]
+        length = float(np.linalg.norm(way))
+        if manner == "guarded" and length > 0.0:
+            middle = plan.world_from_peg[k].copy()
+            middle[:3] += 0.5 * way
+            contacts.append((middle, way / length))
+    return contacts
+
+
+def pressing_force(plan: Plan) -> float:
+    """The largest force (N) with which a plan presses on surfaces, after contact.
+
+    It is the force that stops a guarded motion, plus the spring force of the command's path beyond. A motion
+    that is held without contact before it counts as if it made contact where it begins. Impacts may exceed
+    it.
+    """
+    largest, direction = 0.0, np.zeros(3)
+    for k, manner in enumerate(plan.manners):
+        way = plan.world_from_peg[k + 1, :3] - plan.world_from_peg[k, :3]
+        if manner == "guarded":
+            largest, direction = max(largest, plan.force), way / max(float(np.linalg.norm(way)), 1e-12)
+            contact = plan.world_from_peg[k + 1, :3]
+        elif manner in ("held", "searching"):
+            stopped = bool(direction.any())
+            begins = contact if stopped else plan.world_from_peg[k, :3]
+            along = direction if stopped else way / max(float(np.linalg.norm(way)), 1e-12)
+            beyond = float((plan.world_from_peg[k + 1, :3] - begins) @ along)
+            turn = poses.rotation_matrix(torch.from_numpy(plan.world_from_peg[k + 1])).numpy()
+            stiffness = float(np.square(turn.T @ along) @ np.asarray(plan.stiffness)[:3])
+            largest = max(largest, (plan.force if stopped else 0.0) + stiffness * max(beyond, 0.0))
+        elif manner == "free":
+            direction = np.zeros(3)
+    return largest
+
+
+def free_path(plan: Plan) -> Array:
+    """Poses (M, 7) of the peg, at most 2 mm apart, on its motions before and after contact.
+
+    These are the free motions, and those that are held before any guarded motion. The return from a contact
+    counts from the pose at which the peg is free again: how it leaves the surface depends on the contact.
+    """
+    path, in_contact = [plan.world_from_peg[:1]], False
+    for k, manner in enumerate(plan.manners):
+        if manner == "guarded":
+            in_contact = True
+        elif not in_contact:
+            path.append(_interpolate(plan.world_from_peg[k], plan.world_from_peg[k + 1]))
+        elif manner == "free":
+            path.append(plan.world_from_peg[k + 1 : k + 2])
+            in_contact = False
+    return np.concatenate(path)
+
+
+def _interpolate(start: Array, stop: Array) -> Array:
+    """Poses (M, 7) on the straight motion between two."""
+    steps = max(1, math.ceil(float(np.linalg.norm(stop[:3] - start[:3])) / _SPACING))
+    share = np.linspace(0.0, 1.0, steps + 1)
+    turns = Slerp([0.0, 1.0], Rotation.from_quat(np.stack([start, stop])[:, [4, 5, 6, 3]]))(share)
+    return np.column_stack(
+        [start[:3] + share[:, None] * (stop - start)[:3], turns.as_quat()[:, [3, 0, 1, 2]]]
+    )

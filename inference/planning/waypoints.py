@@ -1,0 +1,85 @@
+"""Waypoints of planned motions, and strokes as long as the belief is uncertain."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.geometry.parts import Part
+from bcppl.robot.plan import Manner
+
+Array = npt.NDArray[np.float64]
+
+STIFFNESS = (2500.0, 2500.0, 2500.0, 150.0, 150.0, 150.0)
+DAMPING = (120.0, 120.0, 120.0, 2.5, 2.5, 2.5)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+class Waypoint(NamedTuple):
+    """A waypoint of the peg.
+
+    Attributes:
+        position: (3,) in the part's frame, metres.
+        manner: of the motion to it.
+        speed: of that motion, m/s.
+    """
+
+    position: Array
+    manner: Manner
+    speed: float
+
+
+class StrokeLimits(Protocol):
+    """The parameters of a guarded stroke's length."""
+
+    @property
+    def standard_deviations(self) -> float:
+        """Half a stroke, in standard deviations of the surface's position along it."""
+
+    @property
+    def shortest_half_stroke(self) -> float:
+        """Metres."""
+
+    @property
+    def longest_half_stroke(self) -> float:
+        """Metres."""
+
+
+def half_stroke(belief: Belief, position: Array, normal: Array, limits: StrokeLimits) -> float:
+    """Half the length (m) of a guarded stroke, in proportion to the uncertainty of the surface's position.
+
+    Args:
+        belief: over world_from_part.
+        position: (3,) on the surface, in the part's frame.
+        normal: (3,) of the surface there, in the part's frame.
+        limits: the proportion and the limits.
+    """
+    positions = poses.transform(belief.world_from_part, torch.as_tensor(position)[None])[:, 0]
+    direction = poses.rotation_matrix(belief.mean) @ torch.as_tensor(normal)
+    along = positions @ direction
+    mean = belief.weights @ along
+    deviation = float(torch.sqrt(belief.weights @ (along - mean) ** 2))
+    shortest, longest = limits.shortest_half_stroke, limits.longest_half_stroke
+    return float(np.clip(limits.standard_deviations * deviation, shortest, longest))
+
+
+def upright(belief: Belief, positions: Array) -> Array:
+    """Poses (K, 7) in the world at positions (K, 3) in the part's frame, oriented as the mean part."""
+    world_from_peg = belief.mean.expand(len(positions), 7).clone()
+    world_from_peg[:, :3] = poses.transform(belief.mean, torch.from_numpy(positions))
+    return np.asarray(world_from_peg.numpy())
+
+
+def top_of(part: Part) -> float:
+    """The height z of a part's top in its frame, metres."""
+    return float(part.vertices[:, 2].max())
+
+
+def tip_of(peg: Part) -> float:
+    """The height z of a peg's tip in its frame, metres."""
+    return float(peg.vertices[:, 2].min())
