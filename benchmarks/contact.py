@@ -1,6 +1,6 @@
-"""Contact physics beside a bare MuJoCo rollout, what skipping free motion saves, what nuisances cost.
+"""Contact physics beside a bare MuJoCo rollout, and what shared free motion and nuisance parameters cost.
 
-Beside the skip stands what sharing all free motion would leave: the particles that are in contact.
+Beside it stands the lower bound: sharing all free motion would leave the particles that are in contact.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def least(physics: PegPhysics, pose: Tensor, probe: Probe, repeats: int) -> tupl
 
 
 def nuisances(particles: int) -> dict[str, Nuisances]:
-    """What may be unknown, as a model would draw it."""
+    """Nuisance parameters, as a model would sample them."""
     one = torch.ones(particles, dtype=torch.float64)
     spread = torch.rand(particles, dtype=torch.float64)
     offset = torch.randn(particles, 6, dtype=torch.float64) * torch.tensor([0.001] * 3 + [0.02] * 3)
@@ -233,7 +233,7 @@ def main() -> None:
             Row(f"{count} models copied and set", 1e3 * made, "ms"),
             Row(f"{count} models set again", 1e3 * again, "ms"),
         ]
-    show("models for nuisances", ["", "copied and set ms", "set again ms"], lines)
+    show("models for nuisance parameters", ["", "copied and set ms", "set again ms"], lines)
 
     if not arguments.quick:
         spent = {}

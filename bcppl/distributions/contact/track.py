@@ -19,7 +19,7 @@ WIDER = 10.0  # a contaminated normal's wide scale over its narrow one
 
 
 class Track(Protocol):
-    """One probe simulated for N particles, as `bcppl.contact.track.ContactTrack` is."""
+    """One probe simulated for N particles, as `bcppl.contact.probe_rollout.ProbeRollout` is."""
 
     @property
     def diverged(self) -> Tensor:
