@@ -1,4 +1,4 @@
-"""Checks of the numbers that functions are given: what is out of range is refused in one sentence."""
+"""Checks of numeric arguments: one out of range is refused in one sentence."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ LARGEST_SEED = 2**63 - 1
 
 
 def whole_number(what: str, value: object, *, least: int = 1, most: int | None = None) -> int:
-    """A count that is a whole number in a range, as an int.
+    """A whole number in a range, as an int.
 
     Args:
         what: the beginning of the sentence, {} where the value stands: "until may make {} sweeps at most".
-        value: what was given; numpy's and torch's whole numbers count as such, True and 3.0 do not.
-        least: the smallest that will do.
-        most: the largest; None for no bound.
+        value: given; numpy's and torch's whole numbers count as such, True and 3.0 do not.
+        least: the smallest allowed.
+        most: the largest allowed; None for no bound.
 
     Raises:
-        InputError: it is no whole number, or out of the range.
+        InputError: it is not a whole number, or out of the range.
     """
     try:
         count = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
@@ -29,7 +29,7 @@ def whole_number(what: str, value: object, *, least: int = 1, most: int | None =
         count = None
     if count is None or count < least or (most is not None and count > most):
         upper = f"{least} or more" if most is None else f"from {least} to {most}"
-        raise InputError(f"{_said(what, value)}; give a whole number, {upper}.")
+        raise InputError(f"{_named(what, value)}; give a whole number, {upper}.")
     return count
 
 
@@ -37,7 +37,7 @@ def seed_number(value: object) -> int:
     """A seed: a whole number from 0 to 2^63 - 1.
 
     Raises:
-        InputError: it is none.
+        InputError: it is not one.
     """
     return whole_number("the seed is {}", value, least=0, most=LARGEST_SEED)
 
@@ -55,14 +55,14 @@ def number_within(
 
     Args:
         what: the beginning of the sentence, {} where the value stands: "adaptive is given threshold {}".
-        value: what was given.
-        above: what it must exceed.
-        least: the smallest that will do.
-        below: what it must not reach.
-        most: the largest that will do.
+        value: given.
+        above: a bound that it must exceed.
+        least: the smallest allowed.
+        below: a bound that it must stay under.
+        most: the largest allowed.
 
     Raises:
-        InputError: it is no number, NaN or infinite, or out of the range.
+        InputError: it is not a number, NaN or infinite, or out of the range.
     """
     try:
         number = math.nan if isinstance(value, str | bytes | bool) else float(value)  # type: ignore[arg-type]
@@ -72,12 +72,12 @@ def number_within(
         return number
     bounds = [(above, "above"), (least, "at least"), (below, "below"), (most, "at most")]
     asked = " and ".join(f"{name} {bound:g}" for bound, name in bounds if math.isfinite(bound))
-    raise InputError(f"{_said(what, value)}; give a finite number{' ' * bool(asked)}{asked}.")
+    raise InputError(f"{_named(what, value)}; give a finite number{' ' * bool(asked)}{asked}.")
 
 
-def _said(what: str, value: object) -> str:
+def _named(what: str, value: object) -> str:
     try:
-        said = repr(value)
+        text = repr(value)
     except ValueError:  # Python spells no whole number of more than 4300 digits
-        said = "a number too long to print"
-    return what.replace("{}", said if len(said) <= 200 else f"{said[:30]}... ({len(said)} characters)")
+        text = "a number too long to print"
+    return what.replace("{}", text if len(text) <= 200 else f"{text[:30]}... ({len(text)} characters)")

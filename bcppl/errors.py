@@ -1,8 +1,8 @@
-"""What bcppl raises when what it was given is wrong."""
+"""The exceptions that bcppl raises."""
 
 
 class InputError(ValueError):
-    """Bad input: one sentence that says what is wrong, where, and what to do about it.
+    """Bad input: one sentence that states what is wrong, where, and what to do about it.
 
     The command line prints the sentence alone and exits with code 2.
     """

@@ -1,8 +1,8 @@
 """SE(3): batched poses, their tangent space and their base measure.
 
 A pose is `[x, y, z, qw, qx, qy, qz]`, metres and a unit quaternion, in the last dimension of a float64
-tensor; q and -q are the same pose. A pose is named after the frames it takes from and to:
-`world_from_part` maps points given in the part's frame to the world's.
+tensor; q and -q are the same pose. A pose is named after the frames that it maps between:
+`world_from_part` maps points of the part's frame to the world's.
 
 The tangent space at a pose is R^3 x so(3), translation and rotation apart: a tangent `[v, w]` moves the
 translation by v (in the frame the pose maps to, metres) and turns the rotation by the rotation vector w
@@ -100,7 +100,7 @@ def inverse(a_from_b: Tensor) -> Tensor:
 
 
 def transform(a_from_b: Tensor, points: Tensor) -> Tensor:
-    """Points given in frame b, in frame a: poses (..., 7) and points (M, 3) give (..., M, 3), metres."""
+    """Points of frame b in frame a: poses (..., 7) and points (M, 3) give (..., M, 3), metres."""
     return points @ rotation_matrix(a_from_b).transpose(-1, -2) + a_from_b[..., None, :3]
 
 
@@ -137,7 +137,7 @@ _AXES = {"x": 0, "y": 1, "z": 2}
 
 @dataclass(frozen=True)
 class Freedom:
-    """Which axes of a pose are free, and so the base measure of its densities.
+    """The free axes of a pose, which determine the base measure of its densities.
 
     Attributes:
         translation: the free translations among "xyz", in the frame the pose maps to.

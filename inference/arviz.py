@@ -1,4 +1,4 @@
-"""Populations as ArviZ reads them: draws of equal weight, one chain for each independent run."""
+"""Populations in ArviZ's data structure: draws of equal weight, one chain for each independent run."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ POSE_COORDINATES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 def to_arviz(
-    found: Any,
+    runs: Any,
     *,
     draws: int | None = None,
     seed: int = 0,
     scheme: Scheme = systematic,
 ) -> Any:
-    """Equal-weight draws of every latent address, with what is known of them.
+    """Equal-weight draws of every latent address, with their log-likelihoods and sampler statistics.
 
-    The draws are resampled from the weighted particles and put in random order, so copies count as draws: how
-    many of them are worth something is in `sample_stats`.
+    The draws are resampled from the weighted particles and put in random order, so copies count as draws;
+    `sample_stats` has the effective sample size.
 
     Args:
-        found: a population, or something that has one, such as a step of SMC; an iterator over steps, of
+        runs: a population, or something that has one, such as a step of SMC; an iterator over steps, of
             which the last counts; or several populations, those of independent runs of one program on the
             same measurements (`repeated(...)`, or a list): the chains. Or `Chains`, whose states are draws
             already: then there is no log_likelihood, and sample_stats has each chain's `acceptance`.
@@ -53,20 +53,20 @@ def to_arviz(
           the mean's.
         - log_likelihood: of every observed address, (chain, draw).
         - sample_stats: (chain, draw) `lp`, the log-probability of all sites; `log_weight`, unnormalised, of
-          the particle that was drawn; `particle`, which one that was; `founder`, which particle of the first
-          population it descends from. (chain,) `log_evidence`,
-          `effective_sample_size` and `distinct_particles`, the last the number of different ones drawn.
+          the drawn particle; `particle`, its index; `founder`, the index of its ancestor in the first
+          population. (chain,) `log_evidence`,
+          `effective_sample_size` and `distinct_particles`, the last the number of different particles drawn.
         - observed_data: the observations.
 
     Raises:
-        InputError: ArviZ is not installed; there is no population, or they differ in their addresses or
+        InputError: ArviZ is not installed; no population is given, or they differ in their addresses or
             their observations; or `draws` is below 1.
-        InferenceError: no particle of a population has any weight.
+        NoWeightError: no particle of a population has any weight.
     """
     arviz = import_arviz()
-    if isinstance(found, Chains):
-        return _of_chains(arviz, found, draws)
-    chains = _populations(found)
+    if isinstance(runs, Chains):
+        return _of_chains(arviz, runs, draws)
+    chains = _populations(runs)
     check_alike(chains)
     with seeded(seed):
         chosen = draw(chains, draws, scheme)
@@ -101,16 +101,16 @@ def to_arviz(
     return data
 
 
-def _populations(found: Any) -> list[Population]:
-    """The populations of runs, of whatever form."""
-    found = getattr(found, "populations", getattr(found, "population", found))
-    if isinstance(found, Population):
-        return [found]
-    if not isinstance(found, Iterable):
+def _populations(runs: Any) -> list[Population]:
+    """The populations of runs in any of the forms that `to_arviz` accepts."""
+    runs = getattr(runs, "populations", getattr(runs, "population", runs))
+    if isinstance(runs, Population):
+        return [runs]
+    if not isinstance(runs, Iterable):
         raise InputError(
-            f"a {type(found).__name__} was given; give a population, a step of SMC, runs or chains."
+            f"a {type(runs).__name__} was given; give a population, a step of SMC, runs or chains."
         )
-    given = list(found)
+    given = list(runs)
     each: list[Population] = []
     for one in given:
         population = getattr(one, "population", one)
@@ -121,12 +121,12 @@ def _populations(found: Any) -> list[Population]:
             )
         each.append(population)
     # An iterator over the steps of one run; populations are those of several.
-    of_one = isinstance(found, Iterator) and not any(isinstance(one, Population) for one in given)
+    of_one = isinstance(runs, Iterator) and not any(isinstance(one, Population) for one in given)
     return each[-1:] if of_one else each
 
 
 def _posed(population: Population, posterior: dict[str, Tensor]) -> list[str]:
-    """Which addresses hold poses; their quaternions are given one sign."""
+    """The addresses that hold poses; their quaternions are given one sign."""
     posed = [address for address in posterior if is_pose(population, address)]
     for address in posed:
         posterior[address] = _one_sign(posterior[address])
@@ -148,13 +148,13 @@ def _of_chains(arviz: Any, chains: Chains, draws: int | None) -> Any:
         coords={"pose": list(POSE_COORDINATES)} if posed else None,
         dims={address: ["pose"] for address in posed},
     )
-    # A group is begun with what hangs on chains and draws.
+    # A group starts with the values that have both dimensions.
     data.sample_stats["acceptance"] = ("chain", chains.acceptance.numpy())
     return data
 
 
 def import_arviz() -> Any:
-    """The package arviz, its notice about version 1 left out.
+    """The package arviz, imported without its notice about version 1.
 
     Raises:
         InputError: it is not installed, or is too new.
@@ -172,10 +172,10 @@ def import_arviz() -> Any:
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Torch's generator started from a seed within, and put back afterwards.
+    """Torch's generator seeded within, and restored afterwards.
 
     Raises:
-        InputError: the seed is no whole number from 0 on.
+        InputError: the seed is not a whole number, 0 or more.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed_number(seed))
@@ -186,7 +186,7 @@ def check_alike(populations: Sequence[Population]) -> None:
     """Refuse populations that are not of one program and the same observations.
 
     Raises:
-        InputError: there is none, or they differ; says which run, and in what.
+        InputError: there is none, or they differ; names the run and the difference.
     """
     if not populations:
         raise InputError("no population was given; give one or more.")
@@ -207,11 +207,11 @@ def check_alike(populations: Sequence[Population]) -> None:
 
 
 def draw(populations: Sequence[Population], draws: int | None, scheme: Scheme = systematic) -> list[Tensor]:
-    """Which particles equal-weight draws are, (draws,) int64 for each population, in random order.
+    """Indices of equal-weight draws, (draws,) int64 for each population, in random order.
 
     Raises:
-        InputError: `draws` is no whole number, 1 or more.
-        InferenceError: no particle of a population has any weight.
+        InputError: `draws` is not a whole number, 1 or more.
+        NoWeightError: no particle of a population has any weight.
     """
     draws = min(map(len, populations)) if draws is None else whole_number("{} draws were asked for", draws)
     # A scheme gives ancestors in order; draws in order would look like a chain that does not mix.

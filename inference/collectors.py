@@ -1,11 +1,12 @@
-"""Collectors: functions that watch a run as it goes by, and leave it as it was.
+"""Collectors: functions of each step of a run, evaluated without changing it.
 
     watched = collect(smc(model, recording, step=step), size=effective_sample_size, hole=mean("hole"))
     for belief, info in watched:
         ...
     watched["size"]                                         # (steps,)
 
-As in `particles` (Chopin and Papaspiliopoulos, 2020), whose collectors they are named after.
+Named after the collectors of `particles` (Chopin and Papaspiliopoulos, An Introduction to Sequential Monte
+Carlo, 2020).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ S = TypeVar("S")
 
 
 class Collected(Generic[S]):
-    """The steps of a run, handed on one by one, and a column for each function of what went by."""
+    """An iterator over the steps of a run, with a column for each function of the steps so far."""
 
     def __init__(self, steps: Iterable[S], functions: dict[str, Callable[[S], Any]]) -> None:
         self._steps = iter(steps)
@@ -35,7 +36,7 @@ class Collected(Generic[S]):
 
     def __next__(self) -> S:
         step = next(self._steps)
-        # What a function draws is not taken from the run.
+        # A function that samples must not change the random numbers of the run.
         with torch.random.fork_rng(devices=[]):
             row = {name: function(step) for name, function in self._functions.items()}
         for name, value in row.items():
@@ -43,7 +44,7 @@ class Collected(Generic[S]):
         return step
 
     def to_end(self) -> Collected[S]:
-        """Let the run go on to its end."""
+        """Run to the end."""
         for _ in self:
             pass
         return self
@@ -66,25 +67,25 @@ class Collected(Generic[S]):
 
 
 def collect(steps: Iterable[S], **functions: Callable[[S], Any]) -> Collected[S]:
-    """Watch a run: `name=function(step)` for each column.
+    """Collect columns of a run, `name=function(step)` each.
 
     Args:
         steps: an iterator such as `smc(...)` or `steps(...)`; it is not run ahead.
-        functions: what is read of each step; see the ones below.
+        functions: of each step; see the ones below.
 
     Returns:
-        An iterator over the same steps, whose `[name]` and `.columns` hold what was collected so far.
+        An iterator over the same steps, whose `[name]` and `.columns` hold the columns so far.
     """
     return Collected(steps, functions)
 
 
 def effective_sample_size(step: Any) -> float:
-    """Of the population after the step."""
+    """The effective sample size of the population after the step."""
     return float(step.population.effective_sample_size)
 
 
 def log_evidence(step: Any) -> float:
-    """Of all measurements so far."""
+    """The log evidence of all measurements so far."""
     return float(step.population.log_evidence)
 
 
@@ -94,7 +95,7 @@ def acceptance(step: Any) -> float:
 
 
 def distinct(step: Any) -> int:
-    """How many particles differ in some latent value."""
+    """The number of particles that differ in some latent value."""
     return kernels.distinct(step.population)
 
 

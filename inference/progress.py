@@ -1,4 +1,4 @@
-"""Progress bars: on a terminal and in a notebook, and nothing elsewhere."""
+"""Progress bars, shown on a terminal and in a notebook."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from rich.progress import (
 
 T = TypeVar("T")
 
-# The bar on show: one is enough, so what runs within what is watched shows none of its own.
+# The bars in use: only the outermost is shown.
 _shown: list[Progress] = []
 
 
 @contextmanager
 def sole_bar(console: Console | None = None) -> Iterator[Progress]:
-    """A bar that is the only one until it is gone; it shows nothing where there is no one to see it."""
+    """A progress bar; hidden within another one, and where there is neither terminal nor notebook."""
     console = get_console() if console is None else console
-    # Without ipywidgets rich warns at every turn and leaves a bar behind for each.
+    # Without ipywidgets rich warns at every update and leaves a bar behind for each.
     notebook = console.is_jupyter and find_spec("ipywidgets") is not None
-    seen = (console.is_terminal or notebook) and not _shown
+    visible = (console.is_terminal or notebook) and not _shown
     columns = (
         TextColumn("{task.description:>12}"),
         BarColumn(bar_width=30),
@@ -45,7 +45,7 @@ def sole_bar(console: Console | None = None) -> Iterator[Progress]:
         *columns,
         console=console,
         transient=True,
-        disable=not seen,
+        disable=not visible,
         redirect_stdout=not console.is_jupyter,
         redirect_stderr=not console.is_jupyter,
     )
@@ -65,13 +65,13 @@ def watched(
     describe: Callable[[T], str] | None = None,
     progress: bool = True,
 ) -> Iterator[T]:
-    """The same items, with a bar that says how many of them have come.
+    """The same items, with a bar that counts them.
 
     Args:
-        items: anything to iterate over: moves, runs, steps of `smc`.
+        items: any iterable: moves, runs, steps of `smc`.
         total: how many there will be; by default the length, where there is one.
-        description: what stands beside the bar.
-        describe: what stands there after an item, in its place.
+        description: beside the bar.
+        describe: the description after each item, in place of that.
         progress: False for no bar.
     """
     if not progress:

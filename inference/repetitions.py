@@ -1,4 +1,4 @@
-"""Repeated independent runs: do they agree, what do they say together, and how sure is their evidence."""
+"""Repeated independent runs: their agreement, their pooled posterior, and the error of their evidence."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ def repeated(run: Run, times: int, seed: int = 0, *, processes: int = 1, progres
 
     Args:
         run: `run(seed)`: gives a population, something that has one (a `Step` of SMC), or an iterator over
-            such, of which the last counts. Torch's generator is set to the seed before each call.
+            those, of which the last counts. Torch's generator is set to the seed before each call.
         times: how many runs.
         seed: the runs' own seeds are derived from it; torch's own generator is left as it was.
-        processes: above 1, runs are shared out among processes, this one and fresh ones. Then `run` must be
-            something that can be imported there (a function of a module, or a `functools.partial` of one),
+        processes: above 1, runs are distributed over processes, this one and fresh ones. Then `run` must be
+            importable there (a function of a module, or a `functools.partial` of one),
             and a script must keep its own work behind `if __name__ == "__main__":`.
         progress: show a bar, on a terminal or in a notebook.
 
     Raises:
         InputError: `times`, `processes` or the seed is out of range, `run` gives no population, it cannot be
             sent to another process, or the runs differ in addresses or observations.
-        InferenceError: a run cannot go on; names it and its seed.
+        InferenceError: a run fails; names it and its seed.
     """
     times = whole_number("{} runs were asked for", times)
     processes = min(whole_number("runs in {} processes were asked for", processes), times)
     seeds = [int(s) for s in np.random.SeedSequence(seed_number(seed)).generate_state(times)]
     if processes == 1:
         numbered = watched(list(enumerate(seeds, 1)), description="runs", progress=progress)
-        found = [_population(run, each, number) for number, each in numbered]
+        populations = [_population(run, each, number) for number, each in numbered]
     else:
-        found = _shared_out(run, seeds, processes, progress)
-    check_alike(found)
-    return Repeated(tuple(found), tuple(seeds))
+        populations = _distributed(run, seeds, processes, progress)
+    check_alike(populations)
+    return Repeated(tuple(populations), tuple(seeds))
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +64,11 @@ class Repeated:
     """Independent runs of one inference; print it for a table.
 
     A run in which no particle has any weight left estimates the evidence by 0, and counts as that, for the
-    mean is not unbiased without it. Of the posterior it says nothing: means, R-hat and what is pooled are
-    those of the others.
+    mean is biased without it. Means, R-hat and the pooled posterior are those of the other runs.
 
     Attributes:
         populations: one for each run.
-        seeds: that they were run with.
+        seeds: of the runs.
     """
 
     populations: tuple[Population, ...]
@@ -89,8 +88,8 @@ class Repeated:
         alive = [p for number, p in enumerate(self.populations, start=1) if number not in self.dead]
         if not alive:
             raise NoWeightError(
-                f"no particle has any weight in any of {len(self)} runs: every particle says that what was "
-                "measured cannot be; widen the prior, or use more particles."
+                f"no particle has any weight in any of {len(self)} runs: no particle explains the "
+                "measurements; widen the prior, or use more particles."
             )
         return tuple(alive)
 
@@ -108,9 +107,9 @@ class Repeated:
 
     @property
     def standard_error(self) -> float:
-        """Of `log_evidence`, by the delta method: that of the mean over the mean; NaN of one run or none.
+        """Standard error of `log_evidence` by the delta method, error over mean; NaN of one run.
 
-        It is too small where few runs carry the mean, for then the runs have not seen the others.
+        It is too small where few runs dominate the mean: others like them are then likely to be missing.
         """
         if len(self) < 2:
             return math.nan
@@ -164,10 +163,10 @@ class Repeated:
     def pooled(self) -> Population:
         """All particles of all runs, each run with the weight of its evidence.
 
-        How sure its evidence is, `standard_error` says: what one run knows of that is not put together.
+        The error of its evidence is `standard_error`: `evidence_variance` does not apply to it.
 
         Raises:
-            InputError: the runs are of a long series, whose traces hang on the steps before.
+            InputError: the runs are of a long series, whose traces depend on the steps before.
         """
         _refuse_series(self.populations[0])
         traces = [population.trace for population in self.populations]
@@ -203,13 +202,13 @@ class Repeated:
         """
         arviz, alive = import_arviz(), self._alive
         if len(alive) < 2:
-            said = f" alive of {len(self)}" if self.dead else ""
-            raise InputError(f"R-hat compares runs, but there is one{said}; repeat it 2 times or more.")
+            alone = f" alive of {len(self)}" if self.dead else ""
+            raise InputError(f"R-hat compares runs, but there is one{alone}; repeat it 2 times or more.")
         with seeded(seed):
             chosen = draw(alive, draws)
         if len(chosen[0]) < 4:
             raise InputError(f"R-hat of {len(chosen[0])} draws was asked for; give 4 or more.")
-        found = {}
+        ratios = {}
         for address in alive[0].trace.choices:
             values = at_draws([p.trace.choices[address] for p in alive], chosen)
             if is_pose(alive[0], address):
@@ -218,8 +217,8 @@ class Repeated:
             numbers = values.to(torch.float64).reshape(*values.shape[:2], -1).numpy()
             with np.errstate(invalid="ignore"):
                 each = [float(arviz.rhat(numbers[..., k])) for k in range(numbers.shape[-1])]
-            found[address] = torch.tensor(each, dtype=torch.float64)
-        return found
+            ratios[address] = torch.tensor(each, dtype=torch.float64)
+        return ratios
 
     def table(self) -> str:
         """The runs, one to a line, their evidence together, and where ArviZ is installed their R-hat."""
@@ -241,7 +240,7 @@ class Repeated:
 
     def _deaths(self) -> list[str]:
         which = f"run{'s' * (len(self.dead) > 1)} {', '.join(map(str, self.dead))}"
-        what = "no particle has any weight left: evidence 0, and nothing said of the posterior"
+        what = "no particle has any weight left: evidence 0, left out of the posterior"
         return [f"in {which} {what}; use more particles, or a wider prior."]
 
     def _agreement(self) -> list[str]:
@@ -252,8 +251,8 @@ class Repeated:
         lines = []
         for address, ratio in ratios.items():
             numbers = " ".join(f"{value:.5g}" for value in self.mean(address).flatten().tolist()[:8])
-            told = ratio[~ratio.isnan()].tolist()
-            agreed = f"R-hat at most {max(told):.3f}" if told else "the same in all draws"
+            finite = ratio[~ratio.isnan()].tolist()
+            agreed = f"R-hat at most {max(finite):.3f}" if finite else "the same in all draws"
             lines.append(f"{address}: {agreed}, mean {numbers}")
         return lines
 
@@ -277,20 +276,20 @@ def _population(run: Run, seed: int, number: int) -> Population:
                 result = last[0] if last else None
     except InferenceError as error:
         raise type(error)(f"run {number} (seed {seed}): {error}") from error
-    found = getattr(result, "population", result)
-    if not isinstance(found, Population):
+    population = getattr(result, "population", result)
+    if not isinstance(population, Population):
         raise InputError(
-            f"a run gave a {type(found).__name__}; "
+            f"a run gave a {type(population).__name__}; "
             "give a population, a step of SMC, or an iterator over those."
         )
-    return found
+    return population
 
 
-def _shared_out(run: Run, seeds: Sequence[int], processes: int, progress: bool) -> list[Population]:
-    """The runs in several processes, this one doing its share.
+def _distributed(run: Run, seeds: Sequence[int], processes: int, progress: bool) -> list[Population]:
+    """The runs in several processes, this one among them.
 
-    A program and its simulators stay where they are: another process sends numbers only, and they are put
-    into the trace of a run made here.
+    A program and its simulators stay in their process: another process sends numbers only, which are put
+    into the trace of a run of this process.
     """
     try:
         pickle.dumps(run)
@@ -307,21 +306,21 @@ def _shared_out(run: Run, seeds: Sequence[int], processes: int, progress: bool) 
         elsewhere = {
             k: pool.submit(_numbers, run, seeds[k], k + 1) for k in range(len(seeds)) if k not in here
         }
-        found: dict[int, Population] = {}
+        runs: dict[int, Population] = {}
         for k in watched([*here, *elsewhere], description="runs", progress=progress):
             if k in here:
-                found[k] = _population(run, seeds[k], k + 1)
-                _refuse_series(found[k])
+                runs[k] = _population(run, seeds[k], k + 1)
+                _refuse_series(runs[k])
             else:
-                found[k] = _put_into(found[0], *elsewhere[k].result())
-    return [found[k] for k in range(len(seeds))]
+                runs[k] = _put_into(runs[0], *elsewhere[k].result())
+    return [runs[k] for k in range(len(seeds))]
 
 
 Numbers = dict[str, Any]
 
 
 def _numbers(run: Run, seed: int, number: int) -> tuple[Numbers, Numbers]:
-    """What a run gave, as arrays: the trace's values, and what else the population holds."""
+    """A run's population as arrays: the trace's values, and its other fields."""
     population = _population(run, seed, number)
     trace = population.trace
     values = {"choices": trace.choices, "observations": trace.observations, "known": trace.known}
@@ -335,7 +334,7 @@ def _numbers(run: Run, seed: int, number: int) -> tuple[Numbers, Numbers]:
 def _refuse_series(population: Population) -> None:
     if type(population.trace) is not Trace:
         raise InputError(
-            "runs of a long series cannot be pooled or shared out among processes; "
+            "runs of a long series cannot be pooled or distributed over processes; "
             "run them here and read each by itself."
         )
 

@@ -1,10 +1,10 @@
-"""What a population says about any of its latent addresses: moments, quantiles, probabilities.
+"""Summaries of a population at any of its latent addresses: moments, quantiles, probabilities.
 
 At the address of a pose (its distribution has a `freedom`) these are the belief's: a mean pose (7,), and six
 tangent coordinates at it, metres and radians, 0 along held axes (`bcppl.beliefs`).
 
-Of a long series (`bcppl.traces.Series`) an address may be one with the number of a step, `("x", 3)`: what
-each particle's ancestor had then, weighed as the particle is now.
+Of a long series (`bcppl.traces.Series`) an address may be one with the number of a step, `("x", 3)`: the
+value of each particle's ancestor at that step, with the particle's present weight.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ def values_at(population: Population, address: Address) -> Tensor:
 
 
 def is_pose(population: Population, address: Address) -> bool:
-    """Whether a latent address holds poses (N, 7): its distribution says which of their axes are free."""
+    """Whether a latent address holds poses (N, 7): its distribution has a `freedom`."""
     values_at(population, address)
     return _freedom(population, address) is not None
 
 
 def _freedom(population: Population, address: Address) -> Freedom | None:
-    # What is a pose now was one at every step.
+    # A pose is one at every step.
     name = address if isinstance(address, str) else address[0]
     return freedom_of(population.trace.distributions[name])
 
@@ -71,7 +71,7 @@ def mean(population: Population, address: Address) -> Tensor:
 
     Raises:
         InputError: no latent site has that address.
-        InferenceError: no particle has any weight.
+        NoWeightError: no particle has any weight.
     """
     if is_pose(population, address):
         return _belief(population, address).mean
@@ -84,7 +84,7 @@ def covariance(population: Population, address: Address) -> Tensor:
 
     Raises:
         InputError: no latent site has that address.
-        InferenceError: no particle has any weight.
+        NoWeightError: no particle has any weight.
     """
     if is_pose(population, address):
         return _belief(population, address).covariance
@@ -104,7 +104,7 @@ def quantiles(population: Population, address: Address, probabilities: object) -
 
     Raises:
         InputError: no latent site has that address, or a probability is not in [0, 1].
-        InferenceError: no particle has any weight.
+        NoWeightError: no particle has any weight.
     """
     if is_pose(population, address):
         return _belief(population, address).quantiles(probabilities)
@@ -114,7 +114,7 @@ def quantiles(population: Population, address: Address, probabilities: object) -
 
 
 class Probabilities(NamedTuple):
-    """The distinct values (K, *event) that particles with weight have, in order, and their weights (K,)."""
+    """The distinct values (K, *event) of particles with weight, in order, and their probabilities (K,)."""
 
     values: Tensor
     probabilities: Tensor
@@ -125,7 +125,7 @@ def probabilities(population: Population, address: Address) -> Probabilities:
 
     Raises:
         InputError: no latent site has that address, or it holds poses.
-        InferenceError: no particle has any weight.
+        NoWeightError: no particle has any weight.
     """
     if is_pose(population, address):
         raise InputError(

@@ -28,7 +28,7 @@ def evidence_variance(population: Population) -> float:
         merged, or where the initial population was stratified.
 
     Raises:
-        InferenceError: no particle has any weight.
+        NoWeightError: no particle has any weight.
     """
     weights = normalised(population.log_weights)
     if math.isinf(population.log_pairs):

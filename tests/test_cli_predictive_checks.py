@@ -29,7 +29,8 @@ def test_a_hidden_view_is_marked_and_named_and_a_clean_one_is_not(
     rows = json.loads((tmp_path / "runs/look/run.json").read_text())["rows"]
     values = [row["p value"] for row in rows]
     assert values[0] == "" and all(values[1:])
-    marked = [k for k, p in enumerate(values) if p.endswith("!")]
+    marked = [k for k, p in enumerate(values) if p == "<0.001!"]
+    assert all(0.001 <= float(p) <= 1.0 for k, p in enumerate(values) if k and k not in marked)
     warnings = [line for line in ran.out.splitlines() if "predictive check" in line]
     if hidden:
         assert scene.hidden_view is not None and scene.hidden_view + 1 in marked

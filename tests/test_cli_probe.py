@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import json
 import re
 import tempfile
@@ -14,7 +15,9 @@ import pytest
 import torch
 
 from bcppl.beliefs import Belief
+from bcppl.cli import probe
 from bcppl.inference.filters.guided_smc import infer
+from bcppl.inference.planning.candidate_list import MIXED
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.recordings import save
@@ -223,3 +226,8 @@ def load_twice(folder: Path) -> Path:
     )
     save_actions([plan, plan], folder / "twice.json")
     return folder / "twice.json"
+
+
+def test_help_states_the_default_candidates(bcppl: Callable[..., Ran]) -> None:
+    default = ",".join(f"{kind}:{count}" for kind, count in MIXED.items())
+    assert f"{default} by default" in " ".join(str(inspect.signature(probe.probe)).split())

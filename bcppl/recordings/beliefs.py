@@ -1,10 +1,10 @@
 """Beliefs on disk: one small HDF5 file after each measurement of a run.
 
-Beside the sought pose's particles, the group `latent` holds what each particle has at every latent address
-of the model, (N, *event) each and in the particles' order, so that one set of weights is for all:
+Beside the particles over the sought pose, the group `latent` holds their values at every latent address of
+the model, (N, *event) each in the particles' order, so that one set of weights is for all:
 
     belief, values = load_belief(path), load_latent(path)
-    share = belief.weights[values["which"] == 2].sum()  # how likely it is the third hole
+    share = belief.weights[values["which"] == 2].sum()  # probability of the third hole
     grip = Belief(values["grip_from_peg"], belief.log_weights)  # a pose: its mean, spread, modes
 """
 
@@ -45,11 +45,11 @@ def save_belief(
     Args:
         belief: the weighted particles.
         path: where to.
-        label: the measurement after which it stands.
+        label: of the last measurement that it has assimilated.
         log_evidence: of all measurements so far.
-        random_state: torch's generator, so that a run can be gone on with.
-        latent: values (N, *event) at the latent addresses, the pose's own among them if you like.
-        of: the `bcppl.recordings.fingerprint.fingerprint` of the recording as far as it was taken in.
+        random_state: of torch's generator, so that a run can be resumed.
+        latent: values (N, *event) at the latent addresses.
+        of: the `bcppl.recordings.fingerprint.fingerprint` of the recording's assimilated measurements.
     """
     path = Path(path)
     unfinished = path.with_name(path.name + ".part")
@@ -77,10 +77,10 @@ def save_belief(
 
 
 def load_belief(path: str | os.PathLike[str]) -> Belief:
-    """Read a belief that `save_belief` wrote.
+    """The belief in a file that `save_belief` wrote.
 
     Raises:
-        InputError: there is no such file, or it holds no belief that this version reads.
+        InputError: the file does not exist, or holds no belief that this version reads.
     """
     with _opened(path) as file:
         freedom = Freedom(str(file.attrs["free_translation"]), str(file.attrs["free_rotation"]))
@@ -92,14 +92,14 @@ def load_belief(path: str | os.PathLike[str]) -> Belief:
 
 
 def load_latent(path: str | os.PathLike[str]) -> dict[str, Tensor]:
-    """Read what the particles of a belief that `save_belief` wrote have at the model's latent addresses.
+    """The particles' values at the model's latent addresses, in a file that `save_belief` wrote.
 
     Returns:
-        Values (N, *event) by address, in the particles' order: `load_belief(path).weights` weighs them.
+        Values (N, *event) by address, in the particles' order, weighted by `load_belief(path).weights`.
 
     Raises:
-        InputError: there is no such file, it holds no belief that this version reads, or it is of a version
-            of bcppl that kept the pose alone.
+        InputError: the file does not exist, holds no belief that this version reads, or is of a version of
+            bcppl that kept the pose alone.
     """
     with _opened(path) as file:
         if LATENT not in file:
@@ -108,27 +108,27 @@ def load_latent(path: str | os.PathLike[str]) -> dict[str, Tensor]:
 
 
 def load_label(path: str | os.PathLike[str]) -> str:
-    """The measurement after which a belief that `save_belief` wrote stands: "prior", "view 1", "window 7".
+    """The label of a belief that `save_belief` wrote: "prior", "view 1", "window 7".
 
     Raises:
-        InputError: there is no such file, or it holds no belief that this version reads.
+        InputError: the file does not exist, or holds no belief that this version reads.
     """
     with _opened(path) as file:
         return str(file.attrs["label"])
 
 
 def load_fingerprint(path: str | os.PathLike[str]) -> str:
-    """What `save_belief` was told of the recording that a belief is of; empty where it was told nothing.
+    """The fingerprint of the recording that a belief is of; empty where `save_belief` was given none.
 
     Raises:
-        InputError: there is no such file, or it holds no belief that this version reads.
+        InputError: the file does not exist, or holds no belief that this version reads.
     """
     with _opened(path) as file:
         return str(file.attrs.get("of", ""))
 
 
 def is_belief(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is one that `save_belief` wrote, of whatever version."""
+    """Whether `save_belief`, of any version, wrote a file."""
     try:
         with h5py.File(path, "r") as file:
             return bool(file.attrs.get("format") == FORMAT)

@@ -1,0 +1,53 @@
+"""The line that ends a run: its error and its credible region, or its spread where the truth is unknown."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.cli.report import result
+from tests.command_line import short
+from tests.made_recordings import assert_one_sentence
+
+TRUTH = torch.as_tensor(short(1).truth, dtype=torch.float64)
+
+
+def around(pose: torch.Tensor, spread: float, count: int = 400) -> Belief:
+    """A belief of that many draws, shifted along the world's axes."""
+    shift = torch.zeros(count, 6, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    shift[:, :3] = spread * torch.randn(count, 3, dtype=torch.float64, generator=generator)
+    return Belief(poses.retract(pose, shift), torch.zeros(count, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("off", [0.0, 0.01])
+def test_with_the_truth_the_error_and_whether_the_region_contains_it(off: float) -> None:
+    away = TRUTH.clone()
+    away[0] += off
+    line = result(around(away, 0.001), replace(short(1), truth=TRUTH.numpy()))
+    assert_one_sentence(line)
+    numbers = [float(each) for each in re.findall(r"([\d.]+) mm", line)]
+    mean, symmetric, average, radius = numbers
+    # Of a normal in three dimensions 90 % lie within 2.50 standard deviations, and the mean distance is 1.60.
+    assert mean == pytest.approx(1e3 * off, abs=0.2) and symmetric <= mean
+    assert radius == pytest.approx(2.5, abs=0.25)
+    assert average == pytest.approx(1.6 if off == 0.0 else 10.1, abs=0.15)
+    assert line.endswith("contains the truth." if off == 0.0 else "misses the truth.")
+
+
+def test_without_the_truth_the_standard_deviations() -> None:
+    line = result(around(TRUTH, 0.001), replace(short(1), truth=None))
+    assert_one_sentence(line)
+    deviations = re.findall(r"standard deviations ([\d.]+) ([\d.]+) ([\d.]+) mm", line)[0]
+    assert [float(each) for each in deviations] == pytest.approx([1.0] * 3, abs=0.12)
+    assert "90 % credible region is within 2." in line and "truth" not in line
+
+
+def test_too_few_particles_have_no_region() -> None:
+    line = result(around(TRUTH, 0.001, 4), replace(short(1), truth=TRUTH.numpy()))
+    assert "too few for a 90 % credible region" in line and "inf" not in line
