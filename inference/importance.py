@@ -1,6 +1,4 @@
-"""Importance sampling: the start of SMC, and by itself an estimate of evidence and posterior.
-
-Plain, or tempered: from the prior to the posterior of a program whose data come all at once.
+"""Importance sampling, plain or tempered: the first step of SMC, or an estimate of evidence and posterior.
 
 Robert and Casella, Monte Carlo Statistical Methods, 2004, section 3.3.
 """
@@ -36,18 +34,18 @@ def importance_sampling(
         args: its arguments.
         observations: values by address, of the shape of the sites' events.
         particles: N.
-        proposal: a Pyro program `proposal(*args)` that chooses values at latent addresses of `program`, more
-            widely than the posterior; what it leaves out is drawn from `program`. By default all is.
+        proposal: a Pyro program `proposal(*args)` that samples values at latent addresses of `program`, with
+            heavier tails than the posterior; other addresses are drawn from `program`. By default all are.
 
     Raises:
-        InputError: an observed or proposed address is never visited, the proposal chooses nothing, or
-            chooses what is observed.
+        InputError: an observed or proposed address is never visited, or the proposal samples no address or
+            an observed one.
     """
     if proposal is None:
         return Population(*generate(program, args, observations, particles))
     proposed = propose(proposal, args, particles)
     if not proposed.choices:
-        raise InputError("a proposal for importance sampling chooses nothing; leave it out.")
+        raise InputError("a proposal for importance sampling samples no address; give none.")
     trace, log_weights = generate(program, args, observations, particles, proposed.choices)
     return Population(trace, log_weights - proposed.log_prob)
 
@@ -59,21 +57,21 @@ def tempered_importance_sampling(
     particles: int,
     step: Tempered,
 ) -> Stepped:
-    """From the prior to the posterior, all observations let in together, bit by bit.
+    """Weighted particles of the posterior, by tempering the likelihood of all observations together.
 
-    The SMC sampler of Del Moral, Doucet and Jasra, JRSS B 68, 2006, section 3.3.2. Where data come one after
-    another, start with `importance_sampling` and go on with `bcppl.inference.filters.step.steps`.
+    The SMC sampler of Del Moral, Doucet and Jasra, JRSS B 68, 2006, section 3.3.2. For sequential data, start
+    with `importance_sampling` and continue with `bcppl.inference.filters.step.steps`.
 
     Args:
         program: a Pyro program.
         args: its arguments.
         observations: values by address, of the shape of the sites' plates and events.
         particles: N.
-        step: how the likelihood is let in, `tempered(kernel)`; what the program itself fixes (`obs=`,
-            `pyro.factor`) is let in with it.
+        step: `tempered(kernel)`; it also tempers what the program itself conditions on (`obs=`,
+            `pyro.factor`).
 
     Returns:
-        The population, with the evidence of all observations, and what happened.
+        The population, with the evidence of all observations, and a record of the steps.
 
     Raises:
         InputError: an observed address is never visited, or `step` is no `tempered(...)`.
@@ -81,7 +79,7 @@ def tempered_importance_sampling(
     """
     if not isinstance(step, Tempered):
         raise InputError(
-            "tempered_importance_sampling is given something else than a step; give tempered(kernel)."
+            f"tempered_importance_sampling is given a {type(step).__name__} as step; give tempered(kernel)."
         )
     trace, log_likelihood = generate(program, args, observations, particles)
     prior = Population(trace, torch.zeros_like(log_likelihood))

@@ -1,7 +1,4 @@
-"""Resampling: when particles are drawn anew by their weights, as decorators of a scheme.
-
-Which ones go on is for the scheme to say (`bcppl.inference.schemes`).
-"""
+"""When to resample: always, never or adaptively, as decorators of a scheme (`bcppl.inference.schemes`)."""
 
 from __future__ import annotations
 
@@ -28,7 +25,7 @@ __all__ = [
 ]
 
 
-# The resampled population and its ancestors (N,), or None where all particles stay as they are.
+# The resampled population and its ancestors (N,), or the same population and None.
 Resample = Callable[[Population], tuple[Population, Tensor | None]]
 
 
@@ -36,7 +33,7 @@ def always(scheme: Scheme = systematic) -> Resample:
     """Resample at every opportunity.
 
     Raises:
-        InputError: what is given is no scheme.
+        InputError: it is given no scheme.
     """
     if not callable(scheme):
         raise InputError(f"resampling is given {scheme!r} in place of a scheme; give one such as systematic.")
@@ -48,8 +45,8 @@ def always(scheme: Scheme = systematic) -> Resample:
     return resample
 
 
-def refuse_scheme(where: str, resample: object) -> None:
-    """Refuse what does not say when to resample, such as a scheme by itself.
+def check_resample(where: str, resample: object) -> None:
+    """Check that an argument is a `Resample`, and not a scheme by itself.
 
     Raises:
         InputError: it is no function of a population.
@@ -57,13 +54,13 @@ def refuse_scheme(where: str, resample: object) -> None:
     if not callable(resample) or resample in (systematic, stratified, multinomial, residual, ssp):
         name = getattr(resample, "__name__", type(resample).__name__)
         raise InputError(
-            f"{where} is told to resample by {name}, which does not say when; "
+            f"{where} is given {name} as resample, which does not define when to resample; "
             "give always(scheme), adaptive(scheme, 0.5) or never."
         )
 
 
 def never(population: Population) -> tuple[Population, Tensor | None]:
-    """Leave the weights as they are."""
+    """Do not resample."""
     return population, None
 
 

@@ -1,4 +1,4 @@
-"""Verbs that change how many particles a population has; each leaves what it estimates unbiased.
+"""Verbs that change the number of particles of a population; its estimates stay unbiased.
 
 GenParticleFilters.jl (`pf_resize!`, `pf_replicate!`, `pf_coalesce!`) has the same verbs.
 """
@@ -19,7 +19,7 @@ from bcppl.traces.series import SeriesTrace
 
 
 def resized(population: Population, count: int, scheme: Scheme = systematic) -> Population:
-    """A population grown or shrunk to `count` particles by resampling, equally weighted.
+    """A population resampled to `count` particles of equal weight.
 
     Raises:
         InferenceError: no particle has any weight.
@@ -29,7 +29,7 @@ def resized(population: Population, count: int, scheme: Scheme = systematic) -> 
 
 
 def replicated(population: Population, times: int) -> Population:
-    """Every particle `times` times, side by side, each copy with the same weight; nothing is drawn.
+    """A population with `times` copies of every particle, side by side, of equal weight; nothing is drawn.
 
     Raises:
         InputError: `times` is no whole number, 1 or more.
@@ -39,10 +39,10 @@ def replicated(population: Population, times: int) -> Population:
 
 
 def merged(population: Population) -> Population:
-    """Particles that agree in every latent value made one, with the sum of their weights.
+    """A population whose particles with equal latent values are merged, their weights added.
 
-    The first of each keeps its place. Of copies that descend from different founders the variance of the
-    evidence can no longer be told (`bcppl.inference.variance`).
+    The first of each keeps its place. After merging copies of different founders the variance of the evidence
+    can no longer be estimated (`bcppl.inference.variance`).
 
     Raises:
         InferenceError: no particle has any weight.
@@ -50,7 +50,7 @@ def merged(population: Population) -> Population:
     """
     if isinstance(population.trace, SeriesTrace):
         raise InputError(
-            "the particles of a series cannot be merged: those that agree in the newest step may have "
+            "the particles of a series cannot be merged: those with equal values at the newest step may have "
             "different pasts; resample instead (`resized`)."
         )
     count = len(population)
@@ -63,7 +63,7 @@ def merged(population: Population) -> Population:
     total = torch.zeros(groups, dtype=torch.float64).index_add_(0, group, weights)
     order = first.argsort()
     kept = first[order]
-    # The mean weight stays what it was, so a merged population goes on as the whole would have.
+    # The mean weight is unchanged, so the merged population has the same estimates.
     log_weights = total.log()[order] + population.log_total + math.log(groups / count)
     mixed = bool((population.founders[first][group] != population.founders).any())
     return replace(

@@ -1,4 +1,4 @@
-"""Stratified starts: the first latent choice is drawn stratum by stratum, so that none is left out.
+"""Stratified initial populations: the first latent choice is drawn by stratum, so that each has particles.
 
 Cochran, Sampling Techniques, 1977, chapter 5; as in GenParticleFilters.jl's `pf_initialize` with strata.
 """
@@ -31,51 +31,51 @@ def generate_stratified(
 ) -> Population:
     """Generate, with the first latent choice of the program drawn by stratum.
 
-    A discrete choice takes each of its values with equally many particles, weighed by the value's chance. A
-    real one with an inverse distribution function is drawn within `strata` stretches of equal chance. For any
-    other, such as a pose, `strata` says which stratum a value lies in; then `candidates` times as many
-    particles are drawn from the program, and from each stratum equally many go on, weighed by the share of
-    the candidates that fell there. The estimate of the evidence is unbiased in all three.
+    A discrete choice takes each of its values with equally many particles, weighted by the value's
+    probability. A real one with an inverse distribution function is drawn within `strata` intervals of equal
+    probability. For any other, such as a pose, `strata` maps a value to its stratum; then `candidates` times
+    as many particles are drawn from the program, and equally many are kept from each stratum, weighted by its
+    share of the candidates. The estimate of the evidence is unbiased in all three.
 
     Args:
         program: a Pyro program.
         args: its arguments.
         observations: values by address, as for `generate`.
         particles: N.
-        strata: how many stretches, by default N; or a function of values (M, *event) that gives the number of
-            each one's stratum, (M,) int64.
-        candidates: how many for each particle, where `strata` is a function.
+        strata: the number of intervals, by default N; or a function of values (M, *event) that returns the
+            number of each one's stratum, (M,) int64.
+        candidates: the number for each particle, where `strata` is a function.
 
     Returns:
-        The population. The variance of its evidence cannot be told from its founders.
+        The population. The variance of its evidence cannot be estimated from its founders.
 
     Raises:
         InputError: a count is no whole number, 1 or more, there is no latent choice, there are fewer
             particles than strata, or no inverse distribution function and no function given.
     """
-    candidates = whole_number("a stratified start is given {} candidates for each particle", candidates)
+    candidates = whole_number("generate_stratified is given {} candidates for each particle", candidates)
     if strata is not None and not callable(strata):
-        strata = whole_number("a start is given {} strata", strata)
+        strata = whole_number("generate_stratified is given {} strata", strata)
     trace, _ = generate(program, args, observations, particles)
     if not trace.choices:
-        raise InputError("a start is to be stratified, but the program has no latent choice; use generate.")
+        raise InputError("a program without latent choice cannot be stratified; use generate.")
     address = next(a for a in trace.addresses if a in trace.choices)
     if callable(strata):
         wide = generate(program, args, observations, particles * candidates)
-        return _chosen(*wide, strata(wide[0][address]), particles)
+        return _selected(*wide, strata(wide[0][address]), particles)
     if trace.distributions[address].has_enumerate_support:
         return _enumerated(program, args, observations, trace, address)
-    return _stretched(program, args, observations, trace, address, particles if strata is None else strata)
+    return _by_quantile(program, args, observations, trace, address, particles if strata is None else strata)
 
 
-def _start(trace: Trace, log_weights: Tensor) -> Population:
+def _population(trace: Trace, log_weights: Tensor) -> Population:
     return Population(trace, log_weights, log_pairs=math.inf)
 
 
 def _refuse_more(strata: int, particles: int) -> None:
     if not 0 < strata <= particles:
         raise InputError(
-            f"{particles} particles are to represent {strata} strata; give at least one for each stratum."
+            f"{particles} particles cannot represent {strata} strata; give at least one for each stratum."
         )
 
 
@@ -89,8 +89,8 @@ def _enumerated(
     site, particles = trace.distributions[address], trace.particles
     if len(site.batch_shape) > 1:
         raise InputError(
-            f"the first latent choice {address!r} stands in a plate; "
-            "give strata as a function that says which stratum a value lies in."
+            f"the first latent choice {address!r} is in a plate; "
+            "give strata as a function that maps a value to its stratum."
         )
     values = site.enumerate_support(expand=False)
     values = values.reshape(len(values), *site.event_shape)
@@ -99,10 +99,10 @@ def _enumerated(
     chosen = values[stratum].to(trace[address])
     started, log_weights = generate(program, args, observations, particles, {address: chosen})
     share = torch.bincount(stratum).to(torch.float64) / particles
-    return _start(started, log_weights - share.log()[stratum])
+    return _population(started, log_weights - share.log()[stratum])
 
 
-def _stretched(
+def _by_quantile(
     program: Program | Series,
     args: tuple[Any, ...],
     observations: Mapping[str, Tensor],
@@ -112,7 +112,7 @@ def _stretched(
 ) -> Population:
     site, particles = trace.distributions[address], trace.particles
     _refuse_more(strata, particles)
-    # Of strata that do not divide N, chance says which get one more: each draw is then the program's own.
+    # Where the strata do not divide N, random ones get one more: each draw is then the program's own.
     stratum = (torch.arange(particles) + int(torch.randint(strata, ()))) % strata
     quantile = (stratum + torch.rand(particles, dtype=torch.float64)) / strata
     try:
@@ -122,26 +122,26 @@ def _stretched(
     except NotImplementedError:
         raise InputError(
             f"the first latent choice {address!r} has no inverse distribution function; "
-            "give strata as a function that says which stratum a value lies in."
+            "give strata as a function that maps a value to its stratum."
         ) from None
     started, log_weights = generate(program, args, observations, particles, {address: chosen})
-    # The values are the program's own draws: it is only together that they are spread more evenly.
-    return _start(started, log_weights - started.log_prob(address))
+    # Each value is a draw of the program; only jointly are they more even than independent draws.
+    return _population(started, log_weights - started.log_prob(address))
 
 
-def _chosen(trace: Trace, log_weights: Tensor, stratum: Tensor, particles: int) -> Population:
-    _, stratum, found = torch.unique(stratum, return_inverse=True, return_counts=True)
-    _refuse_more(len(found), particles)
-    wanted = torch.full_like(found, particles // len(found))
-    wanted[: particles % len(found)] += 1
+def _selected(trace: Trace, log_weights: Tensor, stratum: Tensor, particles: int) -> Population:
+    _, stratum, counts = torch.unique(stratum, return_inverse=True, return_counts=True)
+    _refuse_more(len(counts), particles)
+    wanted = torch.full_like(counts, particles // len(counts))
+    wanted[: particles % len(counts)] += 1
     # Candidates are exchangeable within a stratum, so the first of each are as good as any. A stratum with
-    # fewer than are wanted gives some of them more than once, each with its share of the weight.
+    # fewer than are wanted repeats some of them, each with its share of the weight.
     kept, log_factors = [], []
-    for number, (count, want) in enumerate(zip(found.tolist(), wanted.tolist(), strict=True)):
+    for number, (count, want) in enumerate(zip(counts.tolist(), wanted.tolist(), strict=True)):
         members = (stratum == number).nonzero().flatten()
         kept.append(members[torch.arange(want) % count])
         each = torch.bincount(torch.arange(want) % count).to(torch.float64)
         weight = count / len(stratum) * particles / min(count, want) / each
         log_factors.append(weight.log()[torch.arange(want) % count])
     index = torch.cat(kept)
-    return _start(trace[index], log_weights[index] + torch.cat(log_factors))
+    return _population(trace[index], log_weights[index] + torch.cat(log_factors))

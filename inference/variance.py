@@ -1,4 +1,4 @@
-"""The variance of a run's evidence, from that run alone: how many founders the particles still descend from.
+"""The variance of a run's evidence, estimated from the genealogy of that run alone.
 
 Lee and Whiteley, Variance estimation in the particle filter, Biometrika 105, 2018, eq. 8.
 """
@@ -17,16 +17,15 @@ def evidence_variance(population: Population) -> float:
     """Relative variance of a run's estimate of the evidence: about the variance of its log.
 
     With multinomial resampling, at fixed times, and fixed exponents and proposals, this times the squared
-    estimate is unbiased for the estimate's variance; when to resample may hang on the particles (Du and
-    Guyader, Variance estimation in adaptive sequential Monte Carlo, Annals of Applied Probability 31, 2021:
-    consistent). It counts on independent draws: use `always(multinomial)` or `adaptive(multinomial)` where it
-    is wanted. With systematic or SSP resampling at every step it came out three times too small on a walk of
-    five steps. It may come out negative where the variance is small, and says little once few founders are
-    left.
+    estimate is unbiased for the estimate's variance; with resampling times that depend on the particles it is
+    consistent (Du and Guyader, Variance estimation in adaptive sequential Monte Carlo, Annals of Applied
+    Probability 31, 2021). It assumes independent draws: use `always(multinomial)` or `adaptive(multinomial)`.
+    With systematic or SSP resampling at every step it was three times too small on a walk of five steps. It
+    may be negative where the variance is small, and is imprecise once few founders are left.
 
     Returns:
-        NaN where all particles with weight share one founder, where founders were merged, or where the
-        start was stratified.
+        The relative variance; NaN where all particles with weight share one founder, where founders were
+        merged, or where the initial population was stratified.
 
     Raises:
         InferenceError: no particle has any weight.

@@ -144,7 +144,7 @@ def test_a_scheme_in_place_of_a_resampling_is_refused() -> None:
         lambda r: tempered(WALK, resample=r),
         lambda r: smcp3(Pair(drift("x"), drift("x")), resample=r),
     ):
-        with pytest.raises(InputError, match="resample by systematic, which does not say when"):
+        with pytest.raises(InputError, match="given systematic as resample, which does not define when"):
             make(systematic)
     with pytest.raises(InputError, match="in place of a scheme"):
         always(0.5)  # type: ignore[arg-type]

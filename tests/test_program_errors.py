@@ -272,7 +272,7 @@ def test_what_no_particle_can_explain_is_named() -> None:
 
     trace, weights = generate(program, (), {"near": number(0.0), "far": number(99.0)}, N)
     assert trace.impossible() == trace[[0, 1]].impossible() == ["far"]
-    with pytest.raises(NoWeightError, match="measured at 'far' cannot be; widen the prior"):
+    with pytest.raises(NoWeightError, match="'far' is impossible at every particle; widen the prior"):
         _ = Population(trace, weights).effective_sample_size
 
 

@@ -63,7 +63,7 @@ def test_quantiles_by_hand() -> None:
         even = torch.arange(1, count + 1, dtype=torch.float64)
         exact = weighted_quantiles(even, torch.full((count,), 1 / count, dtype=torch.float64), [0.3, 0.7])
         torch.testing.assert_close(exact, column(0.3 * count + 0.5, 0.7 * count + 0.5))
-    with pytest.raises(InputError, match="probabilities from 0 to 1"):
+    with pytest.raises(InputError, match="give numbers from 0 to 1"):
         weighted_quantiles(values, weights, 1.2)
 
 
@@ -127,14 +127,15 @@ def test_regions_hold_a_fresh_draw_as_often_as_they_say(weighted: bool) -> None:
     mix = torch.randn(6, 6, dtype=torch.float64) * SPREAD[:, None]
     shift = column(0.5, 0, 0, 0.5, 0, 0) * weighted
     replicates, naive = 200, 0
-    held = torch.zeros(len(MEASURES))
+    measures = MEASURES if weighted else MEASURES[:1]
+    held = torch.zeros(len(measures))
     for _ in range(replicates):
         draws = torch.randn(76, 6, dtype=torch.float64)
         draws[:75] += shift
         log_weights = 0.5 * ((draws[:75] - shift) ** 2).sum(1) - 0.5 * (draws[:75] ** 2).sum(1)
         particles = poses.retract(CENTER, draws @ mix.T)
         belief, truth = Belief(particles[:75], log_weights), particles[75]
-        held += torch.tensor([float(belief.credible_region(0.9, m).contains(truth)) for m in MEASURES])
+        held += torch.tensor([float(belief.credible_region(0.9, m).contains(truth)) for m in measures])
         # The mutant: the particles' own Mahalanobis distances, each with its share in mean and covariance.
         distance = belief.credible_region(0.9).distance
         naive += bool(

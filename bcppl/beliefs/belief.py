@@ -1,4 +1,4 @@
-"""A belief: weighted poses, what they say together, and where they fall apart into modes."""
+"""A belief: weighted poses, their moments and quantiles, and their modes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Belief:
     Attributes:
         world_from_part: (N, 7) poses, float64 (made so, if they are of another type).
         log_weights: (N,) unnormalised, float64 (likewise).
-        freedom: which axes of the pose are free.
+        freedom: the free axes of the pose.
 
     Raises:
         InputError: the poses are not (N, 7) or not finite, or the weights not (N,).
@@ -43,8 +43,8 @@ class Belief:
             values: object = getattr(self, name)
             if not isinstance(values, Tensor):
                 raise InputError(
-                    f"a belief is given {name} as a {type(values).__name__}; give a tensor, such as "
-                    "torch.as_tensor makes of it."
+                    f"a belief is given {name} as a {type(values).__name__}; give a tensor, with "
+                    "torch.as_tensor."
                 )
             object.__setattr__(self, name, values.to(torch.float64))
         given, weights = tuple(self.world_from_part.shape), tuple(self.log_weights.shape)
@@ -81,7 +81,7 @@ class Belief:
 
     @cached_property
     def distinct(self) -> int:
-        """How many particles with weight differ from one another."""
+        """The number of distinct particles with weight."""
         return len(self.merged)
 
     @cached_property
@@ -115,7 +115,7 @@ class Belief:
         return self.covariance.diagonal().clamp_min(0.0).sqrt()
 
     def quantiles(self, probabilities: object) -> Tensor:
-        """Weighted quantiles of every tangent coordinate at the mean by itself: metres, then radians.
+        """Weighted quantiles of each tangent coordinate at the mean: metres, then radians.
 
         Args:
             probabilities: one or several in [0, 1].
@@ -130,19 +130,19 @@ class Belief:
 
     @cached_property
     def merged(self) -> Belief:
-        """The same belief with the copies of a pose made one particle, which has the sum of their weights."""
+        """The same belief with the copies of a pose merged into one particle, their weights added."""
         world_from_part, weights = merged(self.world_from_part, self.weights)
         return Belief(world_from_part, weights.log(), self.freedom)
 
     def credible_region(self, mass: float, measure: Measure = pose_deviation) -> Region:
-        """The poses around the mean that hold the truth with probability `mass` (`bcppl.beliefs.regions`).
+        """The region about the mean that contains the truth with probability `mass`.
 
         Args:
             mass: in (0, 1).
-            measure: how far a pose is from the mean: `pose_deviation`, `translation_deviation`,
+            measure: the distance of a pose from the mean: `pose_deviation`, `translation_deviation`,
                 `rotation_deviation` (standard deviations), `translation_distance` (metres), `rotation_angle`
                 (radians), `average_point_distance(points)` (ADD, metres), or, from the nearest of several
-                modes, `nearest_mode_deviation()`.
+                modes, `nearest_mode_deviation()`. See `bcppl.beliefs.regions`.
 
         Raises:
             InputError: the mass is not in (0, 1), or every axis of the measure is held.
@@ -150,9 +150,9 @@ class Belief:
         return region(self.merged, mass, measure)
 
     def add_radius(self, points: np.ndarray | Tensor, mass: float) -> float:
-        """The ADD from the mean pose, metres, that `mass` of the belief's weight does not exceed.
+        """The quantile at `mass` of the ADD from the mean pose, metres.
 
-        It is a quantile of the belief as it stands; `credible_region` makes room for few particles as well.
+        It is a quantile of the particles; `credible_region` also corrects for their number.
 
         Args:
             points: (M, 3) on the part's surface, in its frame.
@@ -166,23 +166,23 @@ class Belief:
     def modes(
         self, translation: float = 0.01, rotation: float = 0.2, symmetries: Tensor | None = None
     ) -> list[Mode]:
-        """The clusters that the particles fall into, the heaviest first.
+        """The clusters of the particles, the heaviest first.
 
-        Two clusters are apart where a gap parts them: (metres / translation)^2 + (radians / rotation)^2 > 1
-        between every particle of one and every particle of the other (`bcppl.beliefs.modes.cluster`).
+        A gap separates two clusters: (metres / translation)^2 + (radians / rotation)^2 > 1 between every
+        particle of one and every particle of the other (`bcppl.beliefs.modes.cluster`).
 
         Args:
             translation: metres.
             rotation: radians.
-            symmetries: (K, 7) `part_from_part`, a group under which the part looks the same: poses that
-                differ by one are the same, and a mode gathers them around its heaviest particle.
+            symmetries: (K, 7) `part_from_part`, a group that leaves the part invariant: poses that differ
+                by one are equivalent, and a mode gathers them about its heaviest particle.
 
         Raises:
             InputError: a scale is not positive, or there are more than 10,000 distinct particles.
         """
         whole = self.merged
         label = modes.cluster(whole.world_from_part, translation, rotation, symmetries)
-        found = []
+        clusters = []
         for which in range(int(label.max()) + 1):
             within = label == which
             poses_within, weights = whole.world_from_part[within], whole.weights[within]
@@ -191,39 +191,36 @@ class Belief:
                     poses_within, poses_within[weights.argmax()], translation, rotation, symmetries
                 )
             belief = Belief(poses_within, weights.log(), self.freedom)
-            found.append(Mode(float(weights.sum()), belief))
-        return sorted(found, key=lambda mode: -mode.mass)
+            clusters.append(Mode(float(weights.sum()), belief))
+        return sorted(clusters, key=lambda mode: -mode.mass)
 
     @property
     def weight_entropy(self) -> float:
-        """Entropy of the weights of the distinct particles, nats: at most log of how many there are."""
+        """Entropy of the weights of the distinct particles, nats: at most the log of their number."""
         return entropy.weight_entropy(self.merged.weights)
 
     @property
     def gaussian_entropy(self) -> float:
         """Entropy in nats, against the base measure, of the Gaussian at the mean (`bcppl.beliefs.entropy`).
 
-        Too high where there are several modes: use `entropy_of_modes`. -inf where the particles do not span
-        the free axes.
+        It overestimates the entropy of several modes: use `entropy_of_modes`. -inf where the particles do not
+        span the free axes.
         """
-        whole = self.merged
-        return entropy.gaussian_entropy(whole.world_from_part, whole.weights, self.mean, self.freedom)
+        return entropy.gaussian_entropy(self)
 
     def nearest_neighbour_entropy(self, neighbours: int = 3) -> float:
-        """Entropy in nats, against the base measure, by distances to neighbours (`bcppl.beliefs.entropy`).
+        """The nearest-neighbour estimate of the entropy in nats, against the base measure.
 
-        It asks for no shape, but for many particles. -inf where they do not span the free axes.
+        It assumes no shape, but needs many particles (`bcppl.beliefs.entropy`). -inf where they do not span
+        the free axes.
 
         Raises:
             InputError: `neighbours` is below 1.
         """
-        whole = self.merged
-        return entropy.nearest_neighbour_entropy(
-            whole.world_from_part, whole.weights, self.mean, self.freedom, neighbours
-        )
+        return entropy.nearest_neighbour_entropy(self, neighbours)
 
     def add(self, points: np.ndarray | Tensor, truth: np.ndarray | Tensor) -> Tensor:
-        """ADD (N,) of every particle, metres: the mean distance of points from where the true pose puts them.
+        """ADD (N,) of every particle, metres: the mean distance of model points from their true positions.
 
         Args:
             points: (M, 3) on the part's surface, in its frame.

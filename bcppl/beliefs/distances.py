@@ -1,4 +1,4 @@
-"""ADD and ADD-S: how far a pose puts the points of a part from where the true pose puts them."""
+"""ADD and ADD-S: mean distances of a part's points at a pose from those at the true pose."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def average_nearest_distance(
 ) -> Tensor:
     """ADD-S (...) of poses (..., 7): as ADD, but to the nearest true point instead of the same one, metres.
 
-    Source: Hinterstoisser et al., ACCV 2012, eq. 4, for parts that look the same from several sides.
+    Source: Hinterstoisser et al., ACCV 2012, eq. 4, for symmetric parts.
     """
     points, truth = torch.as_tensor(points), poses.as_pose(truth, "the true pose")
     there = poses.transform(truth, points).numpy()

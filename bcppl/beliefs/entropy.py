@@ -2,13 +2,14 @@
 
 The base measure is Lebesgue on the free translations times the normalised Haar measure on the free rotations
 (`bcppl.poses.Freedom`). A density p over the tangent coordinates at the mean is p / J against it, J being the
-base measure's density there, so an entropy against it is that of the coordinates plus the mean of log J. All
-of them read merged copies, so doubling every particle changes nothing.
+base measure's density there, so an entropy against it is that of the coordinates plus the mean of log J.
+Copies are merged first, so doubling every particle changes nothing.
 """
 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,24 +21,21 @@ from bcppl import poses
 from bcppl.arguments import whole_number
 from bcppl.poses import Freedom
 
+if TYPE_CHECKING:
+    from bcppl.beliefs.belief import Belief
+
 
 def weight_entropy(weights: Tensor) -> float:
     """-sum w log w of normalised weights (K,): log K where they are equal."""
     return float(torch.special.entr(weights).sum())
 
 
-def gaussian_entropy(world_from_part: Tensor, weights: Tensor, mean: Tensor, freedom: Freedom) -> float:
-    """Entropy of the Gaussian in the tangent space at a mean that has the particles' covariance.
+def gaussian_entropy(belief: Belief) -> float:
+    """Entropy of the Gaussian in the tangent space at a belief's mean that has the particles' covariance.
 
     1/2 log det(2 pi e covariance), plus the mean of log J; -inf where the particles do not span the axes.
-
-    Args:
-        world_from_part: (K, 7) distinct poses.
-        weights: (K,) normalised.
-        mean: (7,).
-        freedom: which axes are free.
     """
-    tangent = poses.local(mean, world_from_part)
+    tangent, weights, freedom = _merged(belief)
     factor = _cholesky(freedom.coordinates(tangent), weights)
     if factor is None:
         return -math.inf
@@ -46,32 +44,23 @@ def gaussian_entropy(world_from_part: Tensor, weights: Tensor, mean: Tensor, fre
     return gaussian + _mean_log_base_density(tangent, weights, freedom)
 
 
-def nearest_neighbour_entropy(
-    world_from_part: Tensor, weights: Tensor, mean: Tensor, freedom: Freedom, neighbours: int
-) -> float:
-    """Entropy by the distance to the k-th nearest neighbour, whatever the shape of the belief.
+def nearest_neighbour_entropy(belief: Belief, neighbours: int) -> float:
+    """The k-nearest-neighbour estimate of the entropy of a belief of any shape.
 
     Kozachenko and Leonenko, Sample estimate of the entropy of a random vector, Problems of Information
     Transmission 23, 1987, for k neighbours as in Kraskov, Stögbauer and Grassberger, Physical Review E 69,
-    2004, eq. 20. Distances are Mahalanobis distances in the tangent space at the mean. The distances tell the
-    density q of the particles; that of the belief is q times K times the weight thereabouts, which is the
-    mean weight of the k neighbours (the particle's own would count itself twice).
+    2004, eq. 20. Distances are Mahalanobis distances in the tangent space at the mean. They estimate the
+    density q of the particles; that of the belief is q times K times the local weight, the mean weight of the
+    k neighbours (the particle's own would be counted twice).
 
-    It is biased upwards by what density changes within that distance: with few particles and many axes by
+    It is biased upwards where the density varies within that distance: with few particles and many axes by
     tenths of a nat and more.
-
-    Args:
-        world_from_part: (K, 7) distinct poses.
-        weights: (K,) normalised.
-        mean: (7,).
-        freedom: which axes are free.
-        neighbours: k.
 
     Raises:
         InputError: k is no whole number, 1 or more.
     """
-    neighbours = whole_number("an entropy by {} neighbours was asked for", neighbours)
-    tangent = poses.local(mean, world_from_part)
+    neighbours = whole_number("nearest_neighbour_entropy is given {} neighbours", neighbours)
+    tangent, weights, freedom = _merged(belief)
     coordinates = freedom.coordinates(tangent)
     count, dimension = coordinates.shape
     factor = _cholesky(coordinates, weights)
@@ -79,12 +68,18 @@ def nearest_neighbour_entropy(
         return -math.inf
     white = torch.linalg.solve_triangular(factor, coordinates.T, upper=False).T.numpy()
     radius, near = cKDTree(white).query(white, k=neighbours + 1)
-    thereabouts = weights[torch.from_numpy(np.asarray(near)[:, 1:])].mean(dim=1)
+    local = weights[torch.from_numpy(np.asarray(near)[:, 1:])].mean(dim=1)
     ball = 0.5 * dimension * math.log(math.pi) - math.lgamma(0.5 * dimension + 1.0)
     volume = ball + dimension * torch.from_numpy(np.asarray(radius)[:, -1]).log()
     particles_density = float(digamma(neighbours) - digamma(count)) - volume
-    found = -float(weights @ (particles_density + (count * thereabouts).log()))
-    return found + float(factor.diagonal().log().sum()) + _mean_log_base_density(tangent, weights, freedom)
+    white_entropy = -float(weights @ (particles_density + (count * local).log()))
+    volume_ratio = float(factor.diagonal().log().sum())
+    return white_entropy + volume_ratio + _mean_log_base_density(tangent, weights, freedom)
+
+
+def _merged(belief: Belief) -> tuple[Tensor, Tensor, Freedom]:
+    """Tangents (K, 6) at the mean and weights (K,) of the distinct particles, and the free axes."""
+    return poses.local(belief.mean, belief.merged.world_from_part), belief.merged.weights, belief.freedom
 
 
 def _cholesky(coordinates: Tensor, weights: Tensor) -> Tensor | None:

@@ -1,4 +1,4 @@
-"""Copies of a pose made one particle, with the sum of their weights."""
+"""Copies of a pose merged into one particle, with the sum of their weights."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def merged(world_from_part: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def distinct_poses(world_from_part: Tensor) -> tuple[Tensor, Tensor]:
-    """The distinct poses (K, 7) among those (N, 7), and which of them each is, (N,) int64."""
+    """The distinct poses (K, 7) among those (N, 7), and the index (N,) int64 of each among them."""
     turn = world_from_part[:, 3:]
     # One sign for a quaternion and its opposite: that of its first number that is not 0.
     first = (turn != 0).to(torch.int8).argmax(dim=1, keepdim=True)

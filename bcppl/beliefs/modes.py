@@ -1,4 +1,4 @@
-"""Modes: what a belief with several places for a part falls apart into."""
+"""Modes: clusters of the particles of a multimodal belief."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.errors import InputError
 
-# Pairs of particles are held as one matrix: this many take 0.8 GB.
+# Pairs of particles are one matrix: this many take 0.8 GB.
 MOST = 10_000
+EXACT = "donot_use_mm_for_euclid_dist"
 
 
 def cluster(
     world_from_part: Tensor, translation: float, rotation: float, symmetries: Tensor | None = None
 ) -> Tensor:
-    """Which cluster each pose is in, int64 (N,): single linkage, the clusters numbered from 0.
+    """The cluster of each pose, int64 (N,) from 0, by single linkage.
 
     Two poses are linked where (metres apart / translation)^2 + (angle between / rotation)^2 <= 1, and are in
     one cluster where a chain of links joins them (Gower and Ross, Minimum spanning trees and single linkage
@@ -29,8 +30,8 @@ def cluster(
         world_from_part: (N, 7).
         translation: the gap between clusters, metres.
         rotation: the gap between clusters, radians.
-        symmetries: (K, 7) `part_from_part`, a group that leaves the part as it is: poses that differ by one
-            are the same. None: the identity alone.
+        symmetries: (K, 7) `part_from_part`, a group that leaves the part invariant: poses that differ by one
+            are equivalent. None: the identity alone.
 
     Raises:
         InputError: a scale is not positive, or there are too many poses.
@@ -43,14 +44,14 @@ def cluster(
 def links(
     world_from_part: Tensor, translation: float, rotation: float, symmetries: Tensor | None = None
 ) -> Tensor:
-    """Which pairs of poses `cluster` links, bool (N, N); it takes and raises what that does."""
+    """The pairs of poses that `cluster` links, bool (N, N), with its arguments and errors."""
     if not (translation > 0 and rotation > 0):
         raise InputError(
-            f"modes were asked for at scales {translation} m and {rotation} rad; give two positive numbers."
+            f"modes have the scales {translation} m and {rotation} rad; give two positive numbers."
         )
     if len(world_from_part) > MOST:
         raise InputError(
-            f"modes of {len(world_from_part)} distinct particles were asked for; resample to {MOST} or fewer."
+            f"modes are given {len(world_from_part)} distinct particles; resample to {MOST} or fewer."
         )
     linked = torch.zeros(len(world_from_part), len(world_from_part), dtype=torch.bool)
     for copy in _copies(world_from_part, symmetries).unbind(dim=1):
@@ -80,7 +81,7 @@ def gathered(
 
 
 def _copies(world_from_part: Tensor, symmetries: Tensor | None) -> Tensor:
-    """The poses (N, 7) and what the symmetries (K, 7) make of them, (N, 1 + K, 7)."""
+    """The poses (N, 7) and their equivalents under the symmetries (K, 7), (N, 1 + K, 7)."""
     if symmetries is None:
         return world_from_part[:, None]
     others = poses.compose(world_from_part[:, None], poses.as_pose(symmetries, "a symmetry"))
@@ -89,13 +90,10 @@ def _copies(world_from_part: Tensor, symmetries: Tensor | None) -> Tensor:
 
 def _separation(first: Tensor, second: Tensor, translation: float, rotation: float) -> Tensor:
     """Squared scaled distances (N, M) between poses (N, 7) and (M, 7)."""
-    # The chord between quaternions, to the nearer of q and -q: the arc cosine is blind to small angles.
+    # The chord between quaternions, to the nearer of q and -q: the arc cosine loses small angles to rounding.
     chord = torch.minimum(
         *(torch.cdist(first[:, 3:], sign * second[:, 3:], compute_mode=EXACT) for sign in (1, -1))
     )
     angle = 4.0 * torch.asin((0.5 * chord).clamp_max(math.sqrt(0.5)))
     apart = torch.cdist(first[:, :3], second[:, :3], compute_mode=EXACT)
     return (apart / translation) ** 2 + (angle / rotation) ** 2
-
-
-EXACT = "donot_use_mm_for_euclid_dist"

@@ -1,16 +1,16 @@
-"""Credible regions: the poses no further from a belief's mean than a radius, by one of several distances.
+"""Credible regions: the poses within a radius of a belief's mean, by one of several distances.
 
-A region of mass p is meant to hold the truth with probability p, if the truth is a draw from the posterior
-of which the particles are n draws: then the truth's distance has the same rank among n + 1 as any particle's.
-So the radius is the particles' quantile at p (n + 1) / n and not at p (split conformal prediction: Vovk,
-Gammerman and Shafer, Algorithmic Learning in a Random World, 2005, section 2.2; weights as in Tibshirani et
-al., NeurIPS 2019), n being the effective sample size of the distinct particles. A particle's own Mahalanobis
-distance is taken from the mean and covariance of the others, because its share in them makes it look nearer
-than a fresh draw would be: with 75 particles and six axes by 13 % in its square. Over 1000 Gaussian beliefs
-of 75 draws, regions of mass 0.9 held 0.91 to 0.93 of fresh draws, and 0.85 without the two corrections.
+A region of mass p contains the truth with probability p, if the truth is a draw from the posterior of which
+the particles are n draws: then the truth's distance has the same rank among n + 1 as any particle's. So the
+radius is the particles' quantile at p (n + 1) / n and not at p (split conformal prediction: Vovk, Gammerman
+and Shafer, Algorithmic Learning in a Random World, 2005, section 2.2; weights as in Tibshirani et al.,
+NeurIPS 2019), n being the effective sample size of the distinct particles. A particle's own Mahalanobis
+distance is taken from the mean and covariance of the others, because its share in them makes it nearer than a
+fresh draw: with 75 particles and six axes by 13 % in its square. Over 1000 Gaussian beliefs of 75 draws,
+regions of mass 0.9 covered 0.91 to 0.93 of fresh draws, and 0.85 without the two corrections.
 
-What this leaves out: particles that moved little since they were copied count as independent, and a weighted
-particle as that many whole ones; a posterior that is wrong keeps its regions wrong.
+Limits: particles that moved little since they were copied count as independent, and a weighted particle as
+that many whole ones; the regions of a miscalibrated posterior are miscalibrated.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Distance:
-    """How far poses are from a belief's mean.
+    """The distance of poses from a belief's mean.
 
     Attributes:
         of: poses (..., 7) to distances (...,).
-        of_particles: (K,) of the belief's own particles, each as if it were not in the belief.
+        of_particles: (K,) of the belief's own particles, each from the mean of the others.
     """
 
     of: Callable[[Tensor], Tensor]
     of_particles: Tensor
 
 
-# Below this variance, in the axes' own standard deviations, the particles do not span a direction.
+# Below this variance, in units of the axes' variances, the particles do not span a direction.
 FLAT = 1e-8
 
 Measure = Callable[["Belief"], Distance]
@@ -54,12 +54,12 @@ Measure = Callable[["Belief"], Distance]
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """The poses no further from `center` than `radius`.
+    """The poses within `radius` of `center`.
 
     Attributes:
         center: (7,) the belief's mean, `world_from_part`.
-        radius: in the distance's unit; +inf where so few particles can promise no smaller one.
-        mass: with what probability the region is to hold the truth.
+        radius: in the distance's unit; +inf where the particles are too few for a smaller one.
+        mass: the nominal probability that the region contains the truth.
         weight: the share of the belief's weight inside.
         distance: poses (..., 7) to their distances (...,) from the centre.
     """
@@ -71,7 +71,7 @@ class Region:
     distance: Callable[[Tensor], Tensor] = field(repr=False)
 
     def contains(self, world_from_part: np.ndarray | Tensor) -> Tensor:
-        """Which of the poses (..., 7) are inside, bool (...,); a deviation does not look at held axes."""
+        """Whether poses (..., 7) are inside, bool (...,); a deviation ignores held axes."""
         return self.distance(poses.as_pose(world_from_part)) <= self.radius * (1.0 + 1e-12)
 
 
@@ -82,7 +82,7 @@ def region(belief: Belief, mass: float, measure: Measure) -> Region:
         InputError: the mass is not in (0, 1).
     """
     if not 0.0 < mass < 1.0:
-        raise InputError(f"a credible region of mass {mass} was asked for; give a mass between 0 and 1.")
+        raise InputError(f"a credible region has the mass {mass}; give one between 0 and 1.")
     distance = measure(belief)
     count = float(1.0 / (belief.weights**2).sum())
     level = mass * (count + 1.0) / count
@@ -103,7 +103,7 @@ def _upper(values: Tensor, weights: Tensor, probability: float) -> float:
 def _mahalanobis(belief: Belief, axes: list[int]) -> Distance:
     """Distance in standard deviations along some axes of the tangent space at the mean."""
     covariance = belief.covariance[axes][:, axes]
-    # A unit of its own for each axis, so that what counts as singular does not hang on metres and radians.
+    # Each axis has its own unit, so that the threshold of singularity does not depend on metres and radians.
     unit = covariance.diagonal().sqrt()
     scale = torch.where(unit > 1e-9, unit, 1e-5)
     variances, directions = torch.linalg.eigh(covariance / torch.outer(scale, scale))
@@ -175,7 +175,7 @@ def _some(freedom: Freedom, wanted: range, name: str) -> list[int]:
     axes = [axis for axis in freedom.axes if axis in wanted]
     if not axes:
         raise InputError(
-            f"a region of the {name} was asked for, but every {name} is held; ask for one of the pose."
+            f"a region of the {name} is undefined since every {name} is held; use pose_deviation."
         )
     return axes
 
@@ -196,5 +196,5 @@ def average_point_distance(points: np.ndarray | Tensor) -> Measure:
 
 
 def _from_mean(belief: Belief, distance: Callable[[Tensor], Tensor]) -> Distance:
-    # A particle's share in the mean itself is of the order of its weight: it is left in.
+    # A particle's share in the mean is of the order of its weight, and is not corrected for.
     return Distance(distance, distance(belief.world_from_part))

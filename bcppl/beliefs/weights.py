@@ -16,7 +16,8 @@ def normalised(log_weights: Tensor, impossible: Sequence[str] = ()) -> Tensor:
 
     Args:
         log_weights: unnormalised.
-        impossible: addresses that no particle can explain (`bcppl.traces.Trace.impossible`), for the error.
+        impossible: addresses of probability zero at every particle (`bcppl.traces.Trace.impossible`), for
+            the error.
 
     Raises:
         NoWeightError: no particle has any weight.
@@ -29,7 +30,7 @@ def normalised(log_weights: Tensor, impossible: Sequence[str] = ()) -> Tensor:
     if not bool((log_weights > -torch.inf).any()):
         where = f" at {', '.join(map(repr, impossible))}" if impossible else ""
         raise NoWeightError(
-            f"no particle has any weight left: every particle says that what was measured{where} cannot be; "
+            f"no particle has any weight left: the measurement{where} is impossible at every particle; "
             "widen the prior, use more particles, or check the recording with `bcppl check`."
         )
     return torch.softmax(log_weights, dim=0)
@@ -40,11 +41,11 @@ def effective_sample_size(log_weights: Tensor) -> float:
     weights = torch.softmax(log_weights, dim=0)
     total = float(weights.dot(weights))
     if math.isnan(total):
-        normalised(log_weights)  # says what is wrong with them
+        normalised(log_weights)  # raises the error
     return 1.0 / total
 
 
-# What rounding leaves of a cumulative sum of weights.
+# The rounding error of a cumulative sum of weights.
 ROUNDING = 1e-12
 
 
@@ -62,23 +63,23 @@ def weighted_quantiles(values: Tensor, weights: Tensor, probabilities: object) -
         probabilities: one or several in [0, 1].
 
     Returns:
-        (Q, *event), or (*event) where a single number was asked for; float64, in the units of the values.
+        (Q, *event), or (*event) for a single probability; float64, in the units of the values.
 
     Raises:
         InputError: a probability is not in [0, 1].
     """
-    asked = torch.as_tensor(probabilities, dtype=torch.float64)
-    if bool(((asked < 0) | (asked > 1) | torch.isnan(asked)).any()):
-        raise InputError(f"quantiles were asked for at {asked.tolist()}; give probabilities from 0 to 1.")
+    levels = torch.as_tensor(probabilities, dtype=torch.float64)
+    if not bool(((levels >= 0) & (levels <= 1)).all()):
+        raise InputError(f"quantiles have the probabilities {levels.tolist()}; give numbers from 0 to 1.")
     carrying = weights > 0
     kept = (
         values[carrying].to(torch.float64).flatten(1) if values.ndim > 1 else values[carrying, None].double()
     )
     ordered, order = kept.sort(dim=0)
     cumulative = weights[carrying][order].cumsum(dim=0).T.contiguous()
-    points = asked.reshape(1, -1).expand(len(cumulative), -1).contiguous()
+    points = levels.reshape(1, -1).expand(len(cumulative), -1).contiguous()
     last = len(ordered) - 1
     left = torch.searchsorted(cumulative, points - ROUNDING).clamp_max(last)
     right = torch.searchsorted(cumulative, points + ROUNDING, right=True).clamp_max(last)
-    found = 0.5 * (ordered.gather(0, left.T) + ordered.gather(0, right.T))
-    return found.reshape((*asked.shape, *values.shape[1:]))
+    quantiles = 0.5 * (ordered.gather(0, left.T) + ordered.gather(0, right.T))
+    return quantiles.reshape((*levels.shape, *values.shape[1:]))

@@ -40,7 +40,7 @@ from bcppl.inference.kernels.jacobian import (
 from bcppl.inference.kernels.kernel import put
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Fitted, Program, Proposal, program_of
-from bcppl.inference.resampling import Resample, adaptive, refuse_scheme
+from bcppl.inference.resampling import Resample, adaptive, check_resample
 from bcppl.traces import Trace, extend, simulate, update
 from bcppl.traces.anticipated import Anticipated
 from bcppl.traces.gradient import result_with_grad, with_gradients
@@ -116,7 +116,7 @@ def smcp3(pair: Pair, *, resample: Resample | None = None) -> StepFunction:
     _refuse_no_pair(pair)
     if resample is None:
         resample = adaptive()
-    refuse_scheme("smcp3", resample)
+    check_resample("smcp3", resample)
 
     def step(population: Population, observed: Observed) -> Stepped:
         weighed = _by_halves(population, pair, observed)

@@ -26,7 +26,7 @@ from bcppl.inference.exponents import next_exponent
 from bcppl.inference.filters.step import Observed, StepInfo, Stepped
 from bcppl.inference.kernels import Kernel, Until, refuse_other, rejuvenate, takes
 from bcppl.inference.population import Population
-from bcppl.inference.resampling import Resample, adaptive, refuse_scheme
+from bcppl.inference.resampling import Resample, adaptive, check_resample
 from bcppl.inference.targets import POSTERIOR, Target, cost_of
 from bcppl.traces import Trace, extend
 
@@ -212,7 +212,7 @@ def tempered(
             f"tempering is given the exponents {list(fixed)}; give increasing ones that end with 1."
         )
     if resample is not None:
-        refuse_scheme("tempered", resample)
+        check_resample("tempered", resample)
     if rejuvenation is None:
         rejuvenation = resample_move(
             kernel, sweeps, adaptive() if resample is None else resample, always_move
