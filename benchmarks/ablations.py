@@ -32,7 +32,8 @@ from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence
 from bcppl.inference.kernels.kernel import Move
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
-from bcppl.inference.proposals.together import continuous, drift_together
+from bcppl.inference.proposals.coordinates import continuous_addresses
+from bcppl.inference.proposals.walk import joint_drift
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.models import look_and_touch, peg_in_hole
 from bcppl.models.worlds.bench import bench_scene
@@ -59,10 +60,10 @@ def walked(pose: str) -> Kernel:
     """Every latent value walks alone, then all of them together: no proposal knows of images or touches."""
 
     def moved(population: Population) -> Move:
-        addresses = continuous(population.trace)
+        addresses = continuous_addresses(population.trace)
         others = [address for address in addresses if address != pose]
         alone = [metropolis_hastings(drift(address, WALK)) for address in addresses]
-        together = [metropolis_hastings(drift_together(pose, *others, scales=WALK))] if others else []
+        together = [metropolis_hastings(joint_drift(pose, *others, scales=WALK))] if others else []
         return sequence([*alone, *together])(population)
 
     return moved

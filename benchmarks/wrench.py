@@ -15,8 +15,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.contact.mujoco_model import ContactParameters
-from bcppl.distributions.contact import ChamferContacts, PegPose
-from bcppl.distributions.wrench import Wrench
+from bcppl.distributions.contact import ChamferContacts, PegPose, Wrench
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models import peg_in_hole
 from bcppl.models.worlds.peg_in_hole import record

@@ -16,7 +16,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bcppl.distributions.mixture import MixturePose
 from bcppl.distributions.pose_normals import (
     GaussianMixture,
     PoseFactor,
@@ -26,6 +25,7 @@ from bcppl.distributions.pose_normals import (
     truncated,
     widened_mixture,
 )
+from bcppl.distributions.poses import MixturePose
 from bcppl.errors import InputError
 from bcppl.inference.laplace import Normal, QuadraticApproximation, quadratic_approximation
 from bcppl.sensors.capabilities import Approximated, Contacts, FitsPose, Linearised

@@ -138,7 +138,7 @@ def sites(scene: Scene, views: int, camera: Tensor, bias: Tensor, rim: Tensor | 
             bias=bias + (settings.widening if scene.insides is None else 0.0),
         )
         if rim is not None:
-            found[f"mask_{k}"] = Silhouette.beside(
+            found[f"mask_{k}"] = Silhouette.from_depth(
                 depth,
                 settings.mask_width / settings.bins,
                 settings.mask_wrong,

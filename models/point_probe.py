@@ -18,8 +18,8 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from bcppl.distributions.path import Path
 from bcppl.distributions.poses import prior_from_guess
+from bcppl.distributions.touch import Path
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.poses import compose, inverse, rotation_matrix, transform

@@ -10,8 +10,7 @@ import pyro.distributions as dist
 import torch
 
 from bcppl import poses
-from bcppl.distributions.mixture import MixturePose
-from bcppl.distributions.poses import NormalPose, UniformPose
+from bcppl.distributions.poses import MixturePose, NormalPose, UniformPose
 from bcppl.poses import Freedom
 from bcppl.traces import Trace, generate, simulate
 from tests.invariance import matrix, number

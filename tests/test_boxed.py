@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from bcppl import poses
-from bcppl.distributions.boxed import BoxedNormal
+from bcppl.distributions.poses import BoxedNormal
 from bcppl.errors import InputError
 
 LIMIT = torch.full((3,), 0.01, dtype=torch.float64)

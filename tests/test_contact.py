@@ -88,8 +88,6 @@ def test_the_surrogate_s_value_laziness_and_refusals() -> None:
     each = torch.stack([points((0, 0, 0), (0, 0, 0))] * 3)
     assert contact.log_prob(each).tolist() == pytest.approx([0.0, -4.0, -math.inf])
     assert contact.event_shape == (2, 3)
-    with pytest.raises(InputError, match="scale"):
-        ChamferContacts(track, 0, 2, scale=0.0, one_empty=1.0)
     with pytest.raises(InputError, match="first"):
         ChamferContacts(track, 2, 2, scale=1.0, one_empty=1.0)
 
@@ -161,7 +159,7 @@ def test_the_normalised_contact_likelihood_is_normalised() -> None:
     settings: dict[str, Any] = {
         "scale": 0.002,
         "missed": 0.1,
-        "invented": 0.2,
+        "false_alarm": 0.2,
         "outlier": 0.3,
         "reach": 0.03,
         "every": 1,
@@ -191,7 +189,7 @@ def test_the_normalised_contact_likelihood_samples_what_it_says() -> None:
     settings: dict[str, Any] = {
         "scale": 0.001,
         "missed": 0.1,
-        "invented": 0.2,
+        "false_alarm": 0.2,
         "outlier": 0.3,
         "reach": 0.05,
         "every": 1,
@@ -218,12 +216,12 @@ def test_locations_anywhere_are_in_the_pegs_frame_wherever_the_peg_is() -> None:
         0,
         1,
         0.001,
-        invented=0.9,
+        false_alarm=0.9,
     ).sample()
     assert float(drawn[..., 0].nanmean()) == pytest.approx(0.0, abs=0.01)
 
 
-def test_stamps_are_whole_numbers_and_an_observation_has_a_row_for_each() -> None:
+def test_an_observation_has_a_row_for_each_stamp() -> None:
     track = Felt(torch.zeros(2, 100, 3, dtype=torch.float64), poses.identity(2, 100))
     for make, numbers in (
         (lambda **given: ChamferContacts(track, scale=0.001, one_empty=18e-6, **given), 3),
@@ -234,9 +232,3 @@ def test_stamps_are_whole_numbers_and_an_observation_has_a_row_for_each() -> Non
         for rows in (1, 90):
             with pytest.raises(InputError, match="100 stamps but its observation"):
                 contact.log_prob(torch.zeros(rows, numbers, dtype=torch.float64))
-        with pytest.raises(InputError, match="whole number"):
-            make(first=0, last=100.0)
-    with pytest.raises(InputError, match="every"):
-        ContactsInTime(track, 0, 100, 0.001, every=2.5)
-    with pytest.raises(InputError, match="every"):
-        PegPose(track, 0, 100, 0.001, 0.01, every=2.5)

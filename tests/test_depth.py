@@ -283,9 +283,6 @@ def test_bad_input_is_named() -> None:
     good = poses_near(4)
     with pytest.raises(InputError, match="shape"):
         distribution(True, good).log_prob(torch.zeros(CAMERA.width, CAMERA.height))
-    with pytest.raises(InputError, match="background"):
-        distribution(True, good, background=np.zeros((2, 2)))
-    with pytest.raises(InputError, match="scale"):
-        LaplaceDepth(RENDERER, CAMERA, good, 0.0)
-    with pytest.raises(InputError, match="outlier"):
-        RobustDepth(RENDERER, CAMERA, good, SCALE, outlier=1.0)
+    for name in ("background", "region"):
+        with pytest.raises(InputError, match=rf"'front' has a {name} of shape \(2, 2\); give \(18, 24\)"):
+            distribution(True, good, **{name: np.zeros((2, 2))})

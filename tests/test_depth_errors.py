@@ -186,8 +186,6 @@ def test_a_temperature_divides() -> None:
     torch.testing.assert_close(cool, whole / 4.0, rtol=1e-12, atol=0.0)
     with pytest.raises(InputError, match="both effective_pixels and temperature"):
         RobustDepth(RENDERER, CAMERA, POSE, SCALE, effective_pixels=50.0, temperature=2.0)
-    with pytest.raises(InputError, match="temperature"):
-        RobustDepth(RENDERER, CAMERA, POSE, SCALE, temperature=0.0)
 
 
 @pytest.mark.parametrize("written", ["image", "background", "region"])
@@ -246,7 +244,7 @@ def test_bad_input_is_named() -> None:
         LaplaceDepth(RENDERER, CAMERA, POSE, SCALE, table(), camera_error=ERROR)
     with pytest.raises(InputError, match="stated_camera_from_camera"):
         LaplaceDepth(RENDERER, CAMERA, POSE, SCALE, camera_error=ERROR[:3])
-    with pytest.raises(InputError, match="bias of camera 'above' has shape"):
+    with pytest.raises(InputError, match=r"camera 'above' has a bias of shape \(3,\); give \(\) or \(7,\)"):
         LaplaceDepth(RENDERER, CAMERA, POSE, SCALE, bias=BIAS[:3])
     with pytest.raises(InputError, match="add up to less than 1"):
         OccludedDepth(RENDERER, CAMERA, POSE, SCALE, occluder=0.6, outlier=0.5)

@@ -217,10 +217,10 @@ def test_the_plane_is_found_where_it_is_and_mutants_find_it_elsewhere() -> None:
 @pytest.mark.parametrize(
     ("numbers", "said"),
     [
-        ({"noise": 0.0}, "noise 0"),
-        ({"shared": -1e-5}, "shared -1e-05"),
-        ({"sink": NAN}, "sink nan"),
-        ({"outlier": 1.0}, "outlier 1"),
+        ({"noise": 0.0}, "noise = 0"),
+        ({"shared": -1e-5}, "shared = -1e-05"),
+        ({"sink": NAN}, "sink = nan"),
+        ({"outlier": 1.0}, "outlier = 1"),
     ],
 )
 def test_numbers_out_of_range_are_refused(numbers: dict[str, float], said: str) -> None:

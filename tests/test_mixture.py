@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from bcppl import poses
-from bcppl.distributions.mixture import MixturePose
-from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.poses import MixturePose, NormalPose
 from bcppl.poses import Freedom
 
 CENTER = poses.as_pose([0.1, -0.2, 0.3, 0.5, 0.5, -0.5, 0.5])

@@ -15,11 +15,10 @@ import trimesh
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.contact import ContactsInTime, PegPose
+from bcppl.distributions.contact import ContactsInTime, PegPose, Wrench
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.poses import NormalPose
-from bcppl.distributions.wrench import Wrench
 from bcppl.errors import InferenceError, InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part

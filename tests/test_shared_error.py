@@ -2,31 +2,21 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
-import trimesh
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.path import Path
-from bcppl.distributions.shared_error import SharedError, SharedOnset
-from bcppl.distributions.touch import Placed
-from bcppl.geometry.distance import SignedDistance
-from bcppl.geometry.parts import Part
+from bcppl.distributions.touch import Path, Placed, SharedError, SharedOnset
+from tests.exact_boxes import Boxes
 
+BOX = Boxes((0.05, 0.1, 0.15))
 SHIFT, TURN, OFFSET, SPREAD = 0.0004, 0.005, 0.0002, 0.0003
 NEVER = torch.full((3,), math.nan, dtype=torch.float64)
 
 
 def t(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
-
-
-def box() -> SignedDistance:
-    """0.1 x 0.2 x 0.3 m about the origin."""
-    mesh = trimesh.creation.box((0.1, 0.2, 0.3))
-    return SignedDistance(Part("box", np.asarray(mesh.vertices), np.asarray(mesh.faces)))
 
 
 def towards(y: float) -> Path:
@@ -36,13 +26,13 @@ def towards(y: float) -> Path:
 
 def log_probs(pose: Tensor, touches: list[tuple[Path, Tensor]], outlier: float = 0.0) -> list[Tensor]:
     """Of every touch given those before it, as a program asks for them: after it has run."""
-    shared = SharedError(Placed(box(), pose), t(0.0, 0.0, 0.0), SHIFT, TURN, OFFSET, SPREAD)
+    shared = SharedError(Placed(BOX, pose), t(0.0, 0.0, 0.0), SHIFT, TURN, OFFSET, SPREAD)
     sites = []
     for path, place in touches:
         shared.placed.expect(path.points)
-        shared.expect(path)
+        shared.add(path)
         sites.append(SharedOnset(shared, outlier))
-        shared.felt(place)
+        shared.condition_on(place)
     return [site.log_prob(place) for site, (_, place) in zip(sites, touches, strict=True)]
 
 
@@ -80,22 +70,20 @@ def test_the_order_of_touches_does_not_matter() -> None:
 def test_each_touch_integrates_to_one_given_the_others() -> None:
     path, steps = towards(0.03), 800
     places = path.at((torch.arange(steps, dtype=torch.float64) + 0.5) / steps * path.length)
-    total = 0.0
-    for place in [*places, NEVER, path.points[0]]:
-        mass = float(log_probs(at(0.0002), [*TOUCHES[:2], (path, place)], 0.05)[-1].exp())
-        total += mass if place is NEVER or place is path.points[0] else mass * path.length / steps
-    assert total == pytest.approx(1.0, abs=5e-3)
+    every = torch.cat([places, NEVER[None], path.points[:1]])
+    mass = log_probs(at(*[0.0002] * len(every)), [*TOUCHES[:2], (path, every)], 0.05)[-1].exp()
+    assert float(mass[:steps].mean() * path.length + mass[steps:].sum()) == pytest.approx(1.0, abs=5e-3)
 
 
 def test_samples_err_together() -> None:
     torch.manual_seed(0)
     pose = at(0.0).expand(20000, 7)
-    shared = SharedError(Placed(box(), pose), t(0.0, 0.0, 0.0), SHIFT, 0.0, OFFSET, SPREAD)
+    shared = SharedError(Placed(BOX, pose), t(0.0, 0.0, 0.0), SHIFT, 0.0, OFFSET, SPREAD)
     drawn = []
     for y in (-0.08, 0.05):
-        shared.expect(towards(y))
+        shared.add(towards(y))
         drawn.append(SharedOnset(shared, 0.0).sample())
-        shared.felt(drawn[-1])
+        shared.condition_on(drawn[-1])
     inside = torch.stack(drawn)[..., 0] + 0.05
     covariance = torch.cov(inside)
     assert inside.mean(dim=1).tolist() == pytest.approx([OFFSET] * 2, abs=1.5e-5)

@@ -34,20 +34,27 @@ def shown() -> Tensor:
 
 
 def test_all_masks_together_have_probability_one() -> None:
+    torch.manual_seed(0)
     small = Camera("s", 4, 3, 8.0, 8.0, 1.5, 1.0, looking_at([0.0, -0.02, 0.4], [0.05, 0.0, 0.0]))
     pose = poses.retract(poses.identity(), torch.randn(3, 6).double() * 0.03)
     masks = torch.tensor(list(itertools.product([0.0, 1.0], repeat=12))).double().reshape(-1, 3, 4)
-    likelihood = Silhouette(RENDERER, small, pose, 0.7, 0.1, rim=torch.tensor([0.4, -0.8, 0.0]).double())
-    assert 0.1 < float(likelihood.chances().min()) + 0.05 < float(likelihood.chances().max())
-    total = torch.logsumexp(torch.stack([likelihood.log_prob(mask) for mask in masks]), dim=0)
+    rim = torch.tensor([0.4, -0.8, 0.0]).double()
+    likelihood = Silhouette(RENDERER, small, pose, 0.7, 0.1, rim=rim)
+    assert 0.1 < float(likelihood.probabilities().min()) + 0.05 < float(likelihood.probabilities().max())
+    count = len(masks)
+    every = Silhouette(
+        RENDERER, small, pose.repeat_interleave(count, 0), 0.7, 0.1, rim=rim.repeat_interleave(count)
+    )
+    total = every.log_prob(masks.repeat(3, 1, 1)).reshape(3, count).logsumexp(dim=1)
     assert torch.allclose(total, torch.zeros(3).double(), atol=1e-5)
+    torch.testing.assert_close(every.log_prob(masks[7])[::count], likelihood.log_prob(masks[7]))
 
 
 def test_draws_are_those_of_the_density() -> None:
     likelihood = Silhouette(RENDERER, CAMERA, TRUTH.expand(400, 7), 1.0, 0.05)
     torch.manual_seed(0)
     masks = likelihood.sample()
-    chance = torch.from_numpy(likelihood.chances()[0]).double()
+    chance = torch.from_numpy(likelihood.probabilities()[0]).double()
     off = (masks.mean(dim=0) - chance) / (chance * (1.0 - chance) / 400).sqrt()
     assert 0.93 < float(off.square().mean()) < 1.07
     entropy = -(chance * chance.log() + (1.0 - chance) * (1.0 - chance).log()).sum()
@@ -80,7 +87,7 @@ def test_a_rim_moves_a_straight_outline_by_so_many_pixels() -> None:
     )
     renderer = RayCaster(block((0.2, 5.0, 0.01)))
     rims = torch.tensor([0.0, 2.0, -2.0]).double()
-    chances = Silhouette(renderer, camera, poses.identity(3), 1.5, rim=rims).chances()[:, 10]
+    chances = Silhouette(renderer, camera, poses.identity(3), 1.5, rim=rims).probabilities()[:, 10]
     right = [float(np.interp(-0.5, -row[30:], np.arange(30.0))) for row in chances]
     assert np.allclose(np.diff(right), [2.0, -4.0], atol=0.1)
 
@@ -95,7 +102,7 @@ def test_a_mask_and_a_depth_image_are_rendered_once() -> None:
     alone = RobustDepth(renderer, CAMERA, pose, 0.003, region=inside).log_prob(image)
     rim = torch.full((len(pose),), 0.3).double()
     before = renderer.effort.items
-    beside = Silhouette.beside(depth, 1.0, 0.02, rim=rim, temperature=4.0)
+    beside = Silhouette.from_depth(depth, 1.0, 0.02, rim=rim, temperature=4.0)
     both = depth.log_prob(image), beside.log_prob(mask)
     assert renderer.effort.items - before == len(pose)
     assert torch.allclose(both[0], alone)
@@ -112,13 +119,11 @@ def test_a_mask_is_binned_by_most_of_its_pixels() -> None:
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda s: s.log_prob(shown().T), r"shape \(64, 48\); give one of its image's, \(48, 64\)"),
+        (lambda s: s.log_prob(shown().T), r"shape \(64, 48\); give \(48, 64\) or \(13, 48, 64\)"),
         (lambda s: s.log_prob(255.0 * shown()), "other values than 0 and 1; give 1 where"),
-        (lambda s: s.sample((2,)), "ask for no sample_shape"),
-        (lambda s: Silhouette(RENDERER, CAMERA, s.pose, 0.0), "width 0"),
-        (lambda s: Silhouette(RENDERER, CAMERA, s.pose, 1.0, 0.5), "wrong with probability 0.5"),
-        (lambda s: Silhouette(RENDERER, CAMERA, s.pose, 1.0, rim=torch.zeros(4)), "one per particle"),
-        (lambda s: Silhouette(RENDERER, CAMERA, s.pose * torch.nan, 1.0).log_prob(shown()), "pose of the"),
+        (lambda s: s.sample((2,)), "give no sample_shape"),
+        (lambda s: Silhouette(RENDERER, CAMERA, s.pose, 1.0, rim=torch.zeros(4)), r"a rim of shape \(4,\)"),
+        (lambda s: Silhouette(RENDERER, CAMERA, s.pose * torch.nan, 1.0).sample(), "have a pose that"),
         (lambda s: binned_mask(np.zeros((4, 4, 3)), 2), "cannot be binned by 2; give one"),
     ],
 )

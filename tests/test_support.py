@@ -13,8 +13,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.beliefs import average_distance
-from bcppl.distributions.mixture import MixturePose
-from bcppl.distributions.poses import NormalPose, SwingTwistPose, UniformPose
+from bcppl.distributions.poses import MixturePose, NormalPose, SwingTwistPose, UniformPose
 from bcppl.distributions.support import freedom_of, log_prob_inside
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.population import Population

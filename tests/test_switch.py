@@ -95,9 +95,9 @@ def test_what_does_not_fit_is_refused() -> None:
     which = torch.tensor([0, 1, 1])
     with pytest.raises(InputError, match="whole number for each particle"):
         Switch(torch.tensor([0.5, 1.0, 1.0]), lambda k, rows: dist.Normal(torch.zeros(len(rows)), 1.0))
-    with pytest.raises(InputError, match=r"choice 0 .*values at the rows"):
+    with pytest.raises(InputError, match=r"choice 0 .*values at the given rows"):
         Switch(which, lambda k, rows: dist.Normal(torch.zeros(3), 1.0))
-    with pytest.raises(InputError, match="must have the same"):
+    with pytest.raises(InputError, match="give all the same shape"):
         Switch(which, lambda k, rows: dist.Normal(torch.zeros(len(rows), k + 1), 1.0).to_event(1))
 
 
@@ -145,7 +145,7 @@ def test_the_cost_does_not_hang_on_what_was_chosen() -> None:
 
     for which in ([0, 0, 0], [0, 1, 1], [1, 1, 1]):
         assert Switch(torch.tensor(which), build, cost=2).cost == 2
-    with pytest.raises(InputError, match="say cost="):
+    with pytest.raises(InputError, match="as cost="):
         Switch(torch.tensor([0, 1, 1]), build)
 
 

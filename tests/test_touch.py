@@ -9,11 +9,13 @@ import trimesh
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.path import Path
-from bcppl.distributions.touch import ForceDirection, FreePath, OnsetLocation
+from bcppl.distributions.touch import ForceDirection, FreePath, OnsetLocation, Path
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.parts import Part
+from tests.exact_boxes import Boxes
+
+BOX = Boxes((0.05, 0.1, 0.15))
 
 
 def t(*values: float) -> Tensor:
@@ -42,11 +44,9 @@ def straight(start: tuple[float, ...], end: tuple[float, ...], count: int = 101)
 
 def test_distance_to_a_box_is_exact() -> None:
     points = torch.from_numpy(np.random.default_rng(0).uniform(-0.3, 0.3, (4, 500, 3)))
-    near = SignedDistance(split_box())(points)
-    q = points.abs() - t(0.05, 0.1, 0.15)
-    exact = q.clamp(min=0).norm(dim=-1) + q.amax(dim=-1).clamp(max=0)
-    assert torch.allclose(near.distance, exact, atol=1e-12)
-    assert torch.allclose(points - near.distance[..., None] * near.normal, near.closest, atol=1e-12)
+    near, exact = SignedDistance(split_box())(points), BOX(points)
+    for mine, theirs in zip(near, exact, strict=True):
+        assert torch.allclose(mine, theirs, atol=1e-12)
 
 
 def test_normals_are_the_gradient_and_point_outwards() -> None:
@@ -84,7 +84,7 @@ def test_an_open_mesh_is_refused() -> None:
     ],
 )
 def test_onset_masses_sum_to_one(start: tuple[float, ...], end: tuple[float, ...]) -> None:
-    path, distance, steps = straight(start, end, 201), SignedDistance(split_box()), 1000
+    path, distance, steps = straight(start, end, 201), BOX, 1000
     inner = path.at((torch.arange(steps, dtype=torch.float64) + 0.5) / steps * path.length)
     atoms = torch.stack([path.points[0], t(math.nan, math.nan, math.nan)])
     for x, spread in ((0.0, 0.0005), (0.0003, 0.0004), (-0.002, 0.0006)):
@@ -95,10 +95,7 @@ def test_onset_masses_sum_to_one(start: tuple[float, ...], end: tuple[float, ...
 
 
 def test_onset_masses_sum_to_one_where_the_finger_touches_twice() -> None:
-    boxes = [trimesh.creation.box((0.1, 0.2, 0.3)), trimesh.creation.box((0.1, 0.2, 0.3))]
-    boxes[1].apply_translation((0.0, 0.22, 0.0))
-    both = trimesh.util.concatenate(boxes)
-    distance = SignedDistance(Part("two boxes", np.asarray(both.vertices), np.asarray(both.faces)))
+    distance = Boxes((0.05, 0.1, 0.15), (0.0, 0.0, 0.0), (0.0, 0.22, 0.0))
     path, steps = straight((-0.0497, 0.08, 0.0), (-0.0497, 0.14, 0.0), 401), 4000
     path = Path(torch.cat([straight((-0.06, 0.08, 0.0), (-0.0497, 0.08, 0.0), 51).points, path.points]))
     inner = path.at((torch.arange(steps, dtype=torch.float64) + 0.5) / steps * path.length)
@@ -111,7 +108,7 @@ def test_onset_masses_sum_to_one_where_the_finger_touches_twice() -> None:
 def test_onset_samples_follow_the_density() -> None:
     torch.manual_seed(0)
     path, count = straight((-0.06, 0.01, 0.02), (-0.0495, 0.012, 0.02)), 20000
-    onset = OnsetLocation(SignedDistance(split_box()), shifted(*[0.0] * count), path, 0.0003, 0.0005, 0.1)
+    onset = OnsetLocation(BOX, shifted(*[0.0] * count), path, 0.0003, 0.0005, 0.1)
     sample = onset.sample()
     never = torch.isnan(sample).any(-1)
     one = OnsetLocation(onset.distance, shifted(0.0), path, 0.0003, 0.0005, 0.1)
@@ -129,7 +126,7 @@ def test_onset_samples_follow_the_density() -> None:
 
 
 def test_onset_prefers_a_tip_inside_and_an_approach_from_outside() -> None:
-    distance, inside, outside = SignedDistance(split_box()), t(-0.0495, 0.0, 0.0), t(-0.0505, 0.0, 0.0)
+    distance, inside, outside = BOX, t(-0.0495, 0.0, 0.0), t(-0.0505, 0.0, 0.0)
     inward = straight((-0.06, 0.0, 0.0), (-0.04, 0.0, 0.0), 21)
     onset = OnsetLocation(distance, shifted(0.0), inward, 0.0005, 0.0002, 0.01)
     assert float(onset.log_prob(inside)) > float(onset.log_prob(outside)) + 5.0
@@ -143,7 +140,7 @@ def test_onset_prefers_a_tip_inside_and_an_approach_from_outside() -> None:
 
 def test_never_is_likely_only_where_the_path_misses() -> None:
     path = straight((-0.06, 0.0, 0.0), (-0.04, 0.0, 0.0), 21)
-    never = OnsetLocation(SignedDistance(split_box()), shifted(0.05, 0.0), path, 0.0, 0.0005, 0.01)
+    never = OnsetLocation(BOX, shifted(0.05, 0.0), path, 0.0, 0.0005, 0.01)
     miss, hit = never.log_prob(t(*[math.nan] * 3))
     assert float(miss) == pytest.approx(math.log(0.99), abs=1e-9)
     assert float(hit) < -50.0
@@ -151,7 +148,7 @@ def test_never_is_likely_only_where_the_path_misses() -> None:
 
 def test_scales_may_differ_between_particles() -> None:
     distance, path, place = (
-        SignedDistance(split_box()),
+        BOX,
         straight((-0.06, 0.0, 0.0), (-0.04, 0.0, 0.0)),
         t(-0.0502, 0, 0),
     )
@@ -171,7 +168,7 @@ def direction(
     pose: Tensor, motion: Tensor, tip: Tensor | None = None, outlier: float = 0.02
 ) -> ForceDirection:
     tip = t(-0.0502, 0.0, 0.0) if tip is None else tip
-    return ForceDirection(SignedDistance(split_box()), pose, tip, motion, 0.4, 0.1, outlier)
+    return ForceDirection(BOX, pose, tip, motion, 0.4, 0.1, outlier)
 
 
 def test_direction_integrates_to_one_over_the_circle() -> None:
@@ -215,7 +212,7 @@ def test_nothing_felt_has_no_direction() -> None:
 def test_free_path_counts_to_one_and_ends_at_the_onset() -> None:
     path = straight((-0.06, 0.0, 0.0), (-0.04, 0.0, 0.0), 41)
     pose = shifted(0.01, 0.0, -0.003)
-    free = FreePath(SignedDistance(split_box()), pose, path, t(-0.05, 0.0, 0.0), 0.001, 0.0005)
+    free = FreePath(BOX, pose, path, t(-0.05, 0.0, 0.0), 0.001, 0.0005)
     total = free.log_prob(t(1.0)[0]).exp() + free.log_prob(t(0.0)[0]).exp()
     assert torch.allclose(total, torch.ones(3, dtype=torch.float64))
     # The last point before the onset is at -50.5 mm: 9.5 mm outside, 0.5 mm outside, 2.5 mm inside.

@@ -13,7 +13,7 @@ from torch import Tensor
 from bcppl.contact.physics import PegPhysics
 from bcppl.contact.probe_rollout import ProbeRollout
 from bcppl.contact.sensing.location import ContactSensing
-from bcppl.distributions.wrench import Wrench
+from bcppl.distributions.contact import Wrench
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.robot.motion import Probe
@@ -99,20 +99,10 @@ def test_diverged_particles_are_impossible_and_bad_settings_refused() -> None:
     likelihood = Wrench(lost, 0, 1, 0.3, 0.02)
     assert torch.isneginf(likelihood.log_prob(track.values[0])).tolist() == [False, True, False]
     assert torch.isnan(likelihood.sample()).all(dim=-1)[:, 0].tolist() == [False, True, False]
-    for bad in (
-        {"force_scale": 0.0},
-        {"torque_scale": math.nan},
-        {"relative": -1.0},
-        {"outlier": 0.0},
-        {"every": 0},
-        {"every": 2.5},
-        {"last": 1.0},
-        {"bias": torch.zeros(6)},
-        {"first": 2},
-    ):
-        given = {"first": 0, "last": 1, "force_scale": 0.3, "torque_scale": 0.02} | bad
-        with pytest.raises(InputError, match="Wrench"):
-            Wrench(track, **given)
+    with pytest.raises(InputError, match=r"Wrench has a bias of shape \(6,\); give \(3, 6\)"):
+        Wrench(track, 0, 1, 0.3, 0.02, bias=torch.zeros(6))
+    with pytest.raises(InputError, match="Wrench has first = 2 and last = 1; give first before last"):
+        Wrench(track, 2, 1, 0.3, 0.02)
 
 
 def test_an_observation_of_other_stamps_is_refused() -> None:

@@ -1,1 +1,1 @@
-"""Pose priors, and likelihoods of depth images and contacts."""
+"""Pose priors, and likelihoods of images, contacts, wrenches and touches."""

@@ -10,6 +10,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 
+from bcppl.distributions.parameters import Range, check_parameters
 from bcppl.errors import InputError
 
 
@@ -22,6 +23,8 @@ class LazyDistribution(TorchDistribution):
     the others determine are therefore cached properties, or are named in `__caches__`.
 
     Attributes:
+        parameters: the ranges of the attributes that are parameters, by name. They are set before this
+            class's `__init__`, which checks them.
         cost: of a log-probability: 0 arithmetic, 1 rendering, 2 physics. Kernels evaluate the cheap sites
             first and move particles less often where they are expensive.
         broadcasts: whether `log_prob` takes H observations at once, (H, 1, *event_shape), and gives (H, N).
@@ -29,11 +32,13 @@ class LazyDistribution(TorchDistribution):
 
     cost: int = 0
     broadcasts: bool = False
+    parameters: dict[str, Range] = {}
 
     arg_constraints: dict[str, Any] = {}
     support = constraints.real
 
     def __init__(self, particles: int, event_shape: tuple[int, ...]) -> None:
+        check_parameters(self)
         super().__init__(torch.Size([particles]), torch.Size(event_shape), validate_args=False)
 
     def expand(self, batch_shape: Any, _instance: Any = None) -> LazyDistribution:

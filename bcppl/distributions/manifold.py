@@ -11,9 +11,9 @@ from scipy.stats import binom
 from torch import Tensor
 from torch.special import log_ndtr
 
-from bcppl.arguments import number_within
 from bcppl.distributions.checks import Check, chi_square
 from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.parameters import COUNT, NONNEGATIVE, POSITIVE, PROBABILITY
 from bcppl.errors import InputError
 
 _FAR = 4.0  # standard deviations
@@ -85,6 +85,13 @@ class ContactManifold(LazyDistribution):
     """
 
     cost = 1
+    parameters = {
+        "stamps": COUNT,
+        "noise": POSITIVE,
+        "shared": NONNEGATIVE,
+        "sink": NONNEGATIVE,
+        "outlier": PROBABILITY,
+    }
 
     def __init__(
         self,
@@ -97,11 +104,7 @@ class ContactManifold(LazyDistribution):
         outlier: float = 0.001,
         motion: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
-        number_within("a contact manifold is given noise {}", noise, above=0.0)
-        number_within("a contact manifold is given shared {}", shared, least=0.0)
-        number_within("a contact manifold is given sink {}", sink, least=0.0)
-        number_within("a contact manifold is given outlier {}", outlier, above=0.0, below=1.0)
-        self.gap, self.pose, self.motion = gap, pose, motion
+        self.gap, self.pose, self.motion, self.stamps = gap, pose, motion, stamps
         self.noise, self.shared, self.sink, self.outlier = noise, shared, sink, outlier
         super().__init__(len(pose), (stamps, 8))
 

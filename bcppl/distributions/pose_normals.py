@@ -9,9 +9,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.boxed import BoxedNormal
-from bcppl.distributions.mixture import MixturePose
-from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.poses import BoxedNormal, MixturePose, NormalPose
 
 # Proposals are mixtures of scaled copies: their scales, in standard deviations, and their probabilities.
 WIDTHS = torch.tensor([1.1, 3.0], dtype=torch.float64)

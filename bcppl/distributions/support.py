@@ -15,7 +15,7 @@ from bcppl.poses import Freedom
 
 
 def base(distribution: Any) -> Any:
-    """A distribution without what only gives it another shape."""
+    """The innermost of distributions that only change the shape of another or mask it."""
     while isinstance(distribution, Independent | ExpandedDistribution | MaskedDistribution):
         distribution = distribution.base_dist
     return distribution
@@ -31,7 +31,7 @@ def masks(distribution: Any) -> bool:
 
 
 def freedom_of(distribution: Any) -> Freedom | None:
-    """Which axes of the poses at a site are free; None where its values are no poses."""
+    """The free axes of the poses at a site; None where its values are no poses."""
     freedom: Freedom | None = getattr(base(distribution), "freedom", None)
     return freedom
 
@@ -45,7 +45,7 @@ def refuse_several_poses(address: str, value: Tensor, distribution: Any) -> None
     if value.ndim != 2 and freedom_of(distribution) is not None:
         raise InputError(
             f"site {address!r} samples poses of shape {tuple(value.shape[1:])} for each particle, in a plate "
-            "or an event; sample each pose at an address of its own, `for k in range(...)`."
+            "or an event; sample each pose at its own address, `for k in range(...)`."
         )
 
 
@@ -60,8 +60,8 @@ def support_of(distribution: Any) -> Any:
 def log_prob_inside(distribution: Any, value: Tensor) -> Tensor:
     """`distribution.log_prob(value)`, -inf where the value lies outside the support.
 
-    Pyro's densities go on beyond it where nothing validates them: an exponential grows below 0. Poses and
-    distributions that are lazy say themselves what is impossible. NaN is no value, and is handed through.
+    Pyro's densities continue beyond it without validation: an exponential's grows below 0. Pose distributions
+    and lazy ones check their support themselves. NaN is no value, and is passed on.
     """
     if not _is_bounded(distribution):
         return distribution.log_prob(value)
@@ -71,7 +71,7 @@ def log_prob_inside(distribution: Any, value: Tensor) -> Tensor:
     if support_of(distribution).is_discrete:
         safe = _inside(distribution, value, masked=False)
         if not bool(safe.all()):
-            # A whole number may be an index: one that is out of range has no density to be masked afterwards.
+            # A whole number may be an index: one out of range raises before its density could be masked.
             with torch.random.fork_rng(devices=[]):
                 drawn = distribution.sample()
             safe = safe.reshape(safe.shape + (1,) * len(distribution.event_shape))
@@ -80,7 +80,7 @@ def log_prob_inside(distribution: Any, value: Tensor) -> Tensor:
 
 
 def _is_bounded(distribution: Any) -> bool:
-    """Whether a value may lie outside the support, and only the support tells."""
+    """Whether a value may lie outside the support, and the log-probability does not check it."""
     if getattr(type(distribution), "support", None) in (constraints.real, constraints.real_vector):
         return False
     innermost = base(distribution)
@@ -90,14 +90,14 @@ def _is_bounded(distribution: Any) -> bool:
         support = support_of(innermost)
     except NotImplementedError:
         return False
-    # The real line and its vectors hold all numbers; a support that hangs on what is not known tells nothing.
+    # The real line and its vectors contain all numbers; a dependent support cannot be checked.
     return isinstance(support, constraints.Constraint) and not (
         support is constraints.real or constraints.is_dependent(support)
     )
 
 
 def _inside(distribution: Any, value: Tensor, masked: bool) -> Tensor:
-    """Whether values lie in the support, over the batch; what is masked out does if `masked`."""
+    """Whether values lie in the support, over the batch; a masked entry counts as inside if `masked`."""
     if isinstance(distribution, MaskedDistribution):
         inside = _inside(distribution.base_dist, value, masked)
         return inside | ~torch.as_tensor(distribution._mask, device=value.device) if masked else inside

@@ -1,4 +1,4 @@
-"""A distribution chosen for each particle: what a discrete site switches between."""
+"""A distribution chosen for each particle by the value of a discrete site."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from bcppl.poses import Freedom
 class Switch(LazyDistribution):
     """One of several distributions, chosen by a discrete value of each particle.
 
-    Only the chosen one is evaluated for a particle, so that a renderer or a physics engine runs no more often
-    than without a choice.
+    Only the chosen one is evaluated for a particle, so a renderer or a physics engine runs no more often than
+    without a choice.
 
         which = pyro.sample("which", Categorical(torch.ones(2)))
         depth = Switch(which, lambda k, rows: LaplaceDepth(renderers[k], camera, pose[rows], 0.003))
@@ -29,18 +29,18 @@ class Switch(LazyDistribution):
 
     Args:
         which: (N,) whole numbers.
-        build: `build(k, rows)` makes the distribution of the particles at `rows` (K,) int64, all of which
+        build: `build(k, rows)` returns the distribution of the particles at `rows` (K,) int64, all of which
             chose k; its batch shape is (K,). Event shape, kind of support (real, positive, ...) and free
             axes of poses are the same for every k, and so is `cost` where none is given.
-        cost: what a log-probability takes (see `LazyDistribution`), whatever was chosen. A batch in which
-            some choice is absent cannot tell, so say it where the choices' costs differ: kernels that sort
-            sites by cost keep their target only if it is the same at every value.
+        cost: of a log-probability (see `LazyDistribution`), whatever was chosen. Give it where the choices'
+            costs differ, since a choice may be absent from a batch: kernels that sort sites by cost leave
+            their target invariant only if the cost is the same at every value.
 
     Attributes:
         freedom: which axes are free where the choices are over poses, else None.
 
     Raises:
-        InputError: `which` is no vector of whole numbers, what was built has another shape, or the choices
+        InputError: `which` is no vector of whole numbers, a distribution has another shape, or the choices
             differ in their support, their free axes, or their costs while no cost is given.
     """
 
@@ -49,7 +49,7 @@ class Switch(LazyDistribution):
     ) -> None:
         if which.ndim != 1 or not bool((which == which.round()).all()):
             raise InputError(
-                f"a switch was given choices of shape {tuple(which.shape)}; "
+                f"Switch has choices of shape {tuple(which.shape)}; "
                 "give one whole number for each particle, such as a draw of Categorical."
             )
         self.groups: list[tuple[Tensor, Any]] = []
@@ -58,22 +58,22 @@ class Switch(LazyDistribution):
             built = build(int(choice), rows)
             if tuple(built.batch_shape) != (len(rows),):
                 raise InputError(
-                    f"choice {int(choice)} of a switch has batch shape {tuple(built.batch_shape)} for "
-                    f"{len(rows)} particles; build it from values at the rows it is given, `pose[rows]`."
+                    f"choice {int(choice)} of Switch has batch shape {tuple(built.batch_shape)} for "
+                    f"{len(rows)} particles; build it from values at the given rows, `pose[rows]`."
                 )
             self.groups.append((rows, built))
         shapes = {tuple(built.event_shape) for _, built in self.groups}
         if len(shapes) > 1:
             raise InputError(
-                f"the choices of a switch have events of shapes {', '.join(map(str, sorted(shapes)))}; "
-                "they must have the same."
+                f"the choices of Switch have events of shapes {', '.join(map(str, sorted(shapes)))}; "
+                "give all the same shape."
             )
         built = [distribution for _, distribution in self.groups]
         costs = sorted({int(getattr(each, "cost", 0)) for each in built})
         if cost is None and len(costs) > 1:
             raise InputError(
-                f"the choices of a switch have costs {', '.join(map(str, costs))}; "
-                "say cost= what it takes whatever is chosen, the largest of them."
+                f"the choices of Switch have costs {', '.join(map(str, costs))}; "
+                "give the largest as cost=, which is the cost whatever is chosen."
             )
         self.cost = costs[0] if cost is None else cost
         self.support, self.freedom = _common_support(self.groups), _common_freedom(built)
@@ -96,10 +96,10 @@ class Switch(LazyDistribution):
         """One value for each particle, (N, *event_shape).
 
         Raises:
-            InputError: a sample_shape was asked for.
+            InputError: a sample_shape is given.
         """
         if torch.Size(sample_shape) != torch.Size():
-            raise InputError("a switch draws one value for each particle; ask for no sample_shape.")
+            raise InputError("Switch draws one value for each particle; give no sample_shape.")
         drawn = [(rows, distribution.sample()) for rows, distribution in self.groups]
         kind = reduce(torch.promote_types, (value.dtype for _, value in drawn))
         values = drawn[0][1].new_empty(self.batch_shape + self.event_shape, dtype=kind)
@@ -112,13 +112,13 @@ def _common_freedom(built: list[Any]) -> Freedom | None:
     free = {freedom_of(each) for each in built}
     if len(free) > 1:
         raise InputError(
-            "the choices of a switch have poses with different free axes, or some have no poses; "
-            "give all the same, since their densities cannot be compared."
+            "the choices of Switch have poses with different free axes, or some have no poses; "
+            "give all the same, or their densities cannot be compared."
         )
     return free.pop()
 
 
-# Closed or half open makes no difference to what moves through them.
+# Closed and half open supports have the same unbounded coordinates.
 _KINDS = {"GreaterThanEq": "GreaterThan", "HalfOpenInterval": "Interval"}
 
 
@@ -134,8 +134,8 @@ def _common_support(groups: list[tuple[Tensor, Any]]) -> Any:
     kinds = sorted({_kind(support) for support in innermost})
     if len(kinds) > 1:
         raise InputError(
-            f"the choices of a switch have supports of different kinds ({', '.join(kinds)}); "
-            "give all the same kind, since their densities cannot be compared."
+            f"the choices of Switch have supports of different kinds ({', '.join(kinds)}); "
+            "give all the same kind, or their densities cannot be compared."
         )
     if kinds == ["discrete"]:
         return whole
@@ -152,7 +152,7 @@ def _common_support(groups: list[tuple[Tensor, Any]]) -> Any:
 
 
 def _spread(bounds: list[tuple[Tensor, Any]]) -> Any:
-    """One bound for each particle, of bounds (K, ...) or () at rows (K,); itself where it is one for all."""
+    """One bound for each particle, from bounds (K, ...) or () at rows (K,); the bound itself if all agree."""
     first = bounds[0][1]
     if not any(isinstance(bound, Tensor) for _, bound in bounds) and all(b == first for _, b in bounds):
         return first

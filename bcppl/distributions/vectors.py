@@ -12,15 +12,15 @@ from bcppl.distributions.lazy import LazyDistribution
 
 
 class NormalStep(LazyDistribution):
-    """Normal around a value: of one shape for all particles, of a size of its own for each.
+    """Normal about a value: its covariance has one shape for all particles, and a size for each.
 
-    The density is that of a `MultivariateNormal` with `size * factor`, which solves with a matrix for every
-    particle where this one solves once.
+    The density is that of a `MultivariateNormal` with `size * factor`, which solves a linear system for every
+    particle where this one solves one.
 
     Args:
-        at: (N, ...) what each particle steps from.
+        at: (N, ...) the value from which each particle steps.
         factor: (d, d) lower Cholesky factor of the covariance of a step over the d entries of the value.
-        size: (N,) times which each particle's step is made; positive.
+        size: (N,) positive factor of each particle's step.
     """
 
     def __init__(self, at: Tensor, factor: Tensor, size: Tensor) -> None:

@@ -14,9 +14,7 @@ import torch
 from torch import Tensor
 
 from bcppl.contact.touch import Touch
-from bcppl.distributions.path import Path
-from bcppl.distributions.shared_error import SharedError, SharedOnset
-from bcppl.distributions.touch import ForceDirection, FreePath, Placed
+from bcppl.distributions.touch import ForceDirection, FreePath, Path, Placed, SharedError, SharedOnset
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
@@ -138,9 +136,9 @@ class PointFinger:
         touched = once("point finger", lambda: self._touched(world_from_part))
         distance, shared = touched.distance, touched.shared
         distance.expect(path.points)
-        shared.expect(path)
+        shared.add(path)
         onset = pyro.sample(f"onset_{number}", SharedOnset(shared, settings.outlier))
-        shared.felt(onset)
+        shared.condition_on(onset)
         if onset.ndim == 1 and not bool(onset.isnan().any()):
             distance.expect(onset[None])
         if settings.use_direction:

@@ -32,7 +32,7 @@ from bcppl.inference.proposals.approximated import (
     forward_kernel,
     joint_random_walk,
 )
-from bcppl.inference.proposals.together import continuous
+from bcppl.inference.proposals.coordinates import continuous_addresses
 from bcppl.inference.resampling import adaptive, never, systematic
 from bcppl.inference.sizing import replicated
 from bcppl.inference.targets import POSTERIOR
@@ -85,7 +85,7 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]]) -> Kernel:
     """
 
     def moved(population: Population) -> Move:
-        others = [address for address in continuous(population.trace) if address != pose]
+        others = [address for address in continuous_addresses(population.trace) if address != pose]
         walks = [metropolis_hastings(drift(other, WALK)) for other in others]
         guided = [metropolis_hastings(proposal) for proposal in proposals(population.approximation)]
         # One for all: chosen for each particle, every walk would have to run.

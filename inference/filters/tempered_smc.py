@@ -25,7 +25,8 @@ from bcppl.inference.kernels.kernel import Move, takes
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Program, drift, independent, prior, spread_of
 from bcppl.inference.proposals.climbing import Modes, jumps, modes
-from bcppl.inference.proposals.together import continuous, drift_together
+from bcppl.inference.proposals.coordinates import continuous_addresses
+from bcppl.inference.proposals.walk import joint_drift
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.traces import Model, Series, Trace, generate
 
@@ -51,15 +52,15 @@ def kernel(pose: str, proposals: Sequence[Program] = (), modes: Modes | None = N
     alone = mixture([metropolis_hastings(drift(pose, (0.2, 2.0))), metropolis_hastings(anew), *far])
 
     def moved(population: Population) -> Move:
-        others = [address for address in continuous(population.trace) if address != pose]
+        others = [address for address in continuous_addresses(population.trace) if address != pose]
         if not others:
             return alone(population)
         each = [metropolis_hastings(drift(other, (0.2, 2.0))) for other in others]
-        walk = metropolis_hastings(drift_together(pose, *others, scales=(0.2, 2.0)))
+        walk = metropolis_hastings(joint_drift(pose, *others, scales=(0.2, 2.0)))
         return sequence([alone, *each, walk])(population)
 
     def spreads(population: Population) -> dict[str, Tensor]:
-        return {a: spread_of(a)(population) for a in continuous(population.trace)}
+        return {a: spread_of(a)(population) for a in continuous_addresses(population.trace)}
 
     given = [metropolis_hastings(p, *([spreads] if takes(p, 2) else [])) for p in proposals]
     shaped = sequence([moved, *given]) if given else moved

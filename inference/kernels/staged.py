@@ -21,7 +21,7 @@ from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_other
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import spread_of
 from bcppl.inference.proposals.coordinates import coordinates_of
-from bcppl.inference.proposals.spread import learned_from
+from bcppl.inference.proposals.spread import weighted_places
 from bcppl.inference.targets import Target, cost_of
 from bcppl.traces import Trace
 
@@ -146,7 +146,7 @@ def student_t(address: str, degrees: float = 5.0, width: float = 1.3) -> Surroga
     width = number_within("student_t is given a width of {}", width, above=0.0)
 
     def fit(population: Population) -> Callable[[Trace], Tensor]:
-        coordinates, places, weights = learned_from(population, address)
+        coordinates, places, weights = weighted_places(population, address)
         center = coordinates.mean(places, weights)
         factor = torch.linalg.cholesky(width * spread_of(address)(population))
 

@@ -1,4 +1,4 @@
-"""Proposals: programs that choose new values at latent addresses."""
+"""Proposals: programs that sample new values at latent addresses."""
 
 from bcppl.inference.proposals.ancestral import prior
 from bcppl.inference.proposals.contact_points import contact_alignment
@@ -8,7 +8,7 @@ from bcppl.inference.proposals.differences import differential_evolution
 from bcppl.inference.proposals.proposal import Fitted, Program, Proposal, program_of
 from bcppl.inference.proposals.spread import spread_of
 from bcppl.inference.proposals.symmetries import Continuous, rotations, symmetry
-from bcppl.inference.proposals.walk import drift
+from bcppl.inference.proposals.walk import drift, joint_drift
 
 __all__ = [
     "Continuous",
@@ -20,6 +20,7 @@ __all__ = [
     "differential_evolution",
     "drift",
     "independent",
+    "joint_drift",
     "prior",
     "program_of",
     "rotations",

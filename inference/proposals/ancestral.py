@@ -1,4 +1,4 @@
-"""Prior: latent values drawn anew from the program itself, discrete ones as well."""
+"""Prior proposals: latent values, discrete ones included, redrawn from the program itself."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from bcppl.traces import Trace
 
 
 def prior(*addresses: str) -> Callable[[Trace], None]:
-    """Some latent values drawn anew from the program, in its order, given the others' values.
+    """A proposal that redraws some latent values from the program, in its order, given the others.
 
-    Later ones are given the earlier ones' new values, as when the program is run. What it says of the other
-    sites decides: proposing from the prior is right for any value, and good for values of which the
-    observations say little.
+    Later ones are conditioned on the new values of earlier ones, as when the program is run. The acceptance
+    ratio is that of the densities of the other sites: the proposal is valid for any value, and efficient for
+    values that the observations hardly inform.
 
     Args:
         addresses: latent addresses, in any order.
@@ -27,13 +27,13 @@ def prior(*addresses: str) -> Callable[[Trace], None]:
         InputError: no address is given; when it is run: one is not latent.
     """
     if not addresses:
-        raise InputError("prior is given no address; give one or more that are latent.")
+        raise InputError("prior is given no address; give one or more latent ones.")
 
     def regenerated(trace: Trace) -> None:
         for address in addresses:
             if address not in trace.choices:
                 raise InputError(
-                    f"prior is to draw {address!r} anew, which is no latent address; "
+                    f"prior is given {address!r}, which is no latent address; "
                     f"latent are {', '.join(trace.choices) or 'none'}."
                 )
         fresh: dict[str, Tensor] = {}

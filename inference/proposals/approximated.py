@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.mixture import MixturePose
 from bcppl.distributions.pose_normals import GaussianMixture, transport, widened_mixture
-from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.poses import MixturePose, NormalPose
 from bcppl.inference.approximation import GaussianApproximation
 from bcppl.sensors.capabilities import FitsPose
 from bcppl.traces import Trace

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import whole_number
-from bcppl.distributions.mixture import MixturePose
-from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.poses import MixturePose, NormalPose
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.exponents import next_exponent

@@ -1,107 +1,92 @@
-"""Contact alignment: a part moved so that what is felt of it in simulation meets what was felt."""
+"""Contact alignment: a part moved so that simulated contacts meet the measured ones."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from fnmatch import fnmatchcase
+from collections.abc import Sequence
 from functools import reduce
 from operator import add
 from typing import Any
 
-import pyro
 import torch
 from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose
-from bcppl.distributions.support import freedom_of
 from bcppl.distributions.touch import OnsetLocation
 from bcppl.errors import InputError
-from bcppl.inference.population import Population
-from bcppl.inference.proposals.least_squares import Equations, aligned
+from bcppl.inference.proposals.least_squares import (
+    Alignment,
+    Equations,
+    aligned,
+    alignment_proposal,
+    matching,
+)
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import spread_of
-from bcppl.poses import FREE
+from bcppl.poses import Freedom
 from bcppl.traces import Trace
 
 SITES = ("contacts_*", "peg_*", "onset_*")
 
 
 def contact_alignment(address: str, sites: Sequence[str] = SITES, *, reach: float = 1.0) -> Fitted:
-    """Moves a part so that contacts felt in simulation meet those that were felt, and proposes around that.
+    """A proposal about the pose at which simulated contacts meet the measured ones.
 
-    Along the direction in which the part pushes, it is moved as far as a felt contact lies from the simulated
-    one at the same stamp, and as far as the peg was measured to stand from where it stands in simulation; of
-    a finger's onset, as far as the surface lies from it. What is off by more than most counts less (Geman
-    and McClure's weights). One Gauss-Newton step; what is proposed is a mixture of normals around it, of the
-    fit's covariance and of some times that.
+    The part is moved along its contact normals: by the distance of a measured contact from the simulated one
+    at the same stamp, by that of the peg's measured pose from the simulated one, and by that of a finger's
+    onset from the surface. Large residuals are downweighted (Geman and McClure's weights). After one
+    Gauss-Newton step, the proposal is a mixture of normals about it, of the fit's covariance and multiples.
 
-    The way back reads the contacts at the new pose, so physics is run for every proposal:
+    The backward density uses the contacts at the new pose, so physics is run for every proposal:
     `delayed_acceptance` refuses it.
 
     Args:
         address: of the pose.
-        sites: patterns of the addresses of what was felt: `ChamferContacts`, `ContactsInTime`, `PegPose`,
-            `OnsetLocation`.
-        reach: the step is damped towards staying, with a covariance that is the particles' own times this
+        sites: patterns of the addresses of contact likelihoods: `ChamferContacts`, `ContactsInTime`,
+            `PegPose`, `OnsetLocation`.
+        reach: the step is damped by a normal prior at the old pose, with the particles' covariance times this
             squared.
 
     Raises:
-        InputError: the reach is not positive; when it is run: no site fits, or one is of another kind or of
-            another pose than that at `address`.
+        InputError: the reach is not positive; when it is run: no site matches, or one is of another kind or
+            of another pose than that at `address`.
     """
     reach = number_within("contact_alignment is given reach {}", reach, above=0.0)
-    spread = spread_of(address)
 
-    def fit(population: Population) -> Callable[[Trace], None]:
-        damping = torch.linalg.inv(reach**2 * spread(population))
+    def align(trace: Trace, damping: Tensor, freedom: Freedom) -> Alignment:
+        matched = matching(trace, "contact_alignment", sites)
+        each, information = zip(*(_equations(trace, address, site) for site in matched), strict=True)
+        return aligned(trace[address], reduce(add, each), damping, freedom, reduce(add, information))
 
-        def towards_contacts(trace: Trace) -> None:
-            felt = [a for a in trace.addresses if any(fnmatchcase(a, pattern) for pattern in sites)]
-            if not felt:
-                raise InputError(
-                    f"contact_alignment is to read {', '.join(sites)}, which fit no address; "
-                    f"the program visits {', '.join(trace.addresses)}."
-                )
-            freedom = freedom_of(trace.distributions[address]) or FREE
-            pose = trace[address]
-            said, sure = zip(*(_equations(trace, address, site) for site in felt), strict=True)
-            answer = aligned(pose, reduce(add, said), damping, freedom, reduce(add, sure))
-            pyro.sample(address, answer.around(freedom))
-
-        return towards_contacts
-
-    return Fitted(fit)
+    return alignment_proposal(address, reach, align)
 
 
-def _equations(trace: Trace, address: str, felt: str) -> tuple[Equations, Tensor]:
-    """What one site says of the poses (N, 7), and how sure it is of where that leads, (N, 6, 6)."""
-    site: Any = trace.distributions[felt]
-    pose, value = trace[address], trace[felt].to(torch.float64)
+def _equations(trace: Trace, address: str, measured: str) -> tuple[Equations, Tensor]:
+    """The equations of one site for the poses (N, 7), and its information (N, 6, 6) about their solution."""
+    site: Any = trace.distributions[measured]
+    pose, value = trace[address], trace[measured].to(torch.float64)
     if isinstance(site, OnsetLocation):
-        _refuse_other(torch.equal(site.pose, pose), address, felt)
+        _refuse_other(torch.equal(site.pose, pose), address, measured)
         place = value.expand(len(pose), 3)[:, None]
         known = torch.isfinite(place).all(dim=-1)
         inside = poses.transform(poses.inverse(pose), torch.nan_to_num(place))
-        measured: Any = getattr(site.distance, "distance", site.distance)  # of a part that is `Placed`
-        near = measured(inside)
+        distance: Any = getattr(site.distance, "distance", site.distance)  # of a part that is `Placed`
+        near = distance(inside)
         gap = near.distance + torch.as_tensor(site.offset, dtype=torch.float64).reshape(-1, 1)
         spread = torch.as_tensor(site.spread, dtype=torch.float64).reshape(-1, 1)
         precision = torch.where(known, 1.0 / spread**2, 0.0)
         return _robust(pose, near.closest, near.normal, gap, precision)
     if not isinstance(site, ChamferContacts | ContactsInTime | PegPose):
         raise InputError(
-            f"contact_alignment reads site {felt!r}, which is a {type(site).__name__}; "
-            "name contacts, peg poses or onsets with `sites`."
+            f"contact_alignment is given the site {measured!r}, which is a {type(site).__name__}; "
+            "give contacts, peg poses or onsets as `sites`."
         )
     track: Any = site.track
-    _refuse_other(torch.equal(track.inputs[0], pose), address, felt)
+    _refuse_other(torch.equal(track.inputs[0], pose), address, measured)
     contacts, world_from_peg = track.window(site.first, site.last)
-    every = getattr(site, "every", 1)
-    chosen = slice(-site.first % every, None, every)
-    contacts, world_from_peg = contacts[:, chosen], world_from_peg[:, chosen]
-    push, value = track.force_directions(site.first, site.last)[:, chosen], value[..., chosen, :]
+    contacts, world_from_peg = contacts[:, site.thinned], world_from_peg[:, site.thinned]
+    push = track.force_directions(site.first, site.last)[:, site.thinned]
+    value = value[..., site.thinned, :]
     known = torch.isfinite(torch.cat([contacts, push, value.expand(len(pose), -1, -1)], dim=-1)).all(dim=-1)
     contacts, push, value = (torch.nan_to_num(x) for x in (contacts, push, value))
     world_from_peg = torch.where(known[..., None], world_from_peg, poses.identity())
@@ -132,9 +117,9 @@ def _moved(world_from_peg: Tensor, points: Tensor) -> Tensor:
 def _robust(
     pose: Tensor, point: Tensor, normal: Tensor, gap: Tensor, precision: Tensor
 ) -> tuple[Equations, Tensor]:
-    """The equations of T points (N, T, 3) of each particle, with less of what is off by more than most.
+    """The equations of T points (N, T, 3) of each particle, large residuals downweighted.
 
-    The step trusts what was felt; how sure its end is, (N, 6, 6), goes by how far the particle is off.
+    The step uses the noise of the measurement; the information (N, 6, 6) the scale of the residuals.
     """
     counted = precision > 0.0
     middle = torch.where(counted, gap.abs(), torch.nan).nanmedian(dim=1, keepdim=True).values
@@ -149,9 +134,9 @@ def _robust(
     return of(precision), of(scale**-2).precision
 
 
-def _refuse_other(same: bool, address: str, felt: str) -> None:
+def _refuse_other(same: bool, address: str, measured: str) -> None:
     if not same:
         raise InputError(
-            f"contact_alignment moves {address!r}, but what is felt at site {felt!r} is of another pose; "
-            "name that part's sites with `sites`."
+            f"contact_alignment moves {address!r}, but the site {measured!r} depends on another pose; "
+            "give that part's sites as `sites`."
         )

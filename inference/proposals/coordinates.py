@@ -1,7 +1,7 @@
-"""Coordinates in which a latent value is moved: a pose's tangent space, or the real line for any support.
+"""Unbounded coordinates of a latent value: a pose's tangent space, or the real line for any other support.
 
-A value whose support is bounded (positive numbers, an interval, a simplex) is moved where it is not, by the
-transformation that Pyro has for its support, and densities take its Jacobian along.
+A value whose support is bounded (positive numbers, an interval, a simplex) is transformed to an unbounded one
+by torch's bijection for its support, and densities include its Jacobian.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from torch.distributions.transforms import IndependentTransform, Transform, iden
 
 from bcppl import poses
 from bcppl.beliefs import Belief
-from bcppl.distributions.mixture import MixturePose
-from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.poses import MixturePose, NormalPose
 from bcppl.distributions.support import freedom_of, refuse_several_poses
 from bcppl.distributions.vectors import NormalStep
 from bcppl.errors import InputError
@@ -27,10 +26,10 @@ from bcppl.traces import Trace
 
 
 class Coordinates(Protocol):
-    """How proposals read and move one latent address.
+    """Coordinates in which proposals move the value at one latent address.
 
-    A place is where a value is, in whatever form `normal` and `mixture` take as a centre: a pose (..., 7), or
-    a vector (..., d) in unbounded coordinates.
+    A place is a value in the form that `normal` and `mixture` take as a centre: a pose (..., 7), or a vector
+    (..., d) in unbounded coordinates.
 
     Attributes:
         dimension: d.
@@ -39,16 +38,16 @@ class Coordinates(Protocol):
     dimension: int
 
     def of(self, trace: Trace) -> Coordinates:
-        """The same for the particles of another trace, on whose other values a support may hang."""
+        """The same for the particles of another trace, since a support may depend on their other values."""
 
     def places(self, values: Tensor) -> Tensor:
-        """Where the values (N, *event) of the particles are, (N, 7) or (N, d)."""
+        """The places, (N, 7) or (N, d), of the particles' values (N, *event)."""
 
     def steps(self, start: Tensor, end: Tensor) -> Tensor:
         """The coordinates (..., d) of the steps between places."""
 
     def stepped(self, start: Tensor, step: Tensor) -> Tensor:
-        """The places that steps (..., d) lead to: the inverse of `steps`."""
+        """The places after steps (..., d): the inverse of `steps`."""
 
     def mean(self, places: Tensor, weights: Tensor) -> Tensor:
         """The weighted mean, one place."""
@@ -59,7 +58,7 @@ class Coordinates(Protocol):
         Args:
             center: places of the N particles.
             covariance: (d, d).
-            size: (N,) times which each particle's step is made.
+            size: (N,) factor of each particle's step.
         """
 
     def mixture(self, log_weights: Tensor, centers: Tensor, covariance: Tensor) -> Any:
@@ -80,7 +79,7 @@ class PoseCoordinates:
         self.dimension = freedom.dimension
 
     def of(self, trace: Trace) -> PoseCoordinates:
-        """These: free axes are the same for all."""
+        """Itself: all particles have the same free axes."""
         return self
 
     def places(self, values: Tensor) -> Tensor:
@@ -88,15 +87,15 @@ class PoseCoordinates:
         return values
 
     def steps(self, start: Tensor, end: Tensor) -> Tensor:
-        """Free coordinates of the tangents that lead from pose to pose."""
+        """Free coordinates of the tangents from pose to pose."""
         return self.freedom.coordinates(poses.local(start, end))
 
     def stepped(self, start: Tensor, step: Tensor) -> Tensor:
-        """The poses that tangents lead to."""
+        """The poses after tangents."""
         return poses.retract(start, self.freedom.embed(step))
 
     def mean(self, places: Tensor, weights: Tensor) -> Tensor:
-        """The belief's mean, reached from a pose along the free axes: the others stay as they are held."""
+        """The weighted mean pose along the free axes; the held ones are those of the first place."""
         mean = Belief(places, weights.log(), self.freedom).mean
         return self.stepped(places[0], self.steps(places[0], mean))
 
@@ -110,7 +109,7 @@ class PoseCoordinates:
 
 
 class VectorCoordinates:
-    """Any other continuous value, flattened and unbounded; its distribution's support says how."""
+    """Any other continuous value, flattened, in the unbounded coordinates of its distribution's support."""
 
     def __init__(self, address: str, transform: Unflattened) -> None:
         self.address = address
@@ -118,7 +117,7 @@ class VectorCoordinates:
         self.dimension = transform.dimension
 
     def of(self, trace: Trace) -> Coordinates:
-        """The same for other particles; a support may hang on their other values."""
+        """The same for other particles; a support may depend on their other values."""
         if self.transform.unbounded:
             return VectorCoordinates(self.address, self.transform.of(trace[self.address]))
         return coordinates_of(trace, self.address)
@@ -163,8 +162,8 @@ class VectorCoordinates:
 class OnSupport(dist.TransformedDistribution):
     """A distribution over unbounded coordinates, transformed to the support of a site.
 
-    Where a step leads beyond what the value's type can hold (a log of -100 is 0 in single precision, one of
-    800 infinite in double), the value has no coordinates any more, and no density: no way leads back.
+    Where a step leaves the range of the value's type (a log of -100 is 0 in single precision, one of 800
+    infinite in double), the value has no coordinates, and its density is zero: no proposal leads back.
     """
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -194,10 +193,10 @@ class Unflattened(Transform):
         self._set(values)
 
     def of(self, values: Tensor) -> Unflattened:
-        """The same for other particles; for a support that is the same for all."""
+        """The same for other particles, if their support is the same."""
         other = Unflattened.__new__(Unflattened)
         other.__dict__.update(self.__dict__)
-        other._inv = None  # torch keeps a transform's inverse, which would be that of the old one
+        other._inv = None  # torch caches a transform's inverse, which would be that of the old one
         other._set(values)
         return other
 
@@ -223,7 +222,7 @@ class Unflattened(Transform):
         return self._free(y).reshape(self.particles, -1)
 
     def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
-        """(N,) of all entries together."""
+        """Log-determinant (N,) over all entries."""
         inside = self._inside(x)
         each = self.to_support.log_abs_det_jacobian(inside, y.to(torch.float64).movedim(0, self.plates))
         return each.movedim(self.plates, 0).reshape(self.particles, -1).sum(dim=1)
@@ -244,15 +243,15 @@ def _is_identity(transform: Transform) -> bool:
 
 
 def coordinates_of(trace: Trace, address: str) -> Coordinates:
-    """The coordinates in which proposals move a latent address of a trace.
+    """The coordinates of a latent address of a trace.
 
     Raises:
-        InputError: the address is not latent, is discrete, holds several poses for each particle, or its
+        InputError: the address is not latent, is discrete, has several poses for each particle, or its
             support has no unbounded coordinates.
     """
     if address not in trace.choices:
         raise InputError(
-            f"a proposal is to move {address!r}, which is no latent address; "
+            f"a proposal moves {address!r}, which is no latent address; "
             f"latent are {', '.join(trace.choices) or 'none'}."
         )
     distribution = trace.distributions[address]
@@ -262,9 +261,7 @@ def coordinates_of(trace: Trace, address: str) -> Coordinates:
         refuse_several_poses(address, value, distribution)
         return PoseCoordinates(freedom)
     if distribution.support.is_discrete or not value.is_floating_point():
-        raise InputError(
-            f"address {address!r} is discrete and cannot be moved by small steps; use prior({address!r})."
-        )
+        raise InputError(f"address {address!r} is discrete and has no coordinates; use prior({address!r}).")
     try:
         return VectorCoordinates(address, Unflattened(distribution, value))
     except NotImplementedError as error:
@@ -272,3 +269,15 @@ def coordinates_of(trace: Trace, address: str) -> Coordinates:
             f"the support of address {address!r}, {distribution.support}, has no unbounded coordinates; "
             f"use prior({address!r}) or a proposal of your own."
         ) from error
+
+
+def continuous_addresses(trace: Trace) -> list[str]:
+    """The latent addresses of a trace that have coordinates."""
+    movable = []
+    for address in trace.choices:
+        try:
+            coordinates_of(trace, address)
+        except InputError:
+            continue
+        movable.append(address)
+    return movable

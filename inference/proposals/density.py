@@ -1,4 +1,4 @@
-"""Independent proposals: a mixture fitted to particles, that does not ask where the moved particle is."""
+"""Independence proposals: a mixture fitted to particles, whatever the moved particle's value."""
 
 from __future__ import annotations
 
@@ -14,12 +14,18 @@ from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import FLOOR, conditioned, covariance_of, learned_from
+from bcppl.inference.proposals.spread import (
+    FLOOR,
+    conditioned,
+    covariance_about_mean,
+    covariance_of,
+    weighted_places,
+)
 from bcppl.inference.schemes import systematic
 from bcppl.traces import Trace
 
-TEACHERS = 1000  # a covariance of these is right to a few percent
-ROUNDS = 10  # of expectation maximisation: what is left to gain hardly shows in the acceptance
+MOST_FITTED = 1000  # particles; their covariance is accurate to a few percent
+ROUNDS = 10  # of expectation maximisation; more hardly change the acceptance
 
 
 def independent(
@@ -29,24 +35,24 @@ def independent(
     inflation: float = 1.05,
     wide: tuple[float, float] = (0.05, 2.0),
 ) -> Fitted:
-    """A value drawn from a mixture of normals that is fitted to the particles, wherever the particle was.
+    """A proposal from a mixture of normals fitted to the particles, independent of the particle's value.
 
-    The independence sampler of Tierney (Annals of Statistics 22, 1994, section 2.3.3). One component more is
-    as wide as the whole population, and wider: it keeps the ratio of target to proposal from growing in the
-    tails, where particles would be stuck (Hesterberg, Weighted average importance sampling and defensive
-    mixture distributions, Technometrics 37, 1995). Poses are fitted in their tangent spaces, other
-    values in unbounded coordinates of their support. Of more than a thousand particles a thousand, drawn by
-    weight, are learned from.
+    The independence sampler of Tierney (Annals of Statistics 22, 1994, section 2.3.3). One more component is
+    wider than the whole population: it bounds the ratio of target to proposal in the tails, where particles
+    would be stuck (Hesterberg, Weighted average importance sampling and defensive mixture distributions,
+    Technometrics 37, 1995). Poses are fitted in their tangent spaces, other values in unbounded coordinates
+    of their support. Of more than a thousand particles a thousand are resampled for the fit.
 
     Args:
-        address: which latent value to move.
-        components: how many normals are fitted by expectation maximisation; None for a kernel density, one
-            normal at every particle, its width by Silverman's rule (Density Estimation, 1986, eq. 4.14).
-        inflation: what the fitted standard deviations are multiplied by.
-        wide: the chance of the wide component, and its standard deviations in the population's.
+        address: of the latent value.
+        components: the number of normals, fitted by expectation maximisation; None for a kernel density
+            estimate, one normal at every particle, its width by Silverman's rule (Density Estimation, 1986,
+            eq. 4.14).
+        inflation: factor of the fitted standard deviations.
+        wide: the weight of the wide component, and its standard deviations in the population's.
 
     Raises:
-        InputError: no whole number of components, a chance not in (0, 1), or a factor not above 0; when it is
+        InputError: no whole number of components, a weight not in (0, 1), or a factor not above 0; when it is
             fitted: the address is not latent, or is discrete.
     """
     if components is not None:
@@ -54,34 +60,33 @@ def independent(
     inflation = number_within("an independent proposal is given the inflation {}", inflation, above=0.0)
     if not isinstance(wide, Sequence) or len(wide) != 2:
         raise InputError(
-            f"the wide component of an independent proposal is {wide!r}; give its chance and its width."
+            f"the wide component of an independent proposal is {wide!r}; give its weight and its width."
         )
-    chance = number_within(
-        "the wide component of an independent proposal has the chance {}", wide[0], above=0.0, below=1.0
+    share = number_within(
+        "the wide component of an independent proposal has the weight {}", wide[0], above=0.0, below=1.0
     )
     width = number_within(
         "the wide component of an independent proposal has the width {}", wide[1], above=0.0
     )
 
     def fit(population: Population) -> Callable[[Trace], None]:
-        known, places, weights = learned_from(population, address)
-        if len(population) > TEACHERS:
-            places = places[systematic(weights.log(), TEACHERS)]
-            weights = weights.new_full((TEACHERS,), 1.0 / TEACHERS)
+        known, places, weights = weighted_places(population, address)
+        if len(population) > MOST_FITTED:
+            places = places[systematic(weights.log(), MOST_FITTED)]
+            weights = weights.new_full((MOST_FITTED,), 1.0 / MOST_FITTED)
         if components is None:
             mixture = _kernel_density(known, places, weights)
         else:
             mixture = _maximised(known, places, weights, components)
-        mean = known.mean(places, weights)
-        whole = conditioned(covariance_of(known.steps(mean, places), weights))
-        shares = torch.cat([mixture.log_weights.exp() * (1.0 - chance), weights.new_tensor([chance])]).log()
-        centers = torch.cat([mixture.centers, mean[None]])
+        whole = covariance_about_mean(known, places, weights)
+        shares = torch.cat([mixture.log_weights.exp() * (1.0 - share), weights.new_tensor([share])])
+        centers = torch.cat([mixture.centers, known.mean(places, weights)[None]])
         covariances = torch.cat([inflation**2 * mixture.covariances, width**2 * whole[None]])
 
-        def anew(trace: Trace) -> None:
-            pyro.sample(address, known.of(trace).mixture(shares, centers, covariances))
+        def independently(trace: Trace) -> None:
+            pyro.sample(address, known.of(trace).mixture(shares.log(), centers, covariances))
 
-        return anew
+        return independently
 
     return Fitted(fit)
 
@@ -95,19 +100,18 @@ class Mixture(NamedTuple):
 
 
 def _kernel_density(coordinates: Coordinates, places: Tensor, weights: Tensor) -> Mixture:
-    """A normal at every particle, as wide as its neighbours are apart."""
+    """A kernel density estimate: a normal at every particle, of Silverman's width."""
     dimension, effective = coordinates.dimension, float(1.0 / (weights**2).sum())
     width = (4.0 / (dimension + 2.0)) ** (1.0 / (dimension + 4.0)) * effective ** (-1.0 / (dimension + 4.0))
-    steps = coordinates.steps(coordinates.mean(places, weights), places)
-    whole = conditioned(covariance_of(steps, weights))
+    whole = covariance_about_mean(coordinates, places, weights)
     return Mixture(weights.log(), places, (width**2 * whole).expand(len(places), -1, -1))
 
 
 def _maximised(coordinates: Coordinates, places: Tensor, weights: Tensor, components: int) -> Mixture:
-    """Expectation maximisation; covariances from few particles are drawn towards what they have in common.
+    """A mixture fitted by expectation maximisation, its covariances shrunk towards the pooled one.
 
-    That is the mode under an inverse Wishart prior at the pooled covariance, of as many particles as there
-    are coordinates (Fraley and Raftery, Journal of Classification 24, 2007, section 3).
+    They are posterior modes under an inverse Wishart prior at the pooled covariance, worth as many particles
+    as there are coordinates (Fraley and Raftery, Journal of Classification 24, 2007, section 3).
     """
     dimension, particles = coordinates.dimension, len(places)
     centers = places[_apart(coordinates, places, weights, components)]
@@ -143,7 +147,7 @@ def _maximised(coordinates: Coordinates, places: Tensor, weights: Tensor, compon
 
 
 def _shares(coordinates: Coordinates, mixture: Mixture, places: Tensor) -> Tensor:
-    """How much of each particle (K, N) belongs to each component, in the tangent spaces at their centres."""
+    """Responsibilities (K, N) of the components for each particle, in the tangent spaces at their centres."""
     each = []
     for share, center, covariance in zip(*mixture, strict=True):
         scale = torch.linalg.cholesky(covariance)
@@ -153,14 +157,12 @@ def _shares(coordinates: Coordinates, mixture: Mixture, places: Tensor) -> Tenso
 
 
 def _apart(coordinates: Coordinates, places: Tensor, weights: Tensor, count: int) -> Tensor:
-    """Particles (K,) far apart from one another, K at most `count`.
+    """Initial centres: the indices (K,), K at most `count`, of particles far apart from one another.
 
-    Drawn as by Arthur and Vassilvitskii, k-means++: the advantages of careful seeding, SODA 2007.
+    Arthur and Vassilvitskii, k-means++: the advantages of careful seeding, SODA 2007.
     """
     chosen = [int(torch.multinomial(weights, 1))]
-    metric = conditioned(
-        covariance_of(coordinates.steps(coordinates.mean(places, weights), places), weights)
-    ).diagonal()
+    metric = covariance_about_mean(coordinates, places, weights).diagonal()
     nearest = torch.full_like(weights, torch.inf)
     while len(chosen) < count:
         apart = (coordinates.steps(places[chosen[-1]], places).square() / metric).sum(dim=-1)

@@ -1,16 +1,13 @@
-"""Depth alignment: a part moved so that its rendered points come onto the measured depth."""
+"""Depth alignment: a part moved so that its rendered points meet the measured depth."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from fnmatch import fnmatchcase
 from functools import reduce
 from operator import add
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pyro
 import torch
 from torch import Tensor
 
@@ -20,112 +17,103 @@ from bcppl.distributions.depth import ClutteredDepth, LaplaceDepth, RobustDepth
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
-from bcppl.inference.population import Population
-from bcppl.inference.proposals.least_squares import Alignment, Equations, aligned
+from bcppl.inference.proposals.least_squares import (
+    Alignment,
+    Equations,
+    aligned,
+    alignment_proposal,
+    matching,
+)
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import spread_of
-from bcppl.poses import FREE
+from bcppl.poses import FREE, Freedom
 from bcppl.rendering.part_renderer import Hits
 from bcppl.traces import Trace
 
 Array = npt.NDArray[np.float64]
 Ids = npt.NDArray[np.int64]
 
-FARTHEST = 10.0  # scales of the depth's noise: what is farther off than this is not reached for
-ENOUGH = 200  # pixels of an image, for each particle: more say hardly more about where to move
-GRAZING = 0.3  # the cosine below which a surface's depth is trusted no less than at that cosine
+FARTHEST = 10.0  # the largest scale of residuals, in scales of the depth's noise
+ENOUGH = 200  # pixels of an image, for each particle: more hardly change the step
+GRAZING = 0.3  # the cosine of incidence below which the weight of a surface's depth grows no further
 
 
 def depth_alignment(address: str, sites: str = "depth_*", *, steps: int = 1, reach: float = 1.0) -> Fitted:
-    """Moves a part so that the points rendered of it meet the measured depth, and proposes around that.
+    """A proposal about the pose at which the part's rendered points meet the measured depth.
 
     Gauss-Newton on point to plane distances along the pixels' rays, the planes those of the faces that are
-    hit, each pixel weighed by how far it is off (Geman and McClure's weights, their scale the particle's own
-    median error): what another thing shows is left out. What is proposed is a mixture of normals around the
-    answer, of the fit's covariance and of some times that. It renders once for each step, there and back.
+    hit. Large residuals are downweighted (Geman and McClure's weights, their scale the particle's own median
+    error), so that pixels of other things do not count. The proposal is a mixture of normals about the
+    solution, of the fit's covariance and multiples. It renders once for each step, forward and backward.
 
     Args:
         address: of the pose.
         sites: a pattern of the addresses of its depth images, `LaplaceDepth`, `RobustDepth` or
             `ClutteredDepth`.
         steps: of Gauss-Newton.
-        reach: the steps are damped towards staying, with a covariance that is the particles' own times this
-            squared.
+        reach: the steps are damped by a normal prior at the old pose, with the particles' covariance times
+            this squared.
 
     Raises:
-        InputError: fewer than one step; when it is run: no depth image is at such an address, or one is of
-            another pose than that at `address`.
+        InputError: fewer than one step; when it is run: no address matches, or a site is no depth image or
+            of another pose than that at `address`.
     """
     steps = whole_number("depth_alignment is given {} steps", steps)
     reach = number_within("depth_alignment is given reach {}", reach, above=0.0)
-    spread = spread_of(address)
 
-    def fit(population: Population) -> Callable[[Trace], None]:
-        damping = torch.linalg.inv(reach**2 * spread(population))
+    def align(trace: Trace, damping: Tensor, freedom: Freedom) -> Alignment:
+        return depth_aligned(trace, address, damping, sites, steps=steps)
 
-        def towards_depth(trace: Trace) -> None:
-            freedom = freedom_of(trace.distributions[address]) or FREE
-            answer = depth_aligned(trace, address, damping, sites, steps=steps)
-            pyro.sample(address, answer.around(freedom))
-
-        return towards_depth
-
-    return Fitted(fit)
+    return alignment_proposal(address, reach, align)
 
 
 def depth_aligned(
     trace: Trace, address: str, damping: Tensor, sites: str = "depth_*", *, steps: int = 1
 ) -> Alignment:
-    """Where `depth_alignment` takes each particle.
+    """The alignment of each particle, about which `depth_alignment` proposes.
 
     Args:
         trace: of the particles.
         address: of the pose.
         sites: a pattern of the addresses of its depth images.
         steps: of Gauss-Newton.
-        damping: (d, d) precision over the free axes of staying where a step begins.
+        damping: (d, d) precision over the free axes of the normal prior at the start of a step.
 
     Raises:
-        InputError: no depth image is at such an address, or one is of another pose than that at `address`.
+        InputError: no address matches, or a site is no depth image or of another pose than that at `address`.
     """
-    images = [a for a in trace.addresses if fnmatchcase(a, sites)]
-    if not images:
-        raise InputError(
-            f"depth_alignment is to read {sites!r}, which fits no address; "
-            f"the program visits {', '.join(trace.addresses)}."
-        )
+    images = matching(trace, "depth_alignment", [sites])
     freedom = freedom_of(trace.distributions[address]) or FREE
     pose = trace[address]
     for _ in range(steps):
         each = [_equations(trace, address, image, pose) for image in images]
-        equations = reduce(add, (said for said, _ in each))
-        answer = aligned(pose, equations, damping, freedom, reduce(add, (sure for _, sure in each)))
-        pose = answer.pose
-    return answer
+        equations, information = (reduce(add, terms) for terms in zip(*each, strict=True))
+        alignment = aligned(pose, equations, damping, freedom, information)
+        pose = alignment.pose
+    return alignment
 
 
 def _equations(trace: Trace, address: str, image: str, pose: Tensor) -> tuple[Equations, Tensor]:
-    """What one depth image says of poses (N, 7), and how sure its likelihood is of that, (N, 6, 6)."""
+    """The equations of one depth image for poses (N, 7), and its information (N, 6, 6)."""
     site: Any = trace.distributions[image]
     renderer: Any = getattr(site, "renderer", None)
     of_one_part = isinstance(getattr(renderer, "part", None), Part)
     if not isinstance(site, ClutteredDepth | LaplaceDepth | RobustDepth) or not of_one_part:
         raise InputError(
-            f"depth_alignment reads site {image!r}, which is a {type(site).__name__} and no depth image; "
-            "name those that are with `sites`."
+            f"depth_alignment is given the site {image!r}, which is a {type(site).__name__} and no depth "
+            "image; give those that are as `sites`."
         )
     if not torch.equal(site.pose, trace[address]):
         raise InputError(
-            f"depth_alignment moves {address!r}, but site {image!r} renders another pose; "
-            "name the images of that part with `sites`."
+            f"depth_alignment moves {address!r}, but the site {image!r} renders another pose; "
+            "give the images of that part as `sites`."
         )
     seen, camera = site.observed(trace[image]), site.camera
     hits = renderer.hits(camera, pose, counted=np.asarray(seen.valid.any(axis=0)), faces=True)
-    hits, stood_for = _thinned(hits, len(pose))
+    hits, multiplicity = _thinned(hits, len(pose))
     assert hits.face is not None
     own = hits.pixel + hits.particle * seen.depth.shape[1] if len(seen.depth) > 1 else hits.pixel
     error = seen.depth.take(own) - hits.depth
-    told = seen.valid.take(own) & (hits.depth < seen.behind.take(hits.pixel))
+    known = seen.valid.take(own) & (hits.depth < seen.behind.take(hits.pixel))
 
     camera_from_part = poses.compose(poses.inverse(torch.as_tensor(camera.world_from_camera)), pose)
     turn = poses.rotation_matrix(camera_from_part).numpy()
@@ -137,11 +125,11 @@ def _equations(trace: Trace, address: str, image: str, pose: Tensor) -> tuple[Eq
     at = ray * hits.depth[:, None] - camera_from_part[:, :3].numpy().take(hits.particle, axis=0)
     turned = turn.take(hits.particle, axis=0)
     point = np.einsum("mji,mj->mi", turned, at)
-    # How far along the normal the plane moves when its depth along the ray grows by one.
+    # The derivative of the plane's position along its normal by its depth along the ray.
     slope = np.einsum("mji,mj,mi->m", turned, ray, normal)
-    scale = _scales(error, told, hits.particle, len(pose), site.scale).take(hits.particle)
-    weight = np.where(told, (1.0 + (0.5 * error / scale) ** 2) ** -2, 0.0)
-    weight *= stood_for.take(hits.particle) / (scale * np.maximum(np.abs(slope), GRAZING)) ** 2
+    scale = _scales(error, known, hits.particle, len(pose), site.scale).take(hits.particle)
+    weight = np.where(known, (1.0 + (0.5 * error / scale) ** 2) ** -2, 0.0)
+    weight *= multiplicity.take(hits.particle) / (scale * np.maximum(np.abs(slope), GRAZING)) ** 2
     equations = Equations.of_planes(
         pose,
         *(torch.from_numpy(np.asarray(x)) for x in (hits.particle, point, normal, error * slope, weight)),
@@ -150,7 +138,7 @@ def _equations(trace: Trace, address: str, image: str, pose: Tensor) -> tuple[Eq
 
 
 def _thinned(hits: Hits, particles: int) -> tuple[Hits, Array]:
-    """Every so many hits of each particle, no more than are enough, and how many (N,) each stands for."""
+    """Every k-th hit of each particle, so that at most `ENOUGH` remain, and k (N,)."""
     count = np.bincount(hits.particle, minlength=particles)
     rank = np.arange(len(hits.particle)) - (np.cumsum(count) - count).take(hits.particle)
     stride = np.maximum(-(-count // ENOUGH), 1)
@@ -160,13 +148,13 @@ def _thinned(hits: Hits, particles: int) -> tuple[Hits, Array]:
     return thinned, stride.astype(np.float64)
 
 
-def _scales(error: Array, told: npt.NDArray[np.bool_], particle: Ids, particles: int, noise: float) -> Array:
-    """Each particle's scale of the errors (N,): by their median size, between noise and farthest."""
-    size = np.where(told, np.abs(error), np.inf)
+def _scales(error: Array, known: npt.NDArray[np.bool_], particle: Ids, particles: int, noise: float) -> Array:
+    """Each particle's robust scale of the errors (N,), from their median absolute value, clipped."""
+    size = np.where(known, np.abs(error), np.inf)
     order = np.lexsort((size, particle))
     first = np.searchsorted(particle, np.arange(particles))
-    count = np.bincount(particle, weights=told, minlength=particles).astype(np.int64)
+    count = np.bincount(particle, weights=known, minlength=particles).astype(np.int64)
     middle = size[order].take(np.minimum(first + count // 2, len(order) - 1)) if len(order) else size
     middle = np.where(count > 0, middle, 0.0) if len(order) else np.zeros(particles)
-    # A normal's median size is 0.674 standard deviations; a Laplace's standard deviation is sqrt 2 scales.
+    # A normal's median absolute value is 0.674 standard deviations; a Laplace has 1.41 scales in one.
     return np.asarray(np.clip(1.483 * middle, np.sqrt(2.0) * noise, FARTHEST * noise))

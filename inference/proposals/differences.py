@@ -14,41 +14,41 @@ from bcppl.arguments import number_within
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import learned_from, spread_of
+from bcppl.inference.proposals.spread import spread_of, weighted_places
 from bcppl.traces import Trace
 
-DIFFERENCES = 200  # how many are drawn when it is fitted
+DIFFERENCES = 200  # drawn when it is fitted
 
 
 def differential_evolution(
     address: str, *, scale: float | None = None, jumps: float = 0.1, noise: float = 0.05
 ) -> Fitted:
-    """A step along the difference of two other particles, up or down it, and some noise.
+    """A proposal that steps along plus or minus the difference of two other particles, with noise.
 
     ter Braak, A Markov Chain Monte Carlo version of the genetic algorithm Differential Evolution, Statistics
-    and Computing 16, 2006, eq. 2. Some steps are whole differences: these lead from one mode to another. The
-    pairs are drawn by weight, from the particles that it is fitted to; of the two directions the mixture's
-    density is taken. For a pose a difference is the tangent from one pose to the other.
+    and Computing 16, 2006, eq. 2. Some steps are whole differences, which lead from one mode to another. The
+    pairs are drawn by weight from the particles of the fit; the density is that of the mixture of both signs.
+    For a pose a difference is the tangent from one pose to the other.
 
     Args:
-        address: which latent value to move.
-        scale: what differences are multiplied by; by default ter Braak's 2.38 / sqrt(2 d).
-        jumps: how often the difference is taken whole, a share.
-        noise: standard deviation of the noise, in the particles' own spread.
+        address: of the latent value.
+        scale: factor of the differences; by default ter Braak's 2.38 / sqrt(2 d).
+        jumps: the probability of a whole difference.
+        noise: standard deviation of the noise, in the particles' standard deviations.
 
     Raises:
-        InputError: the scale or the noise is not positive, or the jumps are no share; when it is fitted: the
-            address is not latent, or is discrete.
+        InputError: the scale or the noise is not positive, or the jumps are no probability; when it is
+            fitted: the address is not latent, or is discrete.
     """
     if scale is not None:
         scale = number_within("differential_evolution is given the scale {}", scale, above=0.0)
-    jumps = number_within("differential_evolution is given the share of jumps {}", jumps, least=0.0, most=1.0)
+    jumps = number_within("differential_evolution is given the jumps {}", jumps, least=0.0, most=1.0)
     noise = number_within("differential_evolution is given the noise {}", noise, above=0.0)
     spread = spread_of(address)
 
     def fit(population: Population) -> Callable[[Trace], None]:
         covariance = noise**2 * spread(population)
-        known, places, weights = learned_from(population, address)
+        known, places, weights = weighted_places(population, address)
         drawn = _differences(known, places, weights)
         usual = 2.38 / math.sqrt(2.0 * known.dimension) if scale is None else scale
         sizes = torch.tensor([usual, 1.0], dtype=torch.float64)
@@ -70,7 +70,7 @@ def differential_evolution(
 
 
 def _differences(coordinates: Coordinates, places: Tensor, weights: Tensor) -> Tensor:
-    """Steps (M, d) from particle to particle, both drawn by weight, no particle with itself."""
+    """Steps (M, d) between two distinct particles, both drawn by weight."""
     if int((weights > 0).sum()) < 2:
         return torch.zeros(1, coordinates.dimension, dtype=torch.float64)
     first = torch.multinomial(weights, DIFFERENCES, replacement=True)

@@ -1,25 +1,33 @@
 """Alignment by least squares: the motion of a part that brings points of it onto planes, for N particles.
 
 A point q of the part, in its frame, moves by v + R (w x q) when its pose is moved by the tangent [v, w]
-(`bcppl.poses`). Asked to move by a gap along a normal n, it gives the row [n, q x R^T n] of a linear system:
-the point to plane distance of Chen and Medioni, Object modelling by registration of multiple range images,
-Image and Vision Computing 10, 1992.
+(`bcppl.poses`). A gap along a normal n gives the row [n, q x R^T n] of a linear system: the point to plane
+distance of Chen and Medioni, Object modelling by registration of multiple range images, Image and Vision
+Computing 10, 1992.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 
+import pyro
 import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.mixture import MixturePose
-from bcppl.poses import Freedom
+from bcppl.distributions.poses import MixturePose
+from bcppl.distributions.support import freedom_of
+from bcppl.errors import InputError
+from bcppl.inference.population import Population
+from bcppl.inference.proposals.proposal import Fitted
+from bcppl.inference.proposals.spread import spread_of
+from bcppl.poses import FREE, Freedom
+from bcppl.traces import Trace
 
-# What is proposed around an alignment: normals of so many of the fit's deviations, each with its share.
-# Far beyond the fit's the target falls more slowly than a normal does, and a particle that comes from there
-# would not be let go, were there no way back.
+# The components of a proposal about an alignment: widths in standard deviations of the fit, and weights. The
+# target has heavier tails than the fit, and a particle in them would be stuck without wide components.
 WIDTHS = (1.0, 3.0, 10.0)
 SHARES = (0.8, 0.15, 0.05)
 
@@ -30,7 +38,7 @@ class Equations:
 
     Attributes:
         precision: (N, 6, 6) of the tangent: 1 / m^2, 1 / (m rad), 1 / rad^2.
-        pull: (N, 6) precision times the tangent that solves them.
+        pull: (N, 6) precision times the solution.
     """
 
     precision: Tensor
@@ -43,29 +51,29 @@ class Equations:
     def of_planes(
         cls, pose: Tensor, particle: Tensor, point: Tensor, normal: Tensor, gap: Tensor, precision: Tensor
     ) -> Equations:
-        """The equations of M points that are to move along normals.
+        """The equations of M points with gaps along normals.
 
         Args:
             pose: (N, 7) world_from_part.
-            particle: (M,) int64, whose point it is.
+            particle: (M,) int64, the particle of each point.
             point: (M, 3) in the part's frame, metres.
             normal: (M, 3) unit normals in the part's frame.
-            gap: (M,) how far each is to move along its normal, metres.
+            gap: (M,) the required displacement along the normal, metres.
             precision: (M,) 1 / m^2.
         """
         upward = (poses.rotation_matrix(pose)[particle] @ normal[:, :, None])[..., 0]
         row = torch.cat([upward, torch.linalg.cross(point, normal)], dim=1)
-        weighed = precision[:, None] * row
+        weighted = precision[:, None] * row
         zero = row.new_zeros(len(pose), 6, 6)
         return cls(
-            zero.index_add(0, particle, weighed[:, :, None] * row[:, None, :]),
-            zero[..., 0].index_add(0, particle, gap[:, None] * weighed),
+            zero.index_add(0, particle, weighted[:, :, None] * row[:, None, :]),
+            zero[..., 0].index_add(0, particle, gap[:, None] * weighted),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where an alignment leads, and how sure it is.
+    """The solution of an alignment.
 
     Attributes:
         pose: (N, 7).
@@ -75,8 +83,8 @@ class Alignment:
     pose: Tensor
     covariance: Tensor
 
-    def around(self, freedom: Freedom) -> MixturePose:
-        """A mixture of normals at the alignment, of its covariance and of several times that."""
+    def proposal(self, freedom: Freedom) -> MixturePose:
+        """A mixture of normals at the solution, of its covariance and multiples."""
         widths = torch.tensor(WIDTHS, dtype=torch.float64)
         return MixturePose(
             torch.tensor(SHARES, dtype=torch.float64).log(),
@@ -86,18 +94,57 @@ class Alignment:
         )
 
 
+def alignment_proposal(
+    address: str, reach: float, align: Callable[[Trace, Tensor, Freedom], Alignment]
+) -> Fitted:
+    """A proposal about the alignment of each particle.
+
+    Args:
+        address: of the pose.
+        reach: the alignment is damped by a normal prior at the old pose, with the particles' covariance times
+            this squared.
+        align: the alignment of a trace's particles, given the damping (d, d) and the free axes.
+    """
+
+    def fit(population: Population) -> Callable[[Trace], None]:
+        damping = torch.linalg.inv(reach**2 * spread_of(address)(population))
+
+        def towards_alignment(trace: Trace) -> None:
+            freedom = freedom_of(trace.distributions[address]) or FREE
+            pyro.sample(address, align(trace, damping, freedom).proposal(freedom))
+
+        return towards_alignment
+
+    return Fitted(fit)
+
+
+def matching(trace: Trace, name: str, patterns: Sequence[str]) -> list[str]:
+    """The addresses of a trace that match one of several patterns; `name` is of the alignment.
+
+    Raises:
+        InputError: there is none.
+    """
+    matched = [a for a in trace.addresses if any(fnmatchcase(a, pattern) for pattern in patterns)]
+    if not matched:
+        raise InputError(
+            f"{name} is given the sites {', '.join(patterns)}, which match no address; "
+            f"the program visits {', '.join(trace.addresses)}."
+        )
+    return matched
+
+
 def aligned(
     pose: Tensor, equations: Equations, damping: Tensor, freedom: Freedom, information: Tensor | None = None
 ) -> Alignment:
     """One Gauss-Newton step along the free axes, damped (Levenberg, Quarterly of Applied Math. 2, 1944).
 
     Args:
-        pose: (N, 7) where the equations were taken.
-        equations: there.
-        damping: (d, d) precision of staying there; keeps the step where the equations say nothing.
+        pose: (N, 7) at which the equations are linearised.
+        equations: at those poses.
+        damping: (d, d) precision of a normal prior there, which makes the step unique.
         freedom: the free axes.
-        information: (N, 6, 6) how sure the likelihood is of the answer, where that is not the equations' own
-            precision, as where a power is taken of it.
+        information: (N, 6, 6) of the likelihood about the solution, where it differs from the equations'
+            precision, as that of a power likelihood does.
     """
     free = list(freedom.axes)
 

@@ -1,9 +1,9 @@
-"""What a proposal is: a Pyro program that, given a trace, chooses new values at latent addresses.
+"""Proposals: Pyro programs that, given a trace, sample new values at latent addresses.
 
-Each particle's new value hangs on its own old values only. What a proposal learns from a population is fixed
-before it runs, is the same on the way back, and comes from other particles than those that it moves
-(`bcppl.inference.kernels.rejuvenate`): so `trace["mu"].mean()` is not for a program to read, but for `Fitted`
-or for what `metropolis_hastings(proposal, *learned)` is told to learn.
+Each particle's new value depends on its own old values only. What a proposal learns from a population is
+fixed before it runs, the same for the forward and the backward density, and comes from other particles than
+those that it moves (`bcppl.inference.kernels.rejuvenate`). So a program must not read `trace["mu"].mean()`:
+that is for `Fitted`, or for the functions `learned` of `metropolis_hastings(proposal, *learned)`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Proposal = Program | Fitted
 def program_of(
     proposal: Proposal, learned: Sequence[Callable[[Population], Any]], population: Population
 ) -> Program:
-    """The program `program(trace)` of a proposal that has learned what it wants from a population."""
+    """The program `program(trace)` of a proposal, fitted to a population."""
     program = proposal.fit(population) if isinstance(proposal, Fitted) else proposal
     values = [learn(population) for learn in learned]
     return (lambda trace: program(trace, *values)) if values else program

@@ -1,4 +1,4 @@
-"""What proposals learn of a population at one latent address: how far its particles are spread."""
+"""Covariances of a population at one latent address, for proposals that are fitted to it."""
 
 from __future__ import annotations
 
@@ -12,32 +12,24 @@ from bcppl.errors import InferenceError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
 
-# Spreads below these are rounding, not belief: metres and radians for poses, the value's own unit otherwise.
+# Standard deviations below this are rounding: metres and radians for poses, the value's unit otherwise.
 FLOOR = 1e-6
 
 
 def spread_of(address: str) -> Callable[[Population], Tensor]:
-    """What a proposal may learn: the weighted covariance (d, d) of the particles at a latent address.
+    """A function of a population: the weighted covariance (d, d) of its particles at a latent address.
 
-    For a pose it is that of its free axes in the tangent space at the mean (m^2, m rad, rad^2). A value whose
-    support is bounded has that of its unbounded coordinates (`bcppl.inference.proposals.coordinates`); any
-    other value is flattened.
+    For a pose it is that of its free axes in the tangent space at the mean (m^2, m rad, rad^2), for any other
+    value that of its unbounded coordinates (`bcppl.inference.proposals.coordinates`).
     """
-
-    def spread(population: Population) -> Tensor:
-        coordinates, places, weights = learned_from(population, address)
-        return conditioned(
-            covariance_of(coordinates.steps(coordinates.mean(places, weights), places), weights)
-        )
-
-    return spread
+    return lambda population: covariance_about_mean(*weighted_places(population, address))
 
 
-def learned_from(population: Population, address: str) -> tuple[Coordinates, Tensor, Tensor]:
-    """The coordinates, places (K, ...) and weights (K,) of the particles that can be learned from.
+def weighted_places(population: Population, address: str) -> tuple[Coordinates, Tensor, Tensor]:
+    """The coordinates, places (K, ...) and weights (K,) of the particles to which a proposal is fitted.
 
-    A draw that ran out of the numbers of its type (0 or infinity where values are positive) has no place in
-    unbounded coordinates: it teaches nothing.
+    A draw beyond the range of its type (0 or infinity where values are positive) has no place in unbounded
+    coordinates, and is omitted.
 
     Raises:
         InferenceError: no particle with weight has a place.
@@ -51,10 +43,15 @@ def learned_from(population: Population, address: str) -> tuple[Coordinates, Ten
     total = float(weights[finite].sum())
     if not total > 0.0:
         raise InferenceError(
-            f"no particle's value at {address!r} can be learned from: all are 0 or infinite in "
-            f"{values.dtype}, at the edge of the support; give the prior less spread."
+            f"no proposal can be fitted at {address!r}: all values are 0 or infinite in {values.dtype}, at "
+            "the edge of the support; give the prior less spread."
         )
     return coordinates, places[finite], weights[finite] / total
+
+
+def covariance_about_mean(coordinates: Coordinates, places: Tensor, weights: Tensor) -> Tensor:
+    """The conditioned weighted covariance (d, d) of places (K, ...) about their mean."""
+    return conditioned(covariance_of(coordinates.steps(coordinates.mean(places, weights), places), weights))
 
 
 def covariance_of(steps: Tensor, weights: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Symmetry: jumps between poses at which a part looks or feels alike, or nearly so."""
+"""Symmetry proposals: jumps between poses that are equivalent, or nearly so, under a symmetry of the part."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within, whole_number
-from bcppl.distributions.mixture import MixturePose
-from bcppl.distributions.poses import HELD
+from bcppl.distributions.poses import HELD, MixturePose
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.poses import FREE
@@ -24,7 +23,7 @@ from bcppl.traces import Trace
 
 @dataclass(frozen=True)
 class Continuous:
-    """Turns about an axis of the part, or shifts along it, or both in step, by any amount up to a largest.
+    """A one-parameter family of motions: turns about an axis of the part, shifts along it, or screws.
 
     Attributes:
         axis: (3,) direction, of any length.
@@ -66,7 +65,7 @@ def rotations(
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0),
     point: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Tensor:
-    """The turns (order - 1, 7) about an axis of the part that an `order`-fold symmetry has, but for none.
+    """The turns (order - 1, 7) of an `order`-fold symmetry about an axis, without the identity.
 
     Raises:
         InputError: the order is below 2.
@@ -79,20 +78,20 @@ def rotations(
 def symmetry(
     address: str, transforms: Any, *, spread: tuple[float, float] = (0.0005, 0.005)
 ) -> Callable[[Trace], None]:
-    """A jump by one of the motions that leave the part as it is, or nearly so, and some noise.
+    """A proposal that jumps by one of the motions that leave the part invariant, or nearly so, with noise.
 
-    The pose goes from `world_from_part` to `world_from_part part_from_part`. Every motion is as likely as
-    its inverse, and the density is that of the mixture over all of them.
+    The pose `world_from_part` is composed with `part_from_part`. Every motion has the probability of its
+    inverse, and the density is that of the mixture over all of them.
 
     Args:
         address: of the pose.
-        transforms: motions (K, 7) `part_from_part`, such as `rotations(4)`; inverses that are missing are
-            added. Or a `Continuous` family.
+        transforms: motions (K, 7) `part_from_part`, such as `rotations(4)`; missing inverses are added. Or a
+            `Continuous` family.
         spread: standard deviations of the noise, metres and radians: about those of a mode.
 
     Raises:
         InputError: the motions are no poses, or the spread is not positive; when it is run: the address is
-            no latent pose, or a motion would leave the pose's free axes.
+            no latent pose, or a motion leaves the pose's free axes.
     """
     if not isinstance(spread, Sequence) or len(spread) != 2:
         raise InputError(f"symmetry is given a spread of {spread!r}; give two, metres and radians.")
@@ -105,7 +104,7 @@ def symmetry(
         pose = trace[address]
         freedom = freedom_of(trace.distributions[address]) or FREE
         if pose.ndim != 2 or pose.shape[-1] != 7 or address not in trace.choices:
-            raise InputError(f"symmetry is to move {address!r}, which is no latent pose; name one that is.")
+            raise InputError(f"symmetry moves {address!r}, which is no latent pose; give one that is.")
         motions = listed
         if family is not None:
             amount = pyro.sample("amount", dist.Uniform(*torch.tensor([0.0, 1.0], dtype=torch.float64)))
@@ -114,7 +113,7 @@ def symmetry(
         if bool((freedom.off_axis(poses.local(pose[:, None], ends)) > HELD).any()):
             raise InputError(
                 f"a symmetry moves the pose at {address!r} along an axis that is held; "
-                "leave that motion out, or free the axis."
+                "omit that motion, or free the axis."
             )
         deviations = torch.tensor([metres] * 3 + [radians] * 3, dtype=torch.float64)
         equal = torch.zeros(ends.shape[:-1], dtype=torch.float64)
@@ -124,7 +123,7 @@ def symmetry(
 
 
 def _with_inverses(transforms: Any) -> Tensor:
-    """Motions (K, 7) and the inverses among which they are not."""
+    """Motions (K, 7) and those inverses that are not among them."""
     motions = poses.as_pose(transforms, "a symmetry").reshape(-1, 7)
     if len(motions) == 0:
         raise InputError("symmetry is given no motion; give one or more, such as rotations(2).")

@@ -1,4 +1,4 @@
-"""What a depth likelihood asks of a renderer, which it is given and does not import."""
+"""The protocol of a renderer, which an image likelihood is given and does not import."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class RendersDepth(Protocol):
     """
 
     def hits(self, camera: Camera, world_from_part: Tensor, counted: Mask | None = None) -> PixelHits:
-        """What the camera sees of the part at poses (N, 7), at the counted pixels (H * W,) only."""
+        """The camera's view of the part at poses (N, 7), at the counted pixels (H * W,) only."""
 
     def images(self, camera: Camera, world_from_part: Tensor) -> Array:
         """Depth images (N, H, W) in metres, +inf where a pixel does not see the part."""
@@ -56,34 +56,34 @@ class _Chosen:
     depth: Array
 
 
-class HitsOfPoses:
-    """What a camera sees of the same poses, compared with several images: rendered twice at most.
+class CachedHits:
+    """A camera's view of the same poses, compared with several images: rendered twice at most.
 
-    The first image asks for its own pixels alone, since most have no second. From then on all pixels that
-    may count are kept.
+    The first image renders its own pixels alone, since most have no second. From then on all pixels that may
+    count are cached.
 
     Args:
         render: the hits at the counted pixels (H * W,), or at all for None.
         region: (H * W,) pixels that may count; None for all.
     """
 
-    __caches__ = ("_asked", "_every")
+    __caches__ = ("_called", "_every")
 
     def __init__(self, render: Callable[[Mask | None], PixelHits], region: Mask | None) -> None:
         self._render, self._region = render, region
-        self._asked = False
+        self._called = False
         self._every: PixelHits | None = None
 
-    def keep_all(self) -> HitsOfPoses:
-        """Itself, which renders every pixel when it is first asked: for several that count different ones."""
-        self._asked, self._region = True, None
+    def keep_all(self) -> CachedHits:
+        """Itself, which renders every pixel at its first call: for images that count different ones."""
+        self._called, self._region = True, None
         return self
 
     def __call__(self, counted: Mask) -> PixelHits:
         """The hits at the counted pixels (H * W,)."""
         if self._every is None:
-            if not self._asked:
-                self._asked = True
+            if not self._called:
+                self._called = True
                 return self._render(counted)
             self._every = self._render(self._region)
         every = self._every

@@ -1,8 +1,9 @@
-"""One line of a depth image as a chain, compiled: what each pixel shows, given what the one before it shows.
+"""One line of a depth image as a hidden Markov chain, compiled.
 
-A pixel shows the part or something unknown. What is unknown goes on from pixel to pixel as it was, or jumps;
-the part's error goes on as well. Which of the two it is, is summed over by the forward algorithm (Rabiner,
-A tutorial on hidden Markov models, Proc. IEEE 77, 1989, section III.A). Missing pixels are skipped.
+The hidden state of a pixel is whether it shows the part or unknown clutter. The depth of clutter continues
+from pixel to pixel, or jumps; the error of the part's depth is autocorrelated. States are summed out by the
+forward algorithm (Rabiner, A tutorial on hidden Markov models, Proc. IEEE 77, 1989, section III.A). Missing
+pixels are skipped.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from bcppl.distributions.depth.rendering import Array, Mask
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-class Chances(NamedTuple):
-    """What the chain is made of; lengths in metres. `ClutteredDepth` says what each means."""
+class Chain(NamedTuple):
+    """Parameters of the chain, those of `ClutteredDepth`; lengths in metres."""
 
     near: float
     far: float
@@ -40,7 +41,7 @@ class Chances(NamedTuple):
 
 
 class Line(NamedTuple):
-    """Where a line lies in an image that is flattened: pixel t of it at `base + t * stride`."""
+    """A line of an image that is flattened: its pixel t is at `base + t * stride`."""
 
     base: int
     stride: int
@@ -52,15 +53,15 @@ class Lines(NamedTuple):
 
     Attributes:
         previous: the last depth before each pixel on its line, NaN where there is none, metres.
-        usual: the density of each pixel where no part is, 1 / m.
+        without_part: the density of each pixel without a part, 1 / m.
     """
 
     previous: Array
-    usual: Array
+    without_part: Array
 
 
 def compiled(function: F) -> F:
-    """Compile on first use; the code is kept where a folder can be written."""
+    """Compile on first use; the code is cached on disk where a folder can be written."""
     try:
         return cast(F, njit(cache=True, nogil=True, error_model="numpy")(function))
     except RuntimeError:  # no such folder
@@ -75,7 +76,7 @@ def laplace(error: float, scale: float) -> float:
 
 @compiled
 def below(error: float, scale: float) -> float:
-    """The share of a Laplace distribution below an error."""
+    """The distribution function of a Laplace distribution at an error."""
     if error < 0.0:
         return 0.5 * math.exp(error / scale)
     return 1.0 - 0.5 * math.exp(-error / scale)
@@ -90,25 +91,25 @@ def quantile(share: float, scale: float) -> float:
 
 
 @compiled
-def read(depth: Array, valid: Mask, line: Line, chances: Chances, lines: Lines) -> float:
-    """Write what a line says without a part to `lines`, and return its log-density."""
-    uniform = 1.0 / (chances.far - chances.near)
+def scan(depth: Array, valid: Mask, line: Line, chain: Chain, lines: Lines) -> float:
+    """Write the densities of a line without a part to `lines`, and return its log-density."""
+    uniform = 1.0 / (chain.far - chain.near)
     last, total = np.nan, 0.0
     for t in range(line.length):
         p = line.base + t * line.stride
         lines.previous[p] = last
         if not valid[p]:
             continue
-        goes_on = uniform if np.isnan(last) else laplace(depth[p] - last, chances.step)
-        lines.usual[p] = (1.0 - chances.jump) * goes_on + chances.jump * uniform
-        total += math.log(lines.usual[p])
+        goes_on = uniform if np.isnan(last) else laplace(depth[p] - last, chain.step)
+        lines.without_part[p] = (1.0 - chain.jump) * goes_on + chain.jump * uniform
+        total += math.log(lines.without_part[p])
         last = depth[p]
     return total
 
 
 @compiled
 def is_inside(rendered: Array, line: Line, t: int, rim: int) -> bool:
-    """Whether all pixels of the line within `rim` of t see the part; what is beyond the image may."""
+    """Whether all pixels of the line within `rim` of t, inside the image, see the part."""
     for s in range(max(0, t - rim), min(line.length, t + rim + 1)):
         if not rendered[line.base + s * line.stride] < np.inf:
             return False
@@ -116,13 +117,13 @@ def is_inside(rendered: Array, line: Line, t: int, rim: int) -> bool:
 
 
 @compiled
-def to_visible(hit: bool, inside: bool, was_inside: bool, chances: Chances) -> tuple[float, float]:
-    """The probabilities that the part is seen, after it was seen and after it was not."""
+def to_visible(hit: bool, inside: bool, was_inside: bool, chain: Chain) -> tuple[float, float]:
+    """The probabilities that a pixel shows the part, after one that does and after one that does not."""
     if not hit:
         return 0.0, 0.0
     if not inside:
-        return 1.0 - chances.leave, chances.enter
-    return 1.0 - chances.switch, chances.switch if was_inside else chances.visible
+        return 1.0 - chain.leave, chain.enter
+    return 1.0 - chain.switch, chain.switch if was_inside else chain.visible
 
 
 @compiled
@@ -133,48 +134,54 @@ def gain(
     line: Line,
     first: int,
     last: int,
-    chances: Chances,
+    chain: Chain,
     lines: Lines,
 ) -> float:
-    """By how much the part, rendered at (H * W,), +inf where it is not, changes a line's log-density.
+    """The log-likelihood ratio of a line with the part, rendered at (H * W,), +inf where absent, to none.
 
-    `first` and `last` are the first and last pixel of the line that see the part.
+    Only pixels from `first` to `last` see the part.
     """
-    uniform = 1.0 / (chances.far - chances.near)
+    while first <= last and not rendered[line.base + first * line.stride] < np.inf:
+        first += 1
+    while last >= first and not rendered[line.base + last * line.stride] < np.inf:
+        last -= 1
+    if first > last:
+        return 0.0
+    uniform = 1.0 / (chain.far - chain.near)
     seen, hidden, total = 0.0, 1.0, 0.0
     was_inside, error_before, at_before = False, 0.0, -2
     for t in range(first, line.length):
         p = line.base + t * line.stride
         if not valid[p]:
             continue
-        surface, usual, previous = rendered[p], lines.usual[p], lines.previous[p]
+        surface, without_part, previous = rendered[p], lines.without_part[p], lines.previous[p]
         known = not np.isnan(previous)
         hit = surface < np.inf
-        inside = hit and is_inside(rendered, line, t, chances.rim)
-        stays, comes = to_visible(hit, inside, was_inside, chances)
+        inside = hit and is_inside(rendered, line, t, chain.rim)
+        stays, comes = to_visible(hit, inside, was_inside, chain)
         shown = follows = 0.0
         if hit:
             error = depth[p] - surface
-            shown = follows = laplace(error, chances.scale)
+            shown = follows = laplace(error, chain.scale)
             if t == at_before + 1:
-                smooth = laplace(error - chances.correlation * error_before, chances.wander)
-                follows = (1.0 - chances.rough) * smooth + chances.rough * shown
+                smooth = laplace(error - chain.correlation * error_before, chain.wander)
+                follows = (1.0 - chain.rough) * smooth + chain.rough * shown
             error_before, at_before = error, t
         if inside:
-            room = max(min(surface, chances.far) - chances.near, 1e-9)
+            room = max(min(surface, chain.far) - chain.near, 1e-9)
             share = room * uniform
             if known:
-                share *= chances.jump
-                share += (1.0 - chances.jump) * below(surface - previous, chances.step)
+                share *= chain.jump
+                share += (1.0 - chain.jump) * below(surface - previous, chain.step)
             before = 1.0 if depth[p] < surface else 0.0
-            other = (1.0 - chances.through) * before * usual / share + chances.through * uniform
-            anew = (1.0 - chances.through) * before / room + chances.through * uniform
+            other = (1.0 - chain.through) * before * without_part / share + chain.through * uniform
+            fresh = (1.0 - chain.through) * before / room + chain.through * uniform
         else:
-            other = usual
-            goes_on = laplace(depth[p] - previous, chances.step) if known else uniform
-            anew = (1.0 - chances.abut) * uniform + chances.abut * goes_on
-        now_seen = (seen * stays * follows + hidden * comes * shown) / usual
-        now_hidden = (seen * (1.0 - stays) * anew + hidden * (1.0 - comes) * other) / usual
+            other = without_part
+            goes_on = laplace(depth[p] - previous, chain.step) if known else uniform
+            fresh = (1.0 - chain.abut) * uniform + chain.abut * goes_on
+        now_seen = (seen * stays * follows + hidden * comes * shown) / without_part
+        now_hidden = (seen * (1.0 - stays) * fresh + hidden * (1.0 - comes) * other) / without_part
         both = now_seen + now_hidden
         total += math.log(both)
         seen, hidden = now_seen / both, now_hidden / both
@@ -193,13 +200,13 @@ def gains(
     pixel: np.ndarray,
     surface: Array,
     rendered: Array,
-    chances: Chances,
+    chain: Chain,
     rows: Lines,
     columns: Lines,
 ) -> tuple[float, float]:
-    """`gain` summed over the rows and over the columns that are looked at, for one particle.
+    """`gain` summed over every `spacing`-th row and over every such column, for one particle.
 
-    Every `spacing`-th line is; `pixel` and `surface` (M,) are what the particle sees of the part; `rendered`
+    `pixel` and `surface` (M,) are the pixels that see the particle's part and its depth there; `rendered`
     (H * W,) is +inf everywhere, and left so.
     """
     height, width = shape
@@ -211,33 +218,20 @@ def gains(
     of_rows = of_columns = 0.0
     for v in range(top, bottom + 1):
         if v % spacing == spacing // 2:
-            line = Line(v * width, 1, width)
-            first, last = left, right
-            while first <= last and not rendered[v * width + first] < np.inf:
-                first += 1
-            while last >= first and not rendered[v * width + last] < np.inf:
-                last -= 1
-            if first <= last:
-                of_rows += gain(depth, valid, rendered, line, first, last, chances, rows)
+            of_rows += gain(depth, valid, rendered, Line(v * width, 1, width), left, right, chain, rows)
     for u in range(left, right + 1):
         if u % spacing == spacing // 2:
             line = Line(u, width, height)
-            first, last = top, bottom
-            while first <= last and not rendered[first * width + u] < np.inf:
-                first += 1
-            while last >= first and not rendered[last * width + u] < np.inf:
-                last -= 1
-            if first <= last:
-                of_columns += gain(depth, valid, rendered, line, first, last, chances, columns)
+            of_columns += gain(depth, valid, rendered, line, top, bottom, chain, columns)
     for k in range(len(pixel)):
         rendered[pixel[k]] = np.inf
     return of_rows, of_columns
 
 
 @compiled
-def draw(rendered: Array, line: Line, chances: Chances, chance: Array, drawn: Array) -> None:
-    """Write a draw of a line to `drawn` (H * W,), from uniform numbers `chance` (H * W, 3)."""
-    near, far = chances.near, chances.far
+def draw(rendered: Array, line: Line, chain: Chain, uniform: Array, drawn: Array) -> None:
+    """Write a draw of a line to `drawn` (H * W,), from uniform numbers (H * W, 3)."""
+    near, far = chain.near, chain.far
     seen = was_inside = False
     error, previous = 0.0, np.nan
     at_before = -2
@@ -245,32 +239,32 @@ def draw(rendered: Array, line: Line, chances: Chances, chance: Array, drawn: Ar
         p = line.base + t * line.stride
         surface = rendered[p]
         hit = surface < np.inf
-        inside = hit and is_inside(rendered, line, t, chances.rim)
-        stays, comes = to_visible(hit, inside, was_inside, chances)
-        which, kind, where = chance[p, 0], chance[p, 1], chance[p, 2]
+        inside = hit and is_inside(rendered, line, t, chain.rim)
+        stays, comes = to_visible(hit, inside, was_inside, chain)
+        which, kind, where = uniform[p, 0], uniform[p, 1], uniform[p, 2]
         was_seen, seen = seen, which < (stays if seen else comes)
         known = not np.isnan(previous)
         if seen:
-            if was_seen and t == at_before + 1 and kind >= chances.rough:
-                value = surface + chances.correlation * error + quantile(where, chances.wander)
+            if was_seen and t == at_before + 1 and kind >= chain.rough:
+                value = surface + chain.correlation * error + quantile(where, chain.wander)
             else:
-                value = surface + quantile(where, chances.scale)
+                value = surface + quantile(where, chain.scale)
         else:
-            goes_on = (chances.abut if was_seen else 1.0 - chances.jump) if known else 0.0
+            goes_on = (chain.abut if was_seen else 1.0 - chain.jump) if known else 0.0
             reach, top = 1.0, far
-            if inside and kind >= chances.through:
-                kind = (kind - chances.through) / (1.0 - chances.through)
+            if inside and kind >= chain.through:
+                kind = (kind - chain.through) / (1.0 - chain.through)
                 top = max(min(surface, far), near + 1e-9)
                 if known and not was_seen:
-                    reach = below(surface - previous, chances.step)
+                    reach = below(surface - previous, chain.step)
                     goes_on *= reach
-                    goes_on /= goes_on + chances.jump * (top - near) / (far - near)
+                    goes_on /= goes_on + chain.jump * (top - near) / (far - near)
                 else:
                     goes_on = 0.0
             elif inside:
                 goes_on = 0.0
             if kind < goes_on:
-                value = previous + quantile(where * reach, chances.step)
+                value = previous + quantile(where * reach, chain.step)
             else:
                 value = near + (top - near) * where
         if hit:

@@ -9,7 +9,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 
-from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.poses.normal import NormalPose
 from bcppl.errors import InputError
 from bcppl.poses import FREE, Freedom
 
@@ -18,7 +18,7 @@ class MixturePose(TorchDistribution):
     """A mixture of K normals over poses (`NormalPose`), all with the same free axes.
 
     Args:
-        log_weights: (K,) or (N, K), unnormalised; -inf for a component that is left out.
+        log_weights: (K,) or (N, K), unnormalised; -inf for a component without weight.
         centers: (K, 7) or (N, K, 7).
         covariance: over the free coordinates, (d, d), (K, d, d) or (N, K, d, d), as `NormalPose` takes it, or
             standard deviations (d,).
@@ -38,11 +38,11 @@ class MixturePose(TorchDistribution):
         components = log_weights.shape[-1]
         if centers.ndim < 2 or centers.shape[-2:] != (components, 7):
             raise InputError(
-                f"a mixture over poses was given {components} weights and centres of shape "
-                f"{tuple(centers.shape)}; give one pose of seven numbers for each weight."
+                f"MixturePose has {components} weights and centres of shape {tuple(centers.shape)}; "
+                "give one pose of seven numbers for each weight."
             )
         if not bool((log_weights > -torch.inf).any(dim=-1).all()):
-            raise InputError("a mixture over poses has no component with any weight; give one or more.")
+            raise InputError("MixturePose has no component with any weight; give one or more.")
         batch = torch.broadcast_shapes(log_weights.shape[:-1], centers.shape[:-2])
         self.log_weights = torch.log_softmax(log_weights.to(torch.float64), dim=-1)
         self.components = NormalPose(centers, covariance, freedom)

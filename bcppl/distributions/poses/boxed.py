@@ -1,4 +1,4 @@
-"""A normal over poses whose translation stays in a box."""
+"""A normal over poses truncated to a box of translations."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from torch.distributions import constraints
 from torch.special import log_ndtr, ndtr, ndtri
 
 from bcppl import poses
-from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.poses.normal import NormalPose
 from bcppl.errors import InputError
 
 _LEAST = 1e-300
-_FARTHEST = 30.0  # deviations: beyond, a uniform share of what is left of a tail is rounding
+_FARTHEST = 30.0  # standard deviations: beyond, the remaining mass of a tail is rounding
 
 
 class BoxedNormal(TorchDistribution):
     """A normal over poses (`NormalPose`, all axes free), its translation drawn within a box, axis by axis.
 
-    Each coordinate is drawn from its conditional given those before, cut off at the box: the simulator of
+    Each coordinate is drawn from its conditional given those before, truncated to the box: the simulator of
     Geweke, Hajivassiliou and Keane (Geweke, Efficient simulation from the multivariate normal and Student-t
     distributions subject to linear constraints, 1991). Its density is that of the normal over the product of
-    the chances of those intervals, and known exactly. It is near the normal given that it is in the box, and
-    a proposal for that.
+    the probabilities of those intervals, and known exactly. It approximates the normal conditioned on the
+    box, and is a proposal for it.
 
     Args:
         center: (N, 7).
@@ -43,7 +43,7 @@ class BoxedNormal(TorchDistribution):
     def __init__(self, center: Tensor, covariance: Tensor, low: Tensor, high: Tensor) -> None:
         if not bool((low < high).all()):
             raise InputError(
-                f"a boxed normal is given a box from {low.tolist()} to {high.tolist()} m; "
+                f"BoxedNormal has a box from {low.tolist()} to {high.tolist()} m; "
                 "give the smaller corner first."
             )
         self.center, self.low, self.high = center, low, high
@@ -53,20 +53,20 @@ class BoxedNormal(TorchDistribution):
 
     @property
     def covariance(self) -> Tensor:
-        """Of the normal that is cut off."""
+        """Covariance of the normal before truncation, (N, 6, 6) or (6, 6)."""
         return self.normal.covariance
 
     def expand(self, batch_shape: Any, _instance: Any = None) -> BoxedNormal:
-        """Itself: it is made for its particles."""
+        """The same distribution for a batch of draws, one for each particle of a plate."""
         if torch.Size(batch_shape) == self.batch_shape:
             return self
         covariance = self.covariance.expand(*batch_shape, 6, 6)
         return BoxedNormal(self.center.expand(*batch_shape, 7), covariance, self.low, self.high)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
-        """Poses (N, 7); only the empty sample_shape is known."""
+        """Poses (N, 7); only the empty sample_shape is supported."""
         if torch.Size(sample_shape) != torch.Size():
-            raise InputError("a boxed normal draws one pose for each particle; ask for no sample_shape.")
+            raise InputError("BoxedNormal draws one pose for each particle; give no sample_shape.")
         scale = torch.linalg.cholesky(self.covariance).expand(*self.batch_shape, 6, 6)
         score = torch.randn(*self.batch_shape, 6, dtype=torch.float64)
         uniform = torch.rand(*self.batch_shape, 3, dtype=torch.float64)
@@ -91,10 +91,11 @@ class BoxedNormal(TorchDistribution):
         return torch.where(inside.all(dim=-1), density, -torch.inf)
 
     def _interval(self, scale: Tensor, score: Tensor, axis: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Between which scores an axis lies in the box, given those before; mirrored in a right tail.
+        """The standardised interval of an axis within the box, given the axes before it.
 
         Returns:
-            The smaller and the larger, and whether both are mirrored: right tails would round to nothing.
+            Its lower and upper end (N,), and whether they are mirrored, as in a right tail: there the
+            distribution function would round to 1.
         """
         middle = self.center[..., axis] + (scale[..., axis, :axis] * score[..., :axis]).sum(dim=-1)
         first = (self.low[axis] - middle) / scale[..., axis, axis]

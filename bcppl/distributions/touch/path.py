@@ -12,7 +12,7 @@ from bcppl.errors import InputError
 
 
 class Located(NamedTuple):
-    """Where places (..., 3) lie on a path.
+    """Positions of places (..., 3) on a path.
 
     Attributes:
         travelled: (...,) distance along the path to the point of it that is nearest to the place, metres.
@@ -40,7 +40,7 @@ class Path:
 
     def __init__(self, points: Tensor) -> None:
         if not bool(torch.isfinite(points).all()):
-            raise InputError("a finger's path holds a point that is not finite; leave those rows out.")
+            raise InputError("a finger's path has a point that is not finite; leave those rows out.")
         moved = torch.ones(len(points), dtype=torch.bool)
         moved[1:] = (points[1:] != points[:-1]).any(dim=-1)
         self.points = points[moved]
@@ -68,7 +68,7 @@ class Path:
         """The point of the path nearest to each of places (..., 3)."""
         if places.ndim > 1:
             return self._located(places)
-        # A place that was seen is asked for by every site and every particle, over and over.
+        # Every site of every run of the program locates the same observed place.
         if self._last is None or not torch.equal(self._last[0], places):
             self._last = places.clone(), self._located(places)
         return self._last[1]

@@ -13,7 +13,8 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.proposals import Proposal, drift
-from bcppl.inference.proposals.together import continuous, drift_together
+from bcppl.inference.proposals.coordinates import continuous_addresses
+from bcppl.inference.proposals.walk import joint_drift
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, simulate
 from tests.exact_targets import CENTER
@@ -53,7 +54,7 @@ def moved(proposal: Proposal, times: int = 2) -> tuple[Trace, Trace, float]:
 
 @pytest.mark.parametrize("addresses", [("pose", "size", "seen"), ("seen", "size", "pose"), ("seen", "pose")])
 def test_it_leaves_the_target_invariant(addresses: tuple[str, ...]) -> None:
-    before, after, acceptance = moved(drift_together(*addresses, scales=(0.3, 1.5)))
+    before, after, acceptance = moved(joint_drift(*addresses, scales=(0.3, 1.5)))
     assert largest_z(of(before), of(after)) < SOUND
     assert 0.05 < acceptance < 0.95
 
@@ -63,7 +64,7 @@ def test_mutant_without_the_jacobian_of_the_positive_number(monkeypatch: pytest.
         "bcppl.inference.proposals.coordinates.Unflattened.log_abs_det_jacobian",
         lambda self, x, y: torch.zeros(len(x), dtype=torch.float64),
     )
-    before, after, _ = moved(drift_together("pose", "size", "seen", scales=(0.3, 1.5)))
+    before, after, _ = moved(joint_drift("pose", "size", "seen", scales=(0.3, 1.5)))
     assert largest_z(of(before), of(after)) > BROKEN
 
 
@@ -72,18 +73,18 @@ def test_it_comes_farther_along_a_ridge_than_each_value_alone() -> None:
         before, after, _ = moved(proposal)
         return float((after["seen"] - before["seen"]).square().mean())
 
-    together = far(drift_together("seen", "size", "pose", scales=(0.3, 1.5)))
+    together = far(joint_drift("seen", "size", "pose", scales=(0.3, 1.5)))
     assert together > 5.0 * far(drift("seen", (0.3, 1.5)))
 
 
 def test_discrete_values_are_not_moved() -> None:
     trace = simulate(ridge, (), 5)
-    assert continuous(trace) == ["pose", "size", "seen"]
+    assert continuous_addresses(trace) == ["pose", "size", "seen"]
     with pytest.raises(InputError, match="which"):
-        drift_together("pose", "which").fit(equal_weights(trace))
+        joint_drift("pose", "which").fit(equal_weights(trace))
 
 
 @pytest.mark.parametrize("addresses", [(), ("pose",), ("pose", "pose")])
 def test_it_refuses_fewer_than_two_values(addresses: tuple[str, ...]) -> None:
     with pytest.raises(InputError, match="two or more"):
-        drift_together(*addresses)
+        joint_drift(*addresses)

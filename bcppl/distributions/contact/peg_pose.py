@@ -1,0 +1,97 @@
+"""The likelihood of a held peg's measured pose."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.contact.track import WIDER, Track, TrackDistribution, contaminated, log_gaussian
+from bcppl.distributions.parameters import POSITIVE
+
+OUTLIER = 0.05
+
+
+def _log_mass_within_pi(scale: float) -> float:
+    """Log of an isotropic Gaussian's mass in the ball of radius pi, where rotation vectors live."""
+    a = math.pi / scale
+    return math.log(math.erf(a / math.sqrt(2.0)) - math.sqrt(2.0 / math.pi) * a * math.exp(-0.5 * a * a))
+
+
+class PegPose(TrackDistribution):
+    """The held peg's measured pose at every `every`-th stamp of `first` to `last` of a probe: normalised.
+
+    At each stamp the errors of translation and rotation are independent, each a mixture of a Gaussian of the
+    given scale and, with weight 0.05, of one ten times as wide. The rotation vector of the error is truncated
+    at pi. The density is with respect to Lebesgue times the normalised Haar measure.
+
+    The event is (last - first, 7), `world_from_peg`.
+
+    Args:
+        track, first, last: as for `TrackDistribution`.
+        translation_scale: metres, along each axis.
+        rotation_scale: radians, about each axis.
+        every: as for `TrackDistribution`.
+    """
+
+    broadcasts = True
+    parameters = TrackDistribution.parameters | {"translation_scale": POSITIVE, "rotation_scale": POSITIVE}
+
+    def __init__(
+        self,
+        track: Track,
+        first: int,
+        last: int,
+        translation_scale: float,
+        rotation_scale: float,
+        every: int = 10,
+    ) -> None:
+        self.translation_scale, self.rotation_scale, self.every = translation_scale, rotation_scale, every
+        super().__init__(track, first, last, 7)
+
+    @property
+    def log_prob_bound(self) -> float:
+        """Its value at errors of zero; +inf where rotations vary so widely that this is no bound."""
+        # Below 2 rad the normal falls faster than the Haar measure of a rotation vector does.
+        if WIDER * self.rotation_scale > 2.0:
+            return math.inf
+        none = torch.zeros(1, dtype=torch.float64)
+        stamps = len(range(self.first, self.last)[self.thinned])
+        return stamps * float(self._log_translation(none) + self._log_rotation(none))
+
+    def _log_prob(self, value: Tensor) -> Tensor:
+        _, simulated = self.track.window(self.first, self.last)
+        expected = torch.where(self.track.diverged[:, None, None], poses.identity(), simulated)
+        error = poses.local(expected[:, self.thinned], value)
+        translation, rotation = error[..., :3].square().sum(-1), error[..., 3:].square().sum(-1)
+        return (self._log_translation(translation) + self._log_rotation(rotation)).sum(dim=-1)
+
+    def _log_translation(self, squared: Tensor) -> Tensor:
+        return contaminated(lambda scale: log_gaussian(squared, scale), self.translation_scale, OUTLIER)
+
+    def _log_rotation(self, squared: Tensor) -> Tensor:
+        def truncated(scale: float) -> Tensor:
+            return log_gaussian(squared, scale) - _log_mass_within_pi(scale)
+
+        log_density = contaminated(truncated, self.rotation_scale, OUTLIER)
+        return log_density - poses.log_haar_density_of_rotation_vector(squared.sqrt())
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """Poses (N, T, 7), the errors of all stamps independent."""
+        _, simulated = self.track.window(self.first, self.last)
+        shape = simulated.shape[:-1]
+
+        def widths(scale: float) -> Tensor:
+            wide = torch.rand(shape, dtype=torch.float64) < OUTLIER
+            return torch.where(wide, WIDER * scale, scale)[..., None]
+
+        translation = widths(self.translation_scale) * torch.randn(*shape, 3, dtype=torch.float64)
+        width = widths(self.rotation_scale).expand(*shape, 3)
+        rotation = width * torch.randn(*shape, 3, dtype=torch.float64)
+        # Each Gaussian is truncated on its own, so a draw beyond pi is drawn again at the same width.
+        while bool((outside := rotation.norm(dim=-1) > math.pi).any()):
+            rotation[outside] = width[outside] * torch.randn(int(outside.sum()), 3, dtype=torch.float64)
+        return poses.retract(simulated, torch.cat([translation, rotation], dim=-1))

@@ -1,0 +1,104 @@
+"""The base of the likelihoods of a probe: a simulated track, and the stamps of one window."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+
+import torch
+from torch import Tensor
+
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.parameters import COUNT, Range, check_parameters
+from bcppl.errors import InputError
+
+S = TypeVar("S", float, Tensor)
+
+WIDER = 10.0  # a contaminated normal's wide scale over its narrow one
+
+
+class Track(Protocol):
+    """One probe simulated for N particles, as `bcppl.contact.probe_rollout.ProbeRollout` is."""
+
+    @property
+    def diverged(self) -> Tensor:
+        """(N,) particles whose simulation failed, up to the stamp that it has reached."""
+
+    def __len__(self) -> int: ...
+
+    def window(self, first: int, last: int) -> tuple[Tensor, Tensor]:
+        """Contacts (N, T, 3) in the peg's frame, NaN where none, and peg poses (N, T, 7), of some stamps."""
+
+    def wrench(self, first: int, last: int) -> Tensor:
+        """Force (N) and torque (N m) on the peg (N, T, 6), in its frame about its origin, of some stamps."""
+
+
+class TrackDistribution(LazyDistribution):
+    """A measurement at the stamps `first` to `last` of a probe, given its simulation for each particle.
+
+    The event is (last - first, entries). Particles whose simulation diverged have log p = -inf.
+
+    Args:
+        track: the simulated probe.
+        first: the first stamp.
+        last: the stamp after the last.
+        entries: the number of entries measured at a stamp.
+
+    Attributes:
+        every: the stamps whose number is a multiple of this enter the density, since errors are correlated
+            in time.
+
+    Raises:
+        InputError: a parameter is out of its range, or `first` is not before `last`.
+    """
+
+    cost = 2
+    every = 1
+    parameters = {"first": Range(least=0, whole=True), "last": Range(least=0, whole=True), "every": COUNT}
+
+    def __init__(self, track: Track, first: int, last: int, entries: int) -> None:
+        self.track, self.first, self.last = track, first, last
+        check_parameters(self)
+        if first >= last:
+            raise InputError(
+                f"{type(self).__name__} has first = {first} and last = {last}; give first before last."
+            )
+        super().__init__(len(track), (self.last - self.first, entries))
+
+    @property
+    def thinned(self) -> slice:
+        """Which of the window's stamps enter the density."""
+        return slice(-self.first % self.every, None, self.every)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-probability (N,) of measurements (T, entries), or of one for each particle (N, T, entries).
+
+        Raises:
+            InputError: there are not as many rows as stamps.
+        """
+        if value.ndim not in (2, 3, 4) or value.shape[-2:] != self.event_shape:
+            raise InputError(
+                f"{type(self).__name__} has {self.event_shape[0]} stamps but its observation has shape "
+                f"{tuple(value.shape)}; give {tuple(self.event_shape)}, a row for each stamp."
+            )
+        log_prob = self._log_prob(value.to(torch.float64)[..., self.thinned, :])
+        return torch.where(self.track.diverged, -math.inf, log_prob)
+
+    def _log_prob(self, value: Tensor) -> Tensor:
+        """Log-probability (N,) of the rows that enter the density, for simulations that did not diverge."""
+        raise NotImplementedError
+
+
+def log_gaussian(squared: Tensor, scale: float) -> Tensor:
+    """Log-density of an isotropic Gaussian in three dimensions at a squared distance."""
+    return -0.5 * squared / scale**2 - 3.0 * math.log(scale) - 1.5 * math.log(2.0 * math.pi)
+
+
+def contaminated(log_density: Callable[[S], Tensor], scale: S, outlier: float) -> Tensor:
+    """Log-density of a mixture of a narrow scale and, with weight `outlier`, of one ten times as wide.
+
+    The contaminated normal of Tukey, A survey of sampling from contaminated distributions, 1960.
+    """
+    narrow = log_density(scale) + math.log1p(-outlier)
+    return torch.logaddexp(narrow, log_density(WIDER * scale) + math.log(outlier))

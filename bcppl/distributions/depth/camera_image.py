@@ -1,0 +1,109 @@
+"""The base of the likelihoods of images: one camera, and parts at the particles' poses."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from bcppl.distributions.depth.rendering import Mask, RendersDepth
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.parameters import check_shape
+from bcppl.errors import InputError
+
+if TYPE_CHECKING:
+    from bcppl.geometry.camera import Camera
+
+
+class CameraImage(LazyDistribution):
+    """An image (H, W) that a camera takes of parts at the particles' poses.
+
+    Args:
+        renderer: renders the part, or several.
+        camera: takes the image.
+        pose: (N, 7) `world_from_part`; (N, K, 7) for a renderer of K parts.
+        region: (H, W) pixels that may count; None for all.
+
+    Attributes:
+        latent: the names of the attributes that may be latent, and are checked to be finite.
+
+    Raises:
+        InputError: a shape does not fit, or the camera's range is none.
+    """
+
+    cost = 1
+    latent: tuple[str, ...] = ("pose",)
+
+    def __init__(
+        self,
+        renderer: RendersDepth,
+        camera: Camera,
+        pose: Tensor,
+        region: Mask | Tensor | None = None,
+    ) -> None:
+        self.renderer, self.camera, self.pose, self.region = renderer, camera, pose, region
+        parts = getattr(renderer, "parts", None)
+        each = (7,) if parts is None else (len(parts), 7)
+        if pose.shape[1:] != each:
+            what = (
+                "one world_from_part" if parts is None else f"a world_from_part of each of {len(parts)} parts"
+            )
+            raise InputError(
+                f"{self._where} has a pose of shape {tuple(pose.shape)}; "
+                f"give ({', '.join(map(str, ('N', *each)))}), {what}."
+            )
+        if not camera.far > camera.near >= 0.0:
+            raise InputError(
+                f"camera {camera.name!r} has the range {camera.near} to {camera.far} m; give 0 <= near < far."
+            )
+        super().__init__(len(pose), (camera.height, camera.width))
+        self._check_shape("a region", region, self.event_shape)
+
+    @property
+    def _where(self) -> str:
+        return f"{type(self).__name__} of camera {self.camera.name!r}"
+
+    def _check_shape(
+        self, name: str, value: npt.NDArray[Any] | Tensor | float | None, *shapes: tuple[int, ...]
+    ) -> None:
+        check_shape(self._where, name, value, *(tuple(shape) for shape in shapes))
+
+    def _check_image(self, value: Tensor) -> None:
+        """Check that an observation is one image, or one for each particle."""
+        self._check_shape("an image", value, self.event_shape, self.batch_shape + self.event_shape)
+
+    def _check_finite(self) -> None:
+        """Check that the latent values of all particles are finite."""
+        count = len(self.pose)
+        for name in self.latent:
+            if (value := getattr(self, name)) is None:
+                continue
+            each = torch.as_tensor(value)
+            each = each.expand(count, *each.shape[1 if len(each.shape) and len(each) == count else 0 :])
+            bad = torch.nonzero(~torch.isfinite(each.reshape(count, -1)).all(dim=-1)).flatten().tolist()
+            if bad:
+                shown = ", ".join(map(str, bad[:10])) + (", ..." if len(bad) > 10 else "")
+                raise InputError(
+                    f"{len(bad)} of {count} particles have a {name.replace('_', ' ')} that is not finite "
+                    f"(particles {shown}) and cannot be rendered for camera {self.camera.name!r}; check the "
+                    "program that proposed them."
+                )
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """One image for each particle, (N, H, W).
+
+        Raises:
+            InputError: a latent value is not finite, or a sample_shape is given.
+        """
+        if torch.Size(sample_shape) != torch.Size():
+            raise InputError(
+                f"{type(self).__name__} draws one image for each particle; give no sample_shape, but as many "
+                "poses as images."
+            )
+        self._check_finite()
+        return self._sample()
+
+    def _sample(self) -> Tensor:
+        raise NotImplementedError

@@ -1,0 +1,100 @@
+"""Normals over poses."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from bcppl import poses
+from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
+from bcppl.errors import InputError
+from bcppl.poses import FREE, Freedom
+
+
+class NormalPose(PoseDistribution):
+    """Normal in the tangent space at a pose, pushed forward by `poses.retract`, its Jacobian included.
+
+    Args:
+        center: (7,) or (N, 7): the pose at which the tangent space is taken.
+        covariance: over the free coordinates in the order of `freedom.axes` (d, d) or (N, d, d), in m^2,
+            m rad and rad^2; or standard deviations (d,), metres then radians.
+        freedom: which axes are free.
+
+    The density is that of the normal over rotation vectors divided by d(Haar)/d(rotation vector)
+    (Chirikjian, Stochastic Models, Information Theory, and Lie Groups, vol. 2, 10.6), summed over the
+    windings next to the principal one where the spread is so wide that they matter.
+
+    Raises:
+        InputError: the covariance has the wrong size or is not positive definite, or a centre has no unit
+            quaternion.
+    """
+
+    def __init__(self, center: Any, covariance: Any, freedom: Freedom = FREE) -> None:
+        matrix = torch.as_tensor(covariance, dtype=torch.float64)
+        if matrix.ndim == 1:
+            if bool((matrix < 0.0).any()):
+                raise InputError(
+                    f"NormalPose has the standard deviations {matrix.tolist()}; "
+                    "give none below 0 (metres, radians)."
+                )
+            matrix = torch.diag(matrix**2)
+        if matrix.shape[-2:] != (freedom.dimension, freedom.dimension):
+            raise InputError(
+                f"NormalPose over {freedom.dimension} free axes has a covariance of shape "
+                f"{tuple(matrix.shape)}; give one row and column for each free axis."
+            )
+        scale, failed = torch.linalg.cholesky_ex(matrix)
+        if bool(failed.any()) or not bool(torch.isfinite(scale).all()):
+            raise InputError(
+                "the covariance of NormalPose is not positive definite; "
+                "give every free axis a standard deviation above 0 (metres, radians)."
+            )
+        self._normal = MultivariateNormal(
+            torch.zeros(freedom.dimension, dtype=torch.float64), scale_tril=scale, validate_args=False
+        )
+        turns = [k for k, axis in enumerate(freedom.axes) if axis >= 3]
+        widest = float(matrix.diagonal(dim1=-2, dim2=-1)[..., turns].max().sqrt()) if turns else 0.0
+        # Beyond half a radian the neighbouring windings carry more than 1e-16 of the mass.
+        self._windings = (0.0,) if widest < 0.5 else (0.0, -2.0 * math.pi, 2.0 * math.pi)
+        middle = torch.as_tensor(center, dtype=torch.float64)
+        if bool(((middle[..., 3:].square().sum(dim=-1) - 1.0).abs() > 2e-3).any()):
+            raise InputError(
+                "NormalPose has a centre whose quaternion is not of unit length; "
+                "give x y z (m) qw qx qy qz, or normalise it with `poses.as_pose`."
+            )
+        super().__init__(middle, freedom)
+
+    @property
+    def covariance(self) -> Tensor:
+        """Over the free coordinates, (d, d) or (N, d, d), in m^2, m rad and rad^2."""
+        scale = self._normal.scale_tril
+        return scale @ scale.transpose(-1, -2)
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """Poses (*sample_shape, *batch_shape, 7)."""
+        shape = torch.Size(sample_shape) + self.batch_shape
+        noise = torch.randn(*shape, self.freedom.dimension, 1, dtype=torch.float64)
+        tangent = self.freedom.embed((self._normal.scale_tril @ noise)[..., 0])
+        return poses.retract(self.center.expand(*shape, 7), tangent)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (...,) with respect to the base measure; -inf where a held axis differs."""
+        tangent = poses.local(self.center, value)
+        angle = tangent[..., 3:].norm(dim=-1)
+        terms = []
+        for winding in self._windings:
+            wound = tangent
+            if winding:
+                stretch = 1.0 + winding / angle.clamp_min(1e-12)
+                wound = torch.cat([tangent[..., :3], tangent[..., 3:] * stretch[..., None]], dim=-1)
+            terms.append(
+                self._normal.log_prob(self.freedom.coordinates(wound))
+                - self.freedom.log_base_density(angle + winding)
+            )
+        density = terms[0] if len(terms) == 1 else torch.logsumexp(torch.stack(terms), dim=0)
+        possible = (self.freedom.off_axis(tangent) <= HELD) & is_unit(value)
+        return torch.where(possible, density, -torch.inf)

@@ -1,0 +1,205 @@
+"""Uniform priors over poses."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bcppl import poses, quaternions
+from bcppl.distributions.parameters import Range, check_parameters
+from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
+from bcppl.errors import InputError
+from bcppl.poses import Freedom
+
+ANGLE = Range(least=0.0, most=math.pi, unit="rad")
+
+
+class _BoxPose(PoseDistribution):
+    """Uniform in a box, times Haar measure restricted to a set of rotations.
+
+    Args:
+        center: (7,) the pose in the middle.
+        translation: half widths (3,) or one for all, metres; 0 holds an axis fixed.
+        rotation: the axes about which it is free, as `Freedom` has them.
+        measure: the normalised Haar measure of the rotations.
+    """
+
+    parameters: dict[str, Range] = {}
+
+    def __init__(self, center: Any, translation: Any, rotation: str, measure: float) -> None:
+        try:
+            self.widths = torch.as_tensor(translation, dtype=torch.float64).expand(3)
+            usable = bool((torch.isfinite(self.widths) & (self.widths >= 0)).all())
+        except (TypeError, ValueError, RuntimeError):
+            usable = False
+        if not usable:
+            raise InputError(
+                f"{type(self).__name__} has half widths {translation!r}; give one number for all axes, or "
+                "three, in metres: positive, or 0 for a held axis."
+            )
+        free = "".join(axis for axis, width in zip("xyz", self.widths.tolist(), strict=True) if width > 0)
+        super().__init__(poses.as_pose(center, "the centre of a pose prior"), Freedom(free, rotation))
+        volume = torch.log(2.0 * self.widths[self.widths > 0])
+        self.log_density = -math.log(measure) - float(volume.sum())
+
+    def _moved(self, shape: torch.Size, rotation: Tensor, translation: Tensor) -> Tensor:
+        """The centre moved by translations (*shape, 3) and quaternions x y z w (*shape, 4)."""
+        center = self.center.expand(*shape, 7)
+        quaternion = quaternions.product(poses.quaternion_xyzw(center).contiguous(), rotation)
+        quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
+        return poses.from_translation_quaternion_xyzw(center[..., :3] + translation, quaternion)
+
+
+class UniformPose(_BoxPose):
+    """Uniform in a box times uniform (Haar) within an angle of a given orientation.
+
+    Args:
+        center: (7,) the pose in the middle.
+        translation: half widths (3,) or one for all, metres, along the axes of the frame the pose maps to;
+            0 holds an axis fixed.
+        angle: the largest rotation angle away from the centre, radians, at most pi; 0 holds the orientation.
+        rotation: "all", or one axis "x", "y", "z" of the frame the pose maps from.
+
+    The Haar measure of a ball of rotation angle a is (a - sin a) / pi.
+
+    Raises:
+        InputError: a width or the angle is out of range.
+    """
+
+    parameters = {"angle": ANGLE}
+
+    def __init__(self, center: Any, translation: Any, angle: float, rotation: str = "all") -> None:
+        self.angle = angle
+        check_parameters(self)
+        if self.angle == 0.0:
+            rotation = "none"
+        ball = (self.angle - math.sin(self.angle)) / math.pi
+        measure = {"none": 1.0, "all": ball}.get(rotation, self.angle / math.pi)
+        super().__init__(center, translation, rotation, measure)
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """Poses (*sample_shape, *batch_shape, 7)."""
+        shape = torch.Size(sample_shape) + self.batch_shape
+        translation = self.widths * (2.0 * torch.rand(*shape, 3, dtype=torch.float64) - 1.0)
+        if self.freedom.rotation == "all":
+            direction = torch.randn(*shape, 3, dtype=torch.float64)
+            direction = direction / direction.norm(dim=-1, keepdim=True)
+            rotation = quaternions.from_rotation_vector(direction * _haar_angle(shape, self.angle)[..., None])
+        else:
+            turn = torch.zeros(*shape, 6, dtype=torch.float64)
+            if self.freedom.rotation != "none":
+                axis = self.freedom.axes[-1]
+                turn[..., axis] = self.angle * (2.0 * torch.rand(*shape, dtype=torch.float64) - 1.0)
+            rotation = quaternions.from_rotation_vector(turn[..., 3:])
+        return self._moved(shape, rotation, translation)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (...,) with respect to the base measure; -inf outside the support."""
+        tangent = poses.local(self.center, value)
+        inside = (tangent[..., :3].abs() <= self.widths + HELD).all(dim=-1)
+        inside &= tangent[..., 3:].norm(dim=-1) <= self.angle + HELD
+        inside &= (self.freedom.off_axis(tangent) <= HELD) & is_unit(value)
+        return torch.where(inside, value.new_tensor(self.log_density), -torch.inf)
+
+
+def _haar_angle(shape: torch.Size, largest: float) -> Tensor:
+    """Rotation angles of Haar-distributed rotations within `largest`: density proportional to 1 - cos a."""
+    # Inverse of the distribution function a - sin a by a fine table: exact to 1e-9 of the range.
+    table = np.linspace(0.0, largest, 20001)
+    uniform = torch.rand(*shape, dtype=torch.float64).numpy()
+    cumulative = table - np.sin(table)
+    return torch.from_numpy(np.asarray(np.interp(uniform * cumulative[-1], cumulative, table)))
+
+
+class SwingTwistPose(_BoxPose):
+    """Uniform in a box times uniform (Haar) over rotations with limited tilt and limited yaw.
+
+    A rotation away from the centre is split into a swing of the part's z axis and a twist about it,
+    R = R_center Swing Twist. Tilt is the angle between the z axis and that of the centre, yaw the twist.
+    Haar measure is the uniform measure of the z axis on the sphere times that of the twist on the circle,
+    so the set has measure (1 - cos tilt) / 2 * yaw / pi.
+
+    Args:
+        center: (7,) the pose in the middle.
+        translation: half widths (3,) or one for all, metres; 0 holds an axis fixed.
+        tilt: the largest tilt, radians; 0 leaves a turn about the part's z axis alone.
+        yaw: the largest twist to either side, radians.
+
+    Raises:
+        InputError: a limit is out of range, or tilt is free while yaw is held (no Haar measure).
+    """
+
+    parameters = {"tilt": ANGLE, "yaw": ANGLE}
+
+    def __init__(self, center: Any, translation: Any, tilt: float, yaw: float) -> None:
+        self.tilt, self.yaw = tilt, yaw
+        check_parameters(self)
+        if self.tilt > 0 and self.yaw == 0:
+            raise InputError(
+                "SwingTwistPose has free tilt and held yaw, which have no Haar measure; "
+                "give yaw a small positive limit."
+            )
+        rotation = "all" if self.tilt > 0 else "z" if self.yaw > 0 else "none"
+        swing = 0.5 * (1.0 - math.cos(self.tilt)) if self.tilt > 0 else 1.0
+        super().__init__(center, translation, rotation, swing * (self.yaw / math.pi if self.yaw else 1.0))
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """Poses (*sample_shape, *batch_shape, 7)."""
+        shape = torch.Size(sample_shape) + self.batch_shape
+        uniform = torch.rand(*shape, 6, dtype=torch.float64)
+        translation = self.widths * (2.0 * uniform[..., :3] - 1.0)
+        cosine = 1.0 - uniform[..., 3] * (1.0 - math.cos(self.tilt))
+        heading = 2.0 * math.pi * uniform[..., 4]
+        swing = torch.acos(cosine)[..., None] * torch.stack(
+            [torch.cos(heading), torch.sin(heading), torch.zeros_like(heading)], dim=-1
+        )
+        twist = torch.zeros(*shape, 3, dtype=torch.float64)
+        twist[..., 2] = self.yaw * (2.0 * uniform[..., 5] - 1.0)
+        rotation = quaternions.product(
+            quaternions.from_rotation_vector(swing), quaternions.from_rotation_vector(twist)
+        )
+        return self._moved(shape, rotation, translation)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (...,) with respect to the base measure; -inf outside the support."""
+        tilt, yaw = tilt_and_yaw(self.center, value)
+        shift = value[..., :3] - self.center[..., :3]
+        inside = (shift.abs() <= self.widths + HELD).all(dim=-1)
+        # The angle of a vanishing tilt is the square root of rounding in the quaternion.
+        inside &= (tilt <= self.tilt + 1e-7) & (yaw.abs() <= self.yaw + HELD) & is_unit(value)
+        return torch.where(inside, value.new_tensor(self.log_density), -torch.inf)
+
+
+def tilt_and_yaw(center: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+    """Tilt of the z axis (0 to pi) and twist about it (-pi to pi) from `center` to `pose`, (...,) radians."""
+    first, second = torch.broadcast_tensors(
+        quaternions.conjugate(poses.quaternion_xyzw(center)), poses.quaternion_xyzw(pose)
+    )
+    x, y, z, w = quaternions.product(first, second).unbind(dim=-1)
+    tilt = 2.0 * torch.atan2(torch.hypot(x, y), torch.hypot(z, w))
+    yaw = torch.remainder(2.0 * torch.atan2(z, w) + math.pi, 2.0 * math.pi) - math.pi
+    return tilt, yaw
+
+
+class _Guess(Protocol):
+    @property
+    def world_from_part(self) -> Any: ...
+    @property
+    def translation(self) -> Any: ...
+    @property
+    def tilt(self) -> float: ...
+    @property
+    def yaw(self) -> float: ...
+    @property
+    def angle(self) -> float | None: ...
+
+
+def prior_from_guess(guess: _Guess) -> UniformPose | SwingTwistPose:
+    """The prior that a recording's guess states: uniform within an angle, or within a tilt and a yaw."""
+    if guess.angle is not None:
+        return UniformPose(guess.world_from_part, guess.translation, guess.angle)
+    return SwingTwistPose(guess.world_from_part, guess.translation, guess.tilt, guess.yaw)

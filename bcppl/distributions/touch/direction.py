@@ -1,0 +1,107 @@
+"""The likelihood of the direction in which a moving finger pushes."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.touch.placed import (
+    LATENT_POSITIVE,
+    OUTLIER,
+    Distance,
+    Placed,
+    Scale,
+    distance_at,
+)
+
+# A normal with less than this in the world's xy plane has no direction there.
+UPRIGHT = 1e-6
+
+
+class ForceDirection(LazyDistribution):
+    """The direction, in the world's xy plane, of the force that a moving finger exerts on the part.
+
+    An angle in radians from the world's x axis. Friction turns the force from the inward normal towards the
+    finger's motion, up to the friction cone's half angle a = atan(friction), where the finger slides. With m
+    the angle from the inward normal to the motion, the force has the angle a tanh(m / a) from that normal:
+    the motion's own direction while the finger sticks, the cone's edge while it slides, and (measured) a
+    smooth passage between them. About that it is normal (wrapped) with `spread`; with probability `outlier`
+    it is uniform. The base measure is Lebesgue on the circle, radians.
+
+    Where the surface faces straight up or down the angle is uniform. Without contact (tip NaN) the direction
+    is NaN with probability one.
+
+    Args:
+        distance: the signed distance to the part.
+        pose: (N, 7) world_from_part.
+        tip: (3,) or (N, 3) where the finger touches, in the world: the normal is taken there; NaN for never.
+        motion: (3,) or (N, 3) the finger's direction of travel there, in the world.
+        friction: coefficient of friction.
+        spread: radians.
+        outlier: probability of a direction that is independent of the part.
+
+    Raises:
+        InputError: the friction or the spread is not positive, or the outlier no probability below 1.
+    """
+
+    parameters = {"friction": LATENT_POSITIVE, "spread": LATENT_POSITIVE, "outlier": OUTLIER}
+
+    def __init__(
+        self,
+        distance: Distance | Placed,
+        pose: Tensor,
+        tip: Tensor,
+        motion: Tensor,
+        friction: Scale,
+        spread: Scale,
+        outlier: float,
+    ) -> None:
+        self.distance, self.pose = distance, pose
+        self.tip, self.motion = tip.expand(len(pose), 3), motion.expand(len(pose), 3)
+        self.friction, self.spread, self.outlier = friction, spread, outlier
+        super().__init__(len(pose), ())
+
+    def _expected(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The expected angle (N,), whether the normal has a direction (N,), and whether there is contact."""
+        touched = ~torch.isnan(self.tip).any(dim=-1)
+        # An observed tip is the same for all particles: a `Placed` then evaluates one place.
+        tip = self.tip[0] if self.tip.stride(0) == 0 else self.tip
+        if not bool(touched.all()):
+            tip = torch.where(touched[:, None], self.tip, self.pose[:, :3])
+        _, normal = distance_at(self.distance, self.pose, tip)
+        inward = torch.atan2(-normal[:, 1], -normal[:, 0])
+        cone = torch.atan(torch.as_tensor(self.friction, dtype=torch.float64))
+        turn = _wrapped(torch.atan2(self.motion[:, 1], self.motion[:, 0]) - inward)
+        return inward + cone * torch.tanh(turn / cone), normal[:, :2].norm(dim=-1) > UPRIGHT, touched
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (N,) of one angle (), or of one for each particle (N,); radians."""
+        expected, sided, touched = self._expected()
+        value = value.expand(len(self.pose))
+        spread = torch.as_tensor(self.spread, dtype=torch.float64)
+        windings = 2.0 * math.pi * torch.arange(-1, 2, dtype=torch.float64)
+        error = (_wrapped(value - expected)[:, None] + windings) / spread[..., None]
+        near = torch.logsumexp(-0.5 * error**2, dim=-1) - torch.log(spread) - 0.5 * math.log(2.0 * math.pi)
+        even = torch.full_like(expected, -math.log(2.0 * math.pi))
+        stray = torch.tensor(self.outlier, dtype=torch.float64).log()
+        density = torch.logaddexp(math.log1p(-self.outlier) + torch.where(sided, near, even), stray + even)
+        given = ~torch.isnan(value)
+        without = torch.where(given, -torch.inf, 0.0)
+        return torch.where(touched, torch.where(given, density, -torch.inf), without)
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """An angle for each particle (N,), radians in (-pi, pi]; NaN without contact."""
+        expected, sided, touched = self._expected()
+        angle = expected + self.spread * torch.randn(len(self.pose), dtype=torch.float64)
+        even = 2.0 * math.pi * torch.rand(len(self.pose), dtype=torch.float64)
+        stray = torch.rand(len(self.pose), dtype=torch.float64) < self.outlier
+        return torch.where(touched, _wrapped(torch.where(stray | ~sided, even, angle)), torch.nan)
+
+
+def _wrapped(angle: Tensor) -> Tensor:
+    """Angles in [-pi, pi), radians."""
+    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi

@@ -1,0 +1,177 @@
+"""Likelihoods of where a finger first touches, and of its free motion up to there."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.special import log_ndtr
+
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.touch.path import Path
+from bcppl.distributions.touch.placed import (
+    LATENT_POSITIVE,
+    OUTLIER,
+    Distance,
+    Placed,
+    Scale,
+    distance_along,
+    distance_at,
+)
+
+# Farther than this (m) from the path is off it: paths are thinned and interpolated, to some micrometres.
+OFF_PATH = 1e-3
+
+
+def _lowest(distance: Distance | Placed, pose: Tensor, path: Path, travelled: Tensor) -> Tensor:
+    """The least signed distance (N,) of the path's points before a distance travelled; inf for none.
+
+    The distance travelled is () for all poses or (N,), one for each.
+    """
+    before = path.travelled < travelled[..., None]
+    return torch.where(before, distance_along(distance, pose, path.points), torch.inf).amin(dim=-1)
+
+
+def _travelled(path: Path, place: Tensor) -> Tensor:
+    """The distance travelled, () or (N,), to a place of contact (3,) or (N, 3); inf for NaN."""
+    touched = ~torch.isnan(place).any(dim=-1)
+    inner = path.locate(torch.where(touched[..., None], place, path.points[0])).travelled
+    return torch.where(touched, inner, torch.inf)
+
+
+class OnsetLocation(LazyDistribution):
+    """The location on its path at which a finger first detects contact: (3,) in the world, NaN for never.
+
+    Contact is detected once the signed distance of the tip falls below a threshold -offset + spread * e, e
+    standard normal: a first passage. With probability `outlier` its location is uniform on the path. So the
+    density at distance s along the path, whose signed distance is d(s), is
+
+        (1 - outlier) N(d(s); -offset, spread) |d'(s)| [d(s) is the least so far] + outlier / length.
+
+    The base measure is Lebesgue measure of the distance travelled (metres) on the inner path, plus a unit
+    mass at its start (contact at once) and a unit mass at "never" (NaN); the total is one whatever the path.
+    That the tip moved freely before the onset is part of the density. A location more than 1 mm off the path
+    has probability zero.
+
+    Args:
+        distance: the signed distance to the part.
+        pose: (N, 7) world_from_part.
+        path: the tip's path in the world; also the points where d is evaluated.
+        offset: metres; positive where the tip lies inside the part at onset, on average.
+        spread: standard deviation of the threshold, metres.
+        outlier: probability of an onset that is independent of the part.
+
+    Raises:
+        InputError: the spread is not positive, or the outlier no probability below 1.
+    """
+
+    parameters = {"spread": LATENT_POSITIVE, "outlier": OUTLIER}
+
+    def __init__(
+        self,
+        distance: Distance | Placed,
+        pose: Tensor,
+        path: Path,
+        offset: Scale,
+        spread: Scale,
+        outlier: float,
+    ) -> None:
+        self.distance, self.pose, self.path = distance, pose, path
+        self.offset, self.spread, self.outlier = offset, spread, outlier
+        super().__init__(len(pose), (3,))
+
+    def threshold(self) -> tuple[Scale, Scale]:
+        """Offset and spread of the threshold, metres."""
+        return self.offset, self.spread
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (N,) of one location (3,), or of one for each particle (N, 3)."""
+        offset, width = self.threshold()
+        # A location that all particles share keeps its shape, and is evaluated once.
+        travelled = _travelled(self.path, value)
+        touched = torch.isfinite(travelled)
+        place = value if bool(touched.all()) else torch.where(touched[..., None], value, self.path.points[0])
+        located = self.path.locate(place)
+        here, normal = distance_at(self.distance, self.pose, place)
+        lowest = _lowest(self.distance, self.pose, self.path, travelled)
+
+        inlier, spread = math.log1p(-self.outlier), torch.as_tensor(width, dtype=torch.float64)
+        approach = -(normal * located.direction).sum(dim=-1)
+        score = (here + offset) / spread
+        passage = -0.5 * score**2 - torch.log(spread) - 0.5 * math.log(2.0 * math.pi)
+        passage = passage + torch.log(approach.clamp(min=0.0))
+        passage = inlier + torch.where(here < lowest, passage, -torch.inf)
+        stray = torch.tensor(self.outlier / self.path.length, dtype=torch.float64).log()
+        density = torch.logaddexp(passage, stray)
+        density = torch.where(travelled == 0.0, inlier + log_ndtr(-score), density)
+        density = torch.where(located.off <= OFF_PATH, density, -torch.inf)
+        return torch.where(touched, density, inlier + log_ndtr((lowest + offset) / spread))
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """Locations of first contact (N, 3), interpolated between the path's points; NaN for never."""
+        particles, path = len(self.pose), self.path
+        offset, spread = self.threshold()
+        threshold = -offset + spread * torch.randn(particles, dtype=torch.float64)
+        distances = distance_along(self.distance, self.pose, path.points)
+        below = distances <= threshold[:, None]
+        first = below.to(torch.uint8).argmax(dim=-1, keepdim=True)
+        after = distances.gather(-1, first)[:, 0]
+        before = distances.gather(-1, (first - 1).clamp(min=0))[:, 0]
+        share = torch.where(first[:, 0] > 0, (before - threshold) / (before - after), 1.0)
+        start = path.travelled[(first[:, 0] - 1).clamp(min=0)]
+        travelled = start + share * (path.travelled[first[:, 0]] - start)
+        place = torch.where(below.any(dim=-1, keepdim=True), path.at(travelled), torch.nan)
+        stray = torch.rand(particles, dtype=torch.float64) < self.outlier
+        anywhere = path.at(path.length * torch.rand(particles, dtype=torch.float64))
+        return torch.where(stray[:, None], anywhere, place)
+
+
+class FreePath(LazyDistribution):
+    """Whether the finger moved freely up to the onset: 1 if it did, 0 if not.
+
+    It did with probability Phi((d + tolerance) / spread), d the least signed distance of the path's points
+    before the onset: a second, independent measurement beside `OnsetLocation`, whose density contains already
+    that no contact was detected before. The base measure counts {0, 1}.
+
+    Args:
+        distance: the signed distance to the part.
+        pose: (N, 7) world_from_part.
+        path: the tip's path in the world.
+        onset: (3,) or (N, 3) the place of contact; NaN for never: the whole path was free.
+        tolerance: metres inside the part at which one path in two counts as free.
+        spread: metres.
+
+    Raises:
+        InputError: the spread is not positive.
+    """
+
+    parameters = {"spread": LATENT_POSITIVE}
+
+    def __init__(
+        self,
+        distance: Distance | Placed,
+        pose: Tensor,
+        path: Path,
+        onset: Tensor,
+        tolerance: Scale,
+        spread: Scale,
+    ) -> None:
+        self.distance, self.pose, self.path = distance, pose, path
+        self.onset, self.tolerance, self.spread = onset.expand(len(pose), 3), tolerance, spread
+        super().__init__(len(pose), ())
+
+    def _score(self) -> Tensor:
+        travelled = _travelled(self.path, self.onset)
+        return (_lowest(self.distance, self.pose, self.path, travelled) + self.tolerance) / self.spread
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-probability (N,) of 1 (free) or 0, one () for all particles or one for each (N,)."""
+        score = self._score()
+        return torch.where(value.expand(len(self.pose)) > 0.5, log_ndtr(score), log_ndtr(-score))
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """1 or 0 for each particle, (N,)."""
+        free = torch.rand(len(self.pose), dtype=torch.float64) < torch.special.ndtr(self._score())
+        return free.to(torch.float64)

@@ -1,0 +1,138 @@
+"""Touches with a shared error: an error of the part's pose during a whole session, integrated out.
+
+A tracker's frame is off the part's, or a robot's base off the tracker's: by the same amount at every touch of
+one session, and by another in the next. Ten touches do not average it away. To first order it adds h_k . b to
+the signed distance at touch k, with b a shift in the plane and a turn about the vertical, normal about zero.
+Then the thresholds of all touches are jointly normal, and each is conditioned on those before it (the
+Cholesky factor of their covariance contains the conditionals): no latent value is added.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.touch.onset import OnsetLocation
+from bcppl.distributions.touch.path import Path
+from bcppl.distributions.touch.placed import Placed
+
+# The residual of an earlier touch is clipped at so many standard deviations.
+CLIPPED = 4.0
+
+
+class SharedError:
+    """The threshold of each touch of a session, given the places of those before it.
+
+    A program adds every touch with `add`, and then conditions on its place with `condition_on`.
+
+    Args:
+        placed: the part at its poses; its z axis is taken for the vertical.
+        center: (3,) in the part's frame: the centre of the turn, metres.
+        shift, turn: standard deviations of the shared error: metres along each axis of the plane, radians.
+        offset, spread: of each touch independently, as for `OnsetLocation`, metres.
+    """
+
+    __caches__ = ("_known",)
+
+    def __init__(
+        self, placed: Placed, center: Tensor, shift: float, turn: float, offset: float, spread: float
+    ) -> None:
+        self.placed, self.center, self.offset, self.spread = placed, center, offset, spread
+        self.scale = torch.tensor([shift, shift, turn], dtype=torch.float64)
+        self.paths: list[Path] = []
+        self.places: list[Tensor] = []
+        self._known: tuple[int, Tensor, Tensor] | None = None
+
+    def add(self, path: Path) -> None:
+        """Add a touch along a path."""
+        self.paths.append(path)
+
+    def condition_on(self, place: Tensor) -> None:
+        """Condition further touches on the place of the last, (3,) or (N, 3) in the world; NaN for never."""
+        self.places.append(place)
+
+    def threshold(self, which: int) -> tuple[Tensor, Tensor]:
+        """Offset and spread (N,) of a touch, given the places of those before it."""
+        if self._known is None or which >= self._known[0]:
+            self._known = len(self.paths), *self._conditionals()
+        _, mean, spread = self._known
+        return self.offset - mean[:, which], spread[:, which]
+
+    def _conditionals(self) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation (N, K) of the error of the signed distance at each touch."""
+        gradients = self._gradients() * self.scale
+        count = len(self.paths)
+        residual = gradients.new_zeros(len(gradients), count)
+        touched = torch.zeros(len(gradients), count, dtype=torch.bool)
+        for k, place in enumerate(self.places):
+            touched[:, k] = ~torch.isnan(place).any(dim=-1)
+            residual[:, k] = self._distance(place) + self.offset
+        # A touch without contact, or still to come, does not inform the others.
+        known = torch.where(touched[..., None], gradients, 0.0)
+        marginal = (known.square().sum(-1) + self.spread**2).sqrt()
+        residual = torch.where(touched, residual, 0.0).clamp(-CLIPPED * marginal, CLIPPED * marginal)
+        covariance = known @ known.mT + self.spread**2 * torch.eye(count, dtype=torch.float64)
+        factor = torch.linalg.cholesky(covariance)
+        error = torch.linalg.solve_triangular(factor, residual[..., None], upper=False)[..., 0]
+        spread = factor.diagonal(dim1=-2, dim2=-1).clone()
+        mean = (factor @ error[..., None])[..., 0] - spread * error
+        for k in (~touched.all(dim=0)).nonzero().flatten().tolist():
+            across = known[:, :k] @ gradients[:, k, :, None]
+            white = torch.linalg.solve_triangular(factor[:, :k, :k], across, upper=False)[..., 0]
+            left = gradients[:, k].square().sum(-1) + self.spread**2 - white.square().sum(-1)
+            mean[:, k] = torch.where(touched[:, k], mean[:, k], (white * error[:, :k]).sum(-1))
+            spread[:, k] = torch.where(touched[:, k], spread[:, k], left.sqrt())
+        return mean, spread
+
+    def _gradients(self) -> Tensor:
+        """Gradients (N, K, 3) of the signed distance where a path meets the part, by its shift and turn.
+
+        They depend on pose and paths, not on the place of contact: so a touch's density integrates to one.
+        """
+        each = torch.arange(len(self.placed.pose))
+        normals, points = [], []
+        for path in self.paths:
+            distance, normal = self.placed.near(path.points)
+            meets = distance.abs().argmin(dim=-1)
+            normals.append(normal[each, meets])
+            points.append(path.points[meets])
+        normal = torch.stack(normals, dim=1)
+        arm = torch.stack(points, dim=1) - poses.transform(self.placed.pose, self.center[None])
+        turning = normal[..., 1] * arm[..., 0] - normal[..., 0] * arm[..., 1]
+        return -torch.stack([normal[..., 0], normal[..., 1], turning], dim=-1)
+
+    def _distance(self, place: Tensor) -> Tensor:
+        """Signed distance (N,) at a place (3,) or (N, 3); any finite number where that is NaN."""
+        if place.ndim == 1:
+            if bool(place.isnan().any()):
+                return self.placed.pose.new_zeros(len(self.placed.pose))
+            return self.placed.near(place[None])[0][:, 0]
+        there = torch.where(torch.isnan(place), self.placed.pose[:, :3], place)
+        pose = self.placed.pose
+        distance: Tensor = self.placed.distance(
+            poses.transform(poses.inverse(pose), there[:, None])[:, 0]
+        ).distance
+        return distance
+
+
+class SharedOnset(OnsetLocation):
+    """`OnsetLocation` of one touch of a session with a shared error.
+
+    Args:
+        shared: the error; this touch is the last that was added to it.
+        outlier: probability of an onset that is independent of the part.
+    """
+
+    __caches__ = ("shared",)
+
+    def __init__(self, shared: SharedError, outlier: float) -> None:
+        self.shared, self.which = shared, len(shared.paths) - 1
+        # Later touches of the session do not change it.
+        self.given = shared.center, shared.scale, tuple(shared.paths), tuple(shared.places)
+        placed, path = shared.placed, shared.paths[-1]
+        super().__init__(placed, placed.pose, path, shared.offset, shared.spread, outlier)
+
+    def threshold(self) -> tuple[Tensor, Tensor]:
+        """Offset and spread (N,) of this touch, given the places of those before it, metres."""
+        return self.shared.threshold(self.which)
