@@ -63,7 +63,7 @@ def merged(population: Population) -> Population:
     total = torch.zeros(groups, dtype=torch.float64).index_add_(0, group, weights)
     order = first.argsort()
     kept = first[order]
-    # The mean weight is unchanged, so that the merged population estimates what the whole would have.
+    # The mean weight is unchanged, so the merged population has the same estimates.
     log_weights = total.log()[order] + population.log_total + math.log(groups / count)
     mixed = bool((population.founders[first][group] != population.founders).any())
     return replace(

@@ -45,7 +45,11 @@ class Range:
     latent: bool = False
 
     def checked(self, what: str, value: Any) -> Any:
-        """The value as a float or an int; `what` begins the sentence that refuses it, {} for the value.
+        """The value as a float or an int.
+
+        Args:
+            what: the beginning of the sentence that refuses it, {} for the value.
+            value: of the parameter.
 
         Raises:
             InputError: the value is out of the range.

@@ -254,7 +254,7 @@ class ContactSensing:
     def tared(self, touches: Sequence[Touch]) -> list[Tensor]:
         """Wrenches (T, 6) of the same windows, gravity compensated and tared but not filtered.
 
-        NaN while taring: `bcppl.distributions.wrench.Wrench` compares them with the simulated ones, and
+        NaN while taring: `bcppl.distributions.contact.Wrench` compares them with the simulated ones, and
         `bcppl.contact.sensing.onset.OnsetDetector` ignores those NaN. A later wrench that is not finite is
         returned as it is.
 

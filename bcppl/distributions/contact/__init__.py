@@ -1,4 +1,4 @@
-"""Likelihoods of what is measured while a held peg touches a part: contact locations, peg poses, wrenches.
+"""Likelihoods of a held peg's probe: contact locations, peg poses and wrenches.
 
 Each compares a window of a recording with the tracks that a simulator predicts for the particles' poses.
 """

@@ -1,4 +1,4 @@
-"""What the likelihoods of a probe share: a simulated track, and the stamps of one window of it."""
+"""The base of the likelihoods of a probe: a simulated track, and the stamps of one window."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the likelihoods of images share: one camera, parts at the particles' poses, and what is refused."""
+"""The base of the likelihoods of images: one camera, and parts at the particles' poses."""
 
 from __future__ import annotations
 

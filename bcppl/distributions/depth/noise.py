@@ -31,7 +31,7 @@ class RobustDepth(DepthDistribution):
     """Laplace noise on every pixel, or, with probability `outlier`, any depth within the sensor's range.
 
     p(o(u) | q) = (1 - outlier) exp(-|o(u) - r(u)| / b) / 2b + outlier / (far - near), so that the cost of
-    what is not modelled (clutter, flying pixels) is bounded. Where the ray misses the part and the background
+    unmodelled pixels (clutter, flying pixels) is bounded. Where the ray misses the part and the background
     is unknown, the uniform alone. The rest is as in `LaplaceDepth`. Beam models of range finders are such
     mixtures: Thrun, Burgard and Fox, Probabilistic Robotics, 6.3.
 

@@ -1,4 +1,4 @@
-"""What the distributions over poses share: a centre, and its free axes."""
+"""The base of the distributions over poses: a centre, and its free axes."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ class ForceDirection(LazyDistribution):
 
     An angle in radians from the world's x axis. Friction turns the force from the inward normal towards the
     finger's motion, up to the friction cone's half angle a = atan(friction), where the finger slides. With m
-    the angle from the inward normal to the motion, the force stands at a tanh(m / a) from the inward normal:
+    the angle from the inward normal to the motion, the force has the angle a tanh(m / a) from that normal:
     the motion's own direction while the finger sticks, the cone's edge while it slides, and (measured) a
     smooth passage between them. About that it is normal (wrapped) with `spread`; with probability `outlier`
     it is uniform. The base measure is Lebesgue on the circle, radians.
