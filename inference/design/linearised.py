@@ -30,7 +30,7 @@ from bcppl.inference.design.observations import Arguments, seeded
 from bcppl.inference.design.ranking import Price, Prospect, Ranking, costs_in_nats, ranked
 from bcppl.inference.population import Population
 from bcppl.traces import Trace
-from bcppl.traces.undrawn import undrawn
+from bcppl.traces.update import undrawn
 
 # What a candidate tells of the pose at particles of a trace, (H, 6, 6); None where its sites say it.
 Information = Callable[[Any, Trace], Tensor | None]
