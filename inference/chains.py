@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
-from bcppl.inference.kernels import Kernel, fitted, put, refuse_other
+from bcppl.inference.kernels import Kernel, fitted, refuse_other, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.schemes import Scheme, systematic
@@ -20,11 +20,11 @@ from bcppl.traces.shown import shapes
 
 
 class Chains(NamedTuple):
-    """Where chains went.
+    """The states of Markov chains.
 
     Attributes:
         draws: (S, N, *event) by address, the state of each of N chains after each recorded move.
-        acceptance: (N,) share of its proposals that each chain took.
+        acceptance: (N,) the share of proposals that each chain accepted.
         trace: the last states.
     """
 
@@ -53,15 +53,15 @@ def markov_chains(
 ) -> Chains:
     """Run a chain from each particle.
 
-    The kernel is fitted once, each half of the chains learning from where the other half starts, and then
-    stays as it is: so the target is left invariant however long the chains are.
+    The kernel is fitted once, for each half of the chains to the starts of the other half, and then stays:
+    the target is left invariant however long the chains are.
 
     Args:
-        kernel: what moves.
-        start: where the chains start, and what is learned from. A population whose weights are not equal is
-            resampled first, to as many particles, so that the chains start where they should end.
+        kernel: moves the chains.
+        start: the first states, to which the kernel is fitted. A population whose weights are not equal is
+            resampled first, to as many particles, so that the chains start from the target.
         moves: how many.
-        target: what the chains leave invariant.
+        target: left invariant by the chains.
         addresses: the latent addresses to record, or one; by default all.
         every: record after each so many moves.
         scheme: resamples; None starts a chain at every particle, whatever its weight.
@@ -88,13 +88,13 @@ def markov_chains(
             )
     order = torch.randperm(count)
     halves = [h for h in (order[: count // 2], order[count // 2 :]) if len(h)]
-    moves_of = [fitted(kernel, _teachers(population[other])) for other in halves[::-1]]
+    moves_of = [fitted(kernel, population[other]) for other in halves[::-1]]
     taken = torch.zeros(count, dtype=torch.float64)
     draws: dict[str, list[Tensor]] = {address: [] for address in recorded}
     for number in watched(range(1, moves + 1), description="chains", progress=progress):
         for mine, move in zip(halves, moves_of, strict=True):
             moved, accepted = move(trace[mine], target)
-            trace = put(trace, mine, moved)
+            trace = scattered(trace, mine, moved)
             taken[mine] += accepted.to(torch.float64)
         if number % every == 0:
             for address, states in draws.items():
@@ -106,8 +106,3 @@ def markov_chains(
 
 def _equal(trace: Trace) -> Population:
     return Population(trace, torch.zeros(trace.particles, dtype=torch.float64))
-
-
-def _teachers(population: Population) -> Population:
-    some = bool((population.log_weights > -torch.inf).any())
-    return population if some else _equal(population.trace)

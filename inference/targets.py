@@ -1,4 +1,4 @@
-"""Targets: what a kernel leaves invariant."""
+"""Targets: the densities that kernels leave invariant."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from bcppl.traces import Trace
 
 
 def cost_of(site: Any) -> int:
-    """What evaluating a site takes: 0 arithmetic, 1 rendering, 2 physics (`bcppl.distributions.lazy`)."""
+    """The cost of evaluating a site: 0 arithmetic, 1 rendering, 2 physics (`bcppl.distributions.lazy`)."""
     return int(getattr(site, "cost", 0))
 
 
 @dataclass(frozen=True)
 class Target:
-    """The unnormalised log-density of a trace, with some sites let in only in part.
+    """The unnormalised log-density of a trace, with some sites tempered.
 
     Attributes:
-        exponents: by address; a site that is not named counts in full, one with exponent 0 is not evaluated.
+        exponents: by address; a site that is not named has 1, one with exponent 0 is not evaluated.
     """
 
     exponents: Mapping[str, float] = field(default_factory=dict)
@@ -34,7 +34,7 @@ class Target:
             number_within(f"site {address!r} is given the exponent {{}}", exponent, least=0.0)
 
     def exponent(self, address: str) -> float:
-        """How much of a site is let in."""
+        """The exponent of a site."""
         return self.exponents.get(address, 1.0)
 
     def __call__(self, trace: Trace) -> Tensor:
@@ -55,7 +55,7 @@ class Target:
             )
 
     def part(self, trace: Trace, addresses: Sequence[str]) -> Tensor:
-        """What some sites add to the log-density (N,)."""
+        """The contribution (N,) of some sites to the log-density."""
         total = torch.zeros(trace.particles, dtype=torch.float64)
         for address in addresses:
             if self.exponent(address) > 0.0:
@@ -65,17 +65,16 @@ class Target:
     def above(
         self, trace: Trace, needed: Tensor, addresses: Sequence[str] | None = None
     ) -> tuple[Tensor, Trace]:
-        """The particles whose log-density is above what is needed, found for as little work as possible.
+        """The particles whose log-density exceeds a threshold, for as few evaluations as possible.
 
-        Sites are asked in the order of their cost and then of the program. A particle that could not reach
-        what it needs even if every site still to be asked gave its upper bound is dropped, so physics is run
-        only for particles still in play, and only as far as they stay in play. The answer is the same to the
-        bit as that of evaluating everything.
+        Sites are evaluated in the order of their cost and then of the program. A particle that could not
+        reach its threshold even if every remaining site had its upper bound is dropped, so that physics is
+        run for the remaining particles only. The result is that of evaluating everything, to the bit.
 
         Args:
             trace: of N particles.
-            needed: (N,) log-densities.
-            addresses: the sites that count, here with others left out; all by default.
+            needed: (N,) the thresholds.
+            addresses: the sites that count; all by default.
 
         Returns:
             Their indices (K,) in increasing order, and the trace of these K particles.
@@ -96,8 +95,8 @@ class Target:
             # Rounding in another order of summation must not drop a particle that would just pass.
             reach = 0.0 if last else sum(bounds[k + 1 :]) + 1e-6
             alive = total + reach > needed
-            dear = not last and cost_of(sites[k + 1][1]) > 0
-            if (last or dear) and not bool(alive.all()):
+            expensive = not last and cost_of(sites[k + 1][1]) > 0
+            if (last or expensive) and not bool(alive.all()):
                 kept = alive.nonzero().flatten()
                 index, trace, total, needed = index[kept], trace[kept], total[kept], needed[kept]
             if len(index) == 0:
@@ -105,22 +104,22 @@ class Target:
         return index, trace
 
     def accept(self, old: Trace, new: Trace, log_ratio: Tensor) -> tuple[Tensor, Trace]:
-        """Which particles take their proposals: Metropolis-Hastings, decided for as little work as possible.
+        """The particles that accept their proposals, by Metropolis-Hastings.
 
         Args:
             old: of N particles.
             new: their proposals.
-            log_ratio: (N,) log-density of the way back minus that of the way there, Jacobian included.
+            log_ratio: (N,) log-density of the reverse proposal minus that of the proposal, Jacobian included.
 
         Returns:
-            The indices (K,) of those that do, and the trace of their proposals.
+            Their indices (K,), and the trace of their proposals.
         """
-        # With the chance drawn first, it is known what a proposal must reach to be accepted.
+        # With the uniform number drawn first, the log-density that a proposal must exceed is known.
         chance = torch.log(torch.rand(old.particles, dtype=torch.float64))
         return self.above(new, chance + self(old) - log_ratio)
 
     def visible(self, trace: Trace) -> Trace:
-        """What a proposal may read of a proposed trace on its way back: here all of it."""
+        """The part of a proposed trace that the reverse proposal may read: here all of it."""
         return trace
 
 

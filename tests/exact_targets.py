@@ -64,7 +64,7 @@ def two_modes() -> None:
 
 
 def bounded() -> None:
-    """Values whose support is an interval that hangs on another, positive, a simplex, single precision."""
+    """Values whose support is an interval that depends on another, positive, a simplex, single precision."""
     top = pyro.sample("top", dist.Gamma(number(2.0), number(1.5)))
     pyro.sample("below", dist.Uniform(torch.zeros_like(top), top))
     pyro.sample("shares", dist.Dirichlet(matrix([2.0, 0.7, 1.5])))

@@ -19,7 +19,7 @@ def normal_log(value: Tensor, mean: Tensor | float, scale: float) -> Tensor:
 
 
 class Felt(LazyDistribution):
-    """Anything that is felt at x; what its log-probability is, is said by those that inherit from it."""
+    """An observation at x; subclasses define its log-probability."""
 
     def __init__(self, x: Tensor) -> None:
         self.x = x

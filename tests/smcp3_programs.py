@@ -1,4 +1,4 @@
-"""What tests of SMCP3 share: mutants of its weights, which they have to find, and a program of no choice."""
+"""Shared by tests of SMCP3: mutants of its weights, and a program without choices."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from bcppl.traces.propose import assessed
 
 
 def silent(*args: Any) -> Trace:
-    """Mutant: the backward program's choices are not weighed."""
+    """Mutant: the backward program's choices have no density."""
     trace = assessed(*args)
     trace.known.update({a: torch.zeros(len(trace), dtype=torch.float64) for a in trace.addresses})
     return trace
 
 
 def flat(again: Any, inputs: Any, outputs: Any, **options: Any) -> Tensor:
-    """Mutant: volumes are not weighed."""
+    """Mutant: no Jacobian."""
     return torch.zeros_like(log_abs_det_jacobian(again, inputs, outputs, **options))
 
 
 def turned_over(*args: Any, **options: Any) -> Tensor:
-    """Mutant: volumes are weighed the wrong way round."""
+    """Mutant: the inverse of the Jacobian."""
     return -log_abs_det_jacobian(*args, **options)
 
 

@@ -39,7 +39,7 @@ class Counter:
 
 
 def carrying(log: list[str]) -> Callable[[int], Any]:
-    """A program that carries a counter; it hangs on x, not on z, and every window runs it on by one step."""
+    """A program that carries a counter, which depends on x and not on z; windows advance it by one step."""
 
     def program(windows: int) -> Any:
         x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
@@ -82,7 +82,7 @@ def test_carried_state_goes_on_and_is_indexed_and_merged_with_its_particles() ->
     log.clear()
     moved = update(trace, {"z": trace["z"] + 1.0})
     moved.log_ratio  # noqa: B018
-    assert log == [], "the state does not hang on z"
+    assert log == [], "the state does not depend on z"
     moved = update(trace, {"x": trace["x"] + 1.0})
     moved.log_ratio  # noqa: B018
     assert log == ["started 4", "ran", "ran", "ran"], "a new x throws the state away"

@@ -1,4 +1,4 @@
-"""Kernels put together, and sweeps of a population: invariance, bookkeeping, and when to stop."""
+"""Combinations of kernels, and sweeps of a population: invariance, bookkeeping, and when to stop."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from bcppl.inference.kernels import (
     distinct,
     metropolis_hastings,
     mixture,
-    put,
     rejuvenate,
     repeat,
+    scattered,
     sequence,
     until,
 )
@@ -92,7 +92,7 @@ def test_mutant_mixture_that_chooses_by_where_a_particle_is() -> None:
             for k, each in enumerate(moves):
                 index = ((trace["x"] > 2.0) == bool(k)).nonzero().flatten()
                 moved, _ = each(trace[index], target)
-                trace = put(trace, index, moved)
+                trace = scattered(trace, index, moved)
             return trace, torch.zeros(len(trace), dtype=torch.float64)
 
         return move
@@ -104,7 +104,7 @@ def test_mutant_mixture_that_chooses_by_where_a_particle_is() -> None:
 
 
 def adding(step: float, share: float, seen: list[Tensor]) -> Kernel:
-    """Not a kernel at all: adds a number to x, says which share it accepted, and keeps what it was given."""
+    """No valid kernel: adds a number to x, returns a given share as accepted, and records its populations."""
 
     def fitted(population: Population) -> Move:
         def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
@@ -256,7 +256,7 @@ def particle_by_particle(population: Population, kernel: Kernel) -> Population:
     move = kernel(population)
     for _ in range(30):
         moved, _ = move(trace[going], POSTERIOR)
-        trace = put(trace, going, moved)
+        trace = scattered(trace, going, moved)
         going = ((trace["x"] - population.trace["x"]).abs() < 1.0).nonzero().flatten()
         if len(going) == 0:
             break

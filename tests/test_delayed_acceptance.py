@@ -80,7 +80,7 @@ def equal_weights(trace: Trace) -> Population:
 
 
 def leaning(trace: Trace) -> None:
-    """Not symmetric: the way back has another density than the way there."""
+    """Not symmetric: the reverse move has another density."""
     pyro.sample("x", dist.Normal(0.6 * trace["x"] + 0.1, 0.5))
 
 

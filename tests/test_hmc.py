@@ -55,7 +55,7 @@ def posterior_draws(exponent: float) -> Callable[[int], Trace]:
 
 
 def bounded() -> None:
-    """Positive, in an interval that hangs on another value, on a simplex, and free: all hang together."""
+    """Positive, in an interval that depends on another value, on a simplex, and free: all dependent."""
     rate = pyro.sample("rate", dist.Gamma(number(3.0), 2.0))
     edge = pyro.sample("edge", dist.Uniform(number(0.5), 2.0))
     pyro.sample("within", dist.Uniform(-edge, edge))
@@ -107,7 +107,7 @@ def test_hmc_leaves_the_target_invariant(case: str) -> None:
     assert worst_z(case) < SOUND
 
 
-def test_a_likelihood_let_in_by_half_and_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tempered_likelihood_and_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(CASES, "tempered", (posterior_draws(0.5), ("x",), 0.9))
     half = Target({"y": 0.5})
     assert worst_z("tempered", target=half) < SOUND
@@ -120,33 +120,33 @@ def test_a_likelihood_let_in_by_half_and_stages(monkeypatch: pytest.MonkeyPatch)
 
 
 def no_last_kick(*args: Any) -> Any:
-    """A trajectory that turned about does not go back."""
-    slope, _, _, size, *_ = args
+    """A trajectory that is not reversible."""
+    gradient, _, _, size, *_ = args
     position, momentum = sound_leapfrog(*args)
-    return position, momentum - 0.5 * size * slope(position)
+    return position, momentum - 0.5 * size * gradient(position)
 
 
 def last_kick_flipped(*args: Any) -> Any:
-    slope, _, _, size, *_ = args
+    gradient, _, _, size, *_ = args
     position, momentum = sound_leapfrog(*args)
-    return position, momentum - size * slope(position)
+    return position, momentum - size * gradient(position)
 
 
-def all_kicks_flipped(slope: Any, *args: Any) -> Any:
-    return sound_leapfrog(lambda z: -slope(z), *args)
+def all_kicks_flipped(gradient: Any, *args: Any) -> Any:
+    return sound_leapfrog(lambda z: -gradient(z), *args)
 
 
 sound_leapfrog = hamiltonian.leapfrog
 
 
 @pytest.mark.parametrize("mutant", [no_last_kick, last_kick_flipped])
-def test_mutants_whose_trajectories_do_not_go_back(mutant: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mutants_whose_trajectories_are_not_reversible(mutant: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hamiltonian, "leapfrog", mutant)
     assert worst_z("correlated Gaussian") > BROKEN
 
 
 def test_mutant_that_climbs_the_wrong_way_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A flipped slope still leaves the target invariant, but goes where nothing is."""
+    """A flipped gradient still leaves the target invariant, but moves away from the mass."""
 
     def accepted() -> float:
         torch.manual_seed(0)
@@ -160,7 +160,9 @@ def test_mutant_that_climbs_the_wrong_way_is_rejected(monkeypatch: pytest.Monkey
 
 
 def test_mutant_that_accepts_everything(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hamiltonian, "accept", lambda target, old, new, ratio: (torch.arange(len(new)), new))
+    monkeypatch.setattr(
+        hamiltonian, "decided", lambda target, old, new, ratio: (new, torch.ones(len(new)).double())
+    )
     assert worst_z("correlated Gaussian", hmc("x", step_size=1.3, steps=4)) > BROKEN
 
 
@@ -226,11 +228,11 @@ def test_the_gradient_is_that_of_the_log_density() -> None:
     values = {a: trace[a].clone().requires_grad_() for a in PLATED}
     density = log_prob_with_grad(trace, values)
     torch.testing.assert_close(density.detach(), trace.log_prob())
-    slopes = torch.autograd.grad(density.sum(), list(values.values()))
-    for (address, value), slope in zip(values.items(), slopes, strict=True):
+    gradients = torch.autograd.grad(density.sum(), list(values.values()))
+    for (address, value), gradient in zip(values.items(), gradients, strict=True):
         step = 1e-6 * torch.randn_like(value.detach())
         higher, lower = (trace.at({address: value.detach() + s * step}).log_prob() for s in (1, -1))
-        expected = (slope * step).reshape(5, -1).sum(1)
+        expected = (gradient * step).reshape(5, -1).sum(1)
         torch.testing.assert_close((higher - lower) / 2, expected, rtol=1e-4, atol=1e-12)
     halved = log_prob_with_grad(trace, values, {"at": 0.5})
     torch.testing.assert_close(halved.detach(), trace.log_prob() - 0.5 * trace.log_prob("at"))
@@ -251,7 +253,7 @@ def test_trajectories_that_diverge_are_rejected() -> None:
 
 
 class Simulated(LazyDistribution):
-    """A likelihood that leaves torch."""
+    """A likelihood that is computed outside of torch."""
 
     def __init__(self, pose: Tensor, cost: int) -> None:
         self.cost = cost
@@ -302,7 +304,7 @@ def test_what_has_no_gradient_is_refused_by_name() -> None:
         with pytest.raises(InputError, match=match) as caught:
             hmc(*addresses)(equal_weights(trace))(trace, POSTERIOR)
         assert "\n" not in str(caught.value)
-        # What no simulator hangs on moves, also beside one.
+        # An address that no simulator depends on moves, also beside one.
         free, _ = hmc("matrix")(equal_weights(trace))(trace, POSTERIOR)
         assert not torch.equal(free["matrix"], trace["matrix"])
 
@@ -312,7 +314,7 @@ def test_what_has_no_gradient_is_refused_by_name() -> None:
     refused("", r"'pose': it is a pose", "pose")
     refused("", r"'which': it is discrete", "which")
     refused("", r"'nowhere', which is no latent address; latent are x, z", "nowhere")
-    refused("", r"'edge' together with 'z', on which its support hangs", "z", "edge")
+    refused("", r"'edge' together with 'z', on which its support depends", "z", "edge")
     refused("", r"no address to move")
     with pytest.raises(InputError, match="step size -1"):
         hmc("x", step_size=-1)

@@ -81,16 +81,16 @@ def nothing(trace: Trace) -> None:
     pass
 
 
-def slopes(trace: Trace) -> None:
-    """Hangs on where the particle is, so that the way back has another density."""
-    pyro.sample("slope", dist.Normal(0.3 * torch.tanh(trace["x"].sum(-1)), 0.5))
+def scales(trace: Trace) -> None:
+    """Depends on where the particle is, so that the reverse move has another density."""
+    pyro.sample("scale", dist.Normal(0.3 * torch.tanh(trace["x"].sum(-1)), 0.5))
 
 
 def stretch(values: Values, choices: Values) -> tuple[Values, Values]:
-    u = choices["slope"]
+    u = choices["scale"]
     x = values["x"]
     center = torch.tensor([0.5, -0.5]).double()
-    return {"x": center + (x - center) * torch.exp(u)[:, None]}, {"slope": -u}
+    return {"x": center + (x - center) * torch.exp(u)[:, None]}, {"scale": -u}
 
 
 def trade(values: Values, choices: Values) -> tuple[Values, Values]:
@@ -164,7 +164,7 @@ def of_rates(trace: Trace) -> Tensor:
 
 
 CASES: dict[str, tuple[Any, Any, Any, Any]] = {
-    "stretched about a point": (vector, slopes, stretch, lambda t: of_vectors(t["x"])),
+    "stretched about a point": (vector, scales, stretch, lambda t: of_vectors(t["x"])),
     "scaled unevenly": (two_rates, factor, scale_both, of_rates),
     "exchanged": (two_rates, factor, trade, of_rates),
     "discrete": (which, nothing, flip_kind, lambda t: of_vectors(torch.stack([t["kind"], t["size"]], 1))),
@@ -273,7 +273,7 @@ def test_volumes_are_those_of_the_base_measure() -> None:
             lambda x: torch.cat([x[:, :3], -x[:, 3:]], dim=1),
         ):
             torch.testing.assert_close(determinant(six, place, function), zero, atol=1e-9, rtol=0)
-    # Three translations stretched by 2, and the rotation vector by 2: the density of Haar measure tells.
+    # Three translations stretched by 2, and the rotation vector by 2: with the density of Haar measure.
     far = UniformPose(CENTER, 0.2, 1.5).sample((50,))
     doubled = determinant(six, far, lambda x: poses.retract(CENTER, 2 * poses.local(CENTER, x)))
     angle = poses.local(CENTER, far)[:, 3:].norm(dim=-1)

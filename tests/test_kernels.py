@@ -1,6 +1,6 @@
 """Kernels leave their target invariant: from exact draws, moves must not change any expectation.
 
-Beside each stands a mutant that the same test has to find: a flipped sign, a way back that is forgotten, a
+Beside each stands a mutant that the same test has to find: a flipped sign, a reverse move that is left out, a
 density without the Jacobian of the rotations, an edge that is not seen.
 """
 
@@ -123,7 +123,7 @@ def test_mutant_that_does_not_see_the_edges() -> None:
 
 
 def test_composed_kernels_and_tempered_targets_are_invariant() -> None:
-    """The likelihood let in by half: the posterior of a noise wider by sqrt 2."""
+    """A likelihood tempered by half: the posterior of a noise wider by sqrt 2."""
     posterior = torch.linalg.inv(torch.linalg.inv(COVARIANCE) + torch.eye(3, dtype=torch.float64) / 0.98)
     halfway = torch.distributions.MultivariateNormal(posterior @ SEEN / 0.98, posterior)
 
@@ -147,7 +147,7 @@ def leaning(trace: Trace) -> None:
 
 
 def fresh(trace: Trace) -> None:
-    """A pose drawn anew about the centre, wherever the particle is."""
+    """An independent pose about the centre, wherever the particle is."""
     pyro.sample("pose", NormalPose(CENTER.expand(len(trace), 7), 0.7 * WIDE))
 
 
@@ -208,7 +208,7 @@ def test_no_particle_shapes_its_own_proposal(count: int) -> None:
         def propose(trace: Trace) -> None:
             if len(moved) < len(learnt):
                 moved.append(set(trace["tag"].tolist()))
-            assert set(trace["tag"].tolist()) == moved[-1], "the way back is of the same particles"
+            assert set(trace["tag"].tolist()) == moved[-1], "the reverse move is of the same particles"
             pyro.sample("x", dist.Normal(trace["x"], 1.0))
 
         return propose
@@ -222,7 +222,7 @@ def test_no_particle_shapes_its_own_proposal(count: int) -> None:
         assert not others & mine and others | mine == tags
     for k in range(sweeps):
         assert moved[2 * k] | moved[2 * k + 1] == tags, "every particle is moved in every sweep"
-    assert count < 20 or moved[0] != moved[2], "halves are drawn anew"
+    assert count < 20 or moved[0] != moved[2], "halves are drawn in each sweep"
     # Particles stay in their places, and what is not moved stays.
     assert torch.equal(done.population.trace["tag"], trace["tag"])
     fresh = Trace(program, (), count, done.population.trace.choices, {})

@@ -37,7 +37,7 @@ class Seen(LazyDistribution):
 
     def __init__(self, part: Tensor, beyond: float | None) -> None:
         self.part, self.beyond = part, beyond
-        super().__init__(len(part), (), (part,))
+        super().__init__(len(part), ())
 
     def log_prob(self, value: Tensor) -> Tensor:
         x = self.part[:, 0]

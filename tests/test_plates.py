@@ -164,6 +164,6 @@ def test_counts_and_structure_that_differs_by_argument() -> None:
     assert generate(counts, (("one",),), {}, N)[0].addresses == ["rate", "one"]
     drawn = regenerate(simulate(counts, (("many",),), N), "many")
     assert drawn.trace["many"].shape == (N, POINTS)
-    assert torch.equal(drawn.log_weight, torch.zeros(N, dtype=torch.float64)), "nothing hangs on it"
+    assert torch.equal(drawn.log_weight, torch.zeros(N, dtype=torch.float64)), "nothing depends on it"
     with pytest.raises(InputError, match="no longer visits address 'many'"):
         extend(trace, (("one",),), {})

@@ -1,4 +1,4 @@
-"""Values drawn anew from the program: in its order, and as moves that leave the posterior as it is."""
+"""Values regenerated from the program: in its order, and as moves that leave the posterior invariant."""
 
 from __future__ import annotations
 

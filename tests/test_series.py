@@ -1,4 +1,4 @@
-"""Models that are a pair (init, step): the same numbers as a program run anew, for the price of one step."""
+"""Models that are a pair (init, step): the same numbers as the whole program, at the cost of one step."""
 
 from __future__ import annotations
 
@@ -250,7 +250,7 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], str]] = {
     "no latent": (lambda t: update(t, {("x", 1): t["x"]}), "no latent address"),
     "another past": (
         lambda t: t.where(torch.ones(N, dtype=torch.bool), filtered()[0]),
-        "not go on from the same",
+        "not begin from the same",
     ),
     "state": (lambda _: simulate(Series(state_of((3, N)), step), (), N), r"shape \(3, 6\) for 6 particles"),
 }

@@ -1,4 +1,4 @@
-"""A series that is not put together right is refused in one sentence that says what to do."""
+"""A series that is not well formed is refused in one sentence that states what to do."""
 
 from __future__ import annotations
 

@@ -146,7 +146,7 @@ def plane_scaled(pose: Tensor, log_factor: Tensor) -> Tensor:
 
 
 def leaning(trace: Trace) -> None:
-    """Says nothing about the way back: read as Metropolis-Hastings reads it."""
+    """Returns nothing: read as a proposal of Metropolis-Hastings."""
     strong = pyro.sample("strong", dist.Bernoulli(number(0.3)))
     pyro.sample("x", dist.Normal(0.8 * trace["x"] + 0.2 * strong[:, None], 0.9).to_event(1))
 
@@ -171,7 +171,7 @@ CASES: dict[str, tuple[Callable[[], None], Pair, Callable[[Trace], Tensor]]] = {
     "line of sight": (standing, Pair(farther, nearer, check=True), of_pose),
     "turned on": (standing, Pair(turn_on, turn_off, check=True), of_pose),
     "in the plane": (sliding, Pair(spread_out, draw_in, check=True), of_pose),
-    "nothing said": (vector, Pair(leaning, leaning, check=True), of_vector),
+    "nothing returned": (vector, Pair(leaning, leaning, check=True), of_vector),
     "drift": (sliding, Pair(drift("pose", (0.2, 0.4)), drift("pose", (0.2, 0.4))), of_pose),
 }
 
@@ -200,7 +200,7 @@ MUTANTS = [
     (case, name, mutant)
     for name, mutant in (("log_abs_det_jacobian", flat), ("assessed", silent))
     for case in CASES
-    if name == "assessed" or case not in ("nothing said", "drift")
+    if name == "assessed" or case not in ("nothing returned", "drift")
 ]
 
 

@@ -24,7 +24,7 @@ MEANS = torch.tensor([-1.0, 2.0, 5.0], dtype=torch.float64)
 
 
 class Counting(LazyDistribution):
-    """Normal about an input, dear, and counted."""
+    """Normal about an input, expensive, and counted."""
 
     cost = 2
     asked: list[int] = []  # noqa: RUF012

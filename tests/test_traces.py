@@ -139,7 +139,7 @@ def test_the_log_ratio_is_that_of_the_densities() -> None:
         value = seen(2)[f"a_{k}"]
         expected = expected + normal_log(value, new, 0.5) - normal_log(value, x, 0.5)
     torch.testing.assert_close(updated.log_ratio, expected)
-    assert set(calls) == {"a_0", "a_1"}, "what does not hang on x is kept"
+    assert set(calls) == {"a_0", "a_1"}, "sites that do not depend on x are kept"
     assert torch.equal(updated.discarded["x"], x) and set(updated.discarded) == {"x"}
     assert torch.equal(trace["x"], x), "the trace itself is as it was"
     back = update(updated.trace, updated.discarded)
@@ -169,7 +169,7 @@ def test_indexing_takes_everything_along(index: Any) -> None:
     assert torch.equal(part["z"], trace["z"][rows])
     torch.testing.assert_close(part.log_prob(), whole[rows])
     assert calls == [], "known log-probabilities are indexed, not computed"
-    # Computed anew for these particles they are the same: none was given to another particle.
+    # Evaluated for these particles they are the same: none was given to another particle.
     fresh = Trace(part.program, part.args, len(part), part.choices, part.observations)
     torch.testing.assert_close(fresh.log_prob(), whole[rows])
 
@@ -237,7 +237,7 @@ def test_verbs_leave_pyros_settings_and_draw_from_torchs_generator_only() -> Non
     assert torch.equal(state, torch.get_rng_state()), "known values are not drawn again"
 
 
-def test_a_hidden_site_says_nothing_whatever_is_made_of_the_trace() -> None:
+def test_a_hidden_site_stays_hidden_whatever_is_made_of_the_trace() -> None:
     calls: list[str] = []
     trace, _ = generate(counted(calls), (2,), seen(2), N)
     calls.clear()
@@ -268,7 +268,7 @@ def test_a_hidden_site_says_nothing_whatever_is_made_of_the_trace() -> None:
     assert trace.log_prob("a_1").shape == (N,), "the trace itself is as it was"
 
 
-def test_regenerating_weighs_what_was_not_drawn_anew() -> None:
+def test_regenerating_weighs_the_sites_that_were_not_sampled() -> None:
     calls: list[str] = []
     trace, _ = generate(counted(calls), (2,), seen(2), N)
     calls.clear()
@@ -282,7 +282,7 @@ def test_regenerating_weighs_what_was_not_drawn_anew() -> None:
         value = seen(2)[f"a_{k}"]
         expected = expected + normal_log(value, new, 0.5) - normal_log(value, x, 0.5)
     torch.testing.assert_close(drawn.log_weight, expected)
-    assert set(calls) == {"a_0", "a_1"}, "what does not hang on x is not evaluated"
+    assert set(calls) == {"a_0", "a_1"}, "sites that do not depend on x are not evaluated"
     both = regenerate(trace, ["z", "x"])
     prior = both.trace.log_prob("x", "z") - trace.log_prob("x", "z")
     torch.testing.assert_close(both.log_weight, update(trace, both.trace.choices).log_ratio - prior)

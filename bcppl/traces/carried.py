@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from bcppl.traces.dependence import Array, alike, equal, snapshot
+from bcppl.traces.indexing import beside
 
 
 class Carryable(Protocol):
@@ -90,7 +91,7 @@ class Entry:
         return replace(self, state=state, merged=merged)
 
     def where(self, mask: Tensor, other: Entry) -> Entry | None:
-        """This entry where `mask` (N,) is true, the other's elsewhere; None if they were not begun alike."""
+        """This entry where `mask` (N,) is true, the other's elsewhere; None if their starts are unlike."""
         if self.start is other.start and self.merged is None and other.merged is None:
             rows = torch.arange(len(mask))
             mine, theirs = (rows if each.index is None else each.index for each in (self, other))
@@ -125,7 +126,7 @@ def _chosen(mask: Tensor, first: Array, second: Array) -> Array | None:
         return first
     if first.shape != second.shape or first.shape[:1] != mask.shape or first.dtype != second.dtype:
         return None
-    mask = mask.reshape(-1, *[1] * (first.ndim - 1))
+    mask = beside(mask, first)
     if isinstance(first, Tensor) and isinstance(second, Tensor):
         return torch.where(mask, first, second)
     return np.where(mask.numpy(), first, second)
@@ -182,7 +183,7 @@ def once(name: str, make: Callable[[], T]) -> T:
 
 @contextmanager
 def carrying(available: Mapping[str, Entry], particles: int) -> Iterator[dict[str, Entry]]:
-    """Offer carried states to a program run within; yields those that it used or started."""
+    """Offer carried states to a program run within; yields those that it used or made."""
     frame = _Frame(particles, available)
     token = _frame.set(frame)
     try:

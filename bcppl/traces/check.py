@@ -1,4 +1,4 @@
-"""A check of a program: whether an update of each latent value gives the densities of a run from nothing."""
+"""A check of a program: whether an update of each latent value gives the densities of a new run."""
 
 from __future__ import annotations
 
@@ -25,11 +25,10 @@ def check_program(
 ) -> None:
     """Check that a trace misses no dependence of a site on a latent value.
 
-    Every latent value is replaced by another draw, in turn; then particles are merged with those before and
-    reordered, as kernels do it. The log-probability of every site has to be that of a run at the same values
-    which starts with no trace. It is not where a site depends on a latent value through something that is
-    no part of it (`bcppl.traces.dependence`), such as a global variable, or where a log-probability is
-    random.
+    Every latent value in turn is replaced by another draw; then particles are merged with those before and
+    reordered, as kernels do. The log-probability of every site has to be that of a new run at the same
+    values. It is not where a site depends on a latent value through something that is no part of it
+    (`bcppl.traces.dependence`), such as a global variable, or where a log-probability is random.
 
     Args:
         program: a Pyro program, or a series, of which `init` is checked.
@@ -53,11 +52,11 @@ def check_program(
 def _compare(trace: Trace, latent: str) -> None:
     again = replace(trace, carried={}, known={})
     for address in trace.addresses:
-        found, expected = trace.log_prob(address), again.log_prob(address)
-        if not torch.allclose(found, expected, rtol=TOLERANCE, atol=TOLERANCE):
-            particle = int((found != expected).nonzero()[0])
+        updated, expected = trace.log_prob(address), again.log_prob(address)
+        if not torch.allclose(updated, expected, rtol=TOLERANCE, atol=TOLERANCE):
+            particle = int((updated != expected).nonzero()[0])
             raise InputError(
-                f"site {address!r} has log-probability {float(found[particle]):.6g} after {latent!r} was "
-                f"updated and {float(expected[particle]):.6g} in a run from nothing; hold all that its "
-                "distribution depends on in the distribution, and make no part of it random."
+                f"site {address!r} has log-probability {float(updated[particle]):.6g} after {latent!r} was "
+                f"updated and {float(expected[particle]):.6g} in a new run; hold all that its distribution "
+                "depends on in the distribution, and make no part of it random."
             )

@@ -1,4 +1,4 @@
-"""A plate as large as the population could hide data without its last axis: one more particle shows it."""
+"""Shapes that fit N particles by coincidence, such as those of a plate of N: one more particle shows them."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.traces.run import Program, Run, run
-from bcppl.traces.series import Stage, taken
+from bcppl.traces.series import Stage, indexed
 
-# More particles than a vector that was meant as one event is likely to have entries.
+# A vector that was meant as one event is unlikely to have more entries.
 FEW = 20
 
 
 def refuse_coincidence(
     program: Program, args: tuple[Any, ...], particles: int, ran: Run, old: Collection[str] = ()
 ) -> None:
-    """Run a program once more, for N + 1 particles, if N is what makes its shapes fit.
+    """Run a program once more, for N + 1 particles, where its shapes may fit N of them alone.
 
-    It is done only where a plate or an event's axis has N entries, or the first site, of few particles, has N
-    before it is spread over them. All sites are set, the last particle to the first one's values: nothing is
-    drawn and no simulator is asked. A proposal that reads a trace is let through: it is made for the
-    particles of that.
+    That is where a plate or an axis of an event has N entries, or the first site, of few particles, has N
+    before it is expanded to them. All sites are set, the last particle to the first one's values: nothing is
+    drawn and no simulator is run. A proposal that reads a trace is not checked: it is made for the trace's
+    particles.
 
     Args:
         program: what was run.
         args: its arguments.
         particles: N.
-        ran: what the run for N particles left.
-        old: addresses that were looked at before.
+        ran: the run for N particles.
+        old: addresses that were checked before.
 
     Raises:
         InputError: the program fits N particles and no other number of them.
     """
-    # A program's first site hangs on no sampled value, so that N entries are a coincidence where N is small
-    # and meant where it is large. A later step of a series goes on from the state, which has N.
+    # A program's first site depends on no sampled value, so that N entries are a coincidence where N is small
+    # and intended where it is large. A later step of a series begins from the state, which has N.
     begins = particles <= FEW and (not isinstance(program, Stage) or program.before is None)
     suspects = ran.coincident | ran.whole if begins else ran.coincident
     if not suspects.difference(old) or any(hasattr(arg, "particles") for arg in args):
@@ -57,7 +57,7 @@ def refuse_coincidence(
             carried,
         )
         if isinstance(program, Stage):
-            taken(again.result, None, particles + 1)
+            indexed(again.result, None, particles + 1)
     except InputError as error:
         raise InputError(
             f"with {particles} particles the shapes fit by coincidence alone; with one more, "

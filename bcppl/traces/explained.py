@@ -1,10 +1,13 @@
-"""What Pyro and torch say of a program that does not fit its particles, in a sentence that names the site."""
+"""Errors of Pyro and torch in a program that does not fit its particles, as sentences that name the site."""
 
 from __future__ import annotations
 
 import re
 
-from bcppl.errors import InferenceError, InputError
+import torch
+from torch import Tensor
+
+from bcppl.errors import InferenceError, InputError, NotANumberError
 
 _MISMATCHED = re.compile(r"Shape mismatch inside plate\('(.+)'\) at site (.+) dim (-?\d+), (\d+) vs (\d+)")
 _COLLIDING = re.compile(r'at plates "(.+)" and "(.+)", collide at dim=(-?\d+)')
@@ -23,7 +26,7 @@ def unfit(site: str, dim: int, plate: str, size: int, given: int) -> InputError:
     return InputError(
         f"site {site!r} has {given} entries at dimension {dim} where plate {plate!r} has {size}; inside "
         "a program the particles are the last batch dimension and plates lie to the left of it, so give "
-        "what hangs on a plate a last axis of 1 (`[:, None]`), and put other dimensions into the event "
+        "what depends on a plate a last axis of 1 (`[:, None]`), and put other dimensions into the event "
         "with `.to_event()`."
     )
 
@@ -36,8 +39,32 @@ def unfit_particles(site: str, particles: int, given: int) -> InputError:
     )
 
 
+def not_a_number(
+    address: str, log_prob: Tensor, latent: Tensor | None, observed: Tensor | None
+) -> NotANumberError:
+    """The error of a site whose log-probability (N,) is NaN or +inf, of a latent or an observed value."""
+    missing = None if observed is None else torch.isnan(observed)
+    if missing is not None and bool(missing.any()):
+        return NotANumberError(
+            f"the observation at site {address!r} is NaN in {int(missing.sum())} of {missing.numel()} "
+            "entries; leave out what was not measured, or mask it in the site's distribution."
+        )
+    which = (torch.isnan(log_prob) | (log_prob == torch.inf)).nonzero().flatten().tolist()
+    first = float(log_prob[which[0]])
+    reason = "a value or a parameter of its distribution is out of range there."
+    if latent is not None and first == torch.inf:
+        reason = (
+            f"rounding to {latent.dtype} put values on the edge of the support, where the density is "
+            "infinite; give the prior parameters in double precision, or less extreme ones."
+        )
+    return NotANumberError(
+        f"site {address!r} has a log-probability of {first} for {len(which)} of {len(log_prob)} particles "
+        f"(first: {', '.join(map(str, which[:5]))}); {reason}"
+    )
+
+
 def explained(error: Exception, particles: int, last: str | None) -> Exception:
-    """An error out of a program as an InputError, where it is one of those that particles bring about.
+    """An error of a program as an InputError, where the particles are its cause.
 
     Args:
         error: what was raised.
@@ -46,33 +73,33 @@ def explained(error: Exception, particles: int, last: str | None) -> Exception:
     """
     if isinstance(error, InputError | InferenceError):
         return error
-    said = str(error).partition("\n")[0]
-    if found := _MISMATCHED.match(said):
-        plate, site, dim, size, given = found.groups()
+    message = str(error).partition("\n")[0]
+    if match := _MISMATCHED.match(message):
+        plate, site, dim, size, given = match.groups()
         return unfit(site, int(dim), plate, int(size), int(given))
-    if found := _COLLIDING.match(said):
-        plate, other, dim = found.groups()
+    if match := _COLLIDING.match(message):
+        plate, other, dim = match.groups()
         return InputError(
             f"plate {plate!r} is put at dimension {dim}, which is that of plate {other!r}"
             "; leave its `dim` out, or take one further to the left (the particles have -1, so -2)."
         )
-    if said.startswith("duplicate plate"):
-        return InputError(f"two plates, one within the other, have the same name ({said}); rename one.")
+    if message.startswith("duplicate plate"):
+        return InputError(f"two plates, one within the other, have the same name ({message}); rename one.")
     where = "before its first site" if last is None else f"after site {last!r}"
-    if _ONE.search(said):
+    if _ONE.search(message):
         return InputError(
             f"{where} the program asks a tensor of {particles} particles for one number or one truth "
             "(`if`, `float`, `int`, `math`); compute with all at once, and choose with `torch.where`."
         )
-    if _SHAPES.search(said) and str(particles) in re.findall(r"\d+", said):
+    if _SHAPES.search(message) and str(particles) in re.findall(r"\d+", message):
         return InputError(
-            f"{where} the program combines tensors that do not fit ({_clause(said)}), with {particles} "
-            "particles; a sampled number has the particles as its last axis, so give what hangs on a plate "
+            f"{where} the program combines tensors that do not fit ({_clause(message)}), with {particles} "
+            "particles; a sampled number has the particles as its last axis, so give what depends on a plate "
             "a last axis of 1 (`[:, None]`), and index the entries of a sampled vector with `[:, k]`."
         )
     return error
 
 
-def _clause(said: str) -> str:
+def _clause(message: str) -> str:
     """The first sentence, to stand in brackets."""
-    return said.split(". ")[0].rstrip(".").replace("The ", "the ", 1)
+    return message.split(". ")[0].rstrip(".").replace("The ", "the ", 1)

@@ -41,7 +41,7 @@ def with_gradients(trace: Trace, values: Mapping[str, Tensor]) -> Trace:
 def result_with_grad(
     program: Program, args: tuple[Any, ...], choices: Mapping[str, Tensor], particles: int
 ) -> Any:
-    """What a program returns at given values of all its choices, attached to those that ask for gradients."""
+    """The result of a program at values of all its choices, attached to those that ask for gradients."""
     return run(differentiable(program), args, particles, choices, {}).result
 
 
@@ -56,10 +56,10 @@ def log_prob_with_grad(
         exponents: by address, as in a tempered target; a site that is not named counts in full.
 
     Returns:
-        (N,) float64, without the sites that hang on none of the values: these add a constant.
+        (N,) float64, without the sites that depend on none of the values: these add a constant.
 
     Raises:
-        InputError: a site that hangs on the values runs a simulator, or passes no gradient on.
+        InputError: a site that depends on the values runs a simulator, or passes no gradient on.
     """
     given, before = {**trace.choices, **trace.observations, **values}, trace._run.distributions
     program = differentiable(trace.program)
@@ -118,7 +118,7 @@ def _refuse(address: str, why: str, parameters: list[Tensor], values: Mapping[st
 
 
 def _refusing(evaluate: Callable[[], Any], address: str, values: Mapping[str, Tensor]) -> Any:
-    """What `evaluate` gives; a conversion that gradients do not survive is told as what it is."""
+    """The result of `evaluate`; a conversion out of torch is an error that names it."""
     try:
         return evaluate()
     except RuntimeError as error:

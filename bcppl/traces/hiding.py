@@ -1,4 +1,4 @@
-"""What a trace answers that hides some of its sites from the proposal that reads it."""
+"""The distributions of a trace that hides some of its sites from the proposal that reads it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bcppl.errors import InputError
 
 
 def refused(address: str) -> InputError:
-    """The error of a proposal that asks for what is hidden from it."""
+    """The error of a proposal that asks for a hidden site."""
     return InputError(
         f"site {address!r} is hidden from a proposal, which asked for its distribution or log-probability; "
         "let the proposal read earlier sites only."

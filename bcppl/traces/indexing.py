@@ -1,10 +1,12 @@
-"""Which particles an index means."""
+"""The particles at an index, and masks of particles beside their values."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -14,7 +16,7 @@ Index = Tensor | Sequence[int] | slice | int
 
 
 def particles_at(key: Index, particles: int) -> Tensor:
-    """The particles (K,) int64 that an index means, of so many.
+    """The particles (K,) int64 at an index.
 
     Args:
         key: whole numbers, one or several, from -N to N - 1; one truth value for each particle; or a slice.
@@ -57,6 +59,11 @@ def particles_at(key: Index, particles: int) -> Tensor:
         )
     index = index.to(torch.int64)
     return torch.where(index < 0, index + particles, index) if least < 0 else index
+
+
+def beside(mask: Tensor, values: Tensor | npt.NDArray[Any]) -> Tensor:
+    """A mask (N,) with as many axes as values (N, ...)."""
+    return mask.reshape(-1, *[1] * (values.ndim - 1))
 
 
 def _refuse_none(index: Tensor, key: object, particles: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""The verbs for proposals, Gen's: propose runs a program forward, assess says how likely its choices are."""
+"""The verbs for proposals, Gen's: propose samples a program's choices, assess gives their log-density."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def propose(program: Program | Series, args: tuple[Any, ...], particles: int) ->
 
 
 def _refuse_fixed(ran: Run) -> None:
-    """What a program observes itself has no density of being chosen."""
+    """Refuse a program that observes something itself: that has no density of being chosen."""
     if ran.fixed:
         raise InputError(
             f"a program that is to propose or to be assessed observes {min(ran.fixed)!r} itself (`obs=` or "

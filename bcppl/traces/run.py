@@ -34,16 +34,16 @@ PARTICLES = "particles"
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What one pass through a program left, by address or name.
+    """The record of one pass through a program, by address or name.
 
     Attributes:
         distributions: of every site, in the order of the program.
         values: (N, *plates, *event), or (*plates, *event) where a site was set to one value for all.
         fixed: addresses that the program observes itself (`obs=`, `pyro.factor`).
-        carried: simulator states that it used or started.
+        carried: simulator states that it used or made.
         result: what it returned.
         coincident: addresses with a plate or an event axis of N entries (`bcppl.traces.coincidence`).
-        whole: the first address, if its distribution had N entries before it was spread over the particles.
+        whole: the first address, if its distribution had N entries before it was expanded to the particles.
     """
 
     distributions: dict[str, Any]
@@ -89,17 +89,17 @@ def run(
             with _apart(), recorder, _Particles(PARTICLES, particles, dim=-1) as plate:
                 result = program(*args)
         except (RuntimeError, TypeError, ValueError) as error:
-            said = explained(error, particles, next(reversed(recorder.distributions), None))
-            if said is error:
+            reason = explained(error, particles, next(reversed(recorder.distributions), None))
+            if reason is error:
                 raise
-            raise said from error
+            raise reason from error
     values, fixed = recorder.values, frozenset(recorder.fixed)
     coincident, whole = frozenset(recorder.coincident), frozenset(plate.whole)
     return Run(recorder.distributions, values, fixed, used, result, coincident, whole)
 
 
 def refuse_other_than_tensors(given: Mapping[str, Any]) -> None:
-    """An error that names an address that something else than a tensor was given for."""
+    """Refuse a value that is no tensor; the error names its address."""
     for address, value in given.items():
         if not isinstance(value, Tensor):
             raise InputError(
@@ -109,7 +109,7 @@ def refuse_other_than_tensors(given: Mapping[str, Any]) -> None:
 
 @contextmanager
 def _apart() -> Iterator[None]:
-    """Within a run, another one that is no part of it: a proposal reads a trace that runs its own program."""
+    """Another run within a run, and no part of it: a proposal reads a trace that runs its own program."""
     outermost = next((k for k, each in enumerate(_PYRO_STACK) if isinstance(each, _Recorder)), None)
     if outermost is None:
         yield
@@ -125,7 +125,7 @@ def _apart() -> Iterator[None]:
 
 
 def inward(value: Tensor, distribution: Any) -> Tensor:
-    """A site's value as its distribution takes it, the particle axis behind the plates, from a trace's."""
+    """A trace's value as the site's distribution takes it, with the particle axis behind the plates."""
     plates = len(distribution.batch_shape) - 1
     if plates == 0:
         return value
@@ -134,7 +134,7 @@ def inward(value: Tensor, distribution: Any) -> Tensor:
 
 
 class _Particles(IndepMessenger):
-    """The plate of the particles: `pyro.plate`, for less where a site has its shape already."""
+    """The plate of the particles: `pyro.plate`, at less cost where a site has its shape already."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -165,7 +165,7 @@ class _Particles(IndepMessenger):
 
 
 class _Recorder(Messenger):
-    """Sets sites to given values and records all; the outermost handler, it sees them as plates made them."""
+    """Sets sites to given values and records all; as the outermost handler it sees them after plates."""
 
     def __init__(self, particles: int, given: Mapping[str, Tensor], draws_lazy: bool = True) -> None:
         super().__init__()
@@ -251,7 +251,7 @@ class _Recorder(Messenger):
             )
 
     def _coincides(self, distribution: Any) -> bool:
-        """Whether another axis has as many entries as there are particles; what is lazy checks its own."""
+        """Whether another axis has as many entries as there are particles; lazy sites check their own."""
         batch, event = distribution.batch_shape, distribution.event_shape
         return (len(batch) > 1 and self.particles in batch[:-1]) or (
             len(event) > 0 and self.particles in event and not isinstance(distribution, LazyDistribution)

@@ -15,9 +15,9 @@
     trace["x"], trace["x", 3]  # now, and what each particle's ancestor had after three steps
 
 The trace is that of the newest step, whose addresses are those that `step` visits; kernels move them. Earlier
-steps are behind it: they are reached by number, and are not moved any more. So T steps cost T, and choosing
-ancestors costs a single gather; paths are traced back when they are asked for (Murray, Bayesian state-space
-modelling on high-performance hardware using LibBi, JSS 67, 2015, section 3.3, stores ancestries so).
+steps are read by number and moved no more. So the cost of T steps is of order T, and choosing ancestors costs
+a single gather; paths are traced back when they are asked for (Murray, Bayesian state-space modelling on
+high-performance hardware using LibBi, JSS 67, 2015, section 3.3).
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class Series:
         history: whether earlier steps stay readable; without, memory does not grow with the steps.
 
     A state is a tensor, or a dictionary, list, tuple or named tuple of such, the particle axis first;
-    numbers, None and tensors without axes are the same for all particles. What else it holds is indexed by
-    (K,) int64.
+    numbers, None and tensors without axes are the same for all particles. Anything else that it holds is
+    indexed by (K,) int64.
 
     Raises:
         InputError: a part is no function.
@@ -70,7 +70,7 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """One step of a series as a program: it knows the trace that it goes on from, and whose states."""
+    """One step of a series as a program, which begins from the states of a trace's particles."""
 
     series: Series
     number: int = 0
@@ -81,7 +81,7 @@ class Stage:
         """Run the step from the states of the chosen particles."""
         if self.before is None:
             return _called("init", self.series.init, args)
-        state = taken(self.before.state, self.chosen, self.before.particles)
+        state = indexed(self.before.state, self.chosen, self.before.particles)
         after = _called("step", self.series.step, (state, *args))
         if after is None and state is not None:
             raise InputError(
@@ -91,7 +91,7 @@ class Stage:
 
     @cached_property
     def chosen(self) -> Tensor | None:
-        """Which particles (N,) of the trace before go on; None if all of them do, in order."""
+        """The particles (N,) of the trace before from which the step begins; None for all, in order."""
         index = None
         for pick in self.picks:
             index = composed(index, pick)
@@ -99,14 +99,14 @@ class Stage:
 
     def take(self, index: Tensor) -> Stage:
         """The same step for the particles at `index` (K,)."""
-        # Composed only when asked for: a filter that goes on from here never does.
+        # Composed only when asked for: a filter that runs the next step never does.
         return replace(self, picks=(*self.picks, index)) if self.before is not None else self
 
     def where(self, mask: Tensor, other: Stage) -> Stage:
         """The same step for this one's ancestors where `mask` (N,) is true, the other's elsewhere."""
         if self.series is not other.series or self.before is not other.before:
             raise InputError(
-                "two traces of a series were to be merged that do not go on from the same step; "
+                "two traces of a series were to be merged that do not begin from the same step; "
                 "merge traces of one population."
             )
         if self.before is None or self.chosen is other.chosen:
@@ -118,7 +118,7 @@ class Stage:
 
 
 def _called(name: str, part: Callable[..., Any], args: tuple[Any, ...]) -> Any:
-    """What a part of a series returns, or an error where it does not take what it is given."""
+    """The result of a part of a series, or an error where it does not take its arguments."""
     try:
         return part(*args)
     except TypeError:
@@ -140,7 +140,7 @@ def _refuse_arguments(name: str, part: Callable[..., Any], args: tuple[Any, ...]
 
 
 def runnable(program: Program | Series) -> Program:
-    """The program itself, or what begins a series."""
+    """The program itself, or the first stage of a series."""
     return Stage(program) if isinstance(program, Series) else program
 
 
@@ -149,7 +149,7 @@ def composed(first: Tensor | None, then: Tensor | None) -> Tensor | None:
     return then if first is None else first if then is None else first.index_select(0, then)
 
 
-def taken(state: Any, index: Tensor | None, particles: int) -> Any:
+def indexed(state: Any, index: Tensor | None, particles: int) -> Any:
     """The states of the particles at `index` (K,), all of them if it is None.
 
     Raises:
@@ -166,9 +166,9 @@ def taken(state: Any, index: Tensor | None, particles: int) -> Any:
             )
         return state if index is None else state.index_select(0, index)
     if isinstance(state, Mapping):
-        return {key: taken(value, index, particles) for key, value in state.items()}
+        return {key: indexed(value, index, particles) for key, value in state.items()}
     if isinstance(state, list | tuple):
-        parts = [taken(value, index, particles) for value in state]
+        parts = [indexed(value, index, particles) for value in state]
         return type(state)(*parts) if hasattr(state, "_fields") else type(state)(parts)
     if index is None or state is None or isinstance(state, str | int | float):
         return state
@@ -231,10 +231,10 @@ class SeriesTrace(Trace):
         if self.origin is None:
             return self._result
         whole, index = self.origin
-        return taken(whole.state, index, whole.particles)
+        return indexed(whole.state, index, whole.particles)
 
     def _keep_run(self, ran: Run) -> None:
-        taken(ran.result, None, self.particles)
+        indexed(ran.result, None, self.particles)
         super()._keep_run(ran)
 
     def log_prob(self, *addresses: str | tuple[str, int]) -> Tensor:
@@ -303,12 +303,12 @@ class SeriesTrace(Trace):
         return node, index
 
     def since(self, previous: Trace) -> list[str]:
-        """The addresses that `extend` added to `previous`: all of the newest step's, if it is another."""
+        """The addresses that `previous` does not visit: all of the newest step's, if it is another."""
         same = isinstance(previous, SeriesTrace) and previous.steps == self.steps
         return [] if same else self.addresses
 
     def ancestors(self, number: int) -> Tensor:
-        """Which particle (N,) int64 of those that a step gave, before any were chosen, each descends from."""
+        """The particle (N,) int64 after a step, before any were chosen, from which each descends."""
         then, index = self._after(number)
         return torch.arange(then.particles) if index is None else index
 
@@ -336,7 +336,7 @@ class SeriesTrace(Trace):
         )
 
     def settled(self) -> SeriesTrace:
-        """The same trace, nothing of it left to be gathered."""
+        """The same trace with all of its values gathered."""
         if self.origin is None:
             return self
         whole, index = self.origin
@@ -347,7 +347,7 @@ class SeriesTrace(Trace):
         """This trace where `mask` (N,) is true, the other (of the same step and past) elsewhere.
 
         Raises:
-            InputError: the two do not go on from the same step of one population.
+            InputError: the two do not begin from the same step of one population.
         """
         assert isinstance(other, SeriesTrace)
         first, second = self.settled(), other.settled()
@@ -365,7 +365,7 @@ class SeriesTrace(Trace):
             whole, index = Forgotten(Stage(series, self.steps), (), self.particles, {}, {}), None
             whole.__dict__["_result"] = self.state
         else:
-            # The state is all that the next step needs: the distributions of a past step are let go.
+            # The state is all that the next step needs: the distributions of a past step are released.
             whole.__dict__["_result"] = whole._result
             whole.__dict__.pop("_run", None)
         return Stage(series, self.steps + 1, whole, () if index is None else (index,))

@@ -1,4 +1,4 @@
-"""The same densities and draws as Pyro's, for less work, where there are many particles."""
+"""The densities and draws of Pyro at less cost, for many particles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-# Below this many entries it is not worth the while.
+# Below this many entries nothing is gained.
 MANY = 1000
 
 

@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.support import log_prob_inside, masks, support_of
-from bcppl.errors import InputError, NotANumberError
+from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.dependence import Comparison, equal
+from bcppl.traces.explained import not_a_number
 from bcppl.traces.hiding import Hiding, refused
-from bcppl.traces.indexing import Index, particles_at
+from bcppl.traces.indexing import Index, beside, particles_at
 from bcppl.traces.run import Program, Run, inward, refuse_other_than_tensors, run
 from bcppl.traces.shortcuts import narrowed
 from bcppl.traces.shown import shapes
@@ -114,7 +115,7 @@ class Trace:
     def log_prob(self, *addresses: str) -> Tensor:
         """Log-probability (N,) of the sites at `addresses`, summed; of all sites where none is named.
 
-        The entries of a site's plates are summed too. The trace may keep the answer: do not write into it.
+        The entries of a site's plates are summed too. The trace may keep the result: do not write into it.
 
         Raises:
             InputError: no site has that address.
@@ -153,25 +154,7 @@ class Trace:
             value = value.sum(tuple(range(len(batch) - 1)))
         # The maximum is NaN where any is.
         if not bool(value.max() < torch.inf):
-            which = (torch.isnan(value) | (value == torch.inf)).nonzero().flatten().tolist()
-            if address in self.observations and bool(torch.isnan(self.observations[address]).any()):
-                seen = torch.isnan(self.observations[address])
-                raise NotANumberError(
-                    f"the observation at site {address!r} is NaN in {int(seen.sum())} of {seen.numel()} "
-                    "entries; leave out what was not measured, or mask it in the site's distribution."
-                )
-            dense = address in self.choices and float(value[which[0]]) == torch.inf
-            raise NotANumberError(
-                f"site {address!r} has a log-probability of {float(value[which[0]])} for "
-                f"{len(which)} of {self.particles} particles (first: {', '.join(map(str, which[:5]))}); "
-                + (
-                    f"rounding to {self.choices[address].dtype} put values on the edge of the support, "
-                    "where the density is infinite; give the prior parameters in double precision, or less "
-                    "extreme ones."
-                    if dense
-                    else "a value or a parameter of its distribution is out of range there."
-                )
-            )
+            raise not_a_number(address, value, self.choices.get(address), self.observations.get(address))
         return value
 
     def __getitem__(self, key: str | Index) -> Any:
@@ -189,7 +172,7 @@ class Trace:
     def chosen(self, index: Tensor) -> Any:
         """The trace of the particles at an index (K,) int64 that is known to be in range.
 
-        For what has made the index itself, such as resampling; `trace[index]` looks at it first.
+        For callers that made the index, such as resampling; `trace[index]` checks it first.
         """
         return replace(
             self,
@@ -200,11 +183,11 @@ class Trace:
         )
 
     def impossible(self) -> list[str]:
-        """The addresses, of those that are not latent, that every particle is known to say cannot be."""
+        """The addresses, not latent, whose log-probability is known to be -inf for every particle."""
         return [a for a, v in self.known.items() if a not in self.choices and bool((v == -torch.inf).all())]
 
     def since(self, previous: Trace) -> list[str]:
-        """The addresses that `extend` added to `previous` to make this trace (or one moved since)."""
+        """The addresses of this trace that `previous`, which was extended to it, does not visit."""
         return [a for a in self.addresses if a not in previous._run.distributions]
 
     def __contains__(self, address: object) -> bool:
@@ -224,10 +207,7 @@ class Trace:
         shared = set(self.known) & set(other.known)
         return replace(
             self,
-            choices={
-                a: torch.where(mask.reshape(-1, *[1] * (v.ndim - 1)), v, other.choices[a])
-                for a, v in self.choices.items()
-            },
+            choices={a: torch.where(beside(mask, v), v, other.choices[a]) for a, v in self.choices.items()},
             carried={
                 a: merged
                 for a, e in self.carried.items()
@@ -238,10 +218,10 @@ class Trace:
         )
 
     def hiding(self, addresses: Iterable[str]) -> Trace:
-        """The same trace for a proposal to read, in which some sites may not be asked what they say.
+        """The same trace for a proposal to read, with some sites hidden.
 
-        Asking it for the distribution or the log-probability of a hidden site, also after indexing or new
-        values, raises an error that names the address. Values stay readable: they are the trace's own.
+        Asking for the distribution or the log-probability of a hidden site, also after indexing or new
+        values, raises an error that names the address. Values stay readable.
 
         Raises:
             InputError: the program visits no such address.

@@ -142,6 +142,14 @@ def extend(
     return updated.trace, updated.log_ratio
 
 
+def undrawn(trace: Trace, args: tuple[Any, ...]) -> Trace:
+    """The trace with the sites that new arguments add, lazy ones NaN: only their distributions are wanted.
+
+    Several of them can then be sampled in one batch. Other new sites are sampled from the program.
+    """
+    return trace.revised({}, args=args, draws_lazy=False)
+
+
 @dataclass(frozen=True, eq=False)
 class Regenerated:
     """What `regenerate` returns; its log weight is evaluated when it is asked for.

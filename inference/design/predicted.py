@@ -13,7 +13,7 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 from bcppl.inference.design.observations import Arguments, observed_addresses, seeded
 from bcppl.traces import Trace
-from bcppl.traces.undrawn import undrawn
+from bcppl.traces.update import undrawn
 
 # The information (S, 6, 6) that a candidate adds about the pose at particles of a trace; None to take it from
 # the quadratic approximations of the candidate's sites.

@@ -1,12 +1,12 @@
-"""SMCP3: particles moved by a pair of programs, weighed by whatever they chose on the way.
+"""SMCP3: particles moved by a pair of probabilistic programs and weighted for whatever these chose.
 
 Lew, Matheos, Zhi-Xuan, Ghavamizadeh, Gothoskar, Russell and Mansinghka, SMCP3: Sequential Monte Carlo with
-probabilistic program proposals, AISTATS 2023. The forward program chooses at random what to do with a
-particle, the backward program what was done; each says what the other has to choose to undo it. The weight of
-a move is p(new) L(backward choices | new) |det J| / (p(old) K(forward choices | old)), J that of the map from
-(old values, forward choices) to (new values, backward choices) (theorem 2 of the paper), taken in the
+probabilistic program proposals, AISTATS 2023. The forward program chooses at random how to move a particle,
+the backward program how it was moved; each returns the choices of the other that undo it. The weight of a
+move is p(new) L(backward choices | new) |det J| / (p(old) K(forward choices | old)), with J the Jacobian of
+the map from (old values, forward choices) to (new values, backward choices) (theorem 2 of the paper), in the
 coordinates of the densities' base measures (`bcppl.inference.kernels.jacobian`). With fixed programs the
-estimate of the evidence stays unbiased.
+estimate of the evidence is unbiased.
 
     def forward(trace):
         shift = pyro.sample("shift", dist.Normal(0.5 * trace["y_3"], 0.2))
@@ -22,7 +22,7 @@ estimate of the evidence stays unbiased.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -37,7 +37,7 @@ from bcppl.inference.kernels.jacobian import (
     refuse_apart,
     refuse_leaving,
 )
-from bcppl.inference.kernels.kernel import put
+from bcppl.inference.kernels.kernel import scattered, weighted
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Fitted, Program, Proposal, program_of
 from bcppl.inference.resampling import Resample, adaptive, check_resample
@@ -59,19 +59,20 @@ class Pair:
     The forward program returns (new values of latent addresses, choices of the backward program); the
     backward program (old values, choices of the forward program), so that one undoes the other. Latent
     addresses that are left out keep their values. What is returned is differentiated, so it is computed in
-    torch; what is handed on as it is costs nothing.
+    torch; a tensor that is returned as it is costs nothing.
 
     A program that returns no such pair is read as one for `metropolis_hastings`: its choices at latent
     addresses are new values, in whose place the other program chooses the old ones, and its other choices
     are the other program's too. So `Pair(drift("x"), drift("x"))` is a pair.
 
     Attributes:
-        forward: reads the old trace, and in it all observations, those of the new measurement too. It may
-            choose values of the latent addresses that come with the measurement; the others are drawn from
-            the model. The earlier steps of a `Series` stay as they are: all that it chooses is new.
+        forward: reads the old trace, together with the new measurement if there is one
+            (`bcppl.traces.anticipated.Anticipated`). It may choose values of the latent addresses that come
+            with the measurement; the others are sampled from the model. The earlier steps of a `Series` stay
+            as they are: all that it chooses is new.
         backward: reads the new trace.
-        check: check, at every move, that the backward program leads back to where the forward one came from,
-            and that particles are not mixed.
+        check: check, at every move, that the backward program undoes the forward one, and that particles are
+            not mixed.
     """
 
     forward: Proposal
@@ -87,13 +88,13 @@ def _refuse_no_pair(pair: object) -> None:
 
 
 def moved(population: Population, pair: Pair) -> Population:
-    """Every particle moved by a pair and weighed for it; the target stays.
+    """The population moved by a pair and weighted for it; the target stays.
 
-    Where a program learns, each half of the population learns from the other.
+    A program that learns is fitted to the other half of the population.
 
     Raises:
         InputError: no `Pair` is given, a program gives an address that the other has not, more coordinates
-            than it takes, or (checked) no way back.
+            than it takes, or (checked) the programs do not undo each other.
         InferenceError: no particle has any weight left.
     """
     _refuse_no_pair(pair)
@@ -101,7 +102,7 @@ def moved(population: Population, pair: Pair) -> Population:
 
 
 def smcp3(pair: Pair, *, resample: Resample | None = None) -> StepFunction:
-    """A step that takes a measurement in by a pair of programs: move, extend, weigh, resample when needed.
+    """A step that assimilates a measurement by a pair of programs: move, weight, resample when needed.
 
     Args:
         pair: proposes new values for old latent addresses and for those that come with the measurement.
@@ -119,11 +120,11 @@ def smcp3(pair: Pair, *, resample: Resample | None = None) -> StepFunction:
     check_resample("smcp3", resample)
 
     def step(population: Population, observed: Observed) -> Stepped:
-        weighed = _by_halves(population, pair, observed)
-        resampled, ancestors = resample(weighed)
+        moved = _by_halves(population, pair, observed)
+        resampled, ancestors = resample(moved)
         info = StepInfo(
             resampled=int(ancestors is not None),
-            effective_sample_size_before=weighed.effective_sample_size,
+            effective_sample_size_before=moved.effective_sample_size,
             effective_sample_size=resampled.effective_sample_size,
             log_evidence=resampled.log_evidence - population.log_evidence,
             ancestors=ancestors,
@@ -134,42 +135,41 @@ def smcp3(pair: Pair, *, resample: Resample | None = None) -> StepFunction:
 
 
 def _by_halves(population: Population, pair: Pair, observed: Observed | None) -> Population:
-    """Both halves learn from the other as it was before the move."""
+    """The population moved by a pair that is fitted, for each half, to the other before the move."""
     count = len(population)
     if not isinstance(pair.forward, Fitted) and not isinstance(pair.backward, Fitted):
         parts = [torch.arange(count)]
     else:
         parts = [half for half in torch.randperm(count).tensor_split(2) if len(half)]
-    factor = torch.zeros(count, dtype=torch.float64)
+    log_factor = torch.zeros(count, dtype=torch.float64)
     whole: Trace | None = None
     for k, mine in enumerate(parts):
         forward, backward = _fitted(pair, population[parts[1 - k]] if len(parts) > 1 else population)
         trace, gained = moved_trace(forward, backward, population.trace[mine], observed, pair.check)
-        factor[mine] = gained
+        log_factor[mine] = gained
         if whole is None:
             index = torch.zeros(count, dtype=torch.int64)
             index[mine] = torch.arange(len(mine))
             whole = trace if len(parts) == 1 else trace[index]
         else:
-            whole = put(whole, mine, trace)
+            whole = scattered(whole, mine, trace)
     assert whole is not None
-    # A particle without weight stays without: it is not brought back by moving where it could be.
-    factor = torch.where(population.log_weights == -torch.inf, 0.0, factor)
-    return population.with_trace(whole).reweighed(factor)
+    # A particle without weight stays without, wherever it is moved.
+    log_factor = torch.where(population.log_weights == -torch.inf, 0.0, log_factor)
+    return population.with_trace(whole).reweighed(log_factor)
 
 
 def _fitted(pair: Pair, others: Population) -> tuple[Program, Program]:
-    if not bool((others.log_weights > -torch.inf).any()):
-        others = replace(others, log_weights=torch.zeros_like(others.log_weights))
+    others = weighted(others)
     forward = program_of(pair.forward, (), others)
-    # What is learned at random must be the same both ways.
+    # What is learned at random must be the same in both.
     return forward, forward if pair.backward is pair.forward else program_of(pair.backward, (), others)
 
 
 def moved_trace(
     forward: Program, backward: Program, old: Trace, observed: Observed | None = None, check: bool = False
 ) -> tuple[Trace, Tensor]:
-    """Particles moved by two programs, and extended by a measurement if there is one; with log factors (N,).
+    """Particles moved by two programs, with a measurement if there is one, and their log factors (N,).
 
     Raises:
         InputError: see `moved`.
@@ -178,44 +178,60 @@ def moved_trace(
     shown = old if observed is None else Anticipated(old, *observed)
     # The next step of a series begins from the values of the last, which stay.
     latent: Values = {} if observed is not None and isinstance(old, SeriesTrace) else old.choices
-    there = simulate(forward, (shown,), count)
-    _refuse_observed("forward", there.choices, shown)
-    new, back = _read(there.result, there.choices, latent, lambda: _brought(shown))
-    reached, log_factor = _reached(old, new, observed)
-    fresh = [a for a in new if a not in latent]
-    way_back = assessed(backward, (reached,), back, count)
-    _refuse_observed("backward", way_back.choices, reached)
+    chosen = simulate(forward, (shown,), count)
+    _refuse_observed("forward", chosen.choices, shown)
+    values, back = _read(chosen.result, chosen.choices, latent, lambda: _brought(shown))
+    new, log_ratio = _updated(old, values, observed)
+    fresh = [a for a in values if a not in latent]
+    reverse = assessed(backward, (new,), back, count)
+    _refuse_observed("backward", reverse.choices, new)
     inputs = charted(OLD, latent, old.distributions)
-    for address, value in new.items():
+    for address, value in values.items():
         if address in latent:
             refuse_leaving(address, inputs[OLD, address].chart, latent[address], value)
-    inputs |= charted(FORWARD, there.choices, there.distributions)
-    outputs = charted(NEW, {a: reached[a] for a in (*latent, *fresh)}, reached.distributions)
-    outputs |= charted(BACKWARD, back, way_back.distributions)
+    inputs |= charted(FORWARD, chosen.choices, chosen.distributions)
+    outputs = charted(NEW, {a: new[a] for a in (*latent, *fresh)}, new.distributions)
+    outputs |= charted(BACKWARD, back, reverse.distributions)
 
-    def again(values: dict[Key, Tensor]) -> dict[Key, Tensor]:
-        before = {a: values[OLD, a] for a in latent}
-        chosen = {a: values[FORWARD, a] for a in there.choices}
+    def again(point: dict[Key, Tensor]) -> dict[Key, Tensor]:
+        before = {a: point[OLD, a] for a in latent}
+        choices = {a: point[FORWARD, a] for a in chosen.choices}
         attached = with_gradients(old, before)
-        looked_at = attached if observed is None else Anticipated(attached, *observed)
-        result = result_with_grad(forward, (looked_at,), chosen, count)
-        after, returned = _read(result, chosen, before, lambda: fresh)
+        read = attached if observed is None else Anticipated(attached, *observed)
+        result = result_with_grad(forward, (read,), choices, count)
+        after, returned = _read(result, choices, before, lambda: fresh)
         return {(NEW, a): v for a, v in {**before, **after}.items()} | {
             (BACKWARD, a): v for a, v in returned.items()
         }
 
-    log_stretch = log_abs_det_jacobian(again, inputs, outputs, check=check)
+    log_jacobian = log_abs_det_jacobian(again, inputs, outputs, check=check)
     if check:
-        values, choices = _read(way_back.result, way_back.choices, {a: reached[a] for a in latent}, list)
-        if not isinstance(way_back.result, tuple):
-            choices = {**choices, **{a: reached[a] for a in fresh}}
-        _refuse_other_choices(there.choices, choices)
-        found = {(OLD, a): values.get(a, reached[a]) for a in latent}
-        refuse_apart("the backward program", inputs, found | {(FORWARD, a): v for a, v in choices.items()})
-    chosen = there.log_prob()
-    log_factor = log_factor + way_back.log_prob() - chosen + log_stretch
-    # What ran out of the numbers of its type (see `metropolis_hastings`) came where nothing leads.
-    return reached, torch.where(chosen == -torch.inf, -torch.inf, log_factor)
+        before, choices = _read(reverse.result, reverse.choices, {a: new[a] for a in latent}, list)
+        if not isinstance(reverse.result, tuple):
+            choices = {**choices, **{a: new[a] for a in fresh}}
+        _refuse_other_choices(chosen.choices, choices)
+        undone = {(OLD, a): before.get(a, new[a]) for a in latent}
+        refuse_apart("the backward program", inputs, undone | {(FORWARD, a): v for a, v in choices.items()})
+    log_chosen = chosen.log_prob()
+    log_factor = log_ratio + reverse.log_prob() - log_chosen + log_jacobian
+    # A choice without density has left the range of its type (see `metropolis_hastings`).
+    return new, torch.where(log_chosen == -torch.inf, -torch.inf, log_factor)
+
+
+def _updated(old: Trace, values: Values, observed: Observed | None) -> tuple[Trace, Tensor]:
+    """The trace at new values, with a measurement if there is one, and its log ratio (N,)."""
+    if observed is None:
+        updated = update(old, values)
+    elif isinstance(old, SeriesTrace):
+        return extend(old, observed.args, observed.observations, values)
+    else:
+        updated = update(old, values, args=observed.args, observations=observed.observations)
+    return updated.trace, updated.log_ratio
+
+
+def _brought(shown: Trace | Anticipated) -> list[str]:
+    """The latent addresses that come with the measurement."""
+    return shown.brought if isinstance(shown, Anticipated) else []
 
 
 def _refuse_observed(which: str, choices: Values, seen: Trace | Anticipated) -> None:
@@ -225,20 +241,6 @@ def _refuse_observed(which: str, choices: Values, seen: Trace | Anticipated) -> 
                 f"the {which} program of a pair samples {address!r}, which is observed; sample at latent "
                 "addresses, and give other choices names of their own."
             )
-
-
-def _reached(old: Trace, new: Values, observed: Observed | None) -> tuple[Trace, Tensor]:
-    """The particles at new values and with a measurement, if there is one; with the log ratio (N,)."""
-    if observed is not None and isinstance(old, SeriesTrace):
-        return extend(old, observed.args, observed.observations, new)
-    args, observations = (None, None) if observed is None else observed
-    updated = update(old, new, args=args, observations=observations)
-    return updated.trace, updated.log_ratio
-
-
-def _brought(shown: Trace | Anticipated) -> list[str]:
-    """The latent addresses that come with a measurement."""
-    return shown.brought if isinstance(shown, Anticipated) else []
 
 
 def _read(
@@ -252,10 +254,10 @@ def _read(
             f"a program of a pair returns a {type(result).__name__} that is no pair of mappings; "
             "return (values by latent address, choices of the other program), or nothing."
         )
-    come = set(fresh()) if any(a not in latent for a in choices) else set()
-    new = {a: v for a, v in choices.items() if a in latent or a in come}
-    # What comes with a measurement goes with it: the other program need not choose it.
-    return new, {a: latent.get(a, v) for a, v in choices.items() if a not in come}
+    brought = set(fresh()) if any(a not in latent for a in choices) else set()
+    new = {a: v for a, v in choices.items() if a in latent or a in brought}
+    # A value that comes with a measurement vanishes with it: the other program need not choose it.
+    return new, {a: latent.get(a, v) for a, v in choices.items() if a not in brought}
 
 
 def _refuse_other_choices(forward: Values, returned: Values) -> None:

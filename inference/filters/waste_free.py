@@ -12,7 +12,7 @@ import torch
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.filters.tempering import Rejuvenated, Rejuvenation
-from bcppl.inference.kernels import Kernel, fitted, put, refuse_other
+from bcppl.inference.kernels import Kernel, fitted, refuse_other, scattered
 from bcppl.inference.population import Population, log_pair
 from bcppl.inference.schemes import Scheme, systematic
 from bcppl.inference.targets import Target
@@ -60,9 +60,9 @@ def waste_free_moves(
         for state in range(1, count // chains):
             for mine, move in zip(halves, moves, strict=True):
                 moved, accepted = move(current[mine], target)
-                current = put(current, mine, moved)
+                current = scattered(current, mine, moved)
                 acceptances.append(accepted.to(torch.float64))
-            whole = put(whole, torch.arange(chains) + state * chains, current)
+            whole = scattered(whole, torch.arange(chains) + state * chains, current)
         kept = replace(
             population,
             trace=whole,

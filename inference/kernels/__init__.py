@@ -1,10 +1,10 @@
-"""Kernels: moves that leave a target invariant, and how they are put together."""
+"""Kernels: moves that leave a target invariant, and their combinations."""
 
 from bcppl.inference.kernels.combinators import cycle, mixture, repeat, sequence
 from bcppl.inference.kernels.hamiltonian import hmc
 from bcppl.inference.kernels.hastings import metropolis_hastings
 from bcppl.inference.kernels.involutions import involutive
-from bcppl.inference.kernels.kernel import Kernel, Move, fitted, put, refuse_other, replaced, takes
+from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_other, scattered, takes
 from bcppl.inference.kernels.rejuvenation import Moved, Until, displacement, distinct, rejuvenate, until
 from bcppl.inference.kernels.staged import Screened, Staged, Surrogate, delayed_acceptance, student_t
 
@@ -25,11 +25,10 @@ __all__ = [
     "involutive",
     "metropolis_hastings",
     "mixture",
-    "put",
     "refuse_other",
     "rejuvenate",
     "repeat",
-    "replaced",
+    "scattered",
     "sequence",
     "student_t",
     "takes",

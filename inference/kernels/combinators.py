@@ -1,7 +1,8 @@
-"""Kernels put together: each of these leaves invariant what its parts leave invariant.
+"""Combinations of kernels: each leaves invariant the target that its parts leave invariant.
 
-Tierney, Markov chains for exploring posterior distributions, Annals of Statistics 22, 1994, section 2.4. No
-choice of what comes next hangs on where the particles are. The acceptance is the mean over what was tried.
+Tierney, Markov chains for exploring posterior distributions, Annals of Statistics 22, 1994, section 2.4. The
+choice of the next kernel does not depend on where the particles are. The acceptance is the mean over the
+proposals.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, Move, fitted, put, refuse_other
+from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_other, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.targets import Target
 from bcppl.traces import Trace
@@ -55,9 +56,9 @@ def sequence(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
 
 
 def cycle(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
-    """Each kernel once, in an order that is drawn anew for each move: Tierney's random permutation scan.
+    """Each kernel once, in an order that is drawn for each move: Tierney's random permutation scan.
 
-    Of reversible kernels a fixed order is not reversible; a random one is.
+    A fixed order of reversible kernels is not reversible; a random one is.
 
     Raises:
         InputError: no kernel is given, or something else, such as a proposal.
@@ -77,15 +78,15 @@ def cycle(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
 
 
 def mixture(kernels: Sequence[Kernel] | Kernel, *more: Any, weights: Sequence[float] | None = None) -> Kernel:
-    """One of several kernels, drawn anew for each particle and each move.
+    """One of several kernels, drawn for each particle and each move.
 
-    Drawn for each particle, so that particles stay independent of one another and a small population sees
-    every kernel; each kernel then moves only the particles that drew it.
+    Particles stay independent of one another, and a small population sees every kernel; each kernel moves
+    only the particles that drew it.
 
     Args:
-        kernels: what is drawn from, as a list, or the first of them.
+        kernels: a list of them, or the first.
         more: the others; after a list, the weights.
-        weights: their chances, not negative, up to a factor; equal by default.
+        weights: their probabilities, up to a factor; equal by default.
 
     Raises:
         InputError: no kernel is given, or something else, such as a proposal; or the weights are not one for
@@ -116,7 +117,7 @@ def mixture(kernels: Sequence[Kernel] | Kernel, *more: Any, weights: Sequence[fl
                 if len(index) == 0:
                     continue
                 moved, share = each(trace[index], target)
-                trace = put(trace, index, moved)
+                trace = scattered(trace, index, moved)
                 accepted[index] = share.to(torch.float64)
             return trace, accepted
 
@@ -128,8 +129,8 @@ def mixture(kernels: Sequence[Kernel] | Kernel, *more: Any, weights: Sequence[fl
 def repeat(kernel: Kernel, times: int) -> Kernel:
     """The same fitted move several times.
 
-    A number that hangs on how far the particles came is not for a kernel to decide, but for the sweeps of a
-    whole population: `bcppl.inference.kernels.until`.
+    A number that depends on how far the particles came is a matter of the sweeps of a whole population:
+    `bcppl.inference.kernels.until`.
 
     Raises:
         InputError: what is given is no kernel, or the times are no whole number, 1 or more.

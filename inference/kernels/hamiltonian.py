@@ -14,14 +14,15 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import normalised
 from bcppl.distributions.support import freedom_of, support_of
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, Move, put, spread
+from bcppl.inference.kernels.kernel import Kernel, Move, decided
 from bcppl.inference.population import Population
-from bcppl.inference.targets import Target, accept
+from bcppl.inference.targets import Target
 from bcppl.traces import Trace, update
 from bcppl.traces.gradient import log_prob_with_grad
+from bcppl.traces.indexing import beside
 from bcppl.traces.run import inward
 
-# A spread below this is rounding, not belief (in the unconstrained coordinates).
+# A standard deviation below this is rounding (in the unconstrained coordinates).
 FLOOR = 1e-6
 
 
@@ -39,8 +40,8 @@ def hmc(
         addresses: latent addresses, one by one or as a list, moved together; the other latent values stay.
         step_size: of the leapfrog, in standard deviations.
         steps: leapfrog steps of a trajectory, each one gradient for all particles.
-        jitter: each trajectory's step size is uniform within this share of `step_size`, so that none runs in
-            circles.
+        jitter: each trajectory's step size is uniform within this share of `step_size`, so that none is
+            periodic.
 
     Raises:
         InputError: no address is named, the step size is not positive, the steps are no whole number, or the
@@ -48,8 +49,8 @@ def hmc(
 
     Returns:
         A kernel. Fitting it raises InputError where an address is no latent one, a pose, discrete, or has a
-        support without unconstrained coordinates; moving raises it where a site that hangs on the addresses
-        runs a simulator or passes no gradient on. A trajectory that diverges is rejected.
+        support without unconstrained coordinates; moving raises it where a site that depends on the
+        addresses runs a simulator or passes no gradient on. A trajectory that diverges is rejected.
     """
     named = tuple(a for each in addresses for a in ([each] if isinstance(each, str) else each))
     if not named:
@@ -67,28 +68,25 @@ def hmc(
             start = space.read(trace)
             scale = 1.0 + jitter * (2.0 * torch.rand(len(trace), 1, dtype=torch.float64) - 1.0)
             momentum = torch.randn_like(start)
-            position, turned = leapfrog(
-                lambda z: space.slope(trace, z, exponents) @ factor,
+            position, last = leapfrog(
+                lambda z: space.gradient(trace, z, exponents) @ factor,
                 start,
                 momentum,
                 step_size * scale.to(start.device),
                 steps,
                 factor,
             )
-            sound = (torch.isfinite(position) & torch.isfinite(turned)).all(dim=1)
+            sound = (torch.isfinite(position) & torch.isfinite(last)).all(dim=1)
             position = torch.where(sound[:, None], position, start)
-            values, log_stretch = space.values(position)
-            # Where an exponential has run over or under, the particle has left the support.
-            sound &= torch.isfinite(log_stretch) & space.inside(values)
-            values = {a: torch.where(spread(sound, v), v, trace[a]) for a, v in values.items()}
-            log_ratio = 0.5 * (momentum**2 - turned**2).sum(dim=1) + log_stretch - space.values(start)[1]
+            values, log_jacobian = space.values(position)
+            # Where an exponential has overflowed or underflowed, the particle has left the support.
+            sound &= torch.isfinite(log_jacobian) & space.inside(values)
+            values = {a: torch.where(beside(sound, v), v, trace[a]) for a, v in values.items()}
+            log_ratio = 0.5 * (momentum**2 - last**2).sum(dim=1) + log_jacobian - space.values(start)[1]
             log_ratio = torch.where(sound, log_ratio, -torch.inf)
             new = update(trace, values).trace
             space.refuse_moved_bounds(new)
-            passed, survivors = accept(target, trace, new, log_ratio)
-            accepted = torch.zeros(len(trace), dtype=torch.float64)
-            accepted[passed] = 1.0
-            return put(trace, passed, survivors), accepted
+            return decided(target, trace, new, log_ratio)
 
         return move
 
@@ -96,28 +94,28 @@ def hmc(
 
 
 def leapfrog(
-    slope: Callable[[Tensor], Tensor],
+    gradient: Callable[[Tensor], Tensor],
     position: Tensor,
     momentum: Tensor,
     size: Tensor,
     steps: int,
     factor: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Positions and momenta (N, D) after some leapfrog steps; volumes stay, turned about it goes back.
+    """Positions and momenta (N, D) after some leapfrog steps: volume preserving, reversed by flipped momenta.
 
     Args:
-        slope: of the log-density, in the coordinates of the momentum: gradient @ factor, (N, D).
+        gradient: of the log-density, (N, D), in the coordinates of the momentum: times `factor`.
         position: (N, D).
         momentum: (N, D), of mass 1.
         size: (N, 1) step sizes.
         steps: how many.
         factor: (D, D) Cholesky factor of the inverse mass matrix of the position.
     """
-    momentum = momentum + 0.5 * size * slope(position)
+    momentum = momentum + 0.5 * size * gradient(position)
     for k in range(steps):
         position = position + size * momentum @ factor.T
         share = 1.0 if k + 1 < steps else 0.5
-        momentum = momentum + share * size * slope(position)
+        momentum = momentum + share * size * gradient(position)
     return position, momentum
 
 
@@ -164,8 +162,8 @@ class _Unconstrained:
             free = free.reshape(len(free), *shape[:plates], *shape[plates + 1 :]).movedim(0, plates)
             start += width
             value = transform(free)
-            stretch = self._outward(address, transform.log_abs_det_jacobian(free, value))
-            total = total + stretch.reshape(len(position), -1).sum(dim=1)
+            log_jacobian = self._outward(address, transform.log_abs_det_jacobian(free, value))
+            total = total + log_jacobian.reshape(len(position), -1).sum(dim=1)
             values[address] = self._outward(address, value).to(self.dtypes[address])
         return values, total
 
@@ -178,27 +176,27 @@ class _Unconstrained:
         return torch.stack(checks).all(dim=0)
 
     def refuse_moved_bounds(self, new: Trace) -> None:
-        """Refuse supports that hang on what is moved: the way back would go through other coordinates."""
+        """Refuse supports that depend on what is moved: the reverse move would be in other coordinates."""
         for address, support in self.supports.items():
             now = new.distributions[address].support
             if any(not torch.equal(a, b) for a, b in zip(_bounds(support), _bounds(now), strict=True)):
                 others = " or ".join(repr(a) for a in self.shapes if a != address)
                 raise InputError(
-                    f"hmc cannot move {address!r} together with {others}, on which its support hangs; "
+                    f"hmc cannot move {address!r} together with {others}, on which its support depends; "
                     "give each a kernel of its own."
                 )
 
-    def slope(self, trace: Trace, position: Tensor, exponents: Mapping[str, float]) -> Tensor:
+    def gradient(self, trace: Trace, position: Tensor, exponents: Mapping[str, float]) -> Tensor:
         """Gradient (N, D) of the log-density of the position."""
         leaf = position.detach().requires_grad_()
         with torch.enable_grad():
-            values, log_stretch = self.values(leaf)
-            density = log_prob_with_grad(trace, values, exponents) + log_stretch
+            values, log_jacobian = self.values(leaf)
+            density = log_prob_with_grad(trace, values, exponents) + log_jacobian
         if not density.requires_grad:
             return torch.zeros_like(position)
-        (slope,) = torch.autograd.grad(density.sum(), leaf)
-        # Where it is no number, the momentum becomes none, and the trajectory counts as one that diverges.
-        return slope
+        # Where it is NaN, so is the momentum, and the trajectory counts as one that diverges.
+        (gradient,) = torch.autograd.grad(density.sum(), leaf)
+        return gradient
 
 
 def _bounds(support: Any) -> list[Tensor]:

@@ -1,4 +1,4 @@
-"""Metropolis-Hastings with a proposal program: run forward by `propose`, back by `assess`."""
+"""Metropolis-Hastings with a proposal program: run by `propose`, its reverse move by `assess`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, Move, put, refuse_observed, spread
+from bcppl.inference.kernels.kernel import Kernel, Move, decided, refuse_observed
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.proposal import Fitted, Proposal, program_of
-from bcppl.inference.targets import Target, accept, visible
+from bcppl.inference.targets import Target, visible
 from bcppl.traces import Trace, assess, propose, update
+from bcppl.traces.indexing import beside
 
 
 def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any]) -> Kernel:
@@ -22,11 +23,11 @@ def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any
     Args:
         proposal: a Pyro program `proposal(trace, *values)`, or a shipped one such as `drift("hole")`. Its
             choices at latent addresses of the trace are new values, each particle's from its own old values
-            only; its other choices are auxiliary and keep their values on the way back (so their distribution
-            must not depend on what is moved in a way that forbids that).
-        learned: functions of a population, such as `spread_of("hole")`; what they give is handed to the
-            program as `values`. They see other particles than those that are moved: a program that itself
-            reads `trace["mu"].mean()` learns from the very particles that it moves, and is not right.
+            only; its other choices are auxiliary and keep their values in the reverse move (so their
+            distribution must not depend on what is moved in a way that forbids that).
+        learned: functions of a population, such as `spread_of("hole")`; the program is given their results as
+            `values`. They see other particles than those that are moved: a program that itself reads
+            `trace["mu"].mean()` learns from the very particles that it moves, and is not right.
 
     The acceptance ratio is that of Hastings, Biometrika 57, 1970, on the pair (trace, auxiliary choices).
 
@@ -57,19 +58,16 @@ def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any
                     f"a proposal has no choice at a latent address: it chooses {chosen}, "
                     f"latent are {', '.join(trace.choices) or 'none'}; sample at one of these."
                 )
-            # What a proposal says it cannot have drawn has run out of the numbers of its type: it stays.
+            # A value to which its own proposal gives no density has left the range of its type: it stays.
             lost = forward.log_prob == -torch.inf
             if bool(lost.any()):
-                new = {a: torch.where(spread(lost, v), trace[a], v) for a, v in new.items()}
+                new = {a: torch.where(beside(lost, v), trace[a], v) for a, v in new.items()}
             updated = update(trace, new)
             refuse_observed("a proposal", forward.choices, updated.trace)
-            back = {**forward.choices, **updated.discarded}
-            backward = assess(program, (visible(target, updated.trace),), back, trace.particles)
-            log_ratio = torch.where(lost, -torch.inf, backward - forward.log_prob)
-            passed, survivors = accept(target, trace, updated.trace, log_ratio)
-            accepted = torch.zeros(trace.particles, dtype=torch.float64)
-            accepted[passed] = 1.0
-            return put(trace, passed, survivors), accepted
+            reverse = {**forward.choices, **updated.discarded}
+            log_reverse = assess(program, (visible(target, updated.trace),), reverse, trace.particles)
+            log_ratio = torch.where(lost, -torch.inf, log_reverse - forward.log_prob)
+            return decided(target, trace, updated.trace, log_ratio)
 
         return move
 

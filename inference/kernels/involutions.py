@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
@@ -17,10 +16,10 @@ from bcppl.inference.kernels.jacobian import (
     refuse_apart,
     refuse_leaving,
 )
-from bcppl.inference.kernels.kernel import Kernel, Move, put, refuse_observed
+from bcppl.inference.kernels.kernel import Kernel, Move, decided, refuse_observed
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.proposal import Proposal, program_of
-from bcppl.inference.targets import Target, accept, visible
+from bcppl.inference.targets import Target, visible
 from bcppl.traces import Trace, assess, simulate, update
 
 Values = Mapping[str, Tensor]
@@ -33,7 +32,7 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
     Green's reversible jump (Biometrika 82, 1995) with everything but the map derived: Cusumano-Towner, Lew
     and Mansinghka, Automating involutive MCMC using probabilistic and differentiable programming, 2020.
     The log-ratio of acceptance is log p(new) q(new choices | new) - log p(old) q(choices | old)
-    + log|det J|; J is found by autograd in the coordinates of the densities' base measures
+    + log|det J|; J is computed by autograd in the coordinates of the densities' base measures
     (`bcppl.inference.kernels.jacobian`).
 
     Args:
@@ -49,7 +48,7 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
     Returns:
         A kernel. Its move raises InputError where the map gives an unknown address, the wrong shape, nothing
         new, a value that carries no gradient, more coordinates than it takes, a pose moved along a held axis,
-        or (checked) no way back.
+        or (checked) is not its own inverse.
     """
 
     def kernel(population: Population) -> Move:
@@ -67,7 +66,7 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
             def mapped(point: Mapping[Key, Tensor]) -> dict[Key, Tensor]:
                 return _mapped(involution, point)
 
-            def stretch(point: Mapping[Key, Tensor], to: Mapping[Key, Tensor]) -> Tensor:
+            def log_jacobian(point: Mapping[Key, Tensor], to: Mapping[Key, Tensor]) -> Tensor:
                 return log_abs_det_jacobian(
                     mapped, _charted(point, charts), _charted(to, charts), check=check
                 )
@@ -82,19 +81,16 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
                 )
             for address, value in new.items():
                 refuse_leaving(address, charts["latent", address], trace.choices[address], value)
-            log_stretch = stretch(start, after)
+            log_forward = log_jacobian(start, after)
             if check:
                 refuse_apart("the involution, applied twice,", before, mapped(after))
-                _refuse_unequal(log_stretch, stretch(after, mapped(after)))
+                _refuse_unequal(log_forward, log_jacobian(after, mapped(after)))
             updated = update(trace, new)
             refuse_observed("the program of an involution", forward.choices, updated.trace)
             choices = {a: v for (kind, a), v in after.items() if kind == "choice"}
-            backward = assess(choose, (visible(target, updated.trace),), choices, count)
-            log_ratio = backward - forward.log_prob() + log_stretch
-            passed, survivors = accept(target, trace, updated.trace, log_ratio)
-            accepted = torch.zeros(count, dtype=torch.float64)
-            accepted[passed] = 1.0
-            return put(trace, passed, survivors), accepted
+            reverse = assess(choose, (visible(target, updated.trace),), choices, count)
+            log_ratio = reverse - forward.log_prob() + log_forward
+            return decided(target, trace, updated.trace, log_ratio)
 
         return move
 
@@ -132,11 +128,11 @@ def _mapped(involution: Involution, point: Mapping[Key, Tensor]) -> dict[Key, Te
     return after
 
 
-def _refuse_unequal(there: Tensor, back: Tensor) -> None:
-    wrong = ~((there + back).abs() <= 1e-6)
+def _refuse_unequal(forward: Tensor, reverse: Tensor) -> None:
+    wrong = ~((forward + reverse).abs() <= 1e-6)
     if bool(wrong.any()):
         particle = int(wrong.nonzero()[0])
         raise InputError(
-            f"the involution stretches volumes by exp({float(there[particle]):.6g}) there and "
-            f"exp({float(back[particle]):.6g}) back for particle {particle}; the two have to cancel."
+            f"the Jacobian of the involution is exp({float(forward[particle]):.6g}) forward and "
+            f"exp({float(reverse[particle]):.6g}) in reverse for particle {particle}; they have to cancel."
         )

@@ -1,4 +1,4 @@
-"""How much a map between values of addresses stretches volumes: log|det J|, by autograd.
+"""The Jacobian of a map between values of addresses, log|det J|, by autograd.
 
 Every address has coordinates, those of the base measure of its density: a real value its entries, a point of
 a simplex all entries but the last, a pose its free axes in the tangent space (translation in the frame the
@@ -7,8 +7,8 @@ its density is with respect to Lebesgue x Haar (`bcppl.poses`), and Haar measure
 up to a constant, the same at every rotation.
 
 Cusumano-Towner, Lew and Mansinghka, Automating involutive MCMC using probabilistic and differentiable
-programming, 2020: an output that is an input is found first, which takes its row and its column
-out of the determinant; only the rest is differentiated.
+programming, 2020: an output that is an input takes its row and its column out of the determinant; only the
+rest is differentiated.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Tangent(Chart):
 
 @dataclass(frozen=True)
 class Uncharted(Chart):
-    """Values on a surface whose volume is not taken here: they may be handed on, and nothing else."""
+    """Values on a surface whose volume is not computed here: they may be handed on, and nothing else."""
 
     surface: str = ""
 
@@ -149,7 +149,7 @@ Point = Mapping[Key, Charted]
 
 
 def charted(kind: str, values: Mapping[str, Tensor], distributions: Mapping[str, Any]) -> dict[Key, Charted]:
-    """Values by address with their coordinates, which the distributions tell."""
+    """Values by address with the coordinates of their distributions."""
     return {(kind, a): Charted(v, chart_of(a, distributions[a], v)) for a, v in values.items()}
 
 
@@ -160,13 +160,13 @@ def log_abs_det_jacobian(
     *,
     check: bool = False,
 ) -> Tensor:
-    """Log of how much a map stretches volumes, for every particle.
+    """Log of the absolute Jacobian determinant of a map, for every particle.
 
     Args:
-        again: the map; called once more, with inputs that ask for gradients. What it gives for a particle
-            hangs on that particle alone.
-        inputs: where it is taken.
-        outputs: what it gave there. An output that is the very tensor of an input is not differentiated.
+        again: the map; called once more, with inputs that ask for gradients. Its outputs for a particle
+            depend on that particle alone.
+        inputs: where it is evaluated.
+        outputs: its outputs there. An output that is the very tensor of an input is not differentiated.
         check: also check that particles are not mixed.
 
     Returns:
@@ -174,7 +174,7 @@ def log_abs_det_jacobian(
 
     Raises:
         InputError: there are more coordinates among the outputs than among the inputs or fewer, an output
-            hangs on no input or (checked) on those of other particles, the map is nowhere one-to-one, or it
+            depends on no input or (checked) on those of other particles, the map is nowhere one-to-one, or it
             uses values on a surface (matrices of a kind, a sphere).
         InferenceError: the Jacobian is not finite.
     """
@@ -184,7 +184,7 @@ def log_abs_det_jacobian(
         if isinstance(chart, Uncharted):
             raise InputError(
                 f"a map uses {key[1]!r} ({key[0]}), whose values in {chart.surface} have a volume that is "
-                "not taken here; hand them on as they are, or sample and move unconstrained values."
+                "not computed here; hand them on as they are, or sample and move unconstrained values."
             )
     wide = sum(inputs[k].chart.dimension for k in columns)
     high = sum(outputs[k].chart.dimension for k in rows)
@@ -216,21 +216,21 @@ def log_abs_det_jacobian(
         read = torch.cat([outputs[k].chart.read(reached[k]) for k in rows], dim=1)
         if check:
             _refuse_mixing(read, leaves)
-        slopes = [_slope(read[:, k].sum(), leaves) for k in range(high)]
-    jacobian = torch.stack(slopes, dim=1)
+        rows_of_jacobian = [_gradient(read[:, k].sum(), leaves) for k in range(high)]
+    jacobian = torch.stack(rows_of_jacobian, dim=1)
     bad = (~torch.isfinite(jacobian)).flatten(1).any(dim=1).nonzero().flatten().tolist()
     if bad:
         raise InferenceError(
             f"the Jacobian from {_listed(inputs, columns)} to {_listed(outputs, rows)} is not finite for "
             f"{len(bad)} of {len(value)} particles (first: {', '.join(map(str, bad[:5]))})."
         )
-    stretch = torch.linalg.slogdet(jacobian).logabsdet
-    if bool((stretch == -torch.inf).all()):
+    log_determinant = torch.linalg.slogdet(jacobian).logabsdet
+    if bool((log_determinant == -torch.inf).all()):
         raise InputError(
             f"a map from {_listed(inputs, columns)} to {_listed(outputs, rows)} is not one-to-one for any "
-            "particle, so there is no way back."
+            "particle, so that it has no inverse."
         )
-    return stretch
+    return log_determinant
 
 
 def refuse_leaving(address: str, chart: Chart, old: Tensor, new: Tensor) -> None:
@@ -248,7 +248,7 @@ def refuse_leaving(address: str, chart: Chart, old: Tensor, new: Tensor) -> None
 
 
 def refuse_apart(what: str, first: Point, second: Mapping[Key, Tensor], tolerance: float = 1e-6) -> None:
-    """Refuse a way there and back that does not end where it began.
+    """Refuse a move and its reverse that do not end where they began.
 
     Raises:
         InputError: names the address and the particle.
@@ -279,18 +279,18 @@ def _remaining(inputs: Point, outputs: Point) -> tuple[list[Key], list[Key]]:
     return [k for k in columns if columns[k].chart.dimension], [k for k in rows if outputs[k].chart.dimension]
 
 
-def _slope(total: Tensor, leaves: list[Tensor]) -> Tensor:
-    """Derivatives (N, D) of a sum over particles whose terms hang on one particle each."""
-    slopes = torch.autograd.grad(total, leaves, retain_graph=True, allow_unused=True)
+def _gradient(total: Tensor, leaves: list[Tensor]) -> Tensor:
+    """Derivatives (N, D) of a sum over particles whose terms depend on one particle each."""
+    gradients = torch.autograd.grad(total, leaves, retain_graph=True, allow_unused=True)
     return torch.cat(
-        [torch.zeros_like(x) if s is None else s for s, x in zip(slopes, leaves, strict=True)], dim=1
+        [torch.zeros_like(x) if g is None else g for g, x in zip(gradients, leaves, strict=True)], dim=1
     )
 
 
 def _refuse_mixing(read: Tensor, leaves: list[Tensor]) -> None:
-    if len(read) > 1 and bool((_slope(read[0].sum(), leaves)[1:] != 0).any()):
+    if len(read) > 1 and bool((_gradient(read[0].sum(), leaves)[1:] != 0).any()):
         raise InputError(
-            "a map mixes particles: what it gives for one hangs on the values of another; "
+            "a map mixes particles: its output for one depends on the values of another; "
             "let it act on every particle alone."
         )
 

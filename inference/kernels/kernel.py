@@ -1,4 +1,4 @@
-"""What a kernel is, and how moved particles are put back.
+"""Kernels, and the moves that they make.
 
 A kernel is fitted to a weighted population, `kernel(population) -> move`, and a move is
 `(trace, target) -> (trace, accepted (N,))` that leaves the target invariant. What a move learns from the
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.targets import Target
+from bcppl.inference.targets import Target, accept
 from bcppl.traces import Trace
 
 Move = Callable[[Trace, Target], tuple[Trace, Tensor]]
@@ -32,6 +33,7 @@ def fitted(kernel: Kernel, population: Population) -> Move:
         InputError: it is no kernel but a proposal.
     """
     refuse_other("a population", kernel)
+    population = weighted(population)
     try:
         move = kernel(population)
     except AttributeError as error:
@@ -39,8 +41,18 @@ def fitted(kernel: Kernel, population: Population) -> Move:
             raise
         move = None
     if not callable(move):
-        raise InputError(f"{_called(kernel)} gives no move, so it is no kernel; {WRAP}.")
+        raise InputError(f"{_name(kernel)} gives no move, so it is no kernel; {WRAP}.")
     return move
+
+
+def weighted(population: Population) -> Population:
+    """The population that a move learns from: where no particle has weight, all have the same.
+
+    A move is valid whatever it learns from other particles than those that it moves.
+    """
+    if bool((population.log_weights > -torch.inf).any()):
+        return population
+    return replace(population, log_weights=torch.zeros_like(population.log_weights))
 
 
 WRAP = "if it is a proposal, wrap it in metropolis_hastings(...)"
@@ -50,7 +62,7 @@ def refuse_other(where: str, kernel: Any) -> None:
     """Refuse what cannot be a kernel.
 
     Raises:
-        InputError: says what was given to whom, and what to do with it.
+        InputError: names what was given in place of one, and what to do.
     """
     if isinstance(kernel, Fitted):
         raise InputError(
@@ -63,7 +75,7 @@ def refuse_other(where: str, kernel: Any) -> None:
         )
     if not takes(kernel, 1):
         raise InputError(
-            f"{where} is given {_called(kernel)} in place of a kernel, which would take a population; {WRAP}."
+            f"{where} is given {_name(kernel)} in place of a kernel, which would take a population; {WRAP}."
         )
 
 
@@ -73,13 +85,17 @@ def takes(function: Callable[..., Any], count: int) -> bool:
         inspect.signature(function).bind(*[None] * count)
     except TypeError:
         return False
-    except ValueError:  # what is written in C may not say
+    except ValueError:  # a function written in C may have no signature
         return True
     return True
 
 
+def _name(function: Any) -> str:
+    return str(getattr(function, "__name__", type(function).__name__))
+
+
 def refuse_observed(what: str, choices: Iterable[str], trace: Trace) -> None:
-    """Refuse a program that samples at an address that the model observes: it would be taken as auxiliary.
+    """Refuse a program that samples at an observed address: its choice would be taken as auxiliary.
 
     Raises:
         InputError: names the address.
@@ -92,27 +108,27 @@ def refuse_observed(what: str, choices: Iterable[str], trace: Trace) -> None:
             )
 
 
-def spread(mask: Tensor, like: Tensor) -> Tensor:
-    """A mask (N,) with as many axes as values (N, ...)."""
-    return mask.reshape(-1, *[1] * (like.ndim - 1))
+def decided(target: Target, trace: Trace, proposed: Trace, log_ratio: Tensor) -> tuple[Trace, Tensor]:
+    """The particles after a Metropolis-Hastings decision, and whether each took its proposal (N,).
+
+    Args:
+        target: the log-density that is left invariant.
+        trace: of N particles.
+        proposed: their proposals.
+        log_ratio: (N,) log-density of the reverse proposal minus that of the proposal, Jacobian included.
+    """
+    index, taken = accept(target, trace, proposed, log_ratio)
+    accepted = torch.zeros(trace.particles, dtype=torch.float64)
+    accepted[index] = 1.0
+    return scattered(trace, index, taken), accepted
 
 
-def _called(function: Any) -> str:
-    return str(getattr(function, "__name__", type(function).__name__))
-
-
-def replaced(population: Population, index: Tensor, moved: Trace) -> Population:
-    """The population with the particles at `index` (K,) replaced by those of a trace of K particles."""
-    trace = put(population.trace, index, moved)
-    return population.with_trace(trace)
-
-
-def put(trace: Trace, index: Tensor, other: Trace) -> Trace:
+def scattered(trace: Trace, index: Tensor, source: Trace) -> Trace:
     """A trace with the particles at `index` (K,) replaced by those of a trace of K particles."""
     if len(index) == 0:
         return trace
-    source = torch.zeros(len(trace), dtype=torch.int64)
-    source[index] = torch.arange(len(index))
+    rows = torch.zeros(len(trace), dtype=torch.int64)
+    rows[index] = torch.arange(len(index))
     mask = torch.zeros(len(trace), dtype=torch.bool)
     mask[index] = True
-    return other[source].where(mask, trace)
+    return source[rows].where(mask, trace)

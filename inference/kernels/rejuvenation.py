@@ -1,8 +1,8 @@
-"""Rejuvenation: every particle of a population moved, each half learning from the other."""
+"""Rejuvenation: every particle of a population is moved by a kernel that the other half is fitted to."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -13,19 +13,19 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import normalised
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, fitted, replaced
+from bcppl.inference.kernels.kernel import Kernel, fitted, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.targets import Target
 
 
 class Moved(NamedTuple):
-    """A rejuvenated population, and what it took.
+    """A rejuvenated population.
 
     Attributes:
         population: after the last sweep.
         acceptance: the share of proposals that were accepted, NaN without sweeps.
-        displacement: how far the particles came, in variances, on the axis on which they came least; NaN
-            unless `until(displacement=...)` asked.
+        displacement: mean squared displacement of the particles, in variances, on the axis on which it is
+            least; NaN unless `until(displacement=...)` is given.
     """
 
     population: Population
@@ -51,18 +51,17 @@ class Until:
 def until(*, distinct: int | None = None, displacement: float | None = None, most: int = 50) -> Until:
     """Sweeps until the particles differ, or have left where they began, or both.
 
-    A particle that stopped when it liked where it is would be there too often: a chain that is looked at just
-    after it moved sees places that are easy to get to. So no particle has a stop of its own. All stop
-    together, on a mean or a count over the population in which each has a share of 1/N; what is left of the
-    bias falls as 1/N, as that of fitted proposals and adaptive tempering does. With a fixed number of
-    sweeps there is none.
+    A particle that had a stopping time of its own would be biased: a chain that is observed just after it
+    moved is at places that are easy to reach. All stop together, on a mean or a count over the population in
+    which each has a share of 1/N; the bias that remains falls as 1/N, as that of fitted proposals and
+    adaptive tempering does. With a fixed number of sweeps there is none.
 
     Args:
         distinct: how many particles shall differ in some latent value (all, if the population has fewer).
-        displacement: the weighted mean squared displacement since the start that is asked for on every
-            axis of every continuous latent value, as a share of its variance in the population. Far apart is
-            2; 0.5 says that the correlation with the start has fallen to about 0.75.
-        most: stop after so many sweeps at any rate.
+        displacement: the weighted mean squared displacement since the start that every axis of every
+            continuous latent value shall reach, as a share of its variance in the population. It is 2 for
+            independent particles, and 0.5 where the correlation with the start is about 0.75.
+        most: the largest number of sweeps.
 
     Raises:
         InputError: nothing is asked for, or what no population can reach.
@@ -88,7 +87,7 @@ def displacement(start: Population, now: Population) -> Tensor:
     """Weighted mean squared displacement (K,) on each axis, as a share of the axis's variance now.
 
     Axes are the free axes of poses, in the tangent space at their mean, and the coordinates of other
-    continuous latent values. An axis without any spread has come nowhere: 0.
+    continuous latent values. An axis without variance has no displacement: 0.
     """
     weights = normalised(now.log_weights)
     shares = [torch.empty(0, dtype=torch.float64)]
@@ -103,7 +102,7 @@ def displacement(start: Population, now: Population) -> Tensor:
 
 
 def _coordinates(start: Population, now: Population, address: str) -> tuple[Tensor, Tensor]:
-    """How far each particle came, and where it is, along the free axes (N, K)."""
+    """Each particle's displacement and its place, along the free axes (N, K)."""
     old, new = start.trace[address], now.trace[address]
     freedom = freedom_of(now.trace.distributions[address])
     if freedom is None or old.ndim != 2:
@@ -117,13 +116,13 @@ def _coordinates(start: Population, now: Population, address: str) -> tuple[Tens
 def rejuvenate(population: Population, kernel: Kernel, target: Target, sweeps: int | Until = 1) -> Moved:
     """Move every particle, `sweeps` times.
 
-    Each half of the population learns from the other, so no particle shapes its own proposal. The particles
-    are split at random: copies of one ancestor lie side by side after resampling.
+    The kernel that moves one half of the population is fitted to the other, so that no particle shapes its
+    own proposal. The particles are split at random: copies of one ancestor lie side by side after resampling.
 
     Args:
-        population: what is moved.
-        kernel: fitted anew to each half.
-        target: what the moves leave invariant.
+        population: of N particles.
+        kernel: fitted to each half, in each sweep.
+        target: left invariant by the moves.
         sweeps: how many; 0 leaves the population as it is. Or `until(...)`.
 
     Raises:
@@ -152,18 +151,8 @@ def _sweep(population: Population, kernel: Kernel, target: Target) -> tuple[Popu
     for mine, others in (halves, halves[::-1]):
         if len(mine) == 0:
             continue
-        move = fitted(kernel, _teachers(population[others] if len(others) else population))
+        move = fitted(kernel, population[others] if len(others) else population)
         moved, share = move(population.trace[mine], target)
         shares.append(share.to(torch.float64))
-        population = replaced(population, mine, moved)
+        population = population.with_trace(scattered(population.trace, mine, moved))
     return population, torch.cat(shares)
-
-
-def _teachers(population: Population) -> Population:
-    """What is learned from; particles that have no weight at all teach with equal weights.
-
-    Whatever is learned from others makes a valid move, only a poorer one.
-    """
-    if bool((population.log_weights > -torch.inf).any()):
-        return population
-    return replace(population, log_weights=torch.zeros_like(population.log_weights))

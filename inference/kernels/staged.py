@@ -1,4 +1,4 @@
-"""Delayed acceptance: cheap sites decide first, and only for the survivors is physics run.
+"""Delayed acceptance: cheap sites decide first, and physics is run for the survivors only.
 
 Christen and Fox, Markov chain Monte Carlo using an approximation, Journal of Computational and Graphical
 Statistics 14, 2005; Banterle, Grazian, Lee and Robert, Accelerating Metropolis-Hastings algorithms by delayed
@@ -30,11 +30,10 @@ PHYSICS = 2  # the cost of a site that simulates contact (`bcppl.distributions.l
 
 @dataclass(frozen=True)
 class Staged(Target):
-    """A target that accepts in stages: a proposal must pass each with chance min(1, ratio of its sites).
+    """A target that accepts in stages: a proposal passes each with probability min(1, ratio of its sites).
 
     The product of the stages' ratios is the ratio of Metropolis-Hastings, and each of them is inverted when
-    the old and the new trace change places: so the balance is kept in detail (Banterle et al., eq. 4 and
-    lemma 1).
+    the old and the new trace change places: so detailed balance holds (Banterle et al., eq. 4 and lemma 1).
 
     Attributes:
         first: patterns of the addresses that decide first, together with the latent sites and the proposal's
@@ -59,7 +58,7 @@ class Staged(Target):
                     f"the program visits {', '.join(sites) or 'none'}."
                 )
         early = [a for a in sites if a in trace.choices or self._first(a, cost_of(sites[a]))]
-        # Sites that count for nothing are in no stage: a stage of them would decide nothing.
+        # Sites with exponent 0 are in no stage: a stage of them would decide nothing.
         late = [a for a in sites if a not in early and self.exponent(a) > 0.0]
         late.sort(key=lambda address: cost_of(sites[address]))
         count = min(self.later, len(late))
@@ -86,7 +85,7 @@ class Staged(Target):
         return index, new
 
     def visible(self, trace: Trace) -> Trace:
-        """The proposed trace without the sites of later stages, which would be evaluated for all."""
+        """The proposed trace with the sites of later stages hidden: they would be evaluated for all."""
         return trace.hiding([a for stage in self.stages(trace)[1:] for a in stage])
 
 
@@ -102,7 +101,7 @@ class Screened(Target):
     """A target that accepts in two stages, the first decided by a surrogate of its log-density.
 
     Christen and Fox, section 2: the surrogate and the proposal's ratio decide which proposals are evaluated;
-    the second stage undoes the surrogate.
+    the second stage divides the surrogate's ratio out.
 
     Attributes:
         surrogate: a log-density (N,) of a trace, up to a constant; it reads latent values.
@@ -112,18 +111,18 @@ class Screened(Target):
 
     def accept(self, old: Trace, new: Trace, log_ratio: Tensor) -> tuple[Tensor, Trace]:
         """Which particles take their proposals: see `Target.accept`."""
-        before, guessed = self(old), self.surrogate(new) - self.surrogate(old)
+        before, surrogate_ratio = self(old), self.surrogate(new) - self.surrogate(old)
         possible = self.part(new, list(new.choices)) > -torch.inf
         chance = torch.log(torch.rand(old.particles, dtype=torch.float64))
-        index = ((guessed + log_ratio > chance) & possible).nonzero().flatten()
+        index = ((surrogate_ratio + log_ratio > chance) & possible).nonzero().flatten()
         if len(index) == 0:
             return index, new[index]
         chance = torch.log(torch.rand(len(index), dtype=torch.float64))
-        passed, survivors = self.above(new[index], chance + before[index] + guessed[index])
+        passed, survivors = self.above(new[index], chance + before[index] + surrogate_ratio[index])
         return index[passed], survivors
 
     def visible(self, trace: Trace) -> Trace:
-        """The proposed trace without the sites that run physics, which would be evaluated for all."""
+        """The proposed trace with the sites that run physics hidden: they would be evaluated for all."""
         sites = trace.distributions
         return trace.hiding([a for a in sites if a not in trace.choices and cost_of(sites[a]) >= PHYSICS])
 
@@ -131,13 +130,13 @@ class Screened(Target):
 def student_t(address: str, degrees: float = 5.0, width: float = 1.3) -> Surrogate:
     """A surrogate: the multivariate t about the particles' weighted mean at a latent address.
 
-    Its tails are heavy, for a particle where the surrogate is far too low would hardly ever leave.
+    Its tails are heavy: a particle where the surrogate is far too low would hardly ever move.
 
     Args:
-        address: of a pose or of another continuous value, taken in the coordinates that proposals move it in
+        address: of a pose or of another continuous value, in the coordinates in which proposals move it
             (`bcppl.inference.proposals.coordinates`).
         degrees: of freedom.
-        width: times the particles' weighted covariance.
+        width: of its scale matrix, times the particles' weighted covariance.
 
     Raises:
         InputError: the degrees of freedom or the width are not greater than 0.
@@ -168,9 +167,9 @@ def delayed_acceptance(
     stages: int = 2,
     surrogate: Surrogate | None = None,
 ) -> Kernel:
-    """A kernel whose proposals are decided by what is cheap first; the target stays exact.
+    """A kernel whose proposals are decided by cheap sites first; the target stays exact.
 
-    It accepts less often than the kernel by itself, and pays for physics only where what is cheap agrees: so
+    It accepts less often than the kernel by itself, and runs physics only where the cheap sites accept: so
     longer steps and more of them are worth while, `repeat(delayed_acceptance(...), 4)`.
 
     Args:
@@ -179,14 +178,14 @@ def delayed_acceptance(
             ratio: "depth_*". By default all sites that cost less than physics.
         stages: how many, the first one included. The other sites are divided among the later ones evenly, in
             the order of cost and of the program, which for windows of a probe is that of time.
-        surrogate: decides first in place of any site, such as `student_t("hole")`; like what a proposal
-            learns, it is fitted to other particles than those that are moved. Two stages then.
+        surrogate: decides first in place of any site, such as `student_t("hole")`; like a proposal, it is
+            fitted to other particles than those that are moved. Two stages then.
 
     Raises:
         InputError: what is given is no kernel, fewer than two stages, a surrogate in the place of `first`, or
-            sites and a surrogate that are both to decide first. When the
-            kernel moves: a pattern fits no address, the target is a plain function, or the way back of a
-            proposal reads a site of a later stage.
+            sites and a surrogate that are both to decide first. When the kernel moves: a pattern fits no
+            address, the target is a plain function, or the reverse move of a proposal reads a site of a
+            later stage.
     """
     refuse_other("delayed_acceptance", kernel)
     if callable(first):

@@ -55,7 +55,7 @@ OVER_SPREAD = torch.tensor([0.02, 0.02, 0.02, 1.2, 1.2, 1.2], dtype=torch.float6
 
 
 def turned_over(trace: Trace) -> None:
-    """A pose drawn anew about the box lying on its other side, wherever the particle is."""
+    """An independent pose about the box lying on its other side, wherever the particle is."""
     pyro.sample("pose", NormalPose(OVER.expand(len(trace), 7), OVER_SPREAD))
 
 

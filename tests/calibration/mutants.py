@@ -13,8 +13,8 @@ smallest p-value times the number of quantities, each p at least 2e-5:
     touch: sign flipped                                      16    0.0001  log-likelihood
     depth, six axes: Jacobian of rotations dropped          300    0.002   angle, turn x
     depth, upright: noise 1.5 times as wide                 150    0.0001  log-likelihood
-    depth, aligned: way back forgotten                       16    0.0001  x, log-likelihood
-    depth, planar: way back forgotten                        20    0.0001  log-likelihood
+    depth, aligned: reverse move left out                    16    0.0001  x, log-likelihood
+    depth, planar: reverse move left out                     20    0.0001  log-likelihood
     depth, planar: fitted on the particle it moves          100    0.0001  log-likelihood
     depth, planar: never moved                               20    0.0001  all
 
@@ -58,7 +58,7 @@ NOISE = {"depth, six axes": 0.04, "depth, planar": 0.015, "depth, upright": 0.01
 
 
 def flipped(kernel: Kernel) -> Kernel:
-    """A kernel that is told that what explains the data badly explains it well."""
+    """A kernel of a target in which the likelihood has the wrong sign."""
 
     def fitted(population: Population) -> Move:
         move = kernel(population)
@@ -90,8 +90,8 @@ def noise_wrong(name: str) -> Case:
     return CASES[name](believed=1.5 * NOISE[name])
 
 
-def way_back_forgotten(name: str) -> Case:
-    """Proposals are weighed by the way there alone."""
+def reverse_move_left_out(name: str) -> Case:
+    """The density of the reverse move is left out."""
 
     def nothing(program: object, args: object, choices: object, particles: int) -> Tensor:
         return torch.zeros(particles, dtype=torch.float64)
@@ -100,7 +100,7 @@ def way_back_forgotten(name: str) -> Case:
 
 
 def taught_by_itself(name: str) -> Case:
-    """Steps as long as the moved particle is far from the centre, and as long on the way back."""
+    """Steps as long as the moved particle is far from the centre, and as long in the reverse move."""
     case = CASES[name]()
 
     def fitted(population: Population) -> Move:
@@ -127,7 +127,7 @@ MUTANTS: dict[str, Callable[[str], Case]] = {
     "sign flipped": sign_flipped,
     "Jacobian of rotations dropped": jacobian_dropped,
     "noise 1.5 times as wide": noise_wrong,
-    "way back forgotten": way_back_forgotten,
+    "reverse move left out": reverse_move_left_out,
     "fitted on the particle it moves": taught_by_itself,
     "never moved": never_moved,
 }
