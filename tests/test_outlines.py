@@ -22,7 +22,8 @@ from bcppl.errors import InputError
 from bcppl.geometry import extrusion
 from bcppl.geometry.extrusion import block, block_with_hole, box_peg, cylinder_peg, extruded, peg_for
 from bcppl.geometry.hausdorff import hausdorff_error, solid_of
-from bcppl.geometry.layers import hole_outline, prismatic
+from bcppl.geometry.holes import hole_of
+from bcppl.geometry.layers import prismatic
 from bcppl.geometry.meshes import load_mesh
 from bcppl.geometry.outlines import NAMED, check_fit, named_outline, round_outline, roundness_error
 from bcppl.geometry.parts import Part
@@ -125,7 +126,7 @@ def test_the_shipped_trays_and_pegs_are_within_5_um_of_their_meshes(shape: str) 
             stem = f"{'tray_insert_' if 'tray' in part.name else ''}{shape}_peg_8mm"
             published = load_mesh(NIST / f"industreal_{stem}.obj")
             assert part.mesh.volume == pytest.approx(published.mesh.volume, rel=1e-6)
-    bore = hole_outline(insert_tray(shape), 0.015)
+    bore = hole_of(insert_tray(shape)).outline
     assert bore.area == pytest.approx(math.pi * 0.0045**2 if shape == "round" else 0.009 * 0.008, rel=2e-3)
 
 

@@ -88,30 +88,6 @@ def prismatic(part: Part, axis: str = "z", tolerance: float = 5e-6) -> Part:
     return made
 
 
-def hole_outline(
-    part: Part, height: float, inside: tuple[float, float] = (0.0, 0.0), tolerance: float = 5e-6
-) -> shapely.Polygon:
-    """The outline of a hole in a cross section, in the part's x-y plane, metres.
-
-    Args:
-        part: with a closed mesh.
-        height: z of the section, metres.
-        inside: a point in the hole.
-        tolerance: vertices within this distance of a straight line are dropped, metres, as by `prismatic`.
-
-    Raises:
-        InputError: there is no hole around the point.
-    """
-    section = shapely.simplify(_section(part.mesh, height), tolerance)
-    for polygon in polygons_of(section):
-        for ring in polygon.interiors:
-            if shapely.Polygon(ring).contains(shapely.Point(inside)):
-                return shapely.Polygon(ring)
-    raise InputError(
-        f"part {part.name!r} has no hole around {inside} at z = {height:g} m; give a point inside a hole."
-    )
-
-
 def _levels(mesh: trimesh.Trimesh) -> list[float]:
     """Heights of the horizontal edges at which the surface bends; between them all faces are planar."""
     bent = mesh.face_adjacency_angles > _FLAT
