@@ -111,7 +111,7 @@ def differences(site: Any, value: Tensor, pose: Tensor, step: Tensor) -> tuple[T
             away[0, axis] += sign * step[axis]
         return -site(poses.retract(pose, away)).log_prob(value)[0]
 
-    slope = torch.stack([(here((k, 1.0)) - here((k, -1.0))) / (2 * step[k]) for k in range(6)])
+    gradient = torch.stack([(here((k, 1.0)) - here((k, -1.0))) / (2 * step[k]) for k in range(6)])
     bend = torch.stack(
         [
             torch.stack(
@@ -129,20 +129,20 @@ def differences(site: Any, value: Tensor, pose: Tensor, step: Tensor) -> tuple[T
             for i in range(6)
         ]
     )
-    return slope, bend
+    return gradient, bend
 
 
-def test_quadratic_is_its_slope_and_curvature_near_the_truth() -> None:
+def test_quadratic_is_its_gradient_and_curvature_near_the_truth() -> None:
     step = torch.tensor([1e-7] * 3 + [3e-6] * 3, dtype=torch.float64)
     scale = torch.tensor([1e-4] * 3 + [3e-3] * 3, dtype=torch.float64)
     value = window([-5e-5, 1e-5, -3e-5, 0.0, 3e-4, 1e-4, 1e-4], [1, 1, 1, 1, 0, 0, NAN])
     for seed in range(4):
         pose = around(1, seed, 2e-5, 2e-4)
         said = manifold(ledge, pose, 7).quadratic(value)
-        slope, bend = differences(lambda p: manifold(ledge, p, 7), value, pose, step)
-        size = float((slope * scale).abs().max())
+        gradient, bend = differences(lambda p: manifold(ledge, p, 7), value, pose, step)
+        size = float((gradient * scale).abs().max())
         # What is far off counts for a little less than it would: up to one part in sixteen per variance.
-        assert float(((said.slope[0] - slope) * scale).abs().max()) < 0.12 * size
+        assert float(((said.gradient[0] - gradient) * scale).abs().max()) < 0.12 * size
         information = said.information[0] * scale[:, None] * scale
         curved = bend * scale[:, None] * scale
         assert float((information - curved).abs().max()) < 0.2 * float(curved.abs().max())
@@ -172,7 +172,7 @@ def test_a_step_of_gauss_and_newton_leads_to_the_truth() -> None:
         noise, shared = math.hypot(NOISE, blur), math.hypot(SHARED, blur)
         said = ContactManifold(gap, pose, 6, noise, shared, SINK, OUTLIER).quadratic(value)
         ridge = torch.diag(torch.tensor([1e4] * 3 + [1e1] * 3).double())
-        pose = poses.retract(pose, -torch.linalg.solve(said.information + ridge, said.slope))
+        pose = poses.retract(pose, -torch.linalg.solve(said.information + ridge, said.gradient))
     off = poses.local(turn, pose)[0]
     assert float(off[:3].norm()) < 1e-4 and float(off[3:].norm()) < 2e-3
     assert float(manifold(gap, pose, 6).residual(value).abs().max()) < 3e-5
@@ -191,7 +191,7 @@ def test_moving_all_changes_nothing_and_what_cannot_be_told_tells_nothing() -> N
     silent[:, 7] = NAN
     said = here.quadratic(silent)
     assert torch.equal(here.log_prob(silent), torch.zeros(20).double())
-    assert not bool(said.slope.any()) and not bool(said.information.any())
+    assert not bool(said.gradient.any()) and not bool(said.information.any())
     shuffled = MIXED[torch.randperm(8)]
     torch.testing.assert_close(here.log_prob(shuffled), here.log_prob(MIXED))
 

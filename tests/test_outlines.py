@@ -191,10 +191,10 @@ def test_invalid_outlines_are_refused_in_one_sentence() -> None:
             0.1,
         ),
         "tolerance nan": lambda: prismatic(block((0.06, 0.06, 0.025)), tolerance=math.nan),
-        "stands up to 0.95 mm": lambda: check_fit(square, translate(named_outline("square", 0.0159), 0.001)),
+        "by up to 0.95 mm": lambda: check_fit(square, translate(named_outline("square", 0.0159), 0.001)),
         "no clearance": lambda: check_fit(square, square),
         "inside out": lambda: prismatic(replace(SOLID, faces=SOLID.faces[:, ::-1])),
-        "stands up to 0.707 mm": lambda: check_fit(square, named_outline("square", 0.017)),
+        "by up to 0.707 mm": lambda: check_fit(square, named_outline("square", 0.017)),
         "no outline 'star'": lambda: named_outline("star"),
         "no insert tray": lambda: insert_tray("oval"),
     }

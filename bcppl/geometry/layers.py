@@ -182,13 +182,12 @@ def _columns(
     k: int, layers: list[Layer], caps: dict[int, tuple[float, shapely.MultiPolygon]], tolerance: float
 ) -> list[Piece]:
     """The pieces of layer `k` with its caps: end height and end section, by direction (-1 below, 1 above)."""
-    drawn, cells = layers[k].low, convex_cells(layers[k].low, OVERLAP)
-    shapely.prepare(drawn)
+    base, cells = layers[k].low, convex_cells(layers[k].low, OVERLAP)
     hulls: list[list[Array]] = [[] for _ in cells]
     for direction in (-1, 1):
         if direction in caps:
             rest = layers[k].bottom if direction < 0 else layers[k].top
-            ends = _capped(cells, drawn, rest, *caps[direction], direction, tolerance)
+            ends = _capped(cells, base, rest, *caps[direction], direction, tolerance)
         else:
             ends = [_upright_end(cell, layers, k, direction) for cell in cells]
         for hull, end in zip(hulls, ends, strict=True):
@@ -211,7 +210,7 @@ def _upright_end(cell: Cell, layers: list[Layer], k: int, direction: int) -> lis
 
 def _capped(
     cells: list[Cell],
-    drawn: shapely.MultiPolygon,
+    base: shapely.MultiPolygon,
     rest: float,
     end: float,
     section: shapely.MultiPolygon,
@@ -219,14 +218,14 @@ def _capped(
     tolerance: float,
 ) -> list[list[Array]]:
     """For each cell the vertices (C, 3) of an end capped by a chamfer, from height `rest` to `end`."""
-    pairs = zip(shapely.get_coordinates(drawn).tolist(), shapely.get_coordinates(section), strict=True)
-    goes = {tuple(a): b for a, b in pairs}
+    pairs = zip(shapely.get_coordinates(base).tolist(), shapely.get_coordinates(section), strict=True)
+    image = {tuple(a): b for a, b in pairs}  # of each vertex at the end of the chamfer
     halfway = shapely.transform(
-        drawn, lambda points: np.array([0.5 * (p + goes[tuple(p.tolist())]) for p in points])
+        base, lambda points: np.array([0.5 * (p + image[tuple(p.tolist())]) for p in points])
     )
     shapely.prepare(allowed := halfway.buffer(0.2 * tolerance))
     capped = []
-    cores = [np.array([goes.get(tuple(p.tolist()), p) for p in cell.core]) for cell in cells]
+    cores = [np.array([image.get(tuple(p.tolist()), p) for p in cell.core]) for cell in cells]
     wide = grown_in(section, [straightened(core) for core in cores], OVERLAP)
     wide = [wider if len(wider) > 2 else core for wider, core in zip(wide, cores, strict=True)]
     for cell, core, wider in zip(cells, cores, wide, strict=True):

@@ -175,7 +175,7 @@ def check_fit(hole: shapely.Polygon, peg: shapely.Polygon) -> float:
         if excess < 1e-9:
             raise InputError("the peg's outline touches the hole's, so it has no clearance; make it smaller.")
         raise InputError(
-            f"the peg's outline stands up to {1000 * excess:.3g} mm out of the hole's; make it smaller."
+            f"the peg's outline protrudes by up to {1000 * excess:.3g} mm from the hole's; make it smaller."
         )
     return 2.0 * float(shapely.distance(peg, hole.boundary))
 
