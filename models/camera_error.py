@@ -87,9 +87,9 @@ def prepare(recording: Recording, **settings: Any) -> Scene:
 
 def simulate_recording(seed: int, **options: Any) -> Recording:
     """A block before two cameras whose poses are in error: see `bcppl.models.worlds.two_cameras`."""
-    from bcppl.models.worlds.two_cameras import record
+    from bcppl.models.worlds.two_cameras import simulate_recording as simulated
 
-    return record(seed, **options)
+    return simulated(seed, **options)
 
 
 model = Model(

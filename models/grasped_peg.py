@@ -84,9 +84,9 @@ def prepare(
 
 def simulate_recording(seed: int, **options: Any) -> Recording:
     """A block with a hole, touched twice with the hand turned between: `bcppl.models.worlds.grasped_peg`."""
-    from bcppl.models.worlds.grasped_peg import record
+    from bcppl.models.worlds.grasped_peg import simulate_recording as simulated
 
-    return record(seed, **options)
+    return simulated(seed, **options)
 
 
 model = Model(

@@ -88,9 +88,9 @@ def likelihoods(
 
 def simulate_recording(seed: int, **options: Any) -> Recording:
     """A block with a hole, seen and probed in a finer simulation: see `bcppl.models.worlds.peg_in_hole`."""
-    from bcppl.models.worlds.peg_in_hole import record
+    from bcppl.models.worlds.peg_in_hole import simulate_recording as simulated
 
-    return record(seed, **options)
+    return simulated(seed, **options)
 
 
 model = Model(

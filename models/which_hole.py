@@ -91,9 +91,9 @@ def prepare(
 
 def simulate_recording(seed: int, **options: Any) -> Recording:
     """A plate with four holes, one of them seen and two neighbours' places touched, in a finer simulation."""
-    from bcppl.models.worlds.which_hole import record
+    from bcppl.models.worlds.which_hole import simulate_recording as simulated
 
-    return record(seed, **options)
+    return simulated(seed, **options)
 
 
 model = Model(
