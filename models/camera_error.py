@@ -1,6 +1,6 @@
 """A part is seen by depth cameras whose stated poses and ranges are in error (`bcppl.sensors.erring_camera`).
 
-Errors that all pixels of an image share are latent, so that the belief is not sure of a wrong pose.
+Errors that are common to all pixels of an image are latent, so that the belief is not overconfident.
 """
 
 from __future__ import annotations
