@@ -30,12 +30,12 @@ from bcppl.inference.summaries import mean
 from bcppl.models.arm_calibration import (
     Arm,
     arm_calibration,
-    linearised,
+    laplace_proposal,
     observations,
     read_seatings,
     sockets,
 )
-from bcppl.models.arm_in_view import arm_in_view, fitted, observations as images_of, prepare
+from bcppl.models.arm_in_view import arm_in_view, fitted_proposal, observations as images_of, prepare
 from bcppl.recordings.importers.bop import draw
 from bcppl.robot.kinematics import Robot
 
@@ -69,7 +69,7 @@ def calibrated(name: str, count: int | None, seed: int, offsets_only: bool) -> t
         torch.manual_seed(seed)
         seen = [q for place in pairs[k] for q in data[place]]
         population = importance_sampling(
-            arm_calibration, (arm, seen), observations(seen), PARTICLES, linearised(arm, seen)
+            arm_calibration, (arm, seen), observations(seen), PARTICLES, laplace_proposal(arm, seen)
         )
         reads = []
         for place, (first, second) in data.items():
@@ -161,7 +161,7 @@ def seen(seeds: range, settings: dict[str, float], masked: bool) -> list[Row]:
         begun = time.perf_counter()
         scene = prepare(robot, camera(), prior_from_guess(guess), angles, images, masks, **settings)
         measured = images_of(scene, images, masks)
-        proposal = fitted(scene, measured)
+        proposal = fitted_proposal(scene, measured)
         population = importance_sampling(arm_in_view, (scene, len(angles)), measured, CAMERAS, proposal)
         seconds = time.perf_counter() - begun
         belief = population.belief("camera")

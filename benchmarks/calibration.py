@@ -19,16 +19,16 @@ from report import Row, finish, options, show
 from scenes import END, MASSES, PARTICLES, REGIONS, VISION, Probed, every, probed, quantile
 from scipy.stats import binomtest
 
-from bcppl.models.worlds.bench import Bench
+from bcppl.models.worlds.bench import BenchParameters
 
 CONFIDENCE = 0.99  # of the intervals of a share
 WITHIN = {0.9: (84.0, 95.0), 0.5: (41.0, 59.0)}  # %, what 200 scenes of true regions stay within
 LEAST = 75.0  # %, of the 90 % regions where the model is wrong
 SCENES, WRONG = 200, 50
 WORLDS = {
-    "as stated": Bench(),
-    "occluder": Bench(occluder=True),
-    "cameras off twice as far": Bench(camera_error_factor=2.0),
+    "as stated": BenchParameters(),
+    "occluder": BenchParameters(occluder=True),
+    "cameras off twice as far": BenchParameters(camera_error_factor=2.0),
 }
 
 

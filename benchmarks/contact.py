@@ -29,7 +29,7 @@ from bcppl.contact.stepping import WRENCH
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.peg_in_hole import model
-from bcppl.models.worlds.peg_in_hole import record
+from bcppl.models.worlds.peg_in_hole import simulate_recording
 from bcppl.recordings import Recording
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors.simulated_probe import CONTACT
@@ -133,7 +133,7 @@ def main() -> None:
     arguments = options(__doc__ or "").parse_args()
     torch.manual_seed(arguments.seed)
     particles, repeats = (25, 2) if arguments.quick else (PARTICLES, 9)
-    recording = record(arguments.seed)
+    recording = simulate_recording(arguments.seed)
     assert recording.peg is not None and recording.truth is not None
     peg = recording.peg
     probe = next(m.action.probe for m in recording.measurements if isinstance(m.action, ProbeWindow))

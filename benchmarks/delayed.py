@@ -35,7 +35,7 @@ from bcppl.inference.proposals import differential_evolution, drift, independent
 from bcppl.inference.resampling import always
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.models.peg_in_hole import model
-from bcppl.models.worlds.peg_in_hole import record
+from bcppl.models.worlds.peg_in_hole import simulate_recording
 from bcppl.traces import Trace
 
 PARTICLES = 75
@@ -161,7 +161,7 @@ def chains(
 
 def posterior(seed: int) -> tuple[Any, Population]:
     """The scene of a probe, and its particles once all measurements are taken in, equally weighted."""
-    recording = record(seed)
+    recording = simulate_recording(seed)
     scene = model.prepare(recording)
     *_, last = infer(model, recording, particles=PARTICLES, seed=seed, scene=scene)
     return scene, always()(last.population)[0]

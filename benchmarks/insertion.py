@@ -29,11 +29,11 @@ from bcppl.inference.planning.insertion import insertion_plan
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.inference.planning.success import success_probability
 from bcppl.models.look_and_touch import model
-from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
+from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
 from bcppl.sensors.candidates import Candidate
 
-CLEARANCES = Bench().clearances
+CLEARANCES = BenchParameters().clearances
 VISION, FIXED, CHOSEN = "vision", "3-2-1 probe", "chosen probes"
 KNOWN = (VISION, FIXED, CHOSEN)
 SECONDS, PROBES = 6.0, 6  # that probes may last altogether, and their number
@@ -137,12 +137,12 @@ def _attempt(scene: BenchScene, arm: BenchArm, belief: Belief, known: str, foret
         name=scene.name,
         known=known,
         inserted=result.inserted,
-        found=math.isfinite(result.found),
+        found=math.isfinite(result.found_at),
         depth=result.depth,
         across=float(off[:2].norm()),
         tilt=tilt,
         peak=result.peak_force,
-        press=result.peak_press,
+        press=result.sustained_force,
         time=result.time,
         chance=chance,
     )

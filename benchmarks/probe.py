@@ -12,7 +12,7 @@ from report import Row, finish, options, show
 
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.peg_in_hole import model
-from bcppl.models.worlds.peg_in_hole import record
+from bcppl.models.worlds.peg_in_hole import simulate_recording
 
 PARTICLES = 75
 
@@ -55,7 +55,7 @@ COLUMNS = (
 
 def run(seed: int) -> Result:
     """Makes the recording of a seed and finds the hole in it."""
-    recording = record(seed)
+    recording = simulate_recording(seed)
     points, kinds = recording.part.surface_points(), [m.kind for m in recording.measurements]
     views = kinds.count("view")
     begun = time.perf_counter()

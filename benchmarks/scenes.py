@@ -40,7 +40,7 @@ from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models.look_and_touch import model
-from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
+from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
 from bcppl.sensors.measurements import Recording
 
 PARTICLES = 75
@@ -187,13 +187,13 @@ def default_run(
     return infer(model, recording, particles=particles, seed=seed, scene=scene, start=start)
 
 
-def probed(seed: int, particles: int = PARTICLES, bench: Bench | None = None) -> Probed:
+def probed(seed: int, particles: int = PARTICLES, bench: BenchParameters | None = None) -> Probed:
     """One scene, whatever happens: an exception makes it a miss, and what was reached before it is kept."""
     return followed(seed, particles, bench)[0]
 
 
 def followed(
-    seed: int, particles: int = PARTICLES, bench: Bench | None = None
+    seed: int, particles: int = PARTICLES, bench: BenchParameters | None = None
 ) -> tuple[Probed, list[Step], Recording | None]:
     """As `probed`, with all steps and the recording of the probe, None where it was not reached."""
     found, steps, recording = Probed(seed), list[Step](), None

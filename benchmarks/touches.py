@@ -26,7 +26,7 @@ from bcppl.contact.touch import Touch
 from bcppl.geometry.distance import SignedDistance
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.filters.tempered_smc import infer
-from bcppl.models.point_probe import learn, model
+from bcppl.models.point_probe import estimate_settings, model
 from bcppl.recordings.importers.point_probe import command
 from bcppl.sensors import Push, Recording
 from bcppl.sensors.point_finger import FingerSettings, contact_of, registration_pose
@@ -55,7 +55,9 @@ def pushes(log: str, count: int, seed: int) -> Recording:
 def learnt(log: str, calibrated: bool = True) -> FingerSettings:
     """FingerSettings from all pushes of a log; without the calibration the finger touches where it says."""
     recording = pushes(log, PUSHES, 0)
-    return learn(recording) if calibrated else learn(recording, finger=(0.0, 0.0, 0.0))
+    return (
+        estimate_settings(recording) if calibrated else estimate_settings(recording, finger=(0.0, 0.0, 0.0))
+    )
 
 
 def errors(world_from_part: Tensor, recording: Recording) -> Errors:

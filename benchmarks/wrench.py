@@ -18,7 +18,7 @@ from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.distributions.contact import ChamferContacts, PegPose, Wrench
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models import peg_in_hole
-from bcppl.models.worlds.peg_in_hole import record
+from bcppl.models.worlds.peg_in_hole import simulate_recording
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors import Recording
 from bcppl.sensors.scene import Numbered, Scene
@@ -92,7 +92,7 @@ def run(task: tuple[str, int]) -> tuple[float, ...]:
     """The error and the spread of a variant's belief over the hole of a seed, and its cost."""
     name, seed = task
     model = replace(peg_in_hole.model, prepare=VARIANTS[name].prepare)
-    recording = record(seed)
+    recording = simulate_recording(seed)
     begun = time.perf_counter()
     *_, last = infer(model, recording, particles=PARTICLES, seed=seed)
     wall = time.perf_counter() - begun

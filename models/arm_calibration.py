@@ -1,15 +1,14 @@
-"""An arm's kinematics are learnt from a ball that sits in sockets, wherever they are.
+"""An arm's kinematics are calibrated by a ball that is seated in sockets at unknown positions.
 
-A ball on the flange is seated in a socket and the arm is moved through many postures in which the ball
-stays where it is; the joint angles are recorded. By the nominal URDF the ball seems to wander by millimetres.
-Latent are what the encoders read too little (`offsets`), where the ball is on its link (`ball`), how each
-joint's origin differs from the drawing (`errors`), and how well the ball sits (`noise`). Where a socket
-is need not be known: it is integrated out under a flat prior, so a turn of the whole arm about its base
-keeps its prior.
+A ball on the flange is seated in a socket and the arm moves through many postures in which the ball stays
+in place; the joint angles are recorded. By the nominal URDF the ball moves by millimetres. Latent are the
+encoders' offsets (`offsets`), the position of the ball on its link (`ball`), the errors of the joints'
+origins (`errors`), and the scatter of the seated ball (`noise`). The socket's position is integrated out
+under a flat prior, so a rotation of the whole arm about its base keeps its prior.
 
-What is measured are angles, so the density of the ball's place needs the volume sqrt(det J J^T) by which
-angles become places. Without it a smaller arm, whose ball wanders less, would seem likelier: on real
-recordings all distances came 0.1 mm too short. Idea and recordings: MUKCa, platonics-delft/
+The measurements are angles, so the density of the ball's position needs the volume sqrt(det J J^T) of the map
+from angles to positions. Without it a smaller arm, whose ball moves less, would have a larger likelihood: on
+real recordings all distances came 0.1 mm too short. Idea and recordings: MUKCa, platonics-delft/
 kinematics_calibration.
 """
 
@@ -34,16 +33,16 @@ from bcppl.traces import Trace
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """What is known beforehand of an arm and its ball.
+    """The prior of an arm and its ball.
 
     Attributes:
         robot: the nominal arm.
         link: whose origin is the ball's nominal centre.
         offset: standard deviation of the encoders' offsets, radians.
-        shift, turn: standard deviations of the errors of the joints' origins, metres and radians; both 0
-            takes the drawing for right, and there is no site `errors`.
-        mount: standard deviation of the ball's centre about its nominal place, metres.
-        noise: median of the scatter of a seated ball along each axis, metres; right within a factor of four.
+        shift, turn: standard deviations of the errors of the joints' origins, metres and radians; with both 0
+            the URDF is exact, and there is no site `errors`.
+        mount: standard deviation of the ball's centre about its nominal position, metres.
+        noise: median of the scatter of a seated ball along each axis, metres; known within a factor of four.
     """
 
     robot: Robot
@@ -63,16 +62,16 @@ class Arm:
             spread["errors"] = torch.tensor([self.shift] * 3 + [self.turn] * 3).expand(joints, 6)
         return {address: value.to(torch.float64) for address, value in spread.items()}
 
-    def places(self, values: Mapping[str, Tensor], angles: Tensor) -> Tensor:
-        """Where the ball is, (N, T, 3), by latent values and angles (T, J), metres."""
+    def positions(self, values: Mapping[str, Tensor], angles: Tensor) -> Tensor:
+        """Positions (N, T, 3) of the ball, metres, by latent values and angles (T, J)."""
         offsets, ball = values["offsets"], values["ball"]
         return self.robot.position(self.link, angles, offsets, ball, values.get("errors"))
 
     def log_volume(self, values: Mapping[str, Tensor], angles: Tensor) -> Tensor:
-        """Log of d(places) / d(angles), summed over the stamps, (N,).
+        """Log-volume (N,) of the map from angles to positions, summed over the stamps.
 
         Raises:
-            InputError: the angles are of another number of joints.
+            InputError: the number of angles is not that of the joints.
         """
         joints = self.robot.joints
         if angles.shape[-1] != len(joints):
@@ -85,51 +84,51 @@ class Arm:
         with torch.enable_grad():
             moved = offsets[:, None].expand(-1, *angles.shape).clone()
             moved = moved if kept and moved.requires_grad else moved.detach().requires_grad_()
-            places = self.places({**values, "offsets": moved}, angles)
+            positions = self.positions({**values, "offsets": moved}, angles)
             rows = [
-                torch.autograd.grad(places[..., k].sum(), moved, create_graph=kept, retain_graph=True)[0]
+                torch.autograd.grad(positions[..., k].sum(), moved, create_graph=kept, retain_graph=True)[0]
                 for k in range(3)
             ]
-            slope = torch.stack(rows, dim=-2)  # (N, T, 3, J)
-            return 0.5 * torch.logdet(slope @ slope.mT).sum(dim=1)
+            jacobian = torch.stack(rows, dim=-2)  # (N, T, 3, J)
+            return 0.5 * torch.logdet(jacobian @ jacobian.mT).sum(dim=1)
 
 
 def arm_calibration(arm: Arm, seatings: Sequence[Tensor]) -> None:
-    """The program: the arm as it is built, then for every seating how far the ball is from standing still."""
+    """The program: the arm's kinematic errors, then the deviations of the ball's positions per seating."""
     values = {
         address: pyro.sample(address, dist.Normal(torch.zeros_like(spread), spread).to_event(spread.ndim))
         for address, spread in arm.spread.items()
     }
     noise = pyro.sample("noise", dist.LogNormal(torch.tensor(np.log(arm.noise)), 0.7))
     for k, angles in enumerate(seatings):
-        # Orthonormal contrasts of the stamps: what is left of the data when their common mean is unknown.
-        contrasts = torch.from_numpy(helmert(len(angles))) @ arm.places(values, angles)
+        # Orthonormal contrasts of the stamps: the data without their common mean, which is unknown.
+        contrasts = torch.from_numpy(helmert(len(angles))) @ arm.positions(values, angles)
         pyro.sample(f"seating_{k}", dist.Normal(contrasts, noise[:, None, None]).to_event(2))
         pyro.factor(f"volume_{k}", arm.log_volume(values, angles))
 
 
 def observations(seatings: Sequence[Tensor]) -> Mapping[str, Tensor]:
-    """A seated ball does not move: every contrast (T - 1, 3) is zero."""
+    """The observed contrasts (T - 1, 3): zero, since a seated ball does not move."""
     return {f"seating_{k}": torch.zeros(len(q) - 1, 3).double() for k, q in enumerate(seatings)}
 
 
 def sockets(arm: Arm, trace: Trace, angles: Tensor) -> Tensor:
-    """Draws (N, 3) of where a socket is, metres, from angles (T, J) of a ball seated in it."""
-    mean = arm.places(trace.choices, angles).mean(dim=1)
+    """Draws (N, 3) of a socket's position, metres, from angles (T, J) of a ball seated in it."""
+    mean = arm.positions(trace.choices, angles).mean(dim=1)
     return mean + trace["noise"][:, None] / len(angles) ** 0.5 * torch.randn_like(mean)
 
 
-def linearised(
-    arm: Arm, seatings: Sequence[Tensor], rounds: int = 5
+def laplace_proposal(
+    arm: Arm, seatings: Sequence[Tensor], steps: int = 5
 ) -> Callable[[Arm, Sequence[Tensor]], None]:
-    """A program that proposes the latent values: what the posterior would be, were the kinematics linear.
+    """A proposal of the latent values: the posterior of linearised kinematics.
 
-    Errors of milliradians are nearly linear, so that importance sampling with it needs no moves.
+    Kinematic errors of milliradians are nearly linear, so that importance sampling needs no moves.
 
     Args:
-        arm: what is known of the arm.
+        arm: its prior.
         seatings: angles (T, J) of each.
-        rounds: Gauss-Newton steps, each with the noise that the residuals of the last one show.
+        steps: of Gauss-Newton, each with the noise estimated from the residuals of the last one.
 
     Returns:
         A program `proposal(arm, seatings)` for `bcppl.inference.importance.importance_sampling`.
@@ -142,41 +141,41 @@ def linearised(
         pieces = torch.split(scaled * prior, [shape.numel() for shape in shapes.values()], dim=1)
         return {a: piece.reshape(len(scaled), *shapes[a]) for a, piece in zip(shapes, pieces, strict=True)}
 
-    def wandering(scaled: Tensor) -> Tensor:
-        found = [torch.from_numpy(helmert(len(q))) @ arm.places(values(scaled), q) for q in seatings]
-        return torch.cat([x.reshape(len(scaled), -1) for x in found], dim=1)
+    def residuals(scaled: Tensor) -> Tensor:
+        contrasts = [torch.from_numpy(helmert(len(q))) @ arm.positions(values(scaled), q) for q in seatings]
+        return torch.cat([x.reshape(len(scaled), -1) for x in contrasts], dim=1)
 
     center, noise, step = torch.zeros_like(prior), arm.noise, 1e-3
     sides = torch.cat([unit, -unit])
     volume = sum(arm.log_volume(values(step * sides), q) for q in seatings)
-    swell = torch.as_tensor(volume).unflatten(0, (2, -1)).diff(dim=0)[0] / (-2.0 * step)
-    for _ in range(rounds):
-        residual = wandering(center[None])[0]
-        slope = wandering(center + step * sides).unflatten(0, (2, -1)).diff(dim=0)[0].T / (-2.0 * step)
-        pull = slope.T @ (slope @ center - residual)
-        information = slope.T @ slope
+    volume_gradient = torch.as_tensor(volume).unflatten(0, (2, -1)).diff(dim=0)[0] / (-2.0 * step)
+    for _ in range(steps):
+        residual = residuals(center[None])[0]
+        jacobian = residuals(center + step * sides).unflatten(0, (2, -1)).diff(dim=0)[0].T / (-2.0 * step)
+        gradient = jacobian.T @ (jacobian @ center - residual)
+        information = jacobian.T @ jacobian
         precision = information / noise**2 + unit
-        told = float(torch.trace(torch.linalg.solve(precision, information))) / noise**2
-        center = torch.linalg.solve(precision, pull / noise**2 + swell)
-        left = len(residual) - told
-        noise = float((wandering(center[None]).square().sum() / left).sqrt())
+        estimated = float(torch.trace(torch.linalg.solve(precision, information))) / noise**2
+        center = torch.linalg.solve(precision, gradient / noise**2 + volume_gradient)
+        freedom = len(residual) - estimated  # degrees of freedom of the residuals
+        noise = float((residuals(center[None]).square().sum() / freedom).sqrt())
 
     def proposal(arm: Arm, seatings: Sequence[Tensor]) -> None:
-        loose = dist.LogNormal(torch.tensor(np.log(noise)), 1.2 / np.sqrt(2.0 * left))
-        scatter = pyro.sample("noise", loose)[:, None, None]
+        wider = dist.LogNormal(torch.tensor(np.log(noise)), 1.2 / np.sqrt(2.0 * freedom))
+        scatter = pyro.sample("noise", wider)[:, None, None]
         covariance = torch.linalg.inv(information / scatter**2 + unit)
         factor = torch.linalg.cholesky(0.5 * (covariance + covariance.mT)) * prior[:, None]
-        mean = prior * (covariance @ (pull / scatter[..., 0] ** 2 + swell)[..., None])[..., 0]
+        mean = prior * (covariance @ (gradient / scatter[..., 0] ** 2 + volume_gradient)[..., None])[..., 0]
         normals = mean.new_zeros(len(mean), 0)
         for address, shape in shapes.items():
-            # Each address given those before it: the same standard normals through rows of the factor.
+            # Each address conditional on those before it: the standard normals through rows of the factor.
             rows = slice(normals.shape[1], normals.shape[1] + shape.numel())
             given = mean[:, rows] + (factor[:, rows, : rows.start] @ normals[..., None])[..., 0]
             square = factor[:, rows, rows]
             reshaped = dist.transforms.ReshapeTransform(torch.Size([shape.numel()]), shape)
             normal = dist.MultivariateNormal(given, scale_tril=square)
-            chosen = pyro.sample(address, dist.TransformedDistribution(normal, reshaped))
-            away = (chosen.reshape(given.shape) - given)[..., None]
+            value = pyro.sample(address, dist.TransformedDistribution(normal, reshaped))
+            away = (value.reshape(given.shape) - given)[..., None]
             normals = torch.cat(
                 [normals, torch.linalg.solve_triangular(square, away, upper=False)[..., 0]], 1
             )
@@ -190,7 +189,7 @@ def read_seatings(folder: str | Path) -> list[Tensor]:
     They come in the order of their numbers, `hole_10.csv` after `hole_9.csv`.
 
     Raises:
-        InputError: there is no such file, or one holds something else than rows of numbers.
+        InputError: there is no such file, or one holds anything but rows of numbers.
     """
     numbered = (
         (re.fullmatch(r"hole_(\d+)\.csv", file.name), file) for file in Path(folder).glob("hole_*.csv")
@@ -203,7 +202,7 @@ def read_seatings(folder: str | Path) -> list[Tensor]:
         try:
             read.append(torch.from_numpy(np.loadtxt(file, delimiter=",", ndmin=2)))
         except ValueError as error:
-            raise InputError(f"{file} holds something else than rows of joint angles ({error}).") from error
+            raise InputError(f"{file} must hold rows of joint angles ({error}).") from error
         if len(read[-1]) < 2:
             raise InputError(f"{file} holds {len(read[-1])} stamps; a seating needs at least two postures.")
     return read

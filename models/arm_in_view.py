@@ -1,10 +1,9 @@
-"""A camera finds where it stands from depth images of the arm itself: calibration without a target.
+"""A camera's extrinsics from depth images of the arm itself: hand-eye calibration without a target.
 
-The camera's pose in the arm's base frame is drawn from the prior, and what the sensor adds to every range.
-Each view is a depth image of the arm at other joint angles: its links are drawn where its joints put them.
-No mask is needed: what stands still behind the arm (table, floor, room) is what the other views show there.
-Where a segmentation has marked the arm's pixels, these masks are measurements too: they say where the outline
-is, and the depth image is left to say how far away the arm is within it.
+The camera's pose in the arm's base frame and its range bias are drawn from the prior. Each view is a depth
+image of the arm at other joint angles, with its links rendered by the forward kinematics. No mask is needed:
+the static background (table, floor, room) is estimated from the other views. Masks of the arm by a
+segmentation are measurements too: they inform the outline, and the depth image the distance within it.
 """
 
 from __future__ import annotations
@@ -38,31 +37,32 @@ from bcppl.traces import Trace
 
 Array = npt.NDArray[np.float64]
 
-WIDER = 1.3  # than the fit: of what is proposed
-# What images say is taken for no surer than this: metres, radians, metres of bias, pixels of rim.
+WIDER = 1.3  # than the fit: of the proposal
+# Smallest standard deviations of the fit: metres, radians, metres of bias, pixels of rim.
 SHARPEST = torch.tensor([5e-4] * 3 + [5e-4] * 3 + [5e-4, 0.05], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is known of the camera.
+    """Parameters of the likelihoods.
 
     Attributes:
-        scale: of the Laplace noise, metres: stereo smears shapes of a centimetre.
+        scale: of the Laplace noise, metres: stereo smooths shapes of a centimetre.
         outlier: the probability that a pixel on the arm shows something else.
-        bias: standard deviation of what the sensor adds to every range, metres.
-        widening: how far the arm seems to reach beyond its outline, metres. A stereo sensor matches windows,
-            and the nearer surface wins half a window: 4 pixels are 5.5 mm at 1.25 m. Without it the arm looks
-            too near, the more so the sharper the likelihood.
-        effective_pixels: how many independent pixels a whole image is worth, those beside the arm included.
-        effective_inside: the same of an image of which only what a mask encloses counts.
-        bins: so many pixels in each direction are read as one, the median of them.
-        mask_width: how far the outline of a mask wanders, pixels of the whole image.
-        mask_rim: standard deviation of how far masks reach beyond the arm all along, pixels.
-        mask_wrong: the probability that a pixel of a mask says the opposite.
-        mask_temperature: how much less a block of a mask is worth than it seems: a segmentation errs by
-            whole patches, and the arm is not quite built as drawn.
-        inside: so many pixels from a mask's outline depth begins to count: there is no window beyond it.
+        bias: standard deviation of the range bias, metres.
+        widening: of the arm's outline in images, metres. A stereo sensor matches windows, and the nearer
+            surface covers half a window: 4 pixels are 5.5 mm at 1.25 m. Without it the arm is estimated too
+            near, the more so the more precise the likelihood.
+        effective_pixels: the number of independent pixels of a whole image, those beside the arm included.
+        effective_inside: the same of an image with a mask, of which only the inside counts.
+        bins: pixels in each direction of a block, which is represented by its median.
+        mask_width: standard deviation of the outline of a mask, pixels of the whole image.
+        mask_rim: standard deviation of the common displacement of masks' outlines, pixels.
+        mask_wrong: the probability that a pixel of a mask is wrong.
+        mask_temperature: divisor of the masks' log-likelihood: a segmentation errs in whole patches, and the
+            arm differs from its drawing.
+        inside: distance from a mask's outline at which depth begins to count, pixels: matching windows do
+            not cross it there.
     """
 
     scale: float = 0.02
@@ -81,14 +81,14 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stays the same over a run.
+    """The scene of the views.
 
     Attributes:
         camera: its optics, binned; its stated pose is not used.
         prior: over `base_from_camera`.
         renderers: of the arm at each view's joint angles, one rigid part each.
-        backgrounds: (H, W) metres, what stands behind the arm in each view, NaN where unknown.
-        insides: (H, W) where depth counts in each view; None where no mask says.
+        backgrounds: (H, W) depth of the background in each view, metres, NaN where unknown.
+        insides: (H, W) the pixels whose depth counts in each view; None without masks.
         settings: of the likelihood.
     """
 
@@ -101,7 +101,7 @@ class Scene:
 
     @property
     def efforts(self) -> Mapping[str, Effort]:
-        """What each simulator has done so far."""
+        """The effort of each simulator so far."""
         return {f"rendering {k}": renderer.effort for k, renderer in enumerate(self.renderers)}
 
 
@@ -120,9 +120,9 @@ def arm_in_view(scene: Scene, views: int) -> None:
 def sites(scene: Scene, views: int, camera: Tensor, bias: Tensor, rim: Tensor | None) -> dict[str, Any]:
     """The likelihoods of the first views' images, by address, of cameras at poses (N, 7)."""
     settings, camera_from_base = scene.settings, poses.inverse(camera)
-    found: dict[str, Any] = {}
+    likelihoods: dict[str, Any] = {}
     for k, (renderer, behind) in enumerate(zip(scene.renderers[:views], scene.backgrounds, strict=False)):
-        depth = found[f"depth_{k}"] = RobustDepth(
+        depth = likelihoods[f"depth_{k}"] = RobustDepth(
             renderer,
             scene.camera,
             camera_from_base,
@@ -134,18 +134,18 @@ def sites(scene: Scene, views: int, camera: Tensor, bias: Tensor, rim: Tensor | 
             region=None if scene.insides is None else scene.insides[k],
             background=behind if scene.insides is None else None,
             background_is_measured=scene.insides is None,
-            # The drawn surface is nearer by the widening.
+            # The widened surface is nearer by the widening.
             bias=bias + (settings.widening if scene.insides is None else 0.0),
         )
         if rim is not None:
-            found[f"mask_{k}"] = Silhouette.from_depth(
+            likelihoods[f"mask_{k}"] = Silhouette.from_depth(
                 depth,
                 settings.mask_width / settings.bins,
                 settings.mask_wrong,
                 rim=rim / settings.bins,
                 temperature=settings.mask_temperature,
             )
-    return found
+    return likelihoods
 
 
 def prepare(
@@ -157,7 +157,7 @@ def prepare(
     masks: Sequence[npt.ArrayLike] | None = None,
     **settings: Any,
 ) -> Scene:
-    """The scene of some views by a camera that stands still.
+    """The scene of some views by a static camera.
 
     Args:
         robot: the arm; its meshes are needed.
@@ -165,7 +165,7 @@ def prepare(
         prior: over `base_from_camera`, such as `prior_from_guess` gives.
         angles: (J,) joint angles of each view, radians.
         images: (H, W) depth image of each view, metres, NaN or 0 where missing.
-        masks: (H, W) which pixels show the arm in each view, 0 where not; None where that is not known.
+        masks: (H, W) the pixels that show the arm in each view, 0 elsewhere; None without masks.
         settings: fields of `Settings`.
 
     Raises:
@@ -179,10 +179,10 @@ def prepare(
     still = replace(camera, world_from_camera=poses.identity().numpy())
     small = still.binned(chosen.bins)
     binned = _binned(images, still, chosen.bins)
-    backgrounds = [still_behind(binned, view) for view in range(len(binned))]
+    backgrounds = [background_of(binned, view) for view in range(len(binned))]
     drawn = [robot.as_part(q) for q in angles]
     if masks is None:
-        # Where no mask says where the arm ends, depth has to, and smears it.
+        # Without masks the outline is informed by depth, which widens it.
         renderers = [RayCaster(widened(part, chosen.widening)) for part in drawn]
         return Scene(small, prior, renderers, backgrounds, None, chosen)
     shown = checked_masks(still, masks, len(angles))
@@ -220,25 +220,25 @@ def _binned(images: Sequence[Array], camera: Camera, bins: int) -> list[Array]:
     return [bin_depth(image, bins, near=camera.near, far=camera.far) for image in images]
 
 
-def still_behind(images: Sequence[Array], view: int) -> Array:
-    """What stands behind the arm in a view, (H, W) metres, NaN where unknown.
+def background_of(images: Sequence[Array], view: int) -> Array:
+    """The depth (H, W) of the background in a view, metres, NaN where unknown.
 
-    The second farthest reading of the other views: the arm may hide it in some of them, and the farthest is
-    often a reading that is wrong. Of two views it is the farther. The view itself has no say.
+    It is the second farthest reading of the other views: the arm may hide it in some of them, and the
+    farthest reading is often wrong. Of two views it is the farther. The view itself is not used.
     """
     others = np.stack(
         [image for k, image in enumerate(images) if k != view] or [np.full_like(images[0], np.nan)]
     )
     farthest = np.sort(np.where(others > 0.0, others, -np.inf), axis=0)[::-1]
     second = farthest[min(1, len(others) - 1)]
-    found = np.where(np.isfinite(second), second, farthest[0])
-    return np.where(np.isfinite(found), found, np.nan)
+    depth = np.where(np.isfinite(second), second, farthest[0])
+    return np.where(np.isfinite(depth), depth, np.nan)
 
 
 def widened(part: Part, by: float) -> Part:
     """The part with every vertex moved outwards along its normal, metres."""
     mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
-    mesh.merge_vertices()  # or faces would part at their edges
+    mesh.merge_vertices()  # faces would otherwise separate at their edges
     vertices = np.asarray(mesh.vertices + by * mesh.vertex_normals, dtype=np.float64)
     return replace(part, vertices=vertices, faces=np.asarray(mesh.faces, dtype=np.int64))
 
@@ -254,30 +254,32 @@ def observations(
     return seen
 
 
-def fitted(scene: Scene, seen: Mapping[str, Tensor], draws: int = 100) -> Callable[[Scene, int], None]:
-    """A program that proposes the latent values: a normal that is fitted to what images and masks say.
+def fitted_proposal(
+    scene: Scene, observed: Mapping[str, Tensor], draws: int = 100
+) -> Callable[[Scene, int], None]:
+    """A proposal of the latent values: a normal that is fitted to the likelihood of images and masks.
 
-    Camera and ranges lie along a valley: the camera may stand lower and look up, or farther and read less.
-    Particles that walk do not settle along it; a normal is as long as the valley is.
+    Camera pose and range bias are strongly correlated: the camera may be lower and look up, or farther away
+    with smaller ranges. A random walk mixes slowly along that ridge; a fitted normal has its shape.
 
     Args:
-        scene: what is known.
-        seen: what `observations` gives.
-        draws: poses that are looked at in each round of the fit.
+        scene: of the views.
+        observed: the result of `observations`.
+        draws: poses that are evaluated in each round of the fit.
 
     Returns:
         A program `proposal(scene, views)` for `bcppl.inference.importance.importance_sampling`.
     """
     settings, prior = scene.settings, scene.prior
-    views = sum(address.startswith("depth_") for address in seen)
+    views = sum(address.startswith("depth_") for address in observed)
     own = [settings.bias] if scene.insides is None else [settings.bias, settings.mask_rim]
     start = torch.cat([normal_like(prior).covariance.diagonal().sqrt(), torch.tensor(own).double()])
 
     def log_density(point: Tensor) -> Tensor:
         camera = poses.retract(prior.center, point[:, :6].contiguous())
         likelihoods = sites(scene, views, camera, point[:, 6], point[:, 7] if len(own) > 1 else None)
-        said = torch.stack([likelihoods[address].log_prob(value) for address, value in seen.items()])
-        return torch.where(prior.log_prob(camera) > -torch.inf, said.sum(dim=0), -torch.inf)
+        log_prob = torch.stack([likelihoods[a].log_prob(value) for a, value in observed.items()])
+        return torch.where(prior.log_prob(camera) > -torch.inf, log_prob.sum(dim=0), -torch.inf)
 
     fit = fitted_normal(log_density, start, SHARPEST[: len(start)], draws=draws, first=3 * draws)
     mean, covariance = fit.mean, fit.covariance
@@ -285,7 +287,7 @@ def fitted(scene: Scene, seen: Mapping[str, Tensor], draws: int = 100) -> Callab
     def proposal(scene: Scene, views: int) -> None:
         away = mean.new_zeros(0)
         for k, address in enumerate(["bias", "rim"][: len(own)]):
-            # Each given those before it.
+            # Each conditional on those before it.
             before, at = slice(6, 6 + k), 6 + k
             gain = torch.linalg.solve(covariance[before, before], covariance[before, at])
             spread = (covariance[at, at] - gain @ covariance[before, at]).sqrt()
@@ -301,10 +303,10 @@ def fitted(scene: Scene, seen: Mapping[str, Tensor], draws: int = 100) -> Callab
     return proposal
 
 
-def along_the_view(trace: Trace) -> None:
-    """A proposal: the sensor reads farther and the camera stands nearer, or the other way round.
+def along_optical_axis(trace: Trace) -> None:
+    """A proposal: a larger range bias and a nearer camera, or the reverse.
 
-    The two are hardly told apart, so that neither moves far alone.
+    The two are strongly correlated, so that neither moves far alone.
     """
     bias = pyro.sample("bias", dist.Normal(trace["bias"], 0.005))
     camera = trace["camera"]

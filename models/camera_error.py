@@ -1,6 +1,6 @@
 """A part is seen by depth cameras whose stated poses and ranges are in error (`bcppl.sensors.erring_camera`).
 
-Errors that all pixels of an image share are latent, so that the belief is not sure of a wrong pose.
+Errors that are common to all pixels of an image are latent, so that the belief is not overconfident.
 """
 
 from __future__ import annotations
@@ -87,9 +87,9 @@ def prepare(recording: Recording, **settings: Any) -> Scene:
 
 def simulate_recording(seed: int, **options: Any) -> Recording:
     """A block before two cameras whose poses are in error: see `bcppl.models.worlds.two_cameras`."""
-    from bcppl.models.worlds.two_cameras import record
+    from bcppl.models.worlds.two_cameras import simulate_recording as simulated
 
-    return record(seed, **options)
+    return simulated(seed, **options)
 
 
 model = Model(

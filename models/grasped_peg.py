@@ -1,12 +1,12 @@
-"""A peg that sits in the hand not quite as planned: its place in the grip is unknown, like the part's pose.
+"""A peg whose pose in the hand is not as planned: the grasp is latent, like the part's pose.
 
-`peg_in_hole` with one more site. Commands, the measured peg pose, the wrench and contact locations are all of
-the grip, the frame in which a peg held as planned would lie; only its surface is elsewhere, by
-`grip_from_peg`. While the hand keeps its orientation, a peg that sits a millimetre to the left is felt like a
-part that lies a millimetre to the right. What tells the two apart is the camera, or touching again with the
-hand turned: half a turn about the peg's axis changes the sign of the one and not of the other. It does so
-across the axis and not along it: how deep the peg sits in the hand is told from the part's height by the
-camera alone, as well as the camera's own pose is known.
+`peg_in_hole` with one more site. Commands, the measured peg pose, the wrench and contact locations are all in
+the frame of the grip, in which a peg held as planned would lie; only the peg's surface is displaced, by
+`grip_from_peg`. While the hand keeps its orientation, a peg displaced by a millimetre to the left gives the
+same contacts as a part displaced by a millimetre to the right. The camera separates the two, or a second
+touch with the hand turned: half a turn about the peg's axis changes the sign of one displacement and not of
+the other. That holds across the axis and not along it: the depth of the peg in the hand is separated from the
+part's height by the camera alone, to the accuracy of its extrinsics.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ def prepare(
     """The scene of a recording.
 
     Args:
-        recording: what was measured.
-        grip_shift: how far the peg may sit off in the hand along each axis of the grip, metres.
-        grip_turn: likewise about each axis, radians; both are standard deviations.
+        recording: of depth images and probe windows.
+        grip_shift: standard deviation of the peg's position in the hand along each axis of the grip, metres.
+        grip_turn: standard deviation of its orientation about each axis, radians.
         settings: as for `peg_in_hole.prepare`.
 
     Raises:
@@ -84,9 +84,9 @@ def prepare(
 
 def simulate_recording(seed: int, **options: Any) -> Recording:
     """A block with a hole, touched twice with the hand turned between: `bcppl.models.worlds.grasped_peg`."""
-    from bcppl.models.worlds.grasped_peg import record
+    from bcppl.models.worlds.grasped_peg import simulate_recording as simulated
 
-    return record(seed, **options)
+    return simulated(seed, **options)
 
 
 model = Model(

@@ -1,8 +1,9 @@
 """A part is seen by depth cameras whose stated poses are in error, then touched with a held peg.
 
 The default model. A camera's extrinsic error and range bias are latent (`bcppl.sensors.erring_camera`). A
-touch is explained by the measured pose of the peg, which robots know to hundredths of a millimetre: while
-contact is felt the peg's distance to the part is zero, elsewhere positive (`bcppl.sensors.contact_probe`).
+touch is explained by the measured pose of the peg, which robots know to hundredths of a millimetre: while the
+wrench shows contact the peg's distance to the part is zero, otherwise positive
+(`bcppl.sensors.contact_probe`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""A part is seen by a depth camera, among clutter that nobody has modelled.
+"""A part is seen by a depth camera, among clutter without a model.
 
-The pose of a part is drawn from the prior, and every view is a depth image of it: Laplace noise where the ray
-meets the part, something unknown where it does not or where something stands in the way. What is unknown goes
-on from one pixel to the next. No mask is needed.
+The part's pose is drawn from the prior, and every view is a depth image of it: Laplace noise where the ray
+meets the part, unknown surfaces elsewhere and in front of it, which continue from pixel to pixel. No mask is
+needed.
 """
 
 from __future__ import annotations
@@ -27,23 +27,22 @@ from bcppl.traces import Model
 
 @dataclass(frozen=True)
 class Settings:
-    """What is known of the camera.
+    """Parameters of the depth likelihood.
 
     Attributes:
         scale: of the Laplace noise, metres.
-        clutter: whether unknown things stand about the part and before it, that go on from pixel to pixel
-            (`ClutteredDepth`). Otherwise, and wherever a background was measured, what is unknown is
-            independent from pixel to pixel (`RobustDepth`).
-        temperature: with clutter, what the log-likelihood is divided by. At 1 it tells where the part is;
-            around there a belief is too sure, for a mesh, a camera's bias and a stated truth are off for all
-            pixels together (on a real frame the stated truth has up to 463 nats less than the best particle,
-            so a belief's spread there is not to be trusted).
-        stride: every stride-th row and column is looked at with clutter, else every stride-th pixel in each
+        clutter: whether unknown surfaces around the part and in front of it continue from pixel to pixel
+            (`ClutteredDepth`). Otherwise, and wherever a background was measured, they are independent from
+            pixel to pixel (`RobustDepth`).
+        temperature: with clutter, the divisor of the log-likelihood. At 1 the mode is right, and the belief
+            around it overconfident: the errors of a mesh, a camera's bias and a stated truth are common to
+            all pixels (on a real frame the stated truth has up to 463 nats less than the best particle).
+        stride: with clutter every stride-th row and column is used, otherwise every stride-th pixel in each
             direction.
         outlier: without clutter, the probability that a pixel on the part shows something else.
-        effective_pixels: without clutter, how many independent pixels a whole image is worth, those that do
-            not show the part included; None for all. Neighbouring pixels err together: with all, a belief is
-            sure of errors.
+        effective_pixels: without clutter, the number of independent pixels that a whole image is worth, those
+            beside the part included; None for all. Errors of neighbouring pixels are correlated: with all, a
+            belief is overconfident.
     """
 
     scale: float = 0.005
@@ -71,7 +70,7 @@ def prepare(
     """The scene of a recording.
 
     Args:
-        recording: what was measured.
+        recording: of depth images.
         renderer: makes the renderer of the part, such as `bcppl.rendering.choice.renderer_for`.
         settings: fields of `Settings`.
 

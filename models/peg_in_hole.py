@@ -32,9 +32,9 @@ class DepthSettings:
 
     Attributes:
         depth_scale: of the Laplace noise, metres.
-        outlier: the probability that a pixel does not show what is rendered.
-        effective_pixels: number of independent pixels that an image is worth; the error of a camera's pose
-            shifts them all together.
+        outlier: the probability that a pixel shows something else than the rendered scene.
+        effective_pixels: the number of independent pixels that an image is worth; the error of a camera's
+            pose is common to all.
     """
 
     depth_scale: float = 0.003
@@ -58,7 +58,7 @@ def prepare(
     """The scene of a recording.
 
     Args:
-        recording: what was measured.
+        recording: of depth images and probe windows.
         renderer: makes the renderer of the part, such as `bcppl.rendering.choice.renderer_for`.
         settings: fields of `DepthSettings` and `ProbeSettings`.
 
@@ -88,9 +88,9 @@ def likelihoods(
 
 def simulate_recording(seed: int, **options: Any) -> Recording:
     """A block with a hole, seen and probed in a finer simulation: see `bcppl.models.worlds.peg_in_hole`."""
-    from bcppl.models.worlds.peg_in_hole import record
+    from bcppl.models.worlds.peg_in_hole import simulate_recording as simulated
 
-    return record(seed, **options)
+    return simulated(seed, **options)
 
 
 model = Model(

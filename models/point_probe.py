@@ -1,8 +1,8 @@
-"""A part is touched by a point finger that is moved towards it until a force is felt.
+"""A part is touched by a point finger that moves towards it until a contact force.
 
-Each push measures where on the finger's path contact begins, the direction of the force, and (as an option)
-that the path before was free (`bcppl.sensors.point_finger`). `learn` estimates the settings from pushes at a
-known pose.
+Each push measures the onset of contact on the finger's path, the direction of the force, and (as an option)
+that the path before was free (`bcppl.sensors.point_finger`). `estimate_settings` estimates the settings from
+pushes at a known pose.
 """
 
 from __future__ import annotations
@@ -70,38 +70,38 @@ model = Model(
 )
 
 
-def learn(recording: Recording, **settings: Any) -> FingerSettings:
-    """Settings from pushes at a known pose: finger, registration, offset, spreads, friction, tolerance.
+def estimate_settings(recording: Recording, **settings: Any) -> FingerSettings:
+    """Finger, registration, offset, spreads, friction and tolerance, estimated from pushes at a known pose.
 
-    The finger's place in the tip's xy plane and the registration are found by least squares on the signed
-    distance at onset (linearised along the normals, three rounds), and the offset is what is left. The spread
-    is what the finger alone leaves: from one log to another the scatter differs by nearly a factor of two,
-    so it had better be wide. The tolerance is the deepest free place, and the friction the one with the least
-    squared error of the force's direction. Where the finger is held nothing is learnt of the registration.
+    The finger's position in the tip's xy plane and the registration are least-squares estimates from the
+    signed distance at onset (three Gauss-Newton steps along the normals); the offset is the mean residual.
+    The spread is that of the residuals without a registration: between logs the scatter differs by nearly a
+    factor of two, so a wide one is safer. The tolerance is the largest depth, and the friction has the least
+    squared error of the force's direction. With a given finger the registration is not estimated.
 
     Args:
         recording: ten pushes or more, with the true pose.
-        settings: fields of `FingerSettings` that are held and not learnt.
+        settings: fields of `FingerSettings` that are given and not estimated.
 
     Raises:
         InputError: the recording has no true pose, or fewer than 10 of its pushes touch.
     """
     if recording.truth is None:
-        raise InputError("settings are learnt at a known pose; give a recording with its true pose.")
+        raise InputError("settings are estimated at a known pose; give a recording with its true pose.")
     truth = torch.as_tensor(recording.truth, dtype=torch.float64)
     distance = SignedDistance(recording.part)
     start = replace(
         FingerSettings(), **{**settings, "finger": (0.0, 0.0, 0.0)}
-    )  # what is read is the recorded tip
+    )  # onsets are of the recorded tip
     pushes = [(m.action, m.observation) for m in recording.measurements]
-    seen = [contact_of(push, touch, start) for push, touch in pushes]
-    kept = [k for k, one in enumerate(seen) if not bool(one.direction.isnan())]
+    contacts = [contact_of(push, touch, start) for push, touch in pushes]
+    kept = [k for k, one in enumerate(contacts) if not bool(one.direction.isnan())]
     if len(kept) < 10:
         raise InputError(
-            f"settings are learnt from 10 touching pushes or more, not from {len(kept)}; record more."
+            f"settings are estimated from 10 pushes with contact or more, not from {len(kept)}; record more."
         )
-    tips = torch.stack([seen[k].onset for k in kept])
-    angles = torch.stack([seen[k].direction for k in kept])
+    tips = torch.stack([contacts[k].onset for k in kept])
+    angles = torch.stack([contacts[k].direction for k in kept])
     world_from_tips = torch.stack(
         [rotation_matrix(torch.from_numpy(pushes[k][0].world_from_tip[0])) for k in kept]
     )
@@ -109,27 +109,27 @@ def learn(recording: Recording, **settings: Any) -> FingerSettings:
     middle = torch.tensor(recording.part.mesh.centroid, dtype=torch.float64)
 
     def fitted(axes: int) -> tuple[Tensor, Tensor, Tensor]:
-        """The first axes of finger (2) and registration (3) by least squares; what is left; normals."""
-        found = torch.cat([tips.new_tensor(settings.get("finger", start.finger))[:2], tips.new_zeros(3)])
+        """The first axes of finger (2) and registration (3) by least squares; residuals and normals."""
+        estimate = torch.cat([tips.new_tensor(settings.get("finger", start.finger))[:2], tips.new_zeros(3)])
         for last in (False, False, False, True):
-            touched = compose(truth, registration_pose(found[2:].tolist(), middle))
-            finger = torch.cat([found[:2], tips.new_zeros(1)])
-            places = transform(inverse(touched), tips + world_from_tips @ finger)
-            near = distance(places)
+            touched = compose(truth, registration_pose(estimate[2:].tolist(), middle))
+            finger = torch.cat([estimate[:2], tips.new_zeros(1)])
+            positions = transform(inverse(touched), tips + world_from_tips @ finger)
+            near = distance(positions)
             normals = near.normal @ rotation_matrix(touched).T
             if not last and axes:
                 in_tip = (world_from_tips.mT @ normals[..., None])[:, :2, 0]
-                turning = torch.linalg.cross(places - middle, near.normal)[:, 2:]
-                slopes = torch.cat([in_tip, -near.normal[:, :2], -turning], dim=1)[:, :axes]
-                found[:axes] -= torch.linalg.lstsq(slopes, near.distance[:, None]).solution[:, 0]
-        return found, -near.distance, normals
+                turning = torch.linalg.cross(positions - middle, near.normal)[:, 2:]
+                jacobian = torch.cat([in_tip, -near.normal[:, :2], -turning], dim=1)[:, :axes]
+                estimate[:axes] -= torch.linalg.lstsq(jacobian, near.distance[:, None]).solution[:, 0]
+        return estimate, -near.distance, normals
 
     held = "finger" in settings
     _, scatter, _ = fitted(0 if held else 2)
-    found, depth, normals = fitted(0 if held else 5)
-    # Half of what one log shows is taken to last and half for this session's own: two normals of equal
-    # variance, of which the sum r was seen, leave r / 2 for the next session, with a variance of 3 / 4 r^2.
-    lasting, drift = 0.5 * found[2:], math.sqrt(0.75) * found[2:].abs()
+    estimate, depth, normals = fitted(0 if held else 5)
+    # Half of one log's registration is attributed to all sessions and half to its own: given the sum r of two
+    # normals of equal variance, the expectation for the next session is r / 2, with a variance of 3 / 4 r^2.
+    lasting, drift = 0.5 * estimate[2:], math.sqrt(0.75) * estimate[2:].abs()
 
     inward = torch.atan2(-normals[:, 1], -normals[:, 0])
     paths = [Path(finger_points(pushes[k][0], start)).thinned(start.spacing) for k in kept]
@@ -145,8 +145,8 @@ def learn(recording: Recording, **settings: Any) -> FingerSettings:
         minimize_scalar(lambda a: float((error(a) ** 2).sum()), bounds=(0.02, 1.4), method="bounded").x
     )
     spread = float(scatter.std())
-    learnt = FingerSettings(
-        finger=(float(found[0]), float(found[1]), 0.0),
+    estimated = FingerSettings(
+        finger=(float(estimate[0]), float(estimate[1]), 0.0),
         registration=(float(lasting[0]), float(lasting[1]), float(lasting[2])),
         drift=(float(drift[:2].square().mean().sqrt()), float(drift[2])),
         offset=float(depth.mean()),
@@ -156,7 +156,7 @@ def learn(recording: Recording, **settings: Any) -> FingerSettings:
         tolerance=float(depth.max()),
         free_spread=spread,
     )
-    return replace(learnt, **settings)
+    return replace(estimated, **settings)
 
 
 def _wrapped(angle: Tensor) -> Tensor:

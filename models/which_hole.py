@@ -1,13 +1,13 @@
-"""Which hole is it? A plate has several holes that look alike, and a camera sees one of them from near by.
+"""Which hole is it? A plate has several equal holes, and a near camera sees one of them.
 
-`hole` is the pose of the hole that is seen, `which` says which of the plate's it is. Where the others and the
-plate's edges are hangs on both. The camera tells where the hole is and not which; touching where a neighbour
-would be tells which. A recording's part has its frame in the first of the holes, so `hole` is the part's pose
-where that is the one that is seen, and the pose that an insertion needs whichever it is.
+`hole` is the pose of the hole in view, `which` its number among the plate's holes. The positions of the
+others and of the plate's edges depend on both. The camera informs `hole` and not `which`; touching where a
+neighbour would be informs `which`. The frame of a recording's part is in the first hole, so `hole` is the
+part's pose if that one is in view, and the pose that an insertion needs in any case.
 
-A discrete site needs nothing else: here the choice moves one plate about, so one renderer and one physics do
-for all. Where the choice is among parts of different shapes, each with its simulators,
-`bcppl.distributions.switch.Switch` evaluates for each particle the one that it chose.
+The discrete site displaces the same plate, so one renderer and one physics serve all particles. For a choice
+among parts of different shapes, each with its simulators, `bcppl.distributions.switch.Switch` evaluates the
+one that each particle has.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Scene
 from bcppl.traces import Model
 
-# Where the holes are in the frame of the first, metres: those of the plate that `simulate_recording` makes.
+# Positions of the holes in the frame of the first, metres: those of the simulated plate.
 PITCH = 0.034
 HOLES = ((0.0, 0.0), (PITCH, 0.0), (0.0, PITCH), (PITCH, PITCH))
 
@@ -42,7 +42,7 @@ class PlateScene(Scene):
 
 
 def which_hole(scene: PlateScene, actions: Sequence[Any]) -> None:
-    """The program: which hole is seen and its pose, then each measurement's sites of the plate."""
+    """The program: the number and the pose of the hole in view, then each measurement's sites."""
     which = pyro.sample("which", Categorical(torch.ones(len(scene.hole_from_part), dtype=torch.float64)))
     hole = pyro.sample("hole", scene.prior)
     part = poses.compose(hole, scene.hole_from_part[which])
@@ -56,8 +56,8 @@ def prepare(
     """The scene of a recording.
 
     Args:
-        recording: what was measured; its part's frame sits in the first hole.
-        holes: where the holes are, x and y in the part's frame, metres.
+        recording: of depth images and probe windows; its part's frame is in the first hole.
+        holes: positions of the holes, x and y in the part's frame, metres.
         settings: as for `peg_in_hole.prepare`.
 
     Raises:
@@ -90,10 +90,10 @@ def prepare(
 
 
 def simulate_recording(seed: int, **options: Any) -> Recording:
-    """A plate with four holes, one of them seen and two neighbours' places touched, in a finer simulation."""
-    from bcppl.models.worlds.which_hole import record
+    """A plate with four holes, one in view, touched at two points: see `bcppl.models.worlds.which_hole`."""
+    from bcppl.models.worlds.which_hole import simulate_recording as simulated
 
-    return record(seed, **options)
+    return simulated(seed, **options)
 
 
 model = Model(

@@ -15,7 +15,7 @@ from bcppl.inference.importance import importance_sampling
 from bcppl.models.arm_calibration import (
     Arm,
     arm_calibration,
-    linearised,
+    laplace_proposal,
     observations,
     read_seatings,
     sockets,
@@ -62,7 +62,7 @@ def test_two_positions_calibrate_the_distance_at_the_others(name: str) -> None:
     seen = [q for place in PLACES[name] for q in data[place]]
     torch.manual_seed(0)
     population = importance_sampling(
-        arm_calibration, (arm, seen), observations(seen), 200, linearised(arm, seen)
+        arm_calibration, (arm, seen), observations(seen), 200, laplace_proposal(arm, seen)
     )
     assert population.effective_sample_size > 30.0
     weights = population.log_weights.softmax(dim=0)
@@ -92,7 +92,7 @@ def test_the_volume_is_that_of_the_angles_jacobian() -> None:
     step, columns = 1e-6, []
     for k in range(7):
         moved = step * torch.eye(7, dtype=torch.float64)[k]
-        ahead, back = arm.places(values, angles + moved), arm.places(values, angles - moved)
+        ahead, back = arm.positions(values, angles + moved), arm.positions(values, angles - moved)
         columns.append((ahead - back) / (2.0 * step))
     jacobian = torch.stack(columns, dim=-1)
     expected = torch.log(torch.linalg.svdvals(jacobian)).sum(dim=(1, 2))
@@ -111,7 +111,7 @@ def test_the_density_of_angles_does_not_depend_on_the_unit_of_positions() -> Non
     twice = dict(values)
     twice["errors"] = torch.cat([shifts, torch.zeros(7, 3)], dim=1)[None].double()
     twice["ball"] = hand[None]
-    assert torch.allclose(arm.places(twice, angles)[0], 2.0 * reach, atol=1e-12)
+    assert torch.allclose(arm.positions(twice, angles)[0], 2.0 * reach, atol=1e-12)
     gain = arm.log_volume(twice, angles) - arm.log_volume(values, angles)
     assert float(gain) == pytest.approx(3 * len(angles) * math.log(2.0))
 
@@ -148,7 +148,7 @@ def test_simulated_offsets_are_recovered() -> None:
     known = Arm(arm.robot, "panda_hand_tcp", offset=0.02, shift=0.0, turn=0.0, mount=1e-4, noise=2e-5)
     torch.manual_seed(0)
     population = importance_sampling(
-        arm_calibration, (known, seatings), observations(seatings), 300, linearised(known, seatings)
+        arm_calibration, (known, seatings), observations(seatings), 300, laplace_proposal(known, seatings)
     )
     weights = population.log_weights.softmax(dim=0)
     mean = (weights[:, None] * population["offsets"]).sum(dim=0)
@@ -177,4 +177,4 @@ def test_seatings_are_ordered_by_number(tmp_path: Path) -> None:
 def test_another_number_of_joints_is_refused() -> None:
     arm = Arm(load_robot("panda", tip="panda_hand"))
     with pytest.raises(InputError, match="has 6 angles for each stamp; give 7, in the order panda_joint1,"):
-        linearised(arm, [torch.zeros(5, 6).double()])
+        laplace_proposal(arm, [torch.zeros(5, 6).double()])

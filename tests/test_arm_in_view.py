@@ -24,12 +24,12 @@ from bcppl.inference.importance import importance_sampling, tempered_importance_
 from bcppl.inference.kernels import metropolis_hastings, mixture
 from bcppl.models.arm_in_view import (
     Scene,
-    along_the_view,
+    along_optical_axis,
     arm_in_view,
-    fitted,
+    background_of,
+    fitted_proposal,
     observations,
     prepare,
-    still_behind,
     widened,
 )
 from bcppl.models.robots import load_robot
@@ -84,7 +84,7 @@ def test_the_truth_is_the_likeliest_with_its_own_bias() -> None:
 def test_camera_and_bias_are_estimated_jointly() -> None:
     scene, seen = drawn(0.012, widening=0.0, effective_pixels=1000.0)
     torch.manual_seed(0)
-    moves = mixture([kernel("camera"), metropolis_hastings(along_the_view)], [0.6, 0.4])
+    moves = mixture([kernel("camera"), metropolis_hastings(along_optical_axis)], [0.6, 0.4])
     population, _ = tempered_importance_sampling(arm_in_view, (scene, 2), seen, 32, tempered(moves, sweeps=3))
     off = poses.local(TRUTH, population.belief("camera").mean)
     before = poses.local(TRUTH, torch.from_numpy(near_the_truth(0.03, 0.05).world_from_part))
@@ -108,7 +108,9 @@ def test_masks_locate_the_camera_whatever_the_range_bias() -> None:
 def test_the_fitted_proposal_is_near_the_posterior() -> None:
     scene, seen = drawn(0.012, masked=True, **MASKED)
     torch.manual_seed(0)
-    population = importance_sampling(arm_in_view, (scene, 2), seen, 200, fitted(scene, seen, draws=200))
+    population = importance_sampling(
+        arm_in_view, (scene, 2), seen, 200, fitted_proposal(scene, seen, draws=200)
+    )
     assert population.effective_sample_size > 20.0
     belief = population.belief("camera")
     off = poses.local(TRUTH, belief.mean)
@@ -164,6 +166,6 @@ def test_the_static_background_is_estimated_from_the_other_views() -> None:
     views[2][0, 1] = views[3][0, 1] = 1.0  # the arm, in two of the others
     views[1][0, 2] = views[2][0, 2] = views[3][0, 2] = np.nan
     views[1][0, 3] = views[2][0, 3] = np.nan
-    behind = still_behind(views, 0)
+    behind = background_of(views, 0)
     assert behind[0, 0] == 2.0 and behind[0, 1] == 1.0 and np.isnan(behind[0, 2]) and behind[0, 3] == 2.0
-    assert np.isnan(still_behind(views[:1], 0)).all()
+    assert np.isnan(background_of(views[:1], 0)).all()

@@ -15,7 +15,7 @@ from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
 from bcppl.errors import InputError
 from bcppl.geometry.outlines import check_fit
-from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
+from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
 from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, bench_part
 from bcppl.models.worlds.guarded_motion import Execution, command_of
 from bcppl.recordings import Recording
@@ -56,7 +56,7 @@ def scene(seed: int = 0, part: str = "square 8 mm") -> BenchScene:
 
 @functools.cache
 def carried(seed: int = 0, part: str = "square 8 mm") -> Execution:
-    return scene(seed, part).executed(plan_of(scene(seed, part)))[0]
+    return scene(seed, part).execute(plan_of(scene(seed, part)))[0]
 
 
 @functools.cache
@@ -132,7 +132,7 @@ def test_the_truth_is_not_what_inference_draws_from_the_same_seed() -> None:
 
 def test_the_measured_wrench_has_the_stated_errors() -> None:
     one = scene()
-    motion, wrench, world_from_peg = one.executed(plan_of(one))
+    motion, wrench, world_from_peg = one.execute(plan_of(one))
     error = wrench - motion.wrench
     # White noise doubles in differences; the walk adds 0.3 N / sqrt(600) to each, which is nothing.
     spread = np.diff(error, axis=0).std(axis=0) / np.sqrt(2.0)
@@ -144,8 +144,8 @@ def test_the_measured_wrench_has_the_stated_errors() -> None:
     still = Plan("still", np.array([0.0, 6.0]), above, ("free",), FORCE, STIFFNESS, DAMPING)
     start, end = [], []
     for seed in range(16):
-        other = bench_scene(seed, Bench(force_noise=0.0), part="square 8 mm")
-        motion, wrench, _ = other.executed(still)
+        other = bench_scene(seed, BenchParameters(force_noise=0.0), part="square 8 mm")
+        motion, wrench, _ = other.execute(still)
         start.append(wrench[0, :3])
         end.append(wrench[-1, :3] - wrench[0, :3])
     assert 0.7 < np.std(start) < 1.3 and 0.2 < np.std(end) < 0.4
@@ -160,7 +160,7 @@ def test_free_motion_is_not_felt_and_stops_no_guarded_motion() -> None:
     raised.world_from_peg[:, 2] += 0.05
     guarded = replace(raised, manners=("guarded",) * 5)
     freely = replace(raised, manners=("free",) * 5)
-    one, other = scene().executed(guarded)[0], scene().executed(freely)[0]
+    one, other = scene().execute(guarded)[0], scene().execute(freely)[0]
     assert not one.stops
     np.testing.assert_array_equal(one.probe.command, other.probe.command)
 
@@ -170,7 +170,7 @@ def test_a_guarded_press_ends_at_its_force_and_a_held_slide_goes_on_from_there(p
     one, plan = scene(0, part), plan_of(scene(0, part))
     if part == "rectangular tray":  # its top is 25 mm wide
         plan = _narrowed(one, plan, 0.5)
-    motion = one.executed(plan)[0]
+    motion = one.execute(plan)[0]
     assert set(motion.stops) == {1, 5}
     for first, last in ((0.9, 1.0), (2.8, 3.1)):
         assert abs(force(motion, between(first, last)).mean() / FORCE - 1.0) < 0.5
@@ -225,7 +225,7 @@ def test_a_command_does_not_hang_on_what_is_felt_later() -> None:
 
 def test_an_occluder_hides_a_third_of_the_part_from_one_camera_only() -> None:
     for seed in range(3):
-        open_, hidden = bench_scene(seed), bench_scene(seed, Bench(occluder=True))
+        open_, hidden = bench_scene(seed), bench_scene(seed, BenchParameters(occluder=True))
         np.testing.assert_array_equal(open_.world_from_cameras, hidden.world_from_cameras)
         for k in range(2):
             camera = replace(open_.cameras[k], world_from_camera=open_.world_from_cameras[k])
@@ -239,7 +239,7 @@ def test_an_occluder_hides_a_third_of_the_part_from_one_camera_only() -> None:
 
 def test_cameras_worse_than_they_say_are_off_by_more_and_say_the_same() -> None:
     for seed in range(3):
-        one, worse = bench_scene(seed), bench_scene(seed, Bench(camera_error_factor=2.0))
+        one, worse = bench_scene(seed), bench_scene(seed, BenchParameters(camera_error_factor=2.0))
         for k in range(2):
             stated = torch.from_numpy(one.cameras[k].world_from_camera)
             np.testing.assert_array_equal(stated, worse.cameras[k].world_from_camera)
@@ -257,7 +257,7 @@ def test_every_part_takes_its_peg_at_every_clearance(name: str) -> None:
     flat, _ = section.to_2D(to_2D=np.eye(4))
     (solid,) = flat.polygons_full
     hole = shapely.affinity.translate(shapely.Polygon(solid.interiors[0]), *-kind.part_from_hole[:2])
-    for clearance in Bench().clearances:
+    for clearance in BenchParameters().clearances:
         peg = kind.peg(clearance)
         assert peg.vertices[:, 2].min() == -PEG_LENGTH and peg.vertices[:, 2].max() == 0.0
         outline = shapely.MultiPoint(peg.vertices[:, :2]).convex_hull
@@ -268,7 +268,7 @@ def test_every_part_takes_its_peg_at_every_clearance(name: str) -> None:
 def test_a_peg_in_its_hole_is_free_by_its_clearance_and_no_more(name: str) -> None:
     """Half a clearance to each side: at 0.4 of it nothing is felt, at 0.6 the wall is."""
     kind = bench_part(name)
-    for clearance in Bench().clearances:
+    for clearance in BenchParameters().clearances:
         physics = PegPhysics(kind.part, kind.peg(clearance), ContactParameters())
         felt = []
         for share in (-0.4, -0.6):

@@ -20,7 +20,7 @@ from bcppl.inference.kernels.kernel import takes
 from bcppl.inference.proposals import spread_of
 from bcppl.inference.targets import Target
 from bcppl.models import camera_error
-from bcppl.models.worlds.two_cameras import World, record
+from bcppl.models.worlds.two_cameras import WorldParameters, simulate_recording
 from bcppl.sensors.measurements import Recording
 from bcppl.traces import Trace, generate
 from tests.invariance import equal_weights, largest_z
@@ -31,10 +31,10 @@ UNSEEN = Target({"depth_0": 0.0, "depth_1": 0.0})
 INSTRUMENTS = ("camera_0", "camera_1")
 
 
-@pytest.fixture(scope="module", params=[None, World(tilt=0.0)], ids=["any tilt", "flat"])
+@pytest.fixture(scope="module", params=[None, WorldParameters(tilt=0.0)], ids=["any tilt", "flat"])
 def recording(request: pytest.FixtureRequest) -> Recording:
     """All axes free, or tilt held."""
-    return record(1, request.param)
+    return simulate_recording(1, request.param)
 
 
 def draws(recording: Recording, count: int) -> Trace:
@@ -112,7 +112,7 @@ def test_what_makes_no_scene_is_refused_in_a_sentence(recording: Recording) -> N
 
 def test_several_views_share_one_error() -> None:
     """A second view from the same place does not inform the error: the images are of one pose."""
-    trace = draws(record(1, World(views=2)), 3)
+    trace = draws(simulate_recording(1, WorldParameters(views=2)), 3)
     assert [a for a in trace.choices if a.startswith("seen_by")] == ["seen_by_camera_0", "seen_by_camera_1"]
     first, second = trace.distributions["depth_0"], trace.distributions["depth_1"]
     assert isinstance(first, RobustDepth)
@@ -122,7 +122,7 @@ def test_several_views_share_one_error() -> None:
 def test_beliefs_hold_the_truth_and_are_as_wide_as_the_cameras_errors() -> None:
     distance = 0.0
     for seed in (1, 2):
-        recording = record(seed)
+        recording = simulate_recording(seed)
         # Fewer moves than the default's: a belief that is not quite there is wide, not sure.
         *_, last = infer(camera_error.model, recording, seed=seed, sweeps=(4, 4), share=(0.6, 0.6))
         belief = last.belief

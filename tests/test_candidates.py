@@ -75,7 +75,7 @@ def test_candidates_touch_the_faces_they_name_and_nothing_on_their_way(seed: int
     for plan in found:
         if not isinstance(plan, Plan) or plan.name.split()[0] not in ("touch", "slide", "pair"):
             continue
-        carried, wrench, world_from_peg = scene.executed(plan)
+        carried, wrench, world_from_peg = scene.execute(plan)
         force = np.linalg.norm(wrench[:, :3] - wrench[:10, :3].mean(axis=0), axis=1)
         met = gap(truth, torch.from_numpy(world_from_peg))
         strokes = [k for k, manner in enumerate(plan.manners) if manner == "guarded"]
@@ -104,7 +104,7 @@ def test_a_slide_stays_on_its_face_and_an_attempt_ends_in_the_hole() -> None:
     for plan in found:
         if not isinstance(plan, Plan) or plan.name.startswith(("touch", "pair")):
             continue
-        _, wrench, world_from_peg = scene.executed(plan)
+        _, wrench, world_from_peg = scene.execute(plan)
         force = np.linalg.norm(wrench[:, :3] - wrench[:10, :3].mean(axis=0), axis=1)
         if plan.name.startswith("slide"):
             pressed = world_from_peg[force > 1.5]

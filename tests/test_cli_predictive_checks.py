@@ -10,7 +10,7 @@ import pytest
 
 from bcppl.cli.predictive_checks import MEANING, NAMED, sentence, together
 from bcppl.inference.predictive import Check
-from bcppl.models.worlds.bench import Bench, bench_scene
+from bcppl.models.worlds.bench import BenchParameters, bench_scene
 from bcppl.recordings import save
 from tests.command_line import Ran, short
 from tests.made_recordings import assert_one_sentence
@@ -22,7 +22,7 @@ SETTINGS = "--model", "look_and_touch", "--inference", "guided_smc", "--particle
 def test_a_hidden_view_is_marked_and_named_and_a_clean_one_is_not(
     hidden: bool, bcppl: Callable[..., Ran], tmp_path: Path
 ) -> None:
-    scene = bench_scene(0, Bench(occluder=hidden))
+    scene = bench_scene(0, BenchParameters(occluder=hidden))
     save(scene.look(), tmp_path / "look.h5")
     ran = bcppl("run", "look.h5", *SETTINGS)
     assert ran.code == 0, ran.err

@@ -14,7 +14,7 @@ from bcppl.distributions.manifold import ContactManifold
 from bcppl.inference import infer
 from bcppl.inference.design import rules
 from bcppl.models.look_and_touch import model
-from bcppl.models.worlds.bench import Bench, bench_scene
+from bcppl.models.worlds.bench import BenchParameters, bench_scene
 from bcppl.recordings import save
 from bcppl.recordings.beliefs import save_belief
 from tests.command_line import Ran
@@ -25,7 +25,7 @@ WORDS = "probe", "belief.h5", "--of", "look.h5", "--candidates", "touch:1", "--o
 @functools.cache
 def saved() -> dict[str, bytes]:
     """A recording of two small views, and the belief after them, as files hold them."""
-    look = bench_scene(5, Bench(width=64, rows=48, focal=64.0), part="square 8 mm").look()
+    look = bench_scene(5, BenchParameters(width=64, rows=48, focal=64.0), part="square 8 mm").look()
     *_, last = infer(model, look, particles=10, seed=0)
     with tempfile.TemporaryDirectory() as folder:
         save(look, f"{folder}/look.h5")

@@ -24,7 +24,7 @@ from bcppl.traces import Trace, extend, generate, simulate, update
 
 @functools.cache
 def recorded() -> Recording:
-    return world.record(0)
+    return world.simulate_recording(0)
 
 
 @functools.cache

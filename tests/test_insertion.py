@@ -112,8 +112,8 @@ def test_a_plan_follows_the_axis_covers_the_doubt_and_searches_as_finely_as_the_
 def test_a_peg_with_a_tenth_of_clearance_goes_in_and_the_chance_says_so(part: str) -> None:
     scene, plan = tight(part), plan_of(part)
     result = scene.insert(plan)
-    assert result.inserted and result.depth > 0.02 and result.peak_press < 10.0
-    assert result.found <= plan.search.times[-1] and result.time < 8.0
+    assert result.inserted and result.depth > 0.02 and result.sustained_force < 10.0
+    assert result.found_at <= plan.search.times[-1] and result.time < 8.0
     assert scene.insert(plan) == result
     if part == "square 8 mm":
         chance = success_probability(touched(part), plan, PegPhysics(scene.part, scene.peg), particles=8)
@@ -129,8 +129,8 @@ def test_the_search_is_what_finds_it() -> None:
         off, scene.part, scene.peg, parameters=InsertionParameters(maximum_radius=0.0001, search_time=1.0)
     )
     result = scene.insert(blind)
-    assert not result.inserted and np.isnan(result.found) and result.depth < 0.001
-    assert result.peak_press < 30.0
+    assert not result.inserted and np.isnan(result.found_at) and result.depth < 0.001
+    assert result.sustained_force < 30.0
 
 
 def test_the_chance_is_the_arms_rises_with_the_clearance_and_is_nothing_without_the_hole() -> None:
@@ -163,7 +163,7 @@ def test_the_chance_is_the_arms_rises_with_the_clearance_and_is_nothing_without_
 
 def test_a_search_that_has_found_its_hole_leaves_the_rest_undone() -> None:
     scene, plan = tight(), plan_of()
-    whole = scene.executed(plan.search)[0]
+    whole = scene.execute(plan.search)[0]
     (stopped,) = [t for k, t in whole.stops.items() if plan.search.manners[k] == "searching"]
     after = whole.probe.command[whole.probe.command_times > stopped + 0.05]
     assert np.ptp(after, axis=0).max() < 1e-9

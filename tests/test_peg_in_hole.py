@@ -44,11 +44,11 @@ def test_inference_does_not_share_the_parameters_of_the_world() -> None:
     for name in ("time_step", "friction", "time_constant"):
         assert getattr(ours, name) != getattr(theirs, name), name
     assert theirs.time_step == 0.0005
-    assert world.World().depth_noise != peg_in_hole.DepthSettings().depth_scale
+    assert world.WorldParameters().depth_noise != peg_in_hole.DepthSettings().depth_scale
 
 
 def test_the_shipped_recording_is_the_bench_s_first() -> None:
-    again = world.record(0)
+    again = world.simulate_recording(0)
     shipped = recorded()
     np.testing.assert_allclose(again.truth, shipped.truth, atol=1e-12)
     for new, old in zip(again.measurements, shipped.measurements, strict=True):

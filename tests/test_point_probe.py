@@ -13,7 +13,7 @@ from bcppl import poses
 from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
-from bcppl.models.point_probe import learn, model, prepare
+from bcppl.models.point_probe import estimate_settings, model, prepare
 from bcppl.models.worlds.point_probe import noise_seed
 from bcppl.recordings.importers.point_probe import command
 from bcppl.sensors import Measurement, Push, Recording
@@ -106,7 +106,7 @@ def test_settings_are_learnt_from_pushes_at_a_known_pose() -> None:
         4, pushes=80, direction_outlier=0.0, **{k: getattr(given, k) for k in keys}
     )
     touching = [m for m in recording.measurements if np.abs(m.observation.wrench[-1, :2]).max() > 2.0]
-    learnt = learn(replace(recording, measurements=touching))
+    learnt = estimate_settings(replace(recording, measurements=touching))
     assert learnt.finger == pytest.approx(given.finger, abs=2e-4)
     # Half of what one session shows is taken to last.
     half = [0.5 * r for r in given.registration]
@@ -168,7 +168,7 @@ def log(name: str) -> Recording:
 
 
 def test_defaults_are_learnt_from_one_log() -> None:
-    learnt, settings = learn(log("10_130")), FingerSettings()
+    learnt, settings = estimate_settings(log("10_130")), FingerSettings()
     for name in ("finger", "registration", "drift"):
         assert getattr(learnt, name) == pytest.approx(getattr(settings, name), abs=1e-5)
     for name in ("offset", "spread", "tolerance", "free_spread"):

@@ -21,7 +21,7 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.predictive import THRESHOLD, Check, surprise
-from bcppl.models.worlds.bench import Bench, BenchScene, bench_scene
+from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
 from bcppl.recordings import DepthImage
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import Series, generate, simulate
@@ -34,7 +34,7 @@ def belief(program: Any, args: tuple[Any, ...], observed: dict[str, Tensor], cou
     return Population(*generate(program, args, observed, count))
 
 
-def looked_at(bench: Bench | None = None, seed: int = 0) -> tuple[BenchScene, Any]:
+def looked_at(bench: BenchParameters | None = None, seed: int = 0) -> tuple[BenchScene, Any]:
     """A scene, and a program by which its first camera that may be hidden sees the part where it is."""
     scene = bench_scene(seed, bench)
     renderer, view = RayCaster(scene.part), 0 if scene.hidden_view is None else scene.hidden_view
@@ -81,7 +81,7 @@ def test_an_occluder_surprises_the_true_pose_and_no_clean_view_does() -> None:
     still = torch.zeros(3, dtype=torch.float64)
     for seed in range(3):
         for hidden in (False, True):
-            scene, program = looked_at(Bench(occluder=hidden), seed)
+            scene, program = looked_at(BenchParameters(occluder=hidden), seed)
             check = surprise(belief(program, (still,), {"depth": of_view(scene)}))["depth"]
             assert check.kind == "image" and check.surprising == hidden, (seed, hidden, check)
     # So does a belief that is off by two centimetres.
@@ -198,7 +198,7 @@ def test_a_series_is_left_out_and_no_particles_are_refused() -> None:
 
 def test_a_mutant_that_draws_over_missing_pixels_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the mask replicas have more pixels than the image: nothing would ever surprise."""
-    scene, program = looked_at(Bench(occluder=True))
+    scene, program = looked_at(BenchParameters(occluder=True))
     image = of_view(scene)
     image[torch.rand_like(image) < 0.6] = math.nan
     population = belief(program, (torch.zeros(3).double(),), {"depth": image})

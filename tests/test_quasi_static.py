@@ -222,7 +222,7 @@ def touch_plan() -> Plan:
 def test_the_benchs_arm_gets_to_where_the_probe_of_its_plan_does() -> None:
     """The arm stops its guarded motion and goes on from there; the probe presses on, and slides the same."""
     plan, one = touch_plan(), scene()
-    carried, _, _ = one.executed(plan)
+    carried, _, _ = one.execute(plan)
     probe = probe_of(plan)
     np.testing.assert_array_equal(probe.stamps, carried.probe.stamps)
     window = action_of(plan)

@@ -19,7 +19,7 @@ from bcppl.inference.filters import bayes_contact, guided_smc, tempered_smc
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models import look_and_touch, peg_in_hole, point_probe
-from bcppl.models.worlds.bench import Bench, bench_scene
+from bcppl.models.worlds.bench import BenchParameters, bench_scene
 from bcppl.recordings import Recording, load
 from bcppl.sensors.scene import Scene
 from bcppl.traces import Model
@@ -35,7 +35,7 @@ TOP, LATER, ON = 8, 10, 11  # windows in which the peg feels the top, again fart
 @functools.cache
 def probed() -> Recording:
     """A scene of the bench with small images, probed by a plan laid out at the truth."""
-    scene = bench_scene(7, Bench(width=64, rows=48, focal=64.0), part="square 8 mm")
+    scene = bench_scene(7, BenchParameters(width=64, rows=48, focal=64.0), part="square 8 mm")
     truth = torch.from_numpy(scene.truth)
     certain = Belief(truth.expand(4, 7).clone(), torch.zeros(4, dtype=torch.float64))
     whole = scene.probe(three_two_one(certain, scene.part, scene.peg))

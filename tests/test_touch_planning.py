@@ -187,7 +187,7 @@ def carried(seed: int) -> tuple[BenchScene, Plan, Execution]:
     """A plan for a belief that is the truth, as the bench carries it out."""
     scene = bench_scene(seed)
     plan = three_two_one(about(scene, 0.0), scene.part, scene.peg)
-    return scene, plan, scene.executed(plan)[0]
+    return scene, plan, scene.execute(plan)[0]
 
 
 SEEDS = (5, 7, 11)  # a square and a D-shaped hole in blocks, a round tray

@@ -18,7 +18,7 @@ from bcppl.traces import extend, generate, update
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_vision_leaves_it_open_and_each_touch_settles_one_half(seed: int) -> None:
-    recording, true = world.record(seed), world.which(seed)
+    recording, true = world.simulate_recording(seed), world.which(seed)
     scene = which_hole.prepare(recording)
     empty, _ = generate(which_hole.which_hole, (scene, []), {}, 4)
     truth = torch.from_numpy(recording.truth).expand(4, 7).clone()
@@ -42,7 +42,7 @@ def test_the_plate_s_pieces_are_its_mesh() -> None:
     places, inside = places[(inside - 0.009).abs() > 0.0015], inside[(inside - 0.009).abs() > 0.0015] < 0.009
     over = poses.identity(len(places))
     over[:, :2], over[:, 2] = -places, -0.036
-    recording = world.record(0)
+    recording = world.simulate_recording(0)
     action = recording.measurements[1].action
     assert isinstance(action, ProbeWindow)
     probe = action.probe
@@ -58,8 +58,8 @@ def test_the_plate_s_pieces_are_its_mesh() -> None:
 def test_it_is_offered_by_name_and_refuses_what_cannot_be_chosen_from() -> None:
     assert loading.model("which_hole") is which_hole.model
     with pytest.raises(InputError, match="two or more"):
-        which_hole.prepare(world.record(0), holes=[(0.0, 0.0)])
-    recording = world.record(0)
+        which_hole.prepare(world.simulate_recording(0), holes=[(0.0, 0.0)])
+    recording = world.simulate_recording(0)
     for holes, message in [
         ([(0, 0), (34, 0)], r"hole 1 is at \[34.0, 0.0\], beside part .* give metres"),
         ([(0, 0), (float("nan"), 0)], "hole 1 is at .nan"),

@@ -1,5 +1,5 @@
 from bcppl.models.worlds.bench import (
-    Bench as Bench,
+    BenchParameters as BenchParameters,
     BenchScene as BenchScene,
     bench_scene as bench_scene,
 )

@@ -1,4 +1,4 @@
-"""The arm and the cameras of a bench scene, asked to do one thing after another."""
+"""The arm and the cameras of a bench scene, which execute one candidate after another."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.models.worlds.bench import BenchScene
 from bcppl.models.worlds.inserting import InsertionResult
+from bcppl.models.worlds.simulated_sensors import depth_image, per_axis
 from bcppl.robot.insertion_plan import InsertionPlan
 from bcppl.sensors import DepthImage, Measurement
 from bcppl.sensors.candidates import Candidate, motion_of
@@ -20,15 +21,15 @@ from bcppl.sensors.candidates import Candidate, motion_of
 Array = npt.NDArray[np.float64]
 
 _BETWEEN = 0.5  # s from the end of one probe to the beginning of the next
-_VIEWS = 9  # what cameras that come later are drawn from, beside what the scene is
+_VIEWS = 9  # stream of random numbers for further cameras
 
 
 class BenchArm:
-    """A world for `bcppl.inference.design.loop`, which remembers the time and where its sensor has drifted.
+    """A world for `bcppl.inference.design.loop`, with a clock and a drifting wrench sensor.
 
-    The first plan is felt as in `BenchScene.probe`; every other has new noise, and a zero that has walked on.
-    A camera that the scene does not know stands off from where it says, and has a range bias, as the scene's
-    cameras do; one that shares its device with one of these, by the same.
+    The first plan is measured as in `BenchScene.probe`; every other has new noise, and a bias that has
+    drifted. A camera that is not the scene's has an error of its stated pose and a range bias like those; one
+    of the same device has the same.
 
     Attributes:
         scene: the bench scene.
@@ -38,49 +39,47 @@ class BenchArm:
     def __init__(self, scene: BenchScene) -> None:
         self.scene = scene
         self.clock = 0.0
-        self._sensors = scene.sensors()
-        self._looking = np.random.default_rng([scene.seed, _VIEWS])
-        self._off: dict[str, tuple[Array, float]] = {}
-        for camera, stands, bias in zip(
-            scene.cameras, scene.world_from_cameras, scene.range_bias, strict=True
-        ):
-            off = poses.local(torch.from_numpy(camera.world_from_camera), torch.from_numpy(stands))
-            self._off[camera.instrument] = off.numpy(), float(bias)
+        self._errors = scene.sensor_errors()
+        self._views = np.random.default_rng([scene.seed, _VIEWS])
+        self._cameras: dict[str, tuple[Array, float]] = {}  # by device, error of the pose and range bias
+        true_poses, bias = scene.world_from_cameras, scene.range_bias
+        for k, camera in enumerate(scene.cameras):
+            stated, true_pose = torch.from_numpy(camera.world_from_camera), torch.from_numpy(true_poses[k])
+            self._cameras[camera.instrument] = poses.local(stated, true_pose).numpy(), float(bias[k])
 
     def execute(self, candidate: Candidate) -> list[Measurement]:
-        """What is measured: the windows of a plan, on a clock that goes on, or an image.
+        """The measurements of a candidate: the windows of a plan, later than those before it, or an image.
 
         Raises:
-            InputError: it is asked for something else.
+            InputError: it is of no known kind.
         """
         motion = motion_of(candidate)
         if motion is None:
             return [Measurement(candidate, self._look(candidate.camera))]
-        began = candidate.times[0]
-        plan = replace(candidate, times=candidate.times - began + self.clock)
+        plan = replace(candidate, times=candidate.times - candidate.times[0] + self.clock)
         self.clock = float(plan.times[-1]) + _BETWEEN
-        return self.scene.felt(plan, self._sensors)
+        return self.scene.measure(plan, self._errors)
 
     def insert(self, plan: InsertionPlan) -> InsertionResult:
-        """An insertion as it truly went.
+        """The true result of an insertion.
 
         Raises:
-            InputError: what is given is no plan of one.
+            InputError: the plan is of another type.
         """
         if not isinstance(plan, InsertionPlan):
             raise InputError(
-                f"the arm is asked to insert by a {type(plan).__name__}; give what `insertion_plan` makes."
+                f"the arm is asked to insert by a {type(plan).__name__}; give the result of `insertion_plan`."
             )
-        return self.scene.insert(plan, self._sensors)
+        return self.scene.insert(plan, self._errors)
 
     def _look(self, camera: Camera) -> DepthImage:
         bench = self.scene.bench
-        if camera.instrument not in self._off:
-            spread = np.array([bench.camera_shift] * 3 + [bench.camera_turn] * 3) * bench.camera_error_factor
-            off = spread * self._looking.normal(size=6)
-            self._off[camera.instrument] = off, float(self._looking.normal(scale=bench.range_bias))
-        off, bias = self._off[camera.instrument]
-        stands = poses.retract(torch.as_tensor(camera.world_from_camera), torch.from_numpy(off))
-        depth = self.scene.depth_from(replace(camera, world_from_camera=stands.numpy()))
-        read = bench.depth_noise.sample(camera, depth + bias, self._looking)
-        return DepthImage(read.astype(np.float32).astype(np.float64))
+        if camera.instrument not in self._cameras:
+            spread = per_axis(bench.camera_shift, bench.camera_turn) * bench.camera_error_factor
+            error = spread * self._views.normal(size=6)
+            self._cameras[camera.instrument] = error, float(self._views.normal(scale=bench.range_bias))
+        error, bias = self._cameras[camera.instrument]
+        true_pose = poses.retract(torch.as_tensor(camera.world_from_camera), torch.from_numpy(error))
+        depth = self.scene.depth_from(replace(camera, world_from_camera=true_pose.numpy()))
+        read = bench.depth_noise.sample(camera, depth + bias, self._views)
+        return depth_image(read)

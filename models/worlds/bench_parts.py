@@ -20,17 +20,17 @@ Array = npt.NDArray[np.float64]
 
 PEG_LENGTH = 0.08  # m, from the wrench sensor to the tip
 BLOCK = (0.06, 0.06, 0.025)  # m
-OFFSET = (0.007, 0.005)  # m: where the hole is in a block's frame
-TRAY_TOP = 0.028  # m: height of a tray's top face in its frame, in which it stands on z = 0
+OFFSET = (0.007, 0.005)  # m, of the hole in a block's frame
+TRAY_TOP = 0.028  # m: height of a tray's top face in its frame, whose z = 0 is its underside
 
 
 @dataclass(frozen=True, eq=False)
 class BenchPart:
-    """One part that is looked for.
+    """A part with a hole.
 
     Attributes:
-        name: what people call it.
-        part: what is seen and touched, one geometry for both.
+        name: of the part.
+        part: its geometry, for rendering and contact.
         hole: the hole's outline in its own frame, metres.
         part_from_hole: (7,) the hole's frame: origin at the centre of its outline in the plane of the part's
             top face, z out of the material.

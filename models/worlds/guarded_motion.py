@@ -1,7 +1,7 @@
-"""An arm that carries out a plan: guarded motions end where it feels a force, searches where the peg yields.
+"""An arm that executes a plan: a contact force stops guarded motions, a sinking peg stops searches.
 
-The wrench is watched as a robot's program would watch it: at the recorded rate, tared, noise and bias
-included; a motion that has felt enough twice in a row is stopped at the next sample.
+The wrench is monitored as by a robot's program: at the recorded rate, tared, noise and bias included. A
+motion is stopped at the sample after two in a row that exceed its force.
 """
 
 from __future__ import annotations
@@ -25,20 +25,19 @@ Array = npt.NDArray[np.float64]
 STEP = 0.005  # s between the command's poses
 ROUNDED = 8  # steps over which corners are rounded: 40 ms
 TARE = 10  # samples
-FELT = 2  # samples in a row: an impact, over within one, is no press
+SUSTAINED = 2  # samples in a row: an impact is shorter
 
 
 @dataclass(frozen=True, eq=False)
 class Execution:
-    """A plan as it was carried out.
+    """The execution of a plan.
 
     Attributes:
         probe: the command and the stamps.
-        stops: (s) when each guarded motion that felt enough, or search that found its hole, was stopped, by
-            its place in the plan.
-        wrench: (T, 6) what was truly exerted on the peg at the stamps, N and N m, in the peg's frame.
-        world_from_peg: (T, 7) where the peg truly was.
-        met: (7,) where the peg was when the last guarded motion was stopped; None where none was.
+        stops: (s) when each guarded motion or search was stopped, by its number in the plan.
+        wrench: (T, 6) true wrench on the peg at the stamps, N and N m, in the peg's frame.
+        world_from_peg: (T, 7) true poses of the peg.
+        contact_pose: (7,) of the peg when the last guarded motion was stopped; None where none was.
         state: of the simulation at the last stamp, from which the next motion continues.
     """
 
@@ -46,30 +45,30 @@ class Execution:
     stops: Mapping[int, float]
     wrench: Array
     world_from_peg: Array
-    met: Array | None
+    contact_pose: Array | None
     state: SimulationState
 
 
 def stamps_of(plan: Plan) -> Array:
-    """When a plan's wrench and peg pose are read, s: (T,), up to but without its last knot."""
+    """The times (T,) of a plan's samples, s, up to its last knot and without it."""
     duration = float(plan.times[-1] - plan.times[0])
     return np.asarray(plan.times[0] + np.arange(round(duration * plan.rate)) / plan.rate)
 
 
 def command_of(plan: Plan, stops: Mapping[int, float]) -> Probe:
-    """The command of a plan of which some guarded motions and searches are stopped early, and no others.
+    """The command of a plan of which some guarded motions and searches are stopped early.
 
-    Corners are rounded: the command is the mean of the last 40 ms of where the plan leads. So it is 20 ms
-    late, stops within 40 ms, and never depends on what is yet to be felt. A corner at which the velocity
-    changes by 100 mm/s is felt as 0.5 N by the 0.2 kg of the tool; slower corners as less, in proportion.
+    Corners are rounded: the command is the mean of the plan's last 40 ms. So it is 20 ms late, stops within
+    40 ms, and never depends on later contacts. A corner at which the velocity changes by 100 mm/s takes 0.5 N
+    to accelerate the 0.2 kg of the tool; others in proportion.
 
     Args:
-        plan: what the arm is asked to do.
-        stops: when (s) a guarded or searching motion is stopped, by its place in the plan.
+        plan: of the arm.
+        stops: when (s) a guarded or searching motion is stopped, by its number in the plan.
     """
-    found = False  # what the search was for: the motions it has left stay undone
+    found = False  # the hole: the remaining motions of the search are skipped
     times, ends = [float(plan.times[0])], [plan.world_from_peg[0]]
-    shift, turn = np.zeros(3), Rotation.identity()  # of what follows, by the ways left undone
+    shift, turn = np.zeros(3), Rotation.identity()  # of the motions that follow, by the skipped ones
     for k, manner in enumerate(plan.manners):
         if manner == "free":
             shift, turn = np.zeros(3), Rotation.identity()
@@ -107,26 +106,26 @@ def execute(
     world_from_part: Array,
     error: Array,
     *,
-    until_found: bool = False,
-    following: Execution | None = None,
-    zero: Array | None = None,
+    stop_at_hole: bool = False,
+    after: Execution | None = None,
+    tare: Array | None = None,
 ) -> Execution:
-    """Simulate an arm that carries out a plan.
+    """Simulate an arm that executes a plan.
 
-    From 10 to 40 mm/s a motion guarded at 4 N ended at 3.0 to 5.9 N (it goes on for up to 60 ms and the
+    From 10 to 40 mm/s a motion guarded at 4 N ended at 3.0 to 5.9 N (it continues for up to 60 ms and the
     spring is 2500 N/m), at 60 mm/s at 6.7 to 8.4 N; the impact itself peaks at up to 46 N for a sample.
 
     Args:
-        plan: what the arm is asked to do.
-        part: what is touched.
-        peg: what is held.
+        plan: of the arm.
+        part: in contact.
+        peg: the held peg.
         contact: the world's physics.
-        world_from_part: (7,) where the part truly is.
-        error: (T, 6) what the sensor adds to the wrench at the stamps: bias, drift and noise, N and N m.
-        until_found: it is over when a search has found its hole.
-        following: another plan, just carried out: the peg goes on from where it stood, as fast as it was.
-        zero: (3,) N that the sensor reads when nothing is touched; unless given the mean of the first ten
-            samples, during which nothing stops.
+        world_from_part: (7,) true pose of the part.
+        error: (T, 6) of the measured wrench at the stamps: bias, drift and noise, N and N m.
+        stop_at_hole: whether the execution ends when a search has found its hole.
+        after: the execution just before it, whose final position and velocity are the initial ones.
+        tare: (3,) N, the sensor's reading without contact; by default the mean of the first ten samples,
+            during which no motion is stopped.
 
     Raises:
         InputError: the plan takes less than the eleven samples by which the wrench is tared, or is sampled
@@ -142,10 +141,10 @@ def execute(
     stops: dict[int, float] = {}
     probe = command_of(plan, stops)
     stepper = Stepper(model, probe, contact.time_step)
-    state = stepper.at_rest(1) if following is None else following.state
+    state = stepper.at_rest(1) if after is None else after.state
     rows = np.empty((len(stamps), WRENCH.stop))
     motion = np.clip(np.searchsorted(plan.times, stamps + 1e-9, side="right") - 1, 0, len(manners) - 1)
-    done, met = len(stamps), None
+    count, contact_pose = len(stamps), None
     for k, of in enumerate(motion):
         row, state = stepper.run(state, pose, {}, k, k + 1)
         rows[k] = row[0, 0]
@@ -154,37 +153,38 @@ def execute(
         if (
             manners[of] == "guarded"
             and stamps[k + 1] < plan.times[of + 1]
-            and (k >= TARE or zero is not None)
+            and (k >= TARE or tare is not None)
         ):
-            felt = rows[: k + 1, WRENCH][:, :3] + error[: k + 1, :3]
-            rest = felt[:TARE].mean(axis=0) if zero is None else zero
-            stopped = bool((np.linalg.norm(felt[-FELT:] - rest, axis=1) > plan.force).all())
-            met = rows[k, POSE].copy() if stopped else met
+            force = rows[: k + 1, WRENCH][:, :3] + error[: k + 1, :3]
+            rest = force[:TARE].mean(axis=0) if tare is None else tare
+            stopped = bool((np.linalg.norm(force[-SUSTAINED:] - rest, axis=1) > plan.force).all())
+            contact_pose = rows[k, POSE].copy() if stopped else contact_pose
         else:
             searching = manners[of] == "searching" and not _found_before(manners, stops, int(of))
-            stopped = searching and _sunk(probe, rows[k, POSE], float(stamps[k]), met) > plan.sink
-            if stopped and until_found:
-                stops[int(of)], done = float(stamps[k]), k + 1
+            depth = _sunk(probe, rows[k, POSE], float(stamps[k]), contact_pose) if searching else 0.0
+            stopped = searching and depth > plan.sink
+            if stopped and stop_at_hole:
+                stops[int(of)], count = float(stamps[k]), k + 1
                 break
-        if stopped and manners[motion[k + 1]] == manners[of]:  # else it is over anyway
+        if stopped and manners[motion[k + 1]] == manners[of]:  # otherwise it ends now
             stops[int(motion[k + 1])] = float(stamps[k + 1])
-            probe = _going_on(probe, command_of(plan, stops), stamps[k + 1])
+            probe = _continued(probe, command_of(plan, stops), stamps[k + 1])
             stepper = Stepper(model, probe, contact.time_step)
-    rows = rows[:done]
-    probe = replace(probe, stamps=stamps[:done])
-    return Execution(probe, stops, rows[:, WRENCH].copy(), rows[:, POSE].copy(), met, state)
+    rows = rows[:count]
+    probe = replace(probe, stamps=stamps[:count])
+    return Execution(probe, stops, rows[:, WRENCH].copy(), rows[:, POSE].copy(), contact_pose, state)
 
 
-def _sunk(probe: Probe, world_from_peg: Array, time: float, met: Array | None) -> float:
-    """How far (m) a peg is below where it met a surface, along the commanded z; none met: infinite."""
-    if met is None:
+def _sunk(probe: Probe, world_from_peg: Array, time: float, contact_pose: Array | None) -> float:
+    """How far (m) a peg is below its contact with a surface, along the commanded z; infinite without one."""
+    if contact_pose is None:
         return float("inf")
     led = interpolated_command(probe, np.array([time]))[0][0]
-    return float(_rotation(led).inv().apply(met[:3] - world_from_peg[:3])[2])
+    return float(_rotation(led).inv().apply(contact_pose[:3] - world_from_peg[:3])[2])
 
 
 def _found_before(manners: Sequence[Manner], stops: Mapping[int, float], motion: int) -> bool:
-    """Whether the search of which a motion is a part has found its hole."""
+    """Whether the search that a motion belongs to has found its hole."""
     while motion >= 0 and manners[motion] == "searching":
         if motion in stops:
             return True
@@ -192,15 +192,15 @@ def _found_before(manners: Sequence[Manner], stops: Mapping[int, float], motion:
     return False
 
 
-def _going_on(before: Probe, after: Probe, time: float) -> Probe:
-    """The later of two commands, equal to the bit to the earlier one up to a time, as it was commanded."""
+def _continued(before: Probe, after: Probe, time: float) -> Probe:
+    """The later of two commands, equal to the earlier one up to a time, to the bit."""
     given = before.command_times <= time + 1e-9
     after.command[given] = before.command[given]
     return after
 
 
 def _path(plan: Plan, times: Array, world_from_peg: Array) -> Probe:
-    """Straight motions between poses (K, 7) at times that may fall together."""
+    """Straight motions between poses (K, 7) at times of which some may coincide."""
     apart = np.append(np.diff(times) > 1e-9, True)
     return Probe(plan.name, times[apart], world_from_peg[apart], plan.stiffness, plan.damping, times[:1])
 

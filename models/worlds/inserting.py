@@ -1,4 +1,4 @@
-"""An arm that carries out an insertion: it searches until the peg yields, and pushes from where it stands."""
+"""An arm that executes an insertion: it searches until the peg sinks in, and pushes from there."""
 
 from __future__ import annotations
 
@@ -21,25 +21,24 @@ _BESIDE = 0.002  # m: a tip farther from the hole's axis is not in the hole but 
 
 
 class InsertionResult(NamedTuple):
-    """How an insertion went.
+    """The result of an insertion.
 
     Attributes:
         inserted: whether the peg ended in the hole, at least 0.8 of its depth or 10 mm beyond its chamfer
             below the top of the part.
-        found: when (s) the search ended because the peg yielded; NaN where it did not. It is pushed then as
-            well, and may slip in.
-        depth: how deep the tip truly ended below the top, metres.
-        peak_force: the largest force that was exerted on the peg at a sample, N.
-        peak_press: the same but for single samples, over within which is an impact: of each two samples in a
-            row the lesser, N.
-        time: seconds that all of it took.
+        found_at: when (s) the search ended because the peg sank in; NaN where it did not. The push follows
+            all the same, and may still succeed.
+        depth: of the tip below the top at the end, metres.
+        peak_force: the largest force on the peg at a sample, N.
+        sustained_force: the largest force on the peg over two samples in a row, N: an impact is shorter.
+        time: of the whole insertion, s.
     """
 
     inserted: bool
-    found: float
+    found_at: float
     depth: float
     peak_force: float
-    peak_press: float
+    sustained_force: float
     time: float
 
 
@@ -51,58 +50,60 @@ def insert(
     world_from_part: Array,
     part_from_hole: Array,
     error: Array,
-    wobble: Array,
+    pose_error: Array,
 ) -> InsertionResult:
-    """Simulate an arm that carries out an insertion.
+    """Simulate an arm that executes an insertion.
 
     Args:
-        plan: what it is asked to do.
-        part: what has the hole.
-        peg: what is held.
+        plan: of the insertion.
+        part: with the hole.
+        peg: the held peg.
         contact: the world's physics.
-        world_from_part: (7,) where the part truly is.
-        part_from_hole: (7,) where its hole truly is.
-        error: (T, 6) what the sensor adds to the wrench, N and N m; T as `samples_of` the plan.
-        wobble: (T, 6) what the measured pose of the peg is off by, m and radians, in the peg's axes.
+        world_from_part: (7,) true pose of the part.
+        part_from_hole: (7,) true pose of its hole.
+        error: (T, 6) of the measured wrench, N and N m; T as `samples_of` the plan.
+        pose_error: (T, 6) of the peg's measured pose, m and radians, in the peg's axes.
     """
-    search = execute(plan.search, part, peg, contact, world_from_part, error, until_found=True)
+    search = execute(plan.search, part, peg, contact, world_from_part, error, stop_at_hole=True)
     done = len(search.wrench)
-    zero = (search.wrench[:TARE, :3] + error[:TARE, :3]).mean(axis=0)
-    seen = poses.retract(torch.from_numpy(search.world_from_peg[-1]), torch.from_numpy(wobble[done - 1]))
+    tare = (search.wrench[:TARE, :3] + error[:TARE, :3]).mean(axis=0)
+    last = torch.from_numpy(search.world_from_peg[-1])
+    measured = poses.retract(last, torch.from_numpy(pose_error[done - 1]))
     push = execute(
-        plan.push_from(seen.numpy(), _below(search.met, seen)),
+        plan.push_from(measured.numpy(), _below(search.contact_pose, measured)),
         part,
         peg,
         contact,
         world_from_part,
         error[done:],
-        following=search,
-        zero=zero,
+        after=search,
+        tare=tare,
     )
     world_from_hole = poses.compose(torch.from_numpy(world_from_part), torch.from_numpy(part_from_hole))
     tip = torch.tensor([[0.0, 0.0, float(peg.vertices[:, 2].min())]], dtype=torch.float64)
-    there = poses.transform(torch.from_numpy(push.world_from_peg[-1]), tip)
-    in_hole = poses.transform(poses.inverse(world_from_hole), there)[0]
+    end = poses.transform(torch.from_numpy(push.world_from_peg[-1]), tip)
+    in_hole = poses.transform(poses.inverse(world_from_hole), end)[0]
     depth, beside = -float(in_hole[2]), float(in_hole[:2].norm())
     force = np.linalg.norm(np.concatenate([search.wrench, push.wrench])[:, :3], axis=1)
     searched = [t for k, t in search.stops.items() if plan.search.manners[k] == "searching"]
     return InsertionResult(
         inserted=bool(depth >= plan.deep_enough and beside < _BESIDE),
-        found=searched[0] if searched else float("nan"),
+        found_at=searched[0] if searched else float("nan"),
         depth=depth,
         peak_force=float(force.max()),
-        peak_press=float(np.minimum(force[1:], force[:-1]).max()),
+        sustained_force=float(np.minimum(force[1:], force[:-1]).max()),
         time=len(force) / plan.search.rate,
     )
 
 
-def _below(met: Array | None, seen: torch.Tensor) -> float | None:
-    """How far (m) a peg is below where it met the top, along its z; None where it met nothing."""
-    if met is None:
+def _below(contact_pose: Array | None, world_from_peg: torch.Tensor) -> float | None:
+    """How far (m) a peg is below its contact with the top, along its z; None without contact."""
+    if contact_pose is None:
         return None
-    return -float(poses.transform(poses.inverse(torch.from_numpy(met)), seen[None, :3])[0, 2])
+    peg_from_world = poses.inverse(torch.from_numpy(contact_pose))
+    return -float(poses.transform(peg_from_world, world_from_peg[None, :3])[0, 2])
 
 
 def samples_of(plan: InsertionPlan) -> int:
-    """How many samples an insertion takes at most."""
+    """The largest number of samples of an insertion."""
     return len(stamps_of(plan.search)) + len(stamps_of(plan.push))

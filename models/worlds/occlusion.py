@@ -1,4 +1,4 @@
-"""A box that stands before a camera, of which no recording speaks."""
+"""A box in front of a camera that is in no recording."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ WIDTH, LENGTH, THICKNESS = 0.05, 0.08, 0.01  # m
 def occluder(
     camera: Camera, part: Part, world_from_part: Array, share: float, angle: float
 ) -> tuple[Part, Array]:
-    """A box between a camera and a part that hides about a share of what the camera sees of it.
+    """A box between a camera and a part that hides about a share of the part's pixels.
 
-    It stands half way, square to the camera, and reaches over the part from one side.
+    It is half-way, perpendicular to the optical axis, and covers the part from one side.
 
     Args:
-        camera: its pose is where it truly stands.
-        part: what is hidden in part.
-        world_from_part: (7,) where it is.
+        camera: with its true pose.
+        part: the part.
+        world_from_part: (7,) its pose.
         share: of the part's pixels, from 0 to 1.
-        angle: towards which side of the image the box lies, radians from right to down.
+        angle: direction of the box in the image, radians from right to down.
 
     Returns:
-        The box, and where it stands (7,).
+        The box, and its pose (7,).
 
     Raises:
         InputError: the camera does not see the part.

@@ -1,4 +1,4 @@
-"""Made-up pushes of a point finger: a part at a pose drawn from the prior, felt as the program says."""
+"""Simulated pushes of a point finger: a pose drawn from the prior, and observations by the program itself."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ Array = npt.NDArray[np.float64]
 
 SPEED = 0.0033  # m/s, as in the MLab_EXP logs
 TIP_PERIOD, FORCE_PERIOD = 0.03, 0.01  # s
-REACH = 0.006  # m: pushes start this far from the point they aim at
+REACH = 0.006  # m from the start of a push to its target
 AIM = 0.001  # m: standard deviation of the aim
 CLEAR = 0.0015  # m: no push starts nearer to the part
 STROKE = 0.012  # m
-STIFFNESS = 2000.0  # N/m: how fast the force grows beyond the onset
+STIFFNESS = 2000.0  # N/m: slope of the force beyond the onset
 NOISE = 0.005  # N
 
 
@@ -42,14 +42,14 @@ def simulate_recording(
     yaw: float = math.radians(20.0),
     **settings: Any,
 ) -> Recording:
-    """A recording in which the part stands somewhere within the prior and is pushed on its upright faces.
+    """A recording of pushes on the upright faces of a part whose pose is drawn from the prior.
 
-    A push aims at a random place of an upright face, at most 60 degrees from the normal, with 1 mm of error.
+    A push aims at a random point of an upright face, at most 60 degrees from the normal, with 1 mm of error.
 
     Args:
         seed: the same seed, the same recording.
         pushes: how many.
-        part: what is pushed; the aluminium triangle of MLab_EXP by default.
+        part: the part; the aluminium triangle of MLab_EXP by default.
         translation: half width of the prior in x and y, metres.
         yaw: half width of the prior in yaw, radians.
         settings: fields of `bcppl.sensors.point_finger.FingerSettings`.
@@ -79,16 +79,18 @@ def simulate_recording(
             else rng.uniform(-math.pi, math.pi)
         )
         measurements.append(Measurement(push, _touch(rng, finger, push, trace[f"onset_{k}"][0], angle)))
-    return Recording(part, guess, measurements, truth=truth, model="point_probe", source="made up by bcppl")
+    return Recording(
+        part, guess, measurements, truth=truth, model="point_probe", source=f"simulated by bcppl, seed {seed}"
+    )
 
 
 def noise_seed(seed: int) -> int:
-    """The seed of a recording's noise: inference may be given the same seed, and must not share its draws."""
+    """The seed of a recording's noise: it differs from inference's, so that they share no draws."""
     return int(np.random.default_rng([seed, 1]).integers(2**62))
 
 
 def _push(rng: np.random.Generator, finger: PointFinger, truth: Array) -> Push:
-    """A straight path onto a random place of an upright face, the finger's touching place leading."""
+    """A straight path onto a random point of an upright face, the finger's tip leading."""
     mesh = finger.part.mesh
     upright = np.abs(mesh.face_normals[:, 2]) < 1e-3
     if not upright.any():
@@ -125,16 +127,18 @@ def _push(rng: np.random.Generator, finger: PointFinger, truth: Array) -> Push:
 
 
 def _touch(rng: np.random.Generator, finger: PointFinger, push: Push, onset: Tensor, angle: float) -> Touch:
-    """The raw wrench that reads as this onset (NaN for never) and this angle of the force on the part."""
+    """The raw wrench of an onset (NaN without contact) and an angle of the force on the part."""
     settings, path = finger.settings, finger.path(push)
     times = np.arange(push.times[0], push.times[-1], FORCE_PERIOD)
     force = np.zeros(len(times))
     if bool(onset.isnan().any()):
         angle = 0.0
     else:
-        felt_at = push.times[0] + float(path.locate(onset).travelled) / SPEED
+        contact_time = push.times[0] + float(path.locate(onset).travelled) / SPEED
         force = np.where(
-            times >= felt_at, settings.threshold + STIFFNESS * SPEED * (times - felt_at) + 5 * NOISE, 0.0
+            times >= contact_time,
+            settings.threshold + STIFFNESS * SPEED * (times - contact_time) + 5 * NOISE,
+            0.0,
         )
     wrench = rng.normal(0.0, NOISE, (len(times), 6)) + rng.normal(0.0, 0.1, 6)
     wrench[:, 3:] = 0.0
