@@ -197,6 +197,19 @@ def test_a_run_by_another_inference_program_on_the_same_scene_has_no_influence()
     assert_same(alone(FIRST, TOP), guided(recording, scene))
 
 
+def test_a_guided_run_is_resumed_from_a_tempered_one_with_the_same_approximation() -> None:
+    """It depends on the measurements alone, not on the particles."""
+    model, scene = look_and_touch.model, fresh()
+    *_, start = tempered_smc.infer(model, bench(FIRST), particles=PARTICLES, sweeps=(1, 1), scene=scene)
+    assert start.population.approximation is None
+    one, other = (
+        run[-1].population.approximation
+        for run in (guided(bench(FIRST, TOP), scene, start), alone(FIRST, TOP))
+    )
+    for mine, theirs in zip(one.mixture, other.mixture, strict=True):
+        assert torch.equal(mine, theirs)
+
+
 def test_a_second_run_on_the_same_scene_is_the_first() -> None:
     first = alone(FIRST, TOP)
     assert_same(first, guided(bench(FIRST, TOP), first[0].population.trace.args[0]))
