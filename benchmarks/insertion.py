@@ -24,7 +24,7 @@ from bcppl.geometry.gap import PegGap
 from bcppl.inference.design.loop import probing_loop
 from bcppl.inference.design.rules import by_linearised_gain
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.planning.candidates import MIXED, plan_candidates
+from bcppl.inference.planning.candidate_layout import MIXED, plan_candidates
 from bcppl.inference.planning.insertion import insertion_plan
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.inference.planning.success import success_probability

@@ -34,7 +34,7 @@ from bcppl.inference.design.rules import (
     in_given_order,
 )
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.planning.candidates import MIXED, plan_candidates
+from bcppl.inference.planning.candidate_layout import MIXED, plan_candidates
 from bcppl.inference.planning.faces import points_on_top, sides
 from bcppl.inference.planning.touching import SurfacePoint, touch
 from bcppl.models.look_and_touch import model

@@ -25,7 +25,7 @@ from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
 from bcppl.inference.design import Ranking, expected_information_gain, linearised_information_gain
 from bcppl.inference.filters.guided_smc import infer
-from bcppl.inference.planning.candidates import plan_candidates
+from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.inference.population import Population
 from bcppl.inference.schemes import systematic
 from bcppl.models.look_and_touch import model

@@ -81,7 +81,11 @@ class Population:
     @cached_property
     def log_total(self) -> float:
         """Log of the sum of the weights."""
-        return float(torch.logsumexp(self.log_weights, 0))
+        # By the operations of `reweighed`, so that a resumed run has the same bits.
+        highest = float(self.log_weights.max())
+        if not math.isfinite(highest):
+            return highest
+        return highest + math.log(float((self.log_weights - highest).exp_().sum()))
 
     def with_trace(self, trace: Trace) -> Population:
         """The same weights for another trace of as many particles: extended, or moved."""

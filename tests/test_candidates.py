@@ -20,7 +20,7 @@ from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
 from bcppl.inference.design.rules import surface_variance
-from bcppl.inference.planning.candidates import plan_candidates
+from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.inference.planning.constraints import Candidates, Constraint, feasible, require_candidates
 from bcppl.inference.planning.motion_constraints import (
     ArmWithPeg,

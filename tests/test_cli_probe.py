@@ -17,7 +17,7 @@ import torch
 from bcppl.beliefs import Belief
 from bcppl.cli import probe
 from bcppl.inference.filters.guided_smc import infer
-from bcppl.inference.planning.candidates import MIXED
+from bcppl.inference.planning.candidate_layout import MIXED
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.recordings import save

@@ -19,7 +19,7 @@ from bcppl.inference.design.loop import Round, named_apart, probing_loop
 from bcppl.inference.design.rules import at_random, by_linearised_gain, in_given_order
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.planning.candidates import plan_candidates
+from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.inference.planning.insertion import insertion_plan
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import BenchScene, bench_scene

@@ -23,7 +23,7 @@ from bcppl.geometry.extrusion import block
 from bcppl.geometry.guess import Guess
 from bcppl.inference.design.rules import by_linearised_gain
 from bcppl.inference.filters import guided_smc, tempered_smc
-from bcppl.inference.planning import candidates
+from bcppl.inference.planning.candidate_layout import candidates
 from bcppl.models import look_and_touch
 from bcppl.models.peg_in_hole import model
 from bcppl.poses import identity, local, retract

@@ -157,10 +157,12 @@ def test_the_baseline_weighs_by_all_measurements(monkeypatch: pytest.MonkeyPatch
 
         @property
         def log_ratio(self) -> Tensor:
-            return self.trace.log_prob("x") - self.previous.log_prob("x")
+            new = [a for a in self.trace.observations if a not in self.previous.observations]
+            gained = self.trace.log_prob(*new) if new else torch.zeros(self.trace.particles)
+            return self.trace.log_prob("x") - self.previous.log_prob("x") + gained
 
-    def mutant(trace: Trace, new: Any) -> PriorOnly:
-        updated = real_update(trace, new)
+    def mutant(trace: Trace, *given: Any, **named: Any) -> PriorOnly:
+        updated = real_update(trace, *given, **named)
         return PriorOnly(updated.trace, updated.previous, updated.discarded)
 
     monkeypatch.setattr(smcp3, "update", mutant)

@@ -14,7 +14,7 @@ from bcppl.arguments import number_within
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
-from bcppl.inference.planning.candidates import MIXED, plan_candidates
+from bcppl.inference.planning.candidate_layout import MIXED, plan_candidates
 from bcppl.inference.planning.constraints import Candidates, Constraint, feasible, require_candidates
 from bcppl.inference.planning.generators import MOTIONS, candidate_kinds
 from bcppl.inference.planning.motion_constraints import (

@@ -99,7 +99,7 @@ def probe(
     from bcppl.cli.posterior import posterior
     from bcppl.figures import action_in_3d
     from bcppl.inference.design.rules import by_linearised_gain, by_reweighted_gain, can_be_linearised
-    from bcppl.inference.planning.candidates import require_uncertain
+    from bcppl.inference.planning.candidate_layout import require_uncertain
     from bcppl.recordings.action_file import save_actions
     from bcppl.sensors import sensor_of
     from bcppl.sensors.candidates import duration_of, name_of, named_apart, planner_of, with_candidates

@@ -26,7 +26,7 @@ from bcppl.inference.design.ranking import Ranking
 from bcppl.inference.design.rules import AcquisitionRule, by_linearised_gain
 from bcppl.inference.filters import guided_smc
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.planning.candidates import require_uncertain
+from bcppl.inference.planning.candidate_layout import require_uncertain
 from bcppl.inference.planning.constraints import Candidates, feasible, require_candidates
 from bcppl.inference.planning.motion_constraints import duration_at_most
 from bcppl.recordings.check import problems

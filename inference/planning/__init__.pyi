@@ -1,4 +1,4 @@
-from bcppl.inference.planning.candidates import plan_candidates as plan_candidates
+from bcppl.inference.planning.candidate_layout import plan_candidates as plan_candidates
 from bcppl.inference.planning.constraints import (
     Candidates as Candidates,
     Constraint as Constraint,
