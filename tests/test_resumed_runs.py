@@ -156,7 +156,7 @@ def test_nothing_is_evaluated_again_on_a_new_scene(model: Model) -> None:
     actions = [m.action for m in recording.measurements]
     trace, _ = generate(model.program, (one, actions), one.observed(recording.measurements), PARTICLES)
     updated = update(trace, args=(other, actions))
-    assert not updated.log_ratio.any() and updated.trace.known.keys() == trace.known.keys()
+    assert updated.trace.known.keys() == trace.known.keys() and not updated.log_ratio.any()
     assert not any(effort.calls for effort in other.efforts.values())
 
 
