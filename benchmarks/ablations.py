@@ -134,8 +134,8 @@ def of_scene(seed: int, particles: int, first: int) -> Variants:
             variants[name] = Variant(moment_of(last.belief, scene), seconds[name])
         except Exception as error:
             variants[name] = Variant(MISSED, math.nan, one_line(error))
-    said = ", ".join(f"{name} {v.end.weighted_add:.2f} mm {v.wall:.1f} s" for name, v in variants.items())
-    print(f"scene {seed} ({found.part}, {found.clearance:g} mm): {said}", flush=True)
+    summary = ", ".join(f"{name} {v.end.weighted_add:.2f} mm {v.wall:.1f} s" for name, v in variants.items())
+    print(f"scene {seed} ({found.part}, {found.clearance:g} mm): {summary}", flush=True)
     return variants
 
 
@@ -166,7 +166,7 @@ def rows_of(seeds: Sequence[int], particles: int, jobs: int) -> list[Row]:
     for name in names:
         pairs = [(result[name], result[DEFAULT]) for result in results if name in result]
         adds = [own.end.weighted_add for own, _ in pairs]
-        # A scene that both missed says nothing of their difference.
+        # A scene that both missed does not count for their difference.
         apart = [
             own.end.weighted_add - default.end.weighted_add
             for own, default in pairs

@@ -1,8 +1,8 @@
 """How accurately a hole is found, over many scenes that inference was not tuned to, each with another part.
 
 A scene is two depth views from cameras that are off, then a 6 s probe planned from the belief after vision by
-one fixed rule, carried out in a finer world whose friction and stiffness inference is not told. A scene that
-ends in an error counts as infinitely far off.
+one fixed rule, carried out in a finer world whose friction and stiffness inference does not know. A scene
+that ends in an error counts as infinitely far off.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ STAGES = (VISION, "planning", "touch")
 
 
 def all_scenes(seeds: Sequence[int], particles: int, jobs: int) -> list[Probed]:
-    """Every scene in order; each is told of as it comes, and an interrupted run keeps what is there."""
+    """Every scene in order; each is reported as it comes, and an interrupted run keeps what is there."""
     found: list[Probed] = []
     try:
         for one in every(partial(probed, particles=particles), seeds, jobs, lost):
             found.append(one)
-            tell(one)
+            report(one)
     except KeyboardInterrupt:
         print(f"interrupted: what follows is of {len(found)} scenes of {len(seeds)}.", flush=True)
     return sorted(found, key=lambda one: one.seed)
@@ -69,7 +69,7 @@ def lost(seed: int, why: str) -> Probed:
     return Probed(seed, missed=why)
 
 
-def tell(one: Probed) -> None:
+def report(one: Probed) -> None:
     """One line on a scene."""
     end = f"MISSED: {one.missed}" if one.missed else f"{one.at(END).weighted_add:.3f} mm in {one.wall:.1f} s"
     print(f"{one.name}: vision {one.at(VISION).weighted_add:.2f} mm, end {end}", flush=True)
@@ -161,8 +161,8 @@ def rows_of(found: Sequence[Probed], alone: bool) -> list[Row]:
         for what in Moment._fields:
             values = of(found, moment, what)
             for name, level in (("median", 0.5), ("90 %", 0.9)):
-                said = f"{WORDS[what]}, {'after' if moment == VISION else 'at'} {moment}, {name}"
-                rows.append(Row(said, quantile(values, level), UNITS[what]))
+                title = f"{WORDS[what]}, {'after' if moment == VISION else 'at'} {moment}, {name}"
+                rows.append(Row(title, quantile(values, level), UNITS[what]))
     rows.append(Row("scenes with a warning", sum(one.warned for one in found), "scenes"))
     wall = [one.wall for one in found if not one.missed]
     rows.append(Row("wall of a scene, median", quantile(wall, 0.5), "s", 6.0 if alone else None))
@@ -198,7 +198,7 @@ def growth(seed: int, counts: Sequence[int]) -> list[Row]:
     rows, lines = list[Row](), list[list[Any]]()
     for count in counts:
         one = apart(probed, seed, count)
-        tell(one)
+        report(one)
         stages = [one.seconds.get(stage, math.nan) for stage in STAGES]
         lines.append([f"{count}", *stages, one.wall, one.memory, one.at(VISION).weighted_add, *one.at(END)])
         rows.append(Row(f"N = {count}: wall", one.wall, "s"))
@@ -212,7 +212,7 @@ def growth(seed: int, counts: Sequence[int]) -> list[Row]:
 def paper(seed: int, particles: int, file: Path) -> list[Row]:
     """One run as a figure, and the number that the paper reports as the goal."""
     one = curves.beside_paper(seed, particles, file)
-    tell(one)
+    report(one)
     name = f"scene {one.name}: weighted ADD at 6 s; the goal is what the paper reports"
     return [Row(name, one.at(END).weighted_add if not one.missed else math.nan, "mm", curves.REPORTED)]
 

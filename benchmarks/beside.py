@@ -18,7 +18,7 @@ TIMED = 10_000
 def ratio(ours: Sequence[float], theirs: Sequence[float], draws: int = 10_000) -> tuple[float, float, float]:
     """The ratio of two mean squared errors, and its 2.5 and 97.5 % bounds.
 
-    By the bootstrap: both sets of runs are drawn anew, each with replacement (percentile interval; Efron and
+    By the bootstrap: both sets of runs are resampled, each with replacement (percentile interval; Efron and
     Tibshirani, An Introduction to the Bootstrap, 1993, section 13.3).
     """
     generator = np.random.default_rng(0)
@@ -103,7 +103,7 @@ def beside(seed: int, runs: int, counts: tuple[int, ...]) -> list[Row]:
 
 
 def timed(seed: int, passes: int = 3, runs: int = 10) -> list[Row]:
-    """Times at equal N, taken in turns with `particles`, so that a busy machine slows both."""
+    """Times at equal N, alternating with `particles`, so that a busy machine slows both."""
     rows: list[Row] = []
     lines: list[list[Any]] = []
     for name, problem in PROBLEMS.items():

@@ -2,7 +2,7 @@
 
 Regions of a belief of mass 0.9 are to hold the truth in nine of ten scenes, of mass 0.5 in half. A scene that
 ends in an error holds it in none. Two variants are worlds that the model does not know of: a box hides a part
-of one camera's view, or the cameras are off by twice what is said.
+of one camera's view, or the cameras are off by twice what is stated.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import real
 import touches
-from accuracy import lost, misses, of, tell
+from accuracy import lost, misses, of, report
 from report import Row, finish, options, show
 from scenes import END, MASSES, PARTICLES, REGIONS, VISION, Probed, every, probed, quantile
 from scipy.stats import binomtest
@@ -59,7 +59,7 @@ def of_world(name: str, seeds: Sequence[int], particles: int, jobs: int) -> list
     try:
         for one in every(partial(probed, particles=particles, bench=bench), seeds, jobs, lost):
             found.append(one)
-            tell(one)
+            report(one)
     except KeyboardInterrupt:
         print(f"interrupted: what follows is of {len(found)} scenes of {len(seeds)}.", flush=True)
     if not found:
@@ -72,8 +72,8 @@ def of_world(name: str, seeds: Sequence[int], particles: int, jobs: int) -> list
                 when = f"{'after' if moment == VISION else 'at'} {moment}"
                 region_named = f"{region}, {100 * mass:.0f} % region {when}"
                 lines.append([region_named, share.held, share.scenes, share.percent, share.low, share.high])
-                said = f"{name}: {region_named} holds the truth"
-                rows += goals_of(said, share, mass, moment == END, name == "as stated")
+                title = f"{name}: {region_named} holds the truth"
+                rows += goals_of(title, share, mass, moment == END, name == "as stated")
     show(
         f"{name}: how often regions hold the truth, {100 * CONFIDENCE:.0f} % interval",
         ["", "held", "scenes", "%", "from %", "to %"],
@@ -92,23 +92,23 @@ def of_world(name: str, seeds: Sequence[int], particles: int, jobs: int) -> list
     rows.append(Row(f"{name}: scenes with a warning", sum(one.warned for one in found), "scenes"))
     rows.append(Row(f"{name}: scenes missed", sum(bool(one.missed) for one in found), "scenes"))
     for one in far:
-        said = "with" if one.warned else "without"
-        print(f"outside and far, {one.name}: ADD {one.at(END).add:.2f} mm, {said} a warning")
+        warned = "with" if one.warned else "without"
+        print(f"outside and far, {one.name}: ADD {one.at(END).add:.2f} mm, {warned} a warning")
     misses(found)
     return rows
 
 
-def goals_of(said: str, share: Share, mass: float, judged: bool, stated: bool) -> list[Row]:
+def goals_of(title: str, share: Share, mass: float, judged: bool, stated: bool) -> list[Row]:
     """Rows of one share: between two bounds where the model is right, above one where it is wrong."""
     if judged and stated:
         low, high = WITHIN[mass]
         return [
-            Row(f"{said}, at least", share.percent, "%", low, "min"),
-            Row(f"{said}, at most", share.percent, "%", high),
+            Row(f"{title}, at least", share.percent, "%", low, "min"),
+            Row(f"{title}, at most", share.percent, "%", high),
         ]
     if judged and mass == 0.9:
-        return [Row(said, share.percent, "%", LEAST, "min")]
-    return [Row(said, share.percent, "%")]
+        return [Row(title, share.percent, "%", LEAST, "min")]
+    return [Row(title, share.percent, "%")]
 
 
 def main() -> None:

@@ -60,14 +60,14 @@ def bare(recording: Recording, probe: Probe, world_from_part: Tensor) -> tuple[C
     chosen = build_model(recording.part, recording.peg, CONTACT)
     set_controller(chosen, probe)
     steps = 1 + round((probe.stamps[-1] - probe.command_times[0]) / CONTACT.time_step)
-    told = rollout_controls(probe, probe.command_times[0] + CONTACT.time_step * np.arange(steps))
+    commanded = rollout_controls(probe, probe.command_times[0] + CONTACT.time_step * np.arange(steps))
     part = world_from_part.numpy()
     control = np.empty((len(part), steps, 20))
-    control[..., :9], control[..., 12:16] = told[:, :9], told[:, 9:]
+    control[..., :9], control[..., 12:16] = commanded[:, :9], commanded[:, 9:]
     control[..., 9:12], control[..., 16:] = part[:, None, :3], part[:, None, 3:]
     size = mujoco.mj_stateSize(chosen, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     state = np.zeros((len(part), size))
-    state[:, 1:8] = told[0, 6:]
+    state[:, 1:8] = commanded[0, 6:]
     pool = mujoco.rollout.Rollout(nthread=cores())
     data = [mujoco.MjData(chosen) for _ in range(cores())]
     return lambda: pool.rollout(chosen, data, state, control, control_spec=CONTROL), steps

@@ -15,7 +15,7 @@ from scenes import Curve, Probed, followed, quantile
 
 from bcppl.figures import PARTICLE, SMALLEST_ADD, STRONG, TRUTH, add_over_time
 
-REPORTED = 0.8  # mm, what the paper says its ADD comes to with 75 particles after a 6 s probe
+REPORTED = 0.8  # mm, the ADD that the paper reports with 75 particles after a 6 s probe
 BEFORE = 0.5  # s on the axis that the prior and each view are given before the probe begins
 
 
@@ -79,7 +79,7 @@ def of_all(found: Sequence[Probed], goals: Sequence[float], file: Path) -> None:
 def beside_paper(seed: int, particles: int, file: Path) -> Probed:
     """One run as the paper's figure 3 shows one: ADD of the weighted particles as views, then windows come.
 
-    The paper's curve is not at hand: only the number that it reports is drawn, as a line that says so.
+    The paper's curve is not at hand: only the number that it reports is drawn, as a labelled line.
     """
     found, steps, recording = followed(seed, particles)
     if found.missed or recording is None:

@@ -222,7 +222,7 @@ def main() -> None:
             lines.append([name, count, *numbers[:3], len(found.milliseconds), failed, *numbers[3:]])
             rows.append(Row(f"{name}, N = {count}", found.median, "ms a step"))
             rows.append(Row(f"{name}, N = {count}", failed, "failed runs", 0 if "bcppl" in name else None))
-            # Of few particles the mean of the evidence hangs on rare runs: there it is only reported.
+            # Of few particles the mean of the evidence depends on rare runs: there it is only reported.
             if name == "bcppl" and count > 1000:
                 rows.append(Row(f"evidence, N = {count}", abs(off), "nats from exact", 4 * deviation + 0.005))
             if failed:

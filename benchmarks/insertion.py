@@ -40,16 +40,16 @@ SECONDS, PROBES = 6.0, 6  # that probes may last altogether, and their number
 OUTER_SAMPLES = 25
 CONFIDENCE = 0.95
 OVERALL, TIGHTEST = 0.97, 0.94  # shares that are to succeed
-CHANCES = 12  # particles by which the chance of an attempt is foretold
+CHANCES = 12  # particles by which the chance of an attempt is predicted
 
 
 class Task(NamedTuple):
-    """One scene at one clearance (m), what is to be known, and whether the chance of attempts is foretold."""
+    """One scene at one clearance (m), what is known, and whether the chance of attempts is predicted."""
 
     seed: int
     clearance: float
     known: tuple[str, ...]
-    foretell: bool
+    predict: bool
 
 
 class Outcome(NamedTuple):
@@ -61,7 +61,7 @@ class Outcome(NamedTuple):
         depth, across, tilt: metres and radians; of the tip, and of the mean across the hole and of its axis.
         peak, press: N; the largest force at a sample, and at two in a row.
         time: s.
-        chance: foretold; NaN unless asked for.
+        chance: predicted; NaN unless asked for.
         failed: what went wrong before the attempt, in words; it counts as not inserted.
     """
 
@@ -99,7 +99,7 @@ def attempts(task: Task) -> list[Outcome]:
                     *_, last = default_run(recording, PARTICLES, task.seed, start=seen)
                 else:
                     last = seen if known == VISION else _probed(scene, arm, seen)
-                outcomes.append(_attempt(scene, arm, last.belief, known, task.foretell))
+                outcomes.append(_attempt(scene, arm, last.belief, known, task.predict))
             except Exception as error:  # one scene must not take the others with it
                 outcomes.append(Outcome(task.seed, task.clearance, scene.name, known, failed=one_line(error)))
     return outcomes
@@ -120,11 +120,11 @@ def _probed(scene: BenchScene, arm: BenchArm, seen: Step) -> Step:
     return last
 
 
-def _attempt(scene: BenchScene, arm: BenchArm, belief: Belief, known: str, foretell: bool) -> Outcome:
+def _attempt(scene: BenchScene, arm: BenchArm, belief: Belief, known: str, predict: bool) -> Outcome:
     plan = insertion_plan(belief, scene.part, scene.peg)
     result = arm.insert(plan)
     chance = math.nan
-    if foretell:
+    if predict:
         physics = PegPhysics(scene.part, scene.peg)
         chance = success_probability(belief, plan, physics, particles=CHANCES, seed=scene.seed).success
     hole = torch.from_numpy(scene.kind.part_from_hole)
@@ -154,13 +154,13 @@ def lost(task: Task, why: str) -> list[Outcome]:
 
 
 def as_they_come(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
-    """Every attempt, told of; an interrupted run keeps what is there."""
+    """Every attempt, reported; an interrupted run keeps what is there."""
     console = Console(stderr=True, highlight=False)
     try:
         for k, made in enumerate(every(attempts, tasks, jobs, lost)):
-            said = "; ".join(f"{o.known} {'in' if o.inserted else o.failed or 'not in'}" for o in made)
+            summary = "; ".join(f"{o.known} {'in' if o.inserted else o.failed or 'not in'}" for o in made)
             scene = f"{made[0].seed}, {1e3 * made[0].clearance:g} mm"
-            console.print(f"{k + 1} of {len(tasks)}, scene {scene}: {said}", soft_wrap=True, markup=False)
+            console.print(f"{k + 1} of {len(tasks)}, scene {scene}: {summary}", soft_wrap=True, markup=False)
             yield from made
     except KeyboardInterrupt:
         console.print("stopped: what follows is of the scenes so far.")
@@ -213,7 +213,7 @@ COLUMNS = (
     "peak N",
     "most",
     "s",
-    "foretold %",
+    "predicted %",
 )
 
 
@@ -224,14 +224,14 @@ def main() -> None:
     parser.add_argument("--known", nargs="+", choices=KNOWN, default=list(KNOWN))
     all_mm = [round(1e3 * clearance, 3) for clearance in CLEARANCES]
     parser.add_argument("--clearances", nargs="+", type=float, choices=all_mm, default=all_mm, help="in mm")
-    parser.add_argument("--foretell", action="store_true", help="compute the chance of each attempt as well")
+    parser.add_argument("--predict", action="store_true", help="compute the chance of each attempt as well")
     arguments = parser.parse_args()
     count = 2 if arguments.quick else arguments.scenes
     seeds = range(arguments.seed, arguments.seed + count)
     known = tuple(arguments.known)
     clearances = [m for m, mm in zip(CLEARANCES, all_mm, strict=True) if mm in arguments.clearances]
     # Clearances in turn: a run that is stopped has as many scenes of each.
-    tasks = [Task(seed, clearance, known, arguments.foretell) for seed in seeds for clearance in clearances]
+    tasks = [Task(seed, clearance, known, arguments.predict) for seed in seeds for clearance in clearances]
     outcomes = sorted(as_they_come(tasks, arguments.jobs), key=lambda o: (o.clearance, o.seed))
     lines, rows = [], []
     for what in known:

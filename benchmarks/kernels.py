@@ -196,7 +196,7 @@ PARTS = ("kernels", "peers", "image")
 def main() -> None:
     parser = options(__doc__ or "")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="only these")
-    parser.add_argument("--runs", type=int, help="beside other packages; 100 unless told")
+    parser.add_argument("--runs", type=int, help="beside other packages; 100 unless given")
     parser.add_argument("--counts", type=int, nargs="+", metavar="N", help="of the other packages' particles")
     parser.add_argument(
         "--jobs", type=int, default=1, help="runs over the image at a time; times then mean little"

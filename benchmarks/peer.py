@@ -25,7 +25,7 @@ def ask(
         environment: variables that are added to this process's own.
 
     Returns:
-        The results; None where the environment is absent or the script fails: one sentence then says so.
+        The results; None where the environment is absent or the script fails: one sentence then reports it.
     """
     python = ENVIRONMENTS / peer / "bin" / "python"
     if not python.is_file():

@@ -1,8 +1,8 @@
 """Three short probes in each scene of the bench after vision, chosen from 32 candidates in four ways.
 
-By what bcppl expects them to tell; at random; by a fixed script (the top, a side, the side across it); and by
+By expected information; at random; by a fixed script (the top, a side, the side across it); and by
 largest variance (the touch that goes to where the belief is least sure of the surface). All begin from the
-same belief and the same candidates; after each probe candidates are planned anew from the new belief.
+same belief and the same candidates; after each probe new candidates are planned from the new belief.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Compared:
 
 
 def scripted(scene: BenchScene) -> Callable[[Belief, int], list[Candidate]]:
-    """The fixed script: where on the part it touches hangs on the part alone."""
+    """The fixed script: where it touches depends on the part alone."""
     part, peg = scene.part, scene.peg
     top = float(part.vertices[:, 2].max())
     height = top - min(SIDE, 0.5 * float(part.extent[2]))
@@ -194,7 +194,7 @@ def lost(seed: int, why: str, ways: Sequence[str] = WAYS) -> Compared:
     return Compared(seed, courses={way: Course(failed=why) for way in ways})
 
 
-def told(one: Compared) -> str:
+def line_of(one: Compared) -> str:
     """A scene in one line."""
     shown = []
     for way, course in one.courses.items():
@@ -204,11 +204,11 @@ def told(one: Compared) -> str:
 
 
 def all_scenes(seeds: Sequence[int], jobs: int, function: Any, lose: Any) -> Iterator[Compared]:
-    """Every scene as it comes, told of; an interrupted run keeps what is there."""
+    """Every scene as it comes, reported; an interrupted run keeps what is there."""
     console = Console(stderr=True, highlight=False)
     try:
         for k, one in enumerate(every(function, seeds, jobs, lose)):
-            console.print(f"{k + 1} of {len(seeds)}, scene {told(one)}", soft_wrap=True, markup=False)
+            console.print(f"{k + 1} of {len(seeds)}, scene {line_of(one)}", soft_wrap=True, markup=False)
             yield one
     except KeyboardInterrupt:
         console.print("stopped: what follows is of the scenes so far.")

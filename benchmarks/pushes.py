@@ -20,7 +20,7 @@ LOG = "10_90"
 COUNTS = (1, 2, 3, 5, 10, 20)
 WRONG = 5.0  # mm: farther than this from the truth is another mode, not noise
 
-# What is told to the model: the finger's calibration, and which sites it has.
+# Settings of the model: the finger's calibration, and which sites it has.
 VARIANTS: dict[str, tuple[bool, dict[str, Any]]] = {
     "default": (True, {}),
     "and free path": (True, {"use_free_path": True}),

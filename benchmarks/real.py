@@ -1,9 +1,9 @@
 """bcppl on real data: pushes of an aluminium triangle, one depth image of clutter, five of an arm.
 
 Pushes: what is known of the finger is learnt on one log and tested on the other, both ways. Beside the
-belief's mean stands robust least squares on the same contacts, started at the truth and told the same offset:
-where the finger really touches and how far inside the part. In a second line it is told the registration too,
-all that bcppl was told; in a third no more than how far the recorded tip lies inside on average. On some of
+belief's mean stands robust least squares on the same contacts, started at the truth with the same offset:
+where the finger really touches and how far inside the part. In a second line it has the registration too,
+as bcppl does; in a third no more than how far the recorded tip lies inside on average. On some of
 the draws CHSEL (Zhong, Fazeli and Berenson, "CHSEL: Producing Diverse Plausible Pose Estimates from
 Contact and Free Space Data", RSS 2023) is given the same contacts and the same offset. Then: how often
 credible regions hold the truth, over disjoint groups of pushes.
@@ -68,8 +68,8 @@ class Answer(NamedTuple):
 
 
 Answers = dict[str, dict[int, Answer]]  # by way and number of pushes
-BCPPL, TOLD = "bcppl", "least squares, told the same offset"
-ALL, MEAN = "least squares, told the registration too", "least squares, told the mean offset only"
+BCPPL, GIVEN = "bcppl", "least squares, given the same offset"
+ALL, MEAN = "least squares, given the registration too", "least squares, given the mean offset only"
 
 
 def answers(asked: tuple[str, int, tuple[int, ...]]) -> Answers:
@@ -77,7 +77,7 @@ def answers(asked: tuple[str, int, tuple[int, ...]]) -> Answers:
     log, seed, counts = asked
     recording = pushes(log, max(COUNTS), seed)
     settings = learnt(OTHER[log])
-    found: Answers = {BCPPL: {}, TOLD: {}, ALL: {}, MEAN: {}}
+    found: Answers = {BCPPL: {}, GIVEN: {}, ALL: {}, MEAN: {}}
     shorter = {count: recording_of(log, seed, count) for count in counts}
     recording.measurements[max(counts) :] = []
     for done, (step, seconds) in enumerate(explained(recording, seed, asdict(settings))):
@@ -86,10 +86,10 @@ def answers(asked: tuple[str, int, tuple[int, ...]]) -> Answers:
             wide = 1e3 * float(spread[:2].norm()), math.degrees(float(spread[5]))
             found[BCPPL][done] = Answer(errors(step.belief.mean, recording), *wide, seconds)
     mean = learnt(OTHER[log], calibrated=False)
-    for name, told, registered in ((TOLD, settings, False), (ALL, settings, True), (MEAN, mean, False)):
+    for name, known, registered in ((GIVEN, settings, False), (ALL, settings, True), (MEAN, mean, False)):
         for count, one in shorter.items():
             begun = time.perf_counter()
-            pose = fitted(one, told, registered)
+            pose = fitted(one, known, registered)
             seconds = time.perf_counter() - begun
             found[name][count] = Answer(errors(pose, one), math.nan, math.nan, seconds)
     return found
@@ -103,12 +103,12 @@ def recording_of(log: str, seed: int, count: int) -> Any:
 
 
 def chsel(draws: Sequence[tuple[str, int]], measure: str) -> tuple[list[Answer], list[Answer]] | None:
-    """CHSEL's answers to draws (log, seed), and the same after they are told the registration.
+    """CHSEL's answers to draws (log, seed), and the same given the registration.
 
     An answer is the pose of least cost; its spread is how far the poses lie apart that come back.
     """
     recordings = [recording_of(log, seed, JUDGED) for log, seed in draws]
-    told = [learnt(OTHER[log]) for log, _ in draws]
+    calibrated = [learnt(OTHER[log]) for log, _ in draws]
     starts = []
     for k, recording in enumerate(recordings):
         torch.manual_seed(k)
@@ -122,8 +122,10 @@ def chsel(draws: Sequence[tuple[str, int]], measure: str) -> tuple[list[Answer],
             file,
             vertices=recordings[0].part.vertices,
             faces=recordings[0].part.faces,
-            contacts=torch.stack([contacts(*pair) for pair in zip(recordings, told, strict=True)]).numpy(),
-            signed_distance=np.array([-settings.offset for settings in told]),
+            contacts=torch.stack(
+                [contacts(*pair) for pair in zip(recordings, calibrated, strict=True)]
+            ).numpy(),
+            signed_distance=np.array([-settings.offset for settings in calibrated]),
             starts=torch.stack(starts).numpy(),
         )
         threads = torch.get_num_threads()
@@ -131,7 +133,7 @@ def chsel(draws: Sequence[tuple[str, int]], measure: str) -> tuple[list[Answer],
     if printed is None:
         return None
     found: tuple[list[Answer], list[Answer]] = [], []
-    for recording, settings, one in zip(recordings, told, printed, strict=True):
+    for recording, settings, one in zip(recordings, calibrated, printed, strict=True):
         matrix = torch.tensor(one["world_from_part"], dtype=torch.float64)
         world_from_part = poses.from_rotation_matrix(matrix[:, :3, 3], matrix[:, :3, :3])
         best = world_from_part[int(np.argmin(one["cost"]))]
@@ -181,8 +183,8 @@ def ratios(name: str, ours: Sequence[Answer], theirs: Sequence[Answer], goal: fl
 
             value = float(ratio(*pair))
             drawn = bootstrap(pair, ratio, paired=True, method="percentile", rng=0).confidence_interval
-            said = f"{name}: {error}, {what} ({drawn.low:.2f} to {drawn.high:.2f})"
-            rows.append(Row(said, value, "ratio", goal))
+            title = f"{name}: {error}, {what} ({drawn.low:.2f} to {drawn.high:.2f})"
+            rows.append(Row(title, value, "ratio", goal))
     return rows
 
 
@@ -201,7 +203,7 @@ def of_pushes(draws: int, seed: int, jobs: int, beside: bool) -> list[Row]:
 
     rows, lines = [], []
     for count in COUNTS:
-        for way in (BCPPL, TOLD, ALL, MEAN):
+        for way in (BCPPL, GIVEN, ALL, MEAN):
             for log in OTHER:
                 lines.append(line(f"{way}, log {log}", count, of(way, count, log)))
             lines.append(line(f"{way}, both", count, of(way, count)))
@@ -211,7 +213,7 @@ def of_pushes(draws: int, seed: int, jobs: int, beside: bool) -> list[Row]:
                 rows.append(Row(f"{name}, median", float(np.median(at[error])), unit))
                 rows.append(Row(f"{name}, 90 %", float(np.quantile(at[error], 0.9)), unit))
             rows.append(Row(f"{way}, {count} pushes: wall, median", float(np.median(at["seconds"])), "s"))
-        for way in (TOLD, ALL, MEAN):
+        for way in (GIVEN, ALL, MEAN):
             goal = 1.0 if count == JUDGED and way != ALL else None
             rows += ratios(f"{count} pushes, to {way}", of(BCPPL, count), of(way, count), goal)
     title = f"real pushes: {PARTICLES} particles, {jobs} at a time; medians and 90th percentiles"
@@ -232,9 +234,9 @@ def against_chsel(draws: Sequence[tuple[str, int]], ours: Sequence[Answer]) -> l
         theirs, registered = both
         name = f"CHSEL, {measure} measure"
         lines.append(line(name, JUDGED, theirs))
-        lines.append(line(f"{name}, told the registration too", JUDGED, registered))
+        lines.append(line(f"{name}, given the registration too", JUDGED, registered))
         rows += ratios(f"to {name}", ours, theirs, 1.0)
-        rows += ratios(f"to {name}, told the registration too", ours, registered, None)
+        rows += ratios(f"to {name}, given the registration too", ours, registered, None)
         seconds = [float(np.median(columns_of(a)["seconds"])) for a in (ours, theirs)]
         rows.append(Row(f"to {name}: wall, median", seconds[0] / seconds[1], "ratio", 1.0))
         # How many times too wide or too narrow, whichever it is.
@@ -248,7 +250,7 @@ def against_chsel(draws: Sequence[tuple[str, int]], ours: Sequence[Answer]) -> l
 def calibration(jobs: int, seed: int = 0, divisions: int = 4, count: int = JUDGED) -> list[Row]:
     """How often credible regions hold the truth, over disjoint groups of pushes of both logs.
 
-    Every division puts all pushes anew into groups by chance. Its groups are disjoint; those of several
+    Every division splits all pushes into random groups. Its groups are disjoint; those of several
     divisions are not, so they make the share steadier and the interval no narrower: that is of as many
     independent groups as one division has.
     """

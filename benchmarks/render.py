@@ -156,7 +156,7 @@ def here(scene: Scene) -> dict[str, Callable[[], object]]:
 
 
 def elsewhere(file: Path, repeats: int) -> dict[str, tuple[list[float], str]]:
-    """Seconds of every pass of those that run in processes of their own, and what to say of absent ones."""
+    """Seconds of every pass of those that run in processes of their own, and why others are absent."""
     found: dict[str, tuple[list[float], str]] = {}
     for back_end in ("egl", "osmesa"):
         command = [
@@ -200,7 +200,7 @@ def measure(scene: Scene, rounds: int, folder: Path) -> dict[str, list[float]]:
     )
     seconds: dict[str, list[float]] = {}
     engines = here(scene)
-    told: set[str] = set()
+    reported: set[str] = set()
     for turn in range(rounds + 1):
         for name, run in engines.items():
             begun = time.perf_counter()
@@ -209,8 +209,8 @@ def measure(scene: Scene, rounds: int, folder: Path) -> dict[str, list[float]]:
                 seconds.setdefault(name, []).append(time.perf_counter() - begun)
         if turn:
             for name, (passes, why) in elsewhere(file, 2).items():
-                if why and why not in told:
-                    told.add(why)
+                if why and why not in reported:
+                    reported.add(why)
                     print(why)
                 if passes:
                     seconds.setdefault(name, []).extend(passes)

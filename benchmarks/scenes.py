@@ -100,7 +100,7 @@ class Probed:
         seconds: wall time of "vision", "planning" and "touch".
         efforts: by simulator, wall time (s) and what it made (images or gaps).
         tempered: how many measurements were tempered.
-        warned: whether a run would have said that a measurement does not fit (`bcppl.cli.predictive_checks`).
+        warned: whether a run would have warned of a measurement (`bcppl.cli.predictive_checks`).
         memory: most that the process ever held, GB.
     """
 
@@ -267,7 +267,7 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 
 def one_line(error: BaseException) -> str:
-    """What an exception says, in one line."""
+    """The message of an exception, in one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"[:200]
 
 
@@ -295,7 +295,7 @@ def every(
                 left.remove(asked[future])
                 yield result
     except BrokenProcessPool:
-        # Which of those under way killed its process is not said: each that is left has one of its own.
+        # Which of those under way killed its process is unknown: each that is left has one of its own.
         for task in left:
             try:
                 with _pool(1) as pool:

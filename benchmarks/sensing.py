@@ -23,7 +23,7 @@ Array = npt.NDArray[np.float64]
 
 LENGTH = 0.08  # m, from the sensor to the tip
 FRICTION = (
-    0.5  # the steepest cone: the world's forces are drawn from it, evenly, and it is what sensing is told
+    0.5  # the steepest cone: the world's forces are drawn from it, evenly, and it is what sensing assumes
 )
 NOISE = WrenchNoise(force=0.1, torque=0.005)
 AVERAGED = 10  # samples: 0.1 s at 100 Hz
@@ -210,17 +210,17 @@ def main() -> None:
     box = box_peg(0.016, LENGTH)
     filtered = variance_gain(ContactSensing(box, rate=100.0).sections)
     others = []
-    for label, share, told, friction, shares in (
+    for label, share, assumed, friction, shares in (
         ("one sample", 1.0, FRICTION, FRICTION, (0.6, 0.3, 0.1)),
         ("20 Hz low-pass at 100 Hz", filtered, FRICTION, FRICTION, (0.6, 0.3, 0.1)),
-        ("mean of 10, told friction 1.0", 0.1, 1.0, FRICTION, (0.6, 0.3, 0.1)),
+        ("mean of 10, friction 1.0 assumed", 0.1, 1.0, FRICTION, (0.6, 0.3, 0.1)),
         ("mean of 10, friction 0.2", 0.1, FRICTION, 0.2, (0.6, 0.3, 0.1)),
         ("mean of 10, all on faces", 0.1, FRICTION, FRICTION, (1.0, 0.0, 0.0)),
-        ("mean of 10, friction 1.0 told so", 0.1, 1.0, 1.0, (0.6, 0.3, 0.1)),
+        ("mean of 10, friction 1.0, and assumed so", 0.1, 1.0, 1.0, (0.6, 0.3, 0.1)),
     ):
         world = IntrinsicSensing(box, friction=friction, shares=shares)
         true = contacts(world, count, generator, friction)
-        result, _ = measured(IntrinsicSensing(box, friction=told), true, (3.0, 15.0), share, generator)
+        result, _ = measured(IntrinsicSensing(box, friction=assumed), true, (3.0, 15.0), share, generator)
         others.append([label, *result])
     show("box, 3 to 15 N: other settings", ["", *COLUMNS], others)
 

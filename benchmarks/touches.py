@@ -53,7 +53,7 @@ def pushes(log: str, count: int, seed: int) -> Recording:
 
 @cache
 def learnt(log: str, calibrated: bool = True) -> FingerSettings:
-    """FingerSettings from all pushes of a log; without the calibration the finger touches where it says."""
+    """Settings from all pushes of a log; without calibration the recorded tip is taken as the finger."""
     recording = pushes(log, PUSHES, 0)
     return (
         estimate_settings(recording) if calibrated else estimate_settings(recording, finger=(0.0, 0.0, 0.0))

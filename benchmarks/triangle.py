@@ -1,9 +1,9 @@
 """Where to push next, on real pushes: one contact leaves a triangle free to slide along an edge.
 
-The triangle lies within 20 mm and 3 degrees of the guess. A push is drawn from a log of real ones and taken
-in; what is left is a belief that is long along the edge that was touched. The next push is chosen among
-others of the log, by what each is expected to tell; what was truly felt in it is then taken in. Asked is on
-which edge the chosen push lay (by the true pose, which nobody is told), and what is left of the slide.
+The triangle lies within 20 mm and 3 degrees of the guess. A push is drawn from a log of real ones and
+assimilated; the belief is then long along the edge that was touched. The next push is chosen among others of
+the log by its expected information, and its real measurements are assimilated. Reported are the edge on which
+it lay (by the true pose, which inference does not use), and what is left of the slide.
 With `--every` also what the others would have left, for in some draws few or none of them end it.
 """
 
@@ -177,7 +177,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=cores(), help="processes, of one thread each if several")
     parser.add_argument("--candidates", type=int, default=CANDIDATES, help="pushes to choose from")
     parser.add_argument("--outer-samples", type=int, default=OUTER_SAMPLES, help="true values")
-    parser.add_argument("--every", action="store_true", help="say what every candidate would have left")
+    parser.add_argument("--every", action="store_true", help="report what every candidate would have left")
     arguments = parser.parse_args()
     if arguments.candidates < 1:
         parser.error(f"--candidates is {arguments.candidates}; give one or more.")

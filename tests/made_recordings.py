@@ -1,4 +1,4 @@
-"""Recordings made up for tests, and how two are compared."""
+"""Recordings simulated for tests, and how two are compared."""
 
 import dataclasses
 import math

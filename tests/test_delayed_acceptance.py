@@ -260,12 +260,12 @@ def test_a_way_back_that_reads_a_later_stage_is_refused() -> None:
 
 def test_what_cannot_be_is_refused() -> None:
     trace = exact(5)
-    for make, says in (
+    for make, message in (
         (lambda: delayed_acceptance(WALK, stages=1), "1 stages"),
         (lambda: delayed_acceptance(WALK, "depth_*", surrogate=student_t("x")), "a surrogate"),
         (lambda: student_t("x", degrees=0.0), "0.0 degrees"),
     ):
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=message):
             make()
     with pytest.raises(InputError, match=r"'image_\*', which fits no address; .*depth_1"):
         delayed_acceptance(WALK, "image_*")(equal_weights(trace))(trace, POSTERIOR)

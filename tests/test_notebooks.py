@@ -29,7 +29,7 @@ def test_notebook_is_kept_without_outputs(path: Path) -> None:
 class Ran(NamedTuple):
     """What the cells of a notebook printed, and which of them drew a picture."""
 
-    said: dict[str, str]
+    printed: dict[str, str]
     drawn: set[str]
 
 
@@ -41,45 +41,45 @@ def run(name: str, folder: Path) -> Ran:
     )
     client.execute()
     outputs = {cell.id: cell.outputs for cell in notebook.cells if cell.cell_type == "code"}
-    said = {
+    printed = {
         name: "".join(o.text for o in all_of if o.output_type == "stream" and o.name == "stdout")
         for name, all_of in outputs.items()
     }
     drawn = {
         name for name, all_of in outputs.items() if any("image/png" in o.get("data", {}) for o in all_of)
     }
-    assert "Traceback" not in "".join(said.values())
-    return Ran(said, drawn)
+    assert "Traceback" not in "".join(printed.values())
+    return Ran(printed, drawn)
 
 
 def test_first_belief_runs_and_finds_the_part(tmp_path: Path) -> None:
-    said, drawn = run("first_belief", tmp_path)
+    printed, drawn = run("first_belief", tmp_path)
     assert drawn == {"views", "wrench", "prior", "forward", "vision-figure", "felt", "add", "final"}
 
     # A row for the prior and one for each of the fourteen measurements, ADD in its column.
     rows = re.findall(
         r"^(prior|view \d+|window \d+) .*° +([\d.]+) mm +(\S+) ",
-        said["vision"] + said["touch"] + said["rest"],
+        printed["vision"] + printed["touch"] + printed["rest"],
         flags=re.MULTILINE,
     )
     adds = {label: float(add) for label, add, _ in rows}
     assert len(rows) == len(adds) == 15
     assert adds["window 14"] < adds["view 2"] < adds["prior"]
     assert adds["window 14"] < 2.0
-    (final,) = re.findall(r"^ADD ([\d.]+) mm$", said["answer"], flags=re.MULTILINE)
+    (final,) = re.findall(r"^ADD ([\d.]+) mm$", printed["answer"], flags=re.MULTILINE)
     assert float(final) == adds["window 14"]
 
 
 def test_own_model_names_the_part_and_its_proposal_earns_its_place(tmp_path: Path) -> None:
-    said, drawn = run("own_model", tmp_path)
+    printed, drawn = run("own_model", tmp_path)
     assert drawn == {"look", "figure"}
-    truth = re.search(r"^truth: (.+) at", said["infer"], flags=re.MULTILINE)
+    truth = re.search(r"^truth: (.+) at", printed["infer"], flags=re.MULTILINE)
     assert truth
-    above = said["infer"].split("after the view from above")[1]
+    above = printed["infer"].split("after the view from above")[1]
     named = re.search(rf"^  {truth[1]}: ([\d.]+)$", above, flags=re.MULTILINE)
     assert named and float(named[1]) > 0.8
     (alone,), (helped,) = (
-        re.findall(rf"^{label}: .* deviation ([\d.]+)$", said["without"], flags=re.MULTILINE)
+        re.findall(rf"^{label}: .* deviation ([\d.]+)$", printed["without"], flags=re.MULTILINE)
         for label in ("random walk alone", "with our proposal")
     )
     assert float(helped) < 0.5 * float(alone)
@@ -92,10 +92,10 @@ def test_own_model_and_its_proposal_are_short() -> None:
 
 
 def test_swap_kernels_puts_four_programs_side_by_side(tmp_path: Path) -> None:
-    said, drawn = run("swap_kernels", tmp_path)
+    printed, drawn = run("swap_kernels", tmp_path)
     assert drawn == {"figure"}
     rows = re.findall(
-        r"^(\S.*?) +([\d.]+) +(\d+) +(-?[\d.]+) +([\d.]+) mm ", said["table"], flags=re.MULTILINE
+        r"^(\S.*?) +([\d.]+) +(\d+) +(-?[\d.]+) +([\d.]+) mm ", printed["table"], flags=re.MULTILINE
     )
     table = {name: [float(v) for v in values] for name, *values in rows}
     assert len(table) == 4
@@ -104,13 +104,13 @@ def test_swap_kernels_puts_four_programs_side_by_side(tmp_path: Path) -> None:
 
 
 def test_where_to_touch_chooses_and_ends_in_the_hole(tmp_path: Path) -> None:
-    said, drawn = run("where_to_touch", tmp_path)
+    printed, drawn = run("where_to_touch", tmp_path)
     assert drawn == {"chosen", "beliefs"}
     gains = [
-        float(gain) for gain in re.findall(r"([\d.]+)(?: ± [\d.]+)? nats$", said["ranking"], re.MULTILINE)
+        float(gain) for gain in re.findall(r"([\d.]+)(?: ± [\d.]+)? nats$", printed["ranking"], re.MULTILINE)
     ]
     assert len(gains) == 6 and gains == sorted(gains, reverse=True) and gains[0] > gains[-1] + 0.5
-    (before,) = re.findall(r"ADD ([\d.]+) mm", said["look"])
-    after = re.findall(r"ADD ([\d.]+) mm", said["touch"])
+    (before,) = re.findall(r"ADD ([\d.]+) mm", printed["look"])
+    after = re.findall(r"ADD ([\d.]+) mm", printed["touch"])
     assert len(after) == 3 and float(after[-1]) < 0.25 * float(before)
-    assert "inserted: True" in said["insert"]
+    assert "inserted: True" in printed["insert"]

@@ -22,7 +22,7 @@ from bcppl.models import look_and_touch, peg_in_hole, point_probe
 from bcppl.models.worlds.bench import BenchParameters, bench_scene
 from bcppl.recordings import Recording, load
 from bcppl.sensors.scene import Scene
-from bcppl.traces import Model
+from bcppl.traces import Model, generate, update
 
 PARTICLES = 6
 # Windows are left out of the recordings for the sake of time.
@@ -155,6 +155,18 @@ def test_a_run_is_resumed_on_a_new_scene(name: str) -> None:
     infer, model, recording, (taken,) = RUNS[name]
     run, scene = whole_run(name), model.prepare(recording())
     assert_same(run[taken + 1 :], list(infer(model, recording(), seed=3, start=run[taken], scene=scene)))
+
+
+@pytest.mark.parametrize("model", [look_and_touch.model, point_probe.model])
+def test_nothing_is_evaluated_again_on_a_new_scene(model: Model) -> None:
+    """Its simulators are of equal parts; what the old ones have cached and cost does not count."""
+    recording = bench(FIRST) if model is look_and_touch.model else shipped("point_probe_10_pushes", 0)
+    one, other = (model.prepare(replace(recording, part=replace(recording.part))) for _ in range(2))
+    actions = [m.action for m in recording.measurements]
+    trace, _ = generate(model.program, (one, actions), one.observed(recording.measurements), PARTICLES)
+    updated = update(trace, args=(other, actions))
+    assert updated.trace.known.keys() == trace.known.keys() and not updated.log_ratio.any()
+    assert not any(effort.calls for effort in other.efforts.values())
 
 
 # ---------------------------------------------------------------- one scene for several runs

@@ -53,6 +53,8 @@ class SignedDistance:
         InputError: the part's mesh is empty, open or not finite (after merging duplicate vertices).
     """
 
+    __caches__ = ("_tree",)  # of the vertices and faces
+
     def __init__(self, part: Part) -> None:
         self.part = part
         self.effort = Effort()

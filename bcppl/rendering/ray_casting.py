@@ -54,6 +54,8 @@ class RayCaster(PartRenderer):
     do.
     """
 
+    __caches__ = ("_scene",)  # of the part's mesh
+
     def __init__(self, part: Part) -> None:
         """Build the bounding volume hierarchy; see `PartRenderer`."""
         super().__init__(part)

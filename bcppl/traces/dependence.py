@@ -239,7 +239,7 @@ class _Layout(NamedTuple):
         root: what they are beside their attributes: list, tuple or dict, or object for nothing; None where
             something is kept that Python does not see.
         slots: descriptors of `__slots__`, by name.
-        computed: attributes that are computed from the others on demand.
+        computed: attributes that torch computes from the others, or the others from them.
         caches: attributes that do not count.
     """
 
@@ -264,10 +264,12 @@ class _Layout(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def _layout(kind: type) -> _Layout:
-    slots, computed = {}, set()
+    slots, computed, caches = {}, set(), set(_caches(kind))
     for base in kind.__mro__:
         for name, each in vars(base).items():
-            if isinstance(each, cached_property | lazy_property):
+            if isinstance(each, cached_property):
+                caches.add(name)
+            elif isinstance(each, lazy_property):
                 computed.add(name)
             # What a class of C calls a member is not all that it keeps.
             elif isinstance(each, MemberDescriptorType) and "__slots__" in vars(base):
@@ -278,7 +280,7 @@ def _layout(kind: type) -> _Layout:
     pointers = dictionary + (kind.__weakrefoffset__ > 0) + len(slots)
     whole = kind.__basicsize__ == root.__basicsize__ + pointers * calcsize("P")
     whole = whole and kind.__itemsize__ == root.__itemsize__ and kind is not object
-    return _Layout(root if whole else None, slots, frozenset(computed), _caches(kind))
+    return _Layout(root if whole else None, slots, frozenset(computed), frozenset(caches))
 
 
 def _caches(kind: type) -> frozenset[str]:

@@ -1,6 +1,6 @@
 """Inference is calibrated: the truth's rank among posterior draws is uniform, and broken inference shows it.
 
-A failure says which quantity and how its ranks lie. Ranks heaped at both ends (`spread` above 1): particles
+A failure names the quantity and shows its ranks. Ranks heaped at both ends (`spread` above 1): particles
 are too few, too alike, or too sure; heaped in the middle (below 1): they are not sure enough; to one side
 (`mean` off 0.5): they lie beside the truth. Poor sampling fails like a bug ("never moved"), and also where it
 shows in nothing else: a six-axis touch with 8 moves after each resampling kept 75 distinct particles of 75,
