@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from bcppl.cli import latent_sites
-from bcppl.figures import add_over_time, belief_in_3d
 from bcppl.recordings import Recording
 from bcppl.recordings.beliefs import save_belief
 from bcppl.recordings.fingerprint import fingerprint
@@ -57,6 +56,8 @@ class RunFolder:
 
     def draw(self, steps: Sequence[Any]) -> None:
         """Draw ADD over the measurements, from the final mean where the truth is unknown, and beliefs."""
+        from bcppl.figures import add_over_time, belief_in_3d  # matplotlib takes longer than a first step
+
         recording, points = self.recording, self.recording.part.surface_points()
         known = recording.truth is not None
         true = recording.truth if known else steps[-1].belief.mean
