@@ -1,4 +1,4 @@
-"""Where a part is touched: faces, plans, what is felt, and metrology's 3-2-1 carried out on the bench."""
+"""Faces, plans, contact signals, and metrology's 3-2-1 executed on the bench."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NAN = float("nan")
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.007, 0.005), (-0.008, 0.004)])
-def test_spots_and_the_ways_between_them_keep_their_margins(offset: tuple[float, float]) -> None:
+def test_points_on_top_and_the_ways_between_them_keep_their_margins(offset: tuple[float, float]) -> None:
     part, peg, margin = block_with_square_hole(hole=0.0105, offset=offset), round_peg(0.005, 0.08), 0.004
     spots, lifted = points_on_top(part, peg, margin)
     assert not lifted
@@ -45,7 +45,7 @@ def test_spots_and_the_ways_between_them_keep_their_margins(offset: tuple[float,
     assert area > 0.4 * (0.06 - 2 * 0.009) ** 2  # of a square's corners any three span half of it
 
 
-def test_on_a_narrow_rim_the_peg_is_lifted_to_the_third_spot() -> None:
+def test_on_a_narrow_rim_the_peg_is_lifted_to_the_third_point() -> None:
     part, peg = insert_tray("rectangular"), insert_peg("rectangular")
     spots, lifted = points_on_top(part, peg, 0.003)
     assert lifted

@@ -97,8 +97,8 @@ def linearised_information_gain(
     Raises:
         InputError: there are no candidates; the population has no weight, has collapsed to a point or does
             not span the pose's axes; a candidate adds nothing to observe, or what cannot be linearised;
-            `information` gives no symmetric matrices, or some that are negative; a cost, a rate or a setting
-            is out of range.
+            `information` gives matrices that are not symmetric, or negative; a cost, a rate or a setting is
+            out of range.
         InferenceError: the simulation of a candidate failed under every outer sample.
     """
     candidates, costs, seed = checked(candidates, cost, rate, horizon, seed)
