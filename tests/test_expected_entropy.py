@@ -107,11 +107,13 @@ def test_on_a_line_it_is_the_exact_sum(noise: float) -> None:
     assert worst_z(ranking, line_prior(), tables) < 3.0
     assert all(p.standard_error < 0.03 for p in ranking.utilities)
     # Every particle once: six draws have a large variance, but no bias.
-    everyone = [rank(line_prior(), tables, outer_samples=None, seed=seed) for seed in range(100)]
+    everyone = [rank(line_prior(), tables, outer_samples=None, seed=seed) for seed in range(50)]
     assert len(everyone[0].best.gains) == 6
     for k, table in enumerate(tables):
         found = torch.tensor([ranking.of(k).entropy for ranking in everyone], dtype=torch.float64)
-        assert abs(float(found.mean()) - exact_entropy(line_prior(), table)) < 3.0 * float(found.std()) / 10.0
+        assert (
+            abs(float(found.mean()) - exact_entropy(line_prior(), table)) < 3.0 * float(found.std()) / 50**0.5
+        )
 
 
 def test_in_a_plane_it_is_the_exact_sum() -> None:
@@ -147,10 +149,10 @@ def test_a_flipped_sign_or_forgotten_weights_would_be_seen(monkeypatch: pytest.M
     assert worst_z(ranking, line_prior(), tables) > 5.0
 
 
-def test_the_choice_is_right_in_100_of_100_instances() -> None:
+def test_the_choice_is_right_in_60_of_60_instances() -> None:
     torch.manual_seed(2)
     right = done = 0
-    while done < 100:
+    while done < 60:
         prior = torch.softmax(torch.randn(8, dtype=torch.float64), 0)
         tables = [random_table(8, 4, float(s)) for s in 3.0 * torch.rand(4)]
         exact = torch.tensor([exact_entropy(prior, table) for table in tables])
@@ -158,7 +160,7 @@ def test_the_choice_is_right_in_100_of_100_instances() -> None:
             continue
         done += 1
         right += rank(prior, tables, outer_samples=300, seed=done).best.number == int(exact.argmin())
-    assert right == 100
+    assert right == 60
 
 
 def test_gains_fall_with_the_noise_to_nothing() -> None:

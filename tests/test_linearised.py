@@ -32,21 +32,23 @@ class Read(LazyDistribution):
     """A number (,) read off a pose: a linear function of its tangent at a center, with noise."""
 
     def __init__(self, pose: Tensor, row: Tensor, noise: float) -> None:
-        self.mean, self.row, self.noise = poses.local(CENTER, pose) @ row, row, noise
+        self.expected, self.row, self.noise = poses.local(CENTER, pose) @ row, row, noise
         self.pose = pose
         super().__init__(len(pose), ())
 
     def log_prob(self, value: Tensor) -> Tensor:
-        return -0.5 * ((value - self.mean) / self.noise) ** 2 - math.log(self.noise * math.sqrt(2 * math.pi))
+        return -0.5 * ((value - self.expected) / self.noise) ** 2 - math.log(
+            self.noise * math.sqrt(2 * math.pi)
+        )
 
     def sample(self, sample_shape: object = None) -> Tensor:
-        return self.mean + self.noise * torch.randn(len(self.mean), dtype=torch.float64)
+        return self.expected + self.noise * torch.randn(len(self.expected), dtype=torch.float64)
 
     def quadratic(self, value: Tensor) -> Quadratic:
         turn = torch.linalg.inv(right_jacobian(poses.local(CENTER, self.pose)[:, 3:]))
         rows = self.row.expand(len(self.pose), 6).clone()
         rows[:, 3:] = (rows[:, None, 3:] @ turn)[:, 0]
-        pull = rows * ((self.mean - value) / self.noise**2)[:, None]
+        pull = rows * ((self.expected - value) / self.noise**2)[:, None]
         return Quadratic(pull, rows[:, :, None] * rows[:, None, :] / self.noise**2)
 
 
@@ -196,11 +198,11 @@ def test_given_information_is_used() -> None:
     size = float(torch.cov(poses.local(CENTER, population["part"]).T, correction=0)[0, 0])
     assert ranking.of(3).information_gain == pytest.approx(0.5 * math.log1p(1e8 * size), abs=2e-3)
     uneven = torch.triu(torch.ones(6, 6, dtype=torch.float64)) * 1e4
-    for wrong, says in (
+    for wrong, message in (
         (-known.expand(100, 6, 6), "check the sign"),
         (uneven.expand(100, 6, 6), "not symmetric"),
     ):
-        with pytest.raises(InputError, match=f"the information of candidate 0 .*{says}"):
+        with pytest.raises(InputError, match=f"the information of candidate 0 .*{message}"):
             linearised_information_gain(
                 population,
                 ["view"],

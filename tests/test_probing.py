@@ -191,11 +191,11 @@ def test_bad_input_is_one_sentence() -> None:
         (lambda: rank(population, cost=lambda c: 2.0, rate=-1.0), "at least 0"),
         (lambda: rank(population, cost=lambda c: math.nan), "candidate 0 costs nan"),
     ]
-    for call, said in cases:
+    for call, message in cases:
         with pytest.raises(InputError) as caught:
             call()
         text = str(caught.value)
-        assert said in text and text.endswith(".") and "\n" not in text, text
+        assert message in text and text.endswith(".") and "\n" not in text, text
     discrete = equal_weights(simulate(lambda: pyro.sample("k", dist.Categorical(torch.ones(3))), (), 20))
     with pytest.raises(InputError, match="whole numbers, which have no density; use discrete_entropy"):
         fitted(mixture_entropy("k"), discrete)

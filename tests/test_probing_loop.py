@@ -22,7 +22,7 @@ from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.inference.planning.insertion import insertion_plan
 from bcppl.models.look_and_touch import model
-from bcppl.models.worlds.bench import BenchScene, bench_scene
+from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
 from bcppl.recordings import Recording, View, problems
 from bcppl.robot.motion import ProbeWindow
@@ -34,7 +34,7 @@ PARTICLES = 30
 
 @functools.cache
 def seen() -> tuple[BenchScene, Recording, Step, PegGap]:
-    scene = bench_scene(5)
+    scene = bench_scene(5, BenchParameters(width=80, rows=60, focal=80.0))
     look = scene.look()
     *_, last = infer(model, look, particles=PARTICLES, seed=0)
     return scene, look, last, PegGap(scene.part, scene.peg)
@@ -150,7 +150,7 @@ def test_measurements_must_be_of_the_chosen_candidate_and_fit_the_recording() ->
         scaled = [dataclasses.replace(t, world_from_peg=t.world_from_peg * scale) for t in touches]
         return [dataclasses.replace(w, observation=t) for w, t in zip(windows, scaled, strict=True)]
 
-    for says, change in (
+    for message, change in (
         ("to execute 'touch 1.*' and gave a measurement of 'camera_0'", lambda w: [look.measurements[0]]),
         ("of 'touch 1.*' does not fit: .*millimetres", millimetres),
         ("of 'touch 1.*' does not fit", lambda w: w[len(w) // 2 :]),
@@ -164,10 +164,10 @@ def test_measurements_must_be_of_the_chosen_candidate_and_fit_the_recording() ->
             lambda p, found, s: in_given_order(found),
             start=last,
         )
-        with pytest.raises(InputError, match=says) as caught:
+        with pytest.raises(InputError, match=message) as caught:
             next(loop)
         assert_one_sentence(str(caught.value))
-    for says, settings in (
+    for message, settings in (
         ("candidates_from is a list", {"candidates_from": [plan]}),
         ("rule is a str", {"rule": "information"}),
         ("rule gives a list", {"rule": lambda *now: []}),
@@ -177,7 +177,7 @@ def test_measurements_must_be_of_the_chosen_candidate_and_fit_the_recording() ->
             "candidates_from": lambda *now: [plan],
             "rule": lambda p, found, s: in_given_order(found),
         } | settings
-        with pytest.raises(InputError, match=says) as caught:
+        with pytest.raises(InputError, match=message) as caught:
             next(probing_loop(model, look, BenchArm(scene), start=last, **given))  # type: ignore[arg-type]
         assert_one_sentence(str(caught.value))
     for what in (scene, insertion_plan(last.belief, scene.part, scene.peg)):
@@ -265,7 +265,7 @@ def test_a_loop_without_candidates_or_world_is_refused_in_a_sentence() -> None:
         def execute(self, candidate: object) -> list[object]:
             return [1]
 
-    for says, world, source in (
+    for message, world, source in (
         ("there are no candidates", BenchArm(scene), lambda belief, number: []),
         ("gave no measurement of 'touch 1", Silent(), asked),
         ("gave a int for 'touch 1", Junk(), lambda *now: (c for c in asked(*now))),
@@ -274,8 +274,8 @@ def test_a_loop_without_candidates_or_world_is_refused_in_a_sentence() -> None:
         ("no peg to execute 'touch 1", BenchArm(scene), asked),
         ("world.execute is a NoneType", 1, asked),
     ):
-        known = dataclasses.replace(look, peg=None) if "no peg" in says else look
-        with pytest.raises(InputError, match=says) as caught:
+        known = dataclasses.replace(look, peg=None) if "no peg" in message else look
+        with pytest.raises(InputError, match=message) as caught:
             list(
                 probing_loop(
                     model,

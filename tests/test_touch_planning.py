@@ -97,7 +97,7 @@ def plan_of(**changed: Any) -> Plan:
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"times": np.array([0.0])}, "1 times"),
         ({"world_from_peg": np.zeros((3, 6))}, r"poses \(3, 6\)"),
@@ -121,9 +121,9 @@ def plan_of(**changed: Any) -> Plan:
         ({"world_from_peg": poses.identity(3).numpy() + 506.0 * np.eye(1, 7)}, "to 506 m .* millimetres"),
     ],
 )
-def test_a_plan_that_makes_no_sense_is_refused_by_name(changed: dict[str, Any], said: str) -> None:
+def test_a_plan_that_makes_no_sense_is_refused_by_name(changed: dict[str, Any], message: str) -> None:
     assert plan_of().manners == ("free", "guarded")
-    with pytest.raises(InputError, match=rf"plan 'press' .*{said}") as caught:
+    with pytest.raises(InputError, match=rf"plan 'press' .*{message}") as caught:
         plan_of(**changed)
     assert_one_sentence(str(caught.value))
 
@@ -147,8 +147,8 @@ def forces(*sizes: float) -> torch.Tensor:
 
 def test_a_contact_is_felt_from_one_force_on_and_none_below_another() -> None:
     at_once = ContactDetector(contact=1.5, free=0.8, mass=0.3, neighbours=0)
-    told = at_once(forces(0.0, 0.79, 0.81, 1.49, 1.51, 40.0, NAN))
-    np.testing.assert_array_equal(told.numpy(), [0, 0, NAN, NAN, 1, 1, NAN])
+    detected = at_once(forces(0.0, 0.79, 0.81, 1.49, 1.51, 40.0, NAN))
+    np.testing.assert_array_equal(detected.numpy(), [0, 0, NAN, NAN, 1, 1, NAN])
     # Accelerating the tool takes force: 4 m/s^2 hide 1.2 N.
     np.testing.assert_array_equal(at_once(forces(2.6, 2.8, 0.1), 4.0).numpy(), [NAN, 1, 0])
     each = at_once(forces(2.6, 2.6), torch.tensor([4.0, 0.0], dtype=torch.float64))
@@ -157,10 +157,10 @@ def test_a_contact_is_felt_from_one_force_on_and_none_below_another() -> None:
 
 def test_neighbours_must_agree_either_way_in_time() -> None:
     sizes = [0.1] * 6 + [1.0] + [3.0] * 7 + [0.1] * 5 + [9.0] + [0.1] * 4
-    told = ContactDetector(neighbours=2)(forces(*sizes)).numpy()
+    detected = ContactDetector(neighbours=2)(forces(*sizes)).numpy()
     expected = [0] * 4 + [NAN] * 5 + [1] * 3 + [NAN] * 4 + [0] * 1 + [NAN] * 5 + [0] * 2
-    np.testing.assert_array_equal(told, expected)
-    np.testing.assert_array_equal(ContactDetector(neighbours=2)(forces(*sizes[::-1])).numpy(), told[::-1])
+    np.testing.assert_array_equal(detected, expected)
+    np.testing.assert_array_equal(ContactDetector(neighbours=2)(forces(*sizes[::-1])).numpy(), detected[::-1])
 
 
 def test_forces_and_numbers_that_make_no_sense_are_refused() -> None:

@@ -215,13 +215,13 @@ class BenchScene:
 
     def depth_from(self, camera: Camera, hidden: bool = False) -> Array:
         """The depth (H, W) in metres of a camera without error, with the occluder or without."""
-        parts, stands = [self.part, _table()], [torch.from_numpy(self.truth), poses.identity()]
+        parts, world_from_parts = [self.part, _table()], [torch.from_numpy(self.truth), poses.identity()]
         if hidden:
             angle = _generator(self.seed, _CAMERAS, 1).uniform(0.0, 2.0 * math.pi)
             box, pose = occluder(camera, self.part, self.truth, self.bench.hidden, angle)
             parts.append(box)
-            stands.append(torch.from_numpy(pose))
-        return SceneRenderer(parts).images(camera, torch.stack(stands))[0]
+            world_from_parts.append(torch.from_numpy(pose))
+        return SceneRenderer(parts).images(camera, torch.stack(world_from_parts))[0]
 
 
 def bench_scene(
@@ -305,8 +305,8 @@ def _contact(seed: int, bench: BenchParameters) -> ContactParameters:
     )
 
 
-def _generator(seed: int, *what: int) -> np.random.Generator:
-    return np.random.default_rng([seed, *what])
+def _generator(seed: int, *stream: int) -> np.random.Generator:
+    return np.random.default_rng([seed, *stream])
 
 
 @functools.cache
