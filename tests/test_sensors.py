@@ -23,7 +23,7 @@ from bcppl.geometry.extrusion import block
 from bcppl.geometry.guess import Guess
 from bcppl.inference.design.rules import by_linearised_gain
 from bcppl.inference.filters import guided_smc, tempered_smc
-from bcppl.inference.planning.candidate_layout import candidates
+from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.models import look_and_touch
 from bcppl.models.peg_in_hole import model
 from bcppl.poses import identity, local, retract
@@ -276,7 +276,7 @@ def test_the_quadratic_approximation_of_a_new_kind_agrees_with_differences(laser
 def test_a_new_kind_is_ranked_and_laid_out_beside_others(laser: Any) -> None:
     recording, _ = block_and_beams(laser)
     *_, last = guided_smc.infer(look_and_touch.model, recording, particles=40, seed=1)
-    found = candidates(last.belief, recording.part, None, {"laser": 5, "view": 1}, seed=3)
+    found = plan_candidates(last.belief, recording.part, None, {"laser": 5, "view": 1}, seed=3)
     scene = look_and_touch.prepare(with_candidates(recording, found))
     ranking = by_linearised_gain("part", outer_samples=8, seed=0)(last.population, found, scene)
     assert len(ranking) == 6 and all(each.information_gain > 0.0 for each in ranking)
