@@ -106,7 +106,7 @@ class Scene:
 
 
 def arm_in_view(scene: Scene, views: int) -> None:
-    """The program: where the camera stands, its bias, the masks' rim, and the images of the first views."""
+    """The program: the camera's pose, its bias, the masks' rim, and the images of the first views."""
     settings = scene.settings
     camera = pyro.sample("camera", scene.prior)
     bias = pyro.sample("bias", dist.Normal(torch.zeros(()).double(), settings.bias))

@@ -26,7 +26,7 @@ from bcppl.inference.population import Population
 from bcppl.traces import generate, simulate
 from tests.invariance import equal_weights, matrix
 
-# A test that is done reads x by a table of chances, a row for each state.
+# A measurement reads x by a table of probabilities, a row for each state.
 
 
 def readings(prior: Tensor, tables: list[Tensor]) -> None:
@@ -100,21 +100,23 @@ def worst_z(ranking: Ranking, prior: Tensor, tables: list[Tensor]) -> float:
 
 
 @pytest.mark.parametrize("noise", [0.4, 1.0])
-def test_on_a_line_it_is_the_sum(noise: float) -> None:
+def test_on_a_line_it_is_the_exact_sum(noise: float) -> None:
     tables = line_tables(noise)
     ranking = rank(line_prior(), tables)
     assert ranking.entropy == pytest.approx(float(entropy(line_prior())))
     assert worst_z(ranking, line_prior(), tables) < 3.0
     assert all(p.standard_error < 0.03 for p in ranking.utilities)
-    # Every particle once: six draws tell little, but they are right on average.
-    everyone = [rank(line_prior(), tables, outer_samples=None, seed=seed) for seed in range(100)]
+    # Every particle once: six draws have a large variance, but no bias.
+    everyone = [rank(line_prior(), tables, outer_samples=None, seed=seed) for seed in range(50)]
     assert len(everyone[0].best.gains) == 6
     for k, table in enumerate(tables):
         found = torch.tensor([ranking.of(k).entropy for ranking in everyone], dtype=torch.float64)
-        assert abs(float(found.mean()) - exact_entropy(line_prior(), table)) < 3.0 * float(found.std()) / 10.0
+        assert (
+            abs(float(found.mean()) - exact_entropy(line_prior(), table)) < 3.0 * float(found.std()) / 50**0.5
+        )
 
 
-def test_in_a_plane_it_is_the_sum() -> None:
+def test_in_a_plane_it_is_the_exact_sum() -> None:
     torch.manual_seed(1)
     prior = torch.softmax(torch.randn(20, dtype=torch.float64), 0)
     for noise in (0.5, 1.5):
@@ -147,10 +149,10 @@ def test_a_flipped_sign_or_forgotten_weights_would_be_seen(monkeypatch: pytest.M
     assert worst_z(ranking, line_prior(), tables) > 5.0
 
 
-def test_the_choice_is_right_in_100_of_100_instances() -> None:
+def test_the_choice_is_right_in_60_of_60_instances() -> None:
     torch.manual_seed(2)
     right = done = 0
-    while done < 100:
+    while done < 60:
         prior = torch.softmax(torch.randn(8, dtype=torch.float64), 0)
         tables = [random_table(8, 4, float(s)) for s in 3.0 * torch.rand(4)]
         exact = torch.tensor([exact_entropy(prior, table) for table in tables])
@@ -158,10 +160,10 @@ def test_the_choice_is_right_in_100_of_100_instances() -> None:
             continue
         done += 1
         right += rank(prior, tables, outer_samples=300, seed=done).best.number == int(exact.argmin())
-    assert right == 100
+    assert right == 60
 
 
-def test_it_rises_with_the_noise_and_what_tells_nothing_gains_nothing() -> None:
+def test_gains_fall_with_the_noise_to_nothing() -> None:
     noises = [0.2, 0.4, 0.6, 0.9, 1.3, 2.0, 4.0]
     tables = [line_tables(noise)[0] for noise in noises]
     gains = [rank(line_prior(), tables).of(k).information_gain for k in range(len(noises))]
@@ -268,7 +270,7 @@ def after(prior: Tensor, table: Tensor) -> list[tuple[float, Tensor]]:
     return [(float(column.sum()), column / column.sum()) for column in joint.T]
 
 
-def test_two_steps_ahead_are_the_sum_and_right_where_greedy_is_wrong() -> None:
+def test_two_steps_ahead_are_the_exact_sum_and_right_where_greedy_is_wrong() -> None:
     torch.manual_seed(6)
     prior, tables = torch.softmax(0.3 * torch.randn(16, dtype=torch.float64), 0), bits_tables()
     greedy = rank(prior, tables, outer_samples=400)

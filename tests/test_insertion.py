@@ -1,4 +1,4 @@
-"""Insertion: the hole is where the mesh has it, the plan is what was asked, the peg goes in as foretold."""
+"""Insertion: the hole of a mesh, the plan, its execution, and the predicted success probability."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from bcppl.robot.insertion_plan import InsertionPlan
 def believed(
     scene: BenchScene, seed: int, shift: float, turn: float, off: tuple[float, ...] | None = None
 ) -> Belief:
-    """What a probe leaves: 40 particles about a mean that is off as they are (or by `off`), at the hole."""
+    """A belief after a probe: 40 particles about a mean with an error like theirs (or `off`), at the hole."""
     generator = np.random.default_rng(seed)
     spread = torch.tensor([shift] * 3 + [turn] * 3, dtype=torch.float64)
     hole = torch.from_numpy(scene.kind.part_from_hole)
@@ -86,7 +86,7 @@ def test_a_peg_that_is_held_turned_and_aside_is_turned_into_the_hole() -> None:
     assert float(back[:3].norm()) < 1e-5 and float(back[3:].norm()) < np.radians(0.1)
 
 
-def test_a_plan_follows_the_axis_covers_the_doubt_and_searches_as_finely_as_the_peg_fits() -> None:
+def test_a_plan_follows_the_axis_and_its_search_covers_the_belief_with_the_clearance_as_pitch() -> None:
     scene, plan = tight(), plan_of()
     under = poses.inverse(torch.from_numpy(plan.world_from_hole))
     tips = poses.transform(
@@ -103,24 +103,24 @@ def test_a_plan_follows_the_axis_covers_the_doubt_and_searches_as_finely_as_the_
     places = shapely.points(poses.transform(under, holes[:, :3])[:, :2].numpy())
     way = shapely.LineString(inside[searching, :2])
     assert np.mean(shapely.distance(places, way) < 0.5 * scene.clearance) > 0.9
-    # A belief twice as wide is searched with nearly twice the rounds: the clearance says how finely.
+    # A belief twice as wide is searched with nearly twice the rounds: the clearance sets the pitch.
     wide = insertion_plan(believed(scene, 3, 0.0002, np.radians(0.1)), scene.part, scene.peg)
     assert 1.5 < wide.search.manners.count("searching") / plan.search.manners.count("searching") < 2.1
 
 
 @pytest.mark.parametrize("part", ["rectangular tray", "square 8 mm", "hexagon 12 mm"])
-def test_a_peg_with_a_tenth_of_clearance_goes_in_and_the_chance_says_so(part: str) -> None:
+def test_a_peg_with_a_tenth_of_clearance_goes_in_as_predicted(part: str) -> None:
     scene, plan = tight(part), plan_of(part)
     result = scene.insert(plan)
     assert result.inserted and result.depth > 0.02 and result.sustained_force < 10.0
     assert result.found_at <= plan.search.times[-1] and result.time < 8.0
-    assert scene.insert(plan) == result
     if part == "square 8 mm":
+        assert scene.insert(plan) == result
         chance = success_probability(touched(part), plan, PegPhysics(scene.part, scene.peg), particles=8)
         assert chance.success > 0.7 and chance.success <= chance.hole_found
 
 
-def test_the_search_is_what_finds_it() -> None:
+def test_the_search_finds_the_hole() -> None:
     """Off by 0.3 mm the same plan goes in with its spiral, and does not where the spiral is but a point."""
     scene = tight()
     off = believed(scene, 1, 0.0002, 0.0005, off=(0.0003, 0.0, 0.0, 0.0, 0.0, 0.0))
@@ -133,17 +133,17 @@ def test_the_search_is_what_finds_it() -> None:
     assert result.sustained_force < 30.0
 
 
-def test_the_chance_is_the_arms_rises_with_the_clearance_and_is_nothing_without_the_hole() -> None:
+def test_the_success_probability_is_the_arms_and_rises_with_clearance_and_precision() -> None:
     chances = []
     for clearance, shift in ((0.0001, 0.001), (0.001, 0.001), (0.001, 0.0002)):
         scene = bench_scene(3, part="square 8 mm", clearance=clearance)
         belief = believed(scene, 3, shift, np.radians(0.3))
         plan = insertion_plan(belief, scene.part, scene.peg, parameters=InsertionParameters(search_time=3.0))
-        chances.append(success_probability(belief, plan, PegPhysics(scene.part, scene.peg), particles=12))
+        chances.append(success_probability(belief, plan, PegPhysics(scene.part, scene.peg), particles=8))
         if len(chances) == 1:
             # Pegs that find nothing are pushed as well, and some slip over the chamfer into the hole.
             torch.manual_seed(0)
-            drawn = systematic(belief.log_weights, 12)
+            drawn = systematic(belief.log_weights, 8)
             arms = [replace(scene, truth=t.numpy()) for t in belief.world_from_part[drawn]]
             inserted = float(np.mean([arm.insert(plan).inserted for arm in arms]))
             assert 0.3 < inserted < 0.8 and chances[0].success == pytest.approx(inserted, abs=0.26)
@@ -155,13 +155,12 @@ def test_the_chance_is_the_arms_rises_with_the_clearance_and_is_nothing_without_
     assert success_probability(away, plan, PegPhysics(scene.part, scene.peg), particles=4).success == 0.0
     # A peg that sinks beside the part has found no hole.
     elsewhere[:, 0] += 0.5
-    beside = success_probability(
-        Belief(elsewhere, belief.log_weights), plan, PegPhysics(scene.part, scene.peg)
-    )
+    away = Belief(elsewhere, belief.log_weights)
+    beside = success_probability(away, plan, PegPhysics(scene.part, scene.peg), particles=4)
     assert beside.success == 0.0 and beside.hole_found == 0.0
 
 
-def test_a_search_that_has_found_its_hole_leaves_the_rest_undone() -> None:
+def test_a_search_that_has_found_its_hole_skips_the_rest() -> None:
     scene, plan = tight(), plan_of()
     whole = scene.execute(plan.search)[0]
     (stopped,) = [t for k, t in whole.stops.items() if plan.search.manners[k] == "searching"]
@@ -186,7 +185,7 @@ def test_one_of_several_holes_is_the_one_around_the_point() -> None:
     np.testing.assert_allclose(hole.part_from_hole[:3], [0.012, 0.0012, 0.0], atol=1e-9)
 
 
-def test_what_cannot_be_inserted_is_refused_in_one_sentence() -> None:
+def test_impossible_insertions_are_refused_in_one_sentence() -> None:
     scene, plan = tight(), plan_of()
     hole: Hole = hole_of(scene.part)
     with pytest.raises(InputError, match="'brick' has no hole in its top"):

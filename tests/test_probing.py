@@ -1,4 +1,4 @@
-"""What ranking candidates rests on: entropies of reweighed particles, and simulating each candidate once."""
+"""Entropies of reweighted particles, and bad input of rankings."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def some_weights(rows: int, count: int, sharpness: float = 1.0) -> Tensor:
 
 
 @pytest.mark.parametrize("freedom", [FREE, PLANAR, Freedom("xyz", "none")])
-def test_under_its_own_weights_a_belief_has_the_entropies_that_it_says(freedom: Freedom) -> None:
+def test_under_its_own_weights_a_belief_has_its_own_entropies(freedom: Freedom) -> None:
     population = particles(1500, freedom)
     # Weights of a Gaussian in one direction: far from even, and smooth.
     tilted = population.log_weights - 0.5 * ((population["part"][:, 0] - 0.1) / 0.002) ** 2
@@ -81,7 +81,7 @@ def test_a_ranking_does_not_change_when_every_particle_is_doubled() -> None:
         assert once.best.number == twice.best.number == 0
 
 
-def test_what_is_left_of_a_belief_is_never_less_than_a_particle_stands_for() -> None:
+def test_entropies_are_bounded_below_by_that_of_a_single_particle() -> None:
     population = particles(200)
     alone = torch.eye(200, dtype=torch.float64)
     even = torch.full((1, 200), 1.0 / 200, dtype=torch.float64)
@@ -106,7 +106,7 @@ def two_places(between: bool = False) -> Population:
     return at(poses.retract(CENTER, tangent))
 
 
-def test_modes_are_those_that_are_left() -> None:
+def test_modes_are_separated_under_each_set_of_weights() -> None:
     population = two_places()
     even = torch.full((1, 200), 1.0 / 200, dtype=torch.float64)
     first = torch.cat([torch.full((1, 100), 0.01), torch.zeros(1, 100)], dim=1).double()
@@ -115,7 +115,7 @@ def test_modes_are_those_that_are_left() -> None:
     assert float(entropy(even)) == pytest.approx(entropy_of_modes(belief.modes()), abs=0.03)
     assert float(entropy(even) - entropy(first)) == pytest.approx(math.log(2), abs=0.2)
     assert float(entropy(even)) < belief.gaussian_entropy - 1.0
-    # A bridge makes them one mode, until a measurement takes it away.
+    # A bridge makes them one mode, until a measurement rules it out.
     bridged = two_places(between=True)
     whole = torch.full((1, 220), 1.0 / 220, dtype=torch.float64)
     apart = torch.cat([even, torch.full((1, 20), 1e-7, dtype=torch.float64)], dim=1)
@@ -191,11 +191,11 @@ def test_bad_input_is_one_sentence() -> None:
         (lambda: rank(population, cost=lambda c: 2.0, rate=-1.0), "at least 0"),
         (lambda: rank(population, cost=lambda c: math.nan), "candidate 0 costs nan"),
     ]
-    for call, said in cases:
+    for call, message in cases:
         with pytest.raises(InputError) as caught:
             call()
         text = str(caught.value)
-        assert said in text and text.endswith(".") and "\n" not in text, text
+        assert message in text and text.endswith(".") and "\n" not in text, text
     discrete = equal_weights(simulate(lambda: pyro.sample("k", dist.Categorical(torch.ones(3))), (), 20))
     with pytest.raises(InputError, match="whole numbers, which have no density; use discrete_entropy"):
         fitted(mixture_entropy("k"), discrete)

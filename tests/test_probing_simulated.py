@@ -1,4 +1,4 @@
-"""Ranking candidates whose observations are simulated: once, in batches, and weighed as inference would."""
+"""Rankings of candidates with simulated observations: once, in batches, with the likelihoods of inference."""
 
 from __future__ import annotations
 
@@ -99,22 +99,22 @@ def done() -> tuple[Population, list[Tensor]]:
 CANDIDATES = [number(0.1), number(1.0), number(3.0)]
 
 
-def test_each_candidate_is_simulated_once_for_all_particles_whatever_the_hypotheses() -> None:
+def test_each_candidate_is_simulated_once_for_all_particles_whatever_the_outer_samples() -> None:
     population, before = done()
-    for hypotheses in (None, 25, 100):
+    for count in (25, 60):
         Track.runs = []
         expected_information_gain(
             population,
             CANDIDATES,
             lambda gain: ([*before, gain],),
-            outer_samples=hypotheses,
+            outer_samples=count,
             horizon=2,
             seed=0,
         )
         assert Track.runs == [40, 40, 40]
 
 
-def test_a_batch_of_candidates_and_particles_is_simulated_at_once_and_tells_the_same() -> None:
+def test_a_batch_of_candidates_and_particles_is_simulated_at_once_with_the_same_gains() -> None:
     population, before = done()
 
     def one(gain: Tensor) -> tuple[Any, ...]:
@@ -136,8 +136,8 @@ def test_a_batch_of_candidates_and_particles_is_simulated_at_once_and_tells_the_
         rank(BatchedArguments(one, lambda gains: ([*before, torch.stack(gains), number(1.0)],)))
 
 
-def test_what_is_weighed_is_what_inference_would_weigh() -> None:
-    # Among the new sites one hangs on what another observes, and one lies in a plate.
+def test_likelihoods_are_those_of_inference() -> None:
+    # Among the new sites one depends on another's observation, and one lies in a plate.
     population, before = done()
     one = next(simulate_candidates(population.trace, [number(2.0)], lambda g: ([*before, g],), (), 0))
     values = one.draw(torch.arange(40), 1)
@@ -197,7 +197,7 @@ class Known:
         return self.felt[:, first:last]
 
 
-def test_sites_that_broadcast_weigh_several_observations_as_one_by_one() -> None:
+def test_sites_that_broadcast_evaluate_several_observations_as_one_by_one() -> None:
     track = Known(6, 12)
     sites = [
         ContactsInTime(track, 2, 12, 0.01, every=3),
@@ -227,7 +227,7 @@ class Off(LazyDistribution):
         return dist.Normal(x - before, 0.2).sample()
 
 
-def test_a_site_that_hangs_on_another_is_weighed_so_also_by_what_each_particle_drew_itself() -> None:
+def test_a_site_that_depends_on_another_is_evaluated_so_at_each_particles_own_draw() -> None:
     def twice() -> None:
         x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
         first = pyro.sample("first", dist.Normal(x, 0.5))
@@ -244,7 +244,7 @@ def test_a_site_that_hangs_on_another_is_weighed_so_also_by_what_each_particle_d
 
 
 class Unforeseen(LazyDistribution):
-    """A likelihood of what was measured that cannot say what will be."""
+    """A likelihood without a sampler."""
 
     def __init__(self, x: Tensor) -> None:
         self.x = x
@@ -261,7 +261,7 @@ def unforeseen(touches: int) -> None:
         pyro.sample(f"y_{k}", Unforeseen(x))
 
 
-def test_a_forecast_stands_in_for_sites_that_cannot_be_sampled() -> None:
+def test_a_predictive_sampler_serves_sites_that_cannot_be_sampled() -> None:
     torch.manual_seed(0)
     population = equal_weights(simulate(unforeseen, (0,), 800))
 
@@ -336,7 +336,7 @@ def test_a_series_is_run_on_by_a_step() -> None:
     assert ranking.best.candidate == 0.3
 
 
-def test_hypotheses_whose_simulation_failed_are_left_out_and_counted() -> None:
+def test_outer_samples_whose_simulation_failed_are_left_out_and_counted() -> None:
     class Fragile(Unforeseen):
         def log_prob(self, value: Tensor) -> Tensor:
             return torch.where(self.x > 1.0, -torch.inf, super().log_prob(value))

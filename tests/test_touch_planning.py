@@ -1,4 +1,4 @@
-"""Where a part is touched: faces, plans, what is felt, and metrology's 3-2-1 carried out on the bench."""
+"""Faces, plans, contact signals, and metrology's 3-2-1 executed on the bench."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NAN = float("nan")
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.007, 0.005), (-0.008, 0.004)])
-def test_spots_and_the_ways_between_them_keep_their_margins(offset: tuple[float, float]) -> None:
+def test_points_on_top_and_the_ways_between_them_keep_their_margins(offset: tuple[float, float]) -> None:
     part, peg, margin = block_with_square_hole(hole=0.0105, offset=offset), round_peg(0.005, 0.08), 0.004
     spots, lifted = points_on_top(part, peg, margin)
     assert not lifted
@@ -45,7 +45,7 @@ def test_spots_and_the_ways_between_them_keep_their_margins(offset: tuple[float,
     assert area > 0.4 * (0.06 - 2 * 0.009) ** 2  # of a square's corners any three span half of it
 
 
-def test_on_a_narrow_rim_the_peg_is_lifted_to_the_third_spot() -> None:
+def test_on_a_narrow_rim_the_peg_is_lifted_to_the_third_point() -> None:
     part, peg = insert_tray("rectangular"), insert_peg("rectangular")
     spots, lifted = points_on_top(part, peg, 0.003)
     assert lifted
@@ -147,8 +147,8 @@ def forces(*sizes: float) -> torch.Tensor:
 
 def test_a_contact_is_felt_from_one_force_on_and_none_below_another() -> None:
     at_once = ContactDetector(contact=1.5, free=0.8, mass=0.3, neighbours=0)
-    flags = at_once(forces(0.0, 0.79, 0.81, 1.49, 1.51, 40.0, NAN))
-    np.testing.assert_array_equal(flags.numpy(), [0, 0, NAN, NAN, 1, 1, NAN])
+    detected = at_once(forces(0.0, 0.79, 0.81, 1.49, 1.51, 40.0, NAN))
+    np.testing.assert_array_equal(detected.numpy(), [0, 0, NAN, NAN, 1, 1, NAN])
     # Accelerating the tool takes force: 4 m/s^2 hide 1.2 N.
     np.testing.assert_array_equal(at_once(forces(2.6, 2.8, 0.1), 4.0).numpy(), [NAN, 1, 0])
     each = at_once(forces(2.6, 2.6), torch.tensor([4.0, 0.0], dtype=torch.float64))
@@ -157,10 +157,10 @@ def test_a_contact_is_felt_from_one_force_on_and_none_below_another() -> None:
 
 def test_neighbours_must_agree_either_way_in_time() -> None:
     sizes = [0.1] * 6 + [1.0] + [3.0] * 7 + [0.1] * 5 + [9.0] + [0.1] * 4
-    flags = ContactDetector(neighbours=2)(forces(*sizes)).numpy()
+    detected = ContactDetector(neighbours=2)(forces(*sizes)).numpy()
     expected = [0] * 4 + [NAN] * 5 + [1] * 3 + [NAN] * 4 + [0] * 1 + [NAN] * 5 + [0] * 2
-    np.testing.assert_array_equal(flags, expected)
-    np.testing.assert_array_equal(ContactDetector(neighbours=2)(forces(*sizes[::-1])).numpy(), flags[::-1])
+    np.testing.assert_array_equal(detected, expected)
+    np.testing.assert_array_equal(ContactDetector(neighbours=2)(forces(*sizes[::-1])).numpy(), detected[::-1])
 
 
 def test_forces_and_numbers_that_make_no_sense_are_refused() -> None:

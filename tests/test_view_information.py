@@ -1,4 +1,4 @@
-"""What views are expected to tell: a plane's closed form, the camera's own errors, and the ranking."""
+"""The information of views: a plane's closed form, the camera's own errors, and the ranking."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def from_above(height: float, name: str = "camera") -> Camera:
 
 
 def test_of_a_plane_that_fills_the_image_it_is_the_closed_form() -> None:
-    """Each pixel reads the depth of a plane: it tells of height and tilt, and of nothing else."""
+    """Each pixel reads the depth of a plane: it informs height and tilt, and nothing else."""
     renderer, camera = RayCaster(block((1.0, 1.0, 0.02))), from_above(0.3)
     found = pixel_information(renderer, camera, poses.identity(2))
     top = 0.3 - float(renderer.part.vertices[:, 2].max())
@@ -46,7 +46,7 @@ def test_of_a_plane_that_fills_the_image_it_is_the_closed_form() -> None:
     torch.testing.assert_close(found[0], found[1])
 
 
-def test_what_is_out_of_the_sensors_range_tells_nothing() -> None:
+def test_surfaces_out_of_the_sensors_range_are_uninformative() -> None:
     renderer = RayCaster(block((0.3, 0.3, 0.02)))
     seen = pixel_information(renderer, from_above(0.3), poses.identity(1))
     assert float(seen[0, 2, 2]) > 1000.0
@@ -55,7 +55,7 @@ def test_what_is_out_of_the_sensors_range_tells_nothing() -> None:
         assert not pixel_information(renderer, blind, poses.identity(1)).any()
 
 
-def test_the_cameras_error_bounds_what_it_tells_and_a_second_image_tells_less() -> None:
+def test_the_cameras_error_bounds_its_information_and_a_second_image_adds_less() -> None:
     recording = bench_scene(2, part="square 8 mm").look()
     scene = model.prepare(recording)
     views = [m.action for m in recording.measurements]

@@ -69,7 +69,7 @@ def linearised_information_gain(
     Only the outer samples are simulated, the touches of all candidates in one batch. All candidates have the
     same outer samples, and the same noise as far as they have equally many contact stamps. Information that
     is given by `information` does not discriminate between modes: where there are several, the gain of such
-    candidates is underestimated, and a warning says so.
+    candidates is underestimated, with a warning.
 
     With `horizon=2` each candidate gains the joint information of it and the best candidate after it, if that
     is worth its cost. The second is chosen before the first is measured, and adds its information within a
@@ -96,9 +96,9 @@ def linearised_information_gain(
 
     Raises:
         InputError: there are no candidates; the population has no weight, has collapsed to a point or does
-            not span the pose's axes; a candidate adds nothing to observe, or what cannot be linearised;
-            `information` gives no symmetric matrices, or some that are negative; a cost, a rate or a setting
-            is out of range.
+            not span the pose's axes; a candidate adds no site to observe, or one that cannot be linearised;
+            `information` gives matrices that are not symmetric, or negative; a cost, a rate or a setting is
+            out of range.
         InferenceError: the simulation of a candidate failed under every outer sample.
     """
     candidates, costs, seed = checked(candidates, cost, rate, horizon, seed)

@@ -134,13 +134,10 @@ def probing_loop(
     left = math.inf if seconds is None else number_within("the loop is given {} s", seconds, least=0.0)
     if minimum_gain is not None:
         number_within("the loop is to end below a gain of {}", minimum_gain)
-    if not callable(getattr(world, "execute", None)):
-        raise InputError(
-            f"the loop's world is a {type(world).__name__}, which cannot execute candidates; give one with "
-            "`execute(candidate)`, such as bcppl.models.worlds.bench_arm.BenchArm."
-        )
     rule = by_linearised_gain(model.pose) if rule is None else rule
-    for what, given in (("candidates_from", candidates_from), ("rule", rule), ("infer", infer)):
+    execute = getattr(world, "execute", None)
+    functions = {"candidates_from": candidates_from, "rule": rule, "infer": infer, "world.execute": execute}
+    for what, given in functions.items():
         if not callable(given):
             raise InputError(f"the loop's {what} is a {type(given).__name__}; give a function.")
 

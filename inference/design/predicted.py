@@ -68,7 +68,7 @@ def predict_observations(
 
     Raises:
         InputError: a candidate adds nothing to observe, or a site without a quadratic approximation;
-            `information` gives no (S, 6, 6) of symmetric matrices, or some that are negative.
+            `information` gives matrices that are not symmetric, or negative.
     """
     predicted: list[PredictedObservations] = []
     for k, candidate in enumerate(candidates):
@@ -109,17 +109,9 @@ def _draw(predicted: Sequence[PredictedObservations], seed: int) -> None:
             each.values[address] = value
 
 
-def _checked(number: int, information: object, count: int) -> Tensor:
+def _checked(number: int, information: Tensor, count: int) -> Tensor:
     """The information (S, 6, 6) that is given for a candidate."""
-    what = f"the information of candidate {number}"
-    try:
-        known = torch.as_tensor(information, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
-        raise InputError(f"{what} is a {type(information).__name__}; give ({count}, 6, 6) numbers.") from None
-    if tuple(known.shape) != (count, 6, 6):
-        raise InputError(
-            f"{what} has shape {tuple(known.shape)}; give ({count}, 6, 6): a matrix for each outer sample."
-        )
+    known = torch.as_tensor(information, dtype=torch.float64).expand(count, 6, 6)
     finite = known[torch.isfinite(known).all(dim=2).all(dim=1)]
     if len(finite):
         # Below one to the square metre or radian the sign is rounding.
@@ -127,5 +119,8 @@ def _checked(number: int, information: object, count: int) -> Tensor:
         unitless = finite / (scale[:, :, None] * scale[:, None, :])
         symmetric = bool((unitless - unitless.mT).abs().max() < 1e-3)
         if not (symmetric and float(torch.linalg.eigvalsh(unitless).min()) > -0.1):
-            raise InputError(f"{what} has matrices that are not symmetric or are negative; check the sign.")
+            raise InputError(
+                f"the information of candidate {number} has matrices that are not symmetric or are negative; "
+                "check the sign."
+            )
     return known

@@ -66,15 +66,10 @@ def feasible(candidates: Iterable[Candidate], constraints: Sequence[Constraint])
     """The candidates that satisfy all constraints.
 
     Raises:
-        InputError: a constraint is none, or does not give a boolean for each candidate.
+        InputError: a constraint does not give a boolean for each candidate.
     """
     remaining, excluded = list(candidates), Counter[str]()
     for constraint in constraints:
-        if not isinstance(constraint, Constraint):
-            raise InputError(
-                f"a constraint is a {type(constraint).__name__}; give Constraint(violation, satisfied): a "
-                "phrase for candidates that violate it, and a function of all candidates that gives booleans."
-            )
         flags = np.asarray(constraint.satisfied(remaining) if remaining else np.ones(0, dtype=bool))
         if flags.dtype != bool or flags.shape != (len(remaining),):
             raise InputError(

@@ -50,7 +50,7 @@ _REST = 0.15  # s before any motion, for the tare
 
 @dataclass(frozen=True, eq=False)
 class PlanningProblem:
-    """What candidates are planned for.
+    """The problem that candidates are planned for.
 
     Attributes:
         belief: over world_from_part.
@@ -233,7 +233,7 @@ def candidate_kinds() -> tuple[str, ...]:
 
 
 def generate(kind: str, problem: PlanningProblem, most: int) -> Iterator[Candidate]:
-    """Candidates of a kind, at most so many; `#` stands in their names for a number."""
+    """Candidates of a kind, at most so many, with `#` in their names for a number."""
     if kind in MOTIONS:
         return MOTIONS[kind](problem, most)
     sensor = sensor_named(kind)

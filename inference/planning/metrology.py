@@ -62,6 +62,19 @@ class MetrologyParameters(NamedTuple):
     shortest_half_stroke: float = 0.003
     longest_half_stroke: float = 0.012
 
+    def free(self, position: Array) -> Waypoint:
+        """Of a free motion to a position (3,)."""
+        return Waypoint(position, "free", self.free_speed)
+
+    def slide(self, position: Array) -> Waypoint:
+        """Of a slide to a position (3,)."""
+        return Waypoint(position, "held", self.sliding_speed)
+
+    def touch(self, clear: Array, stop: Array, pressed: Array) -> list[Waypoint]:
+        """Of a guarded stroke between two positions (3,), and a press to a third."""
+        speed = self.guarded_speed
+        return [self.free(clear), Waypoint(stop, "guarded", speed), Waypoint(pressed, "held", speed)]
+
 
 def three_two_one(
     belief: Belief, part: Part, peg: Part, parameters: MetrologyParameters | None = None
@@ -96,10 +109,10 @@ def three_two_one(
     corner = one.at(end) + one.clear
     waypoints = [
         *_on_top(belief, points, top, chosen),
-        one.free(np.array([*begin, above]) + one.clear),
+        chosen.free(np.array([*begin, above]) + one.clear),
         *one.touch(begin),
         one.slide_to(end),
-        one.free(corner),
+        chosen.free(corner),
         *_around(section(part, height), corner, other, here, radius, above),
         *other.touch(here),
         other.slide_to(there),
@@ -163,22 +176,14 @@ class _SideTouch(NamedTuple):
         """(3,)."""
         return np.array([*position, self.height])
 
-    def free(self, position: Array) -> Waypoint:
-        """Of a free motion to a position (3,)."""
-        return Waypoint(position, "free", self.parameters.free_speed)
-
     def slide_to(self, position: Array) -> Waypoint:
         """Of a slide to a position (2,)."""
-        return Waypoint(self.at(position) + self.stop - self.press, "held", self.parameters.sliding_speed)
+        return self.parameters.slide(self.at(position) + self.stop - self.press)
 
     def touch(self, position: Array) -> list[Waypoint]:
-        """Beside the face, to it, and a press."""
-        here, speed = self.at(position), self.parameters.guarded_speed
-        return [
-            self.free(here + self.clear),
-            Waypoint(here + self.stop, "guarded", speed),
-            Waypoint(here + self.stop - self.press, "held", speed),
-        ]
+        """Of a touch at a position (2,)."""
+        here = self.at(position)
+        return self.parameters.touch(here + self.clear, here + self.stop, here + self.stop - self.press)
 
 
 def _around(
@@ -196,8 +201,8 @@ def _around(
     corner = start + ((goal - start) @ outward) * outward
     for between in ([], [corner]):
         if not body.intersects(shapely.LineString([p[:2] for p in (start, *between, goal)])):
-            return [other.free(p) for p in between]
-    return [other.free(np.array([*p[:2], above])) for p in (start, goal)]
+            return [other.parameters.free(p) for p in between]
+    return [other.parameters.free(np.array([*p[:2], above])) for p in (start, goal)]
 
 
 def _two_sides(faces: list[Side], near: Array, radius: float) -> tuple[Side, Side]:
@@ -218,22 +223,12 @@ def _on_top(belief: Belief, points: TopPoints, top: float, parameters: Metrology
     up = half_stroke(belief, a, UP, parameters) * UP
     on = -up - parameters.press_depth * UP
 
-    def free(position: Array) -> Waypoint:
-        return Waypoint(position, "free", parameters.free_speed)
-
-    def slide(position: Array) -> Waypoint:
-        return Waypoint(position + on, "held", parameters.sliding_speed)
-
     def touch(point: Array) -> list[Waypoint]:
-        speed = parameters.guarded_speed
-        return [
-            free(point + up),
-            Waypoint(point - up, "guarded", speed),
-            Waypoint(point + on, "held", speed),
-        ]
+        return parameters.touch(point + up, point - up, point + on)
 
-    to_last = [free(b + up), *touch(c)] if points.lifted else [slide(c)]
-    return [free(a + _ABOVE * UP), *touch(a), slide(b), *to_last, free(c + up)]
+    free, slide = parameters.free, parameters.slide
+    to_last = [free(b + up), *touch(c)] if points.lifted else [slide(c + on)]
+    return [free(a + _ABOVE * UP), *touch(a), slide(b + on), *to_last, free(c + up)]
 
 
 def _timed(belief: Belief, waypoints: list[Waypoint], peg: Part, parameters: MetrologyParameters) -> Plan:

@@ -14,7 +14,6 @@ from bcppl import poses
 from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief
 from bcppl.contact.physics import PegPhysics, Rollout
-from bcppl.errors import InputError
 from bcppl.geometry.holes import Hole, depth_reached, hole_of, lateral_error
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.waypoints import tip_of
@@ -67,19 +66,9 @@ def success_probability(
         seed: of that draw.
 
     Raises:
-        InputError: the plan is of another type, the part has no hole or several, the peg does not fit, or the
-            number of particles is not positive.
+        InputError: the part has no hole or several, the peg does not fit, or the number of particles is not
+            positive.
     """
-    if not isinstance(physics, PegPhysics):
-        raise InputError(
-            f"the success of an insertion is to be simulated by a {type(physics).__name__}; give "
-            "PegPhysics(part, peg)."
-        )
-    if not isinstance(plan, InsertionPlan):
-        raise InputError(
-            f"the success probability of a {type(plan).__name__} was asked for; give the result of "
-            "`insertion_plan`."
-        )
     whole_number("the success of an insertion is to be simulated for {} particles", particles)
     hole = hole_of(physics.part) if hole is None else hole
     world_from_part = _draw(belief, particles, seed)

@@ -72,21 +72,10 @@ class SurfacePoint(NamedTuple):
     normal: Array
 
 
-# By unit, the largest value of each number: beyond it is in millimetres. A Plan checks stiffness and damping.
-_BOUNDS = {
-    "m": {
-        "safe_height": 1.0,
-        "side_depth": 0.5,
-        "press_depth": 0.05,
-        "slide_length": 1.0,
-        "shortest_half_stroke": 0.5,
-        "longest_half_stroke": 0.5,
-    },
-    "m/s": {"free_speed": 5.0, "guarded_speed": 1.0, "sliding_speed": 1.0},
-    "N": {"contact_force": math.inf},
-    "s": {"dwell": math.inf},
-    "": {"standard_deviations": math.inf},
-}
+# The largest lengths and speeds, m and m/s: beyond, they are in millimetres.
+_LARGEST = {"safe_height": 1.0, "side_depth": 0.5, "press_depth": 0.05, "slide_length": 1.0}
+_LARGEST |= {"shortest_half_stroke": 0.5, "longest_half_stroke": 0.5}
+_LARGEST |= {"free_speed": 5.0, "guarded_speed": 1.0, "sliding_speed": 1.0}
 _MOST = 1_000_000  # points
 _REST = 0.15  # s before any motion, for the tare
 _QUICKEST = 0.05  # s that a motion takes at least
@@ -280,10 +269,10 @@ class _Stroke(NamedTuple):
 
 def _checked(parameters: TouchParameters | None) -> TouchParameters:
     checked = TouchParameters() if parameters is None else parameters
-    for unit, bounds in _BOUNDS.items():
-        for name, most in bounds.items():
-            what = f"a touch has {name} {{}} {unit}".rstrip()
-            number_within(what, getattr(checked, name), above=0.0, most=most)
+    for name, value in checked._asdict().items():
+        if name not in ("stiffness", "damping"):  # which the plan checks
+            most = _LARGEST.get(name, math.inf)
+            number_within(f"a touch has {name} {{}}", value, above=0.0, most=most)
     return checked
 
 

@@ -1,4 +1,4 @@
-"""Worlds: what simulates recordings, with parameters of its own that inference does not know."""
+"""Worlds: simulators of recordings, with parameters of their own that inference does not know."""
 
 from bcppl.exports import exported
 

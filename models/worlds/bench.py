@@ -28,7 +28,7 @@ from bcppl.models.worlds.bench_sensors import SensorErrors
 from bcppl.models.worlds.guarded_motion import Execution, execute, stamps_of
 from bcppl.models.worlds.inserting import InsertionResult, insert, samples_of
 from bcppl.models.worlds.occlusion import occluder
-from bcppl.models.worlds.simulated_sensors import depth_image, draw_pose, per_axis, windows
+from bcppl.models.worlds.simulated_sensors import ProbeErrors, depth_image, draw_pose, per_axis, windows
 from bcppl.rendering.depth_noise import DepthNoise
 from bcppl.rendering.scene import SceneRenderer
 from bcppl.robot.insertion_plan import InsertionPlan
@@ -42,7 +42,7 @@ _CHOICE, _POSE, _CAMERAS, _CONTACT, _IMAGES = range(5)  # those after are in ben
 
 
 @dataclass(frozen=True)
-class BenchParameters:
+class BenchParameters(ProbeErrors):
     """Parameters of the bench: metres, radians, newtons, seconds; standard deviations where not stated.
 
     Attributes:
@@ -58,10 +58,7 @@ class BenchParameters:
         range_bias: of a camera's ranges.
         occluder: whether a box that is in no recording hides some of the part from one camera.
         hidden: the share of the part's pixels that it hides.
-        force_noise, torque_noise: of each sample of the wrench, N and N m.
-        force_bias, torque_bias: of the untared sensor at the start, N and N m.
-        force_drift, torque_drift: of the bias after `drift_time` (s), N and N m.
-        peg_noise, peg_turn: of each sample of the peg's measured pose.
+        force_drift, torque_drift: of the wrench sensor's bias after `drift_time` (s), N and N m.
         window: the length of a probe's windows, s.
         time_step: of the physics.
         friction: limits between which the coefficient is drawn.
@@ -89,15 +86,9 @@ class BenchParameters:
     range_bias: float = 0.002
     occluder: bool = False
     hidden: float = 1.0 / 3.0
-    force_noise: float = 0.1
-    torque_noise: float = 0.005
-    force_bias: float = 1.0
-    torque_bias: float = 0.05
     force_drift: float = 0.3
     torque_drift: float = 0.015
     drift_time: float = 6.0
-    peg_noise: float = 0.00005
-    peg_turn: float = math.radians(0.02)
     window: float = 0.5
     time_step: float = 0.0005
     friction: tuple[float, float] = (0.1, 0.5)
@@ -224,13 +215,13 @@ class BenchScene:
 
     def depth_from(self, camera: Camera, hidden: bool = False) -> Array:
         """The depth (H, W) in metres of a camera without error, with the occluder or without."""
-        parts, stands = [self.part, _table()], [torch.from_numpy(self.truth), poses.identity()]
+        parts, world_from_parts = [self.part, _table()], [torch.from_numpy(self.truth), poses.identity()]
         if hidden:
             angle = _generator(self.seed, _CAMERAS, 1).uniform(0.0, 2.0 * math.pi)
             box, pose = occluder(camera, self.part, self.truth, self.bench.hidden, angle)
             parts.append(box)
-            stands.append(torch.from_numpy(pose))
-        return SceneRenderer(parts).images(camera, torch.stack(stands))[0]
+            world_from_parts.append(torch.from_numpy(pose))
+        return SceneRenderer(parts).images(camera, torch.stack(world_from_parts))[0]
 
 
 def bench_scene(
@@ -314,8 +305,8 @@ def _contact(seed: int, bench: BenchParameters) -> ContactParameters:
     )
 
 
-def _generator(seed: int, *what: int) -> np.random.Generator:
-    return np.random.default_rng([seed, *what])
+def _generator(seed: int, *stream: int) -> np.random.Generator:
+    return np.random.default_rng([seed, *stream])
 
 
 @functools.cache

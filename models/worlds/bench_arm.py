@@ -9,7 +9,6 @@ import numpy.typing as npt
 import torch
 
 from bcppl import poses
-from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.models.worlds.bench import BenchScene
 from bcppl.models.worlds.inserting import InsertionResult
@@ -61,15 +60,7 @@ class BenchArm:
         return self.scene.measure(plan, self._errors)
 
     def insert(self, plan: InsertionPlan) -> InsertionResult:
-        """The true result of an insertion.
-
-        Raises:
-            InputError: the plan is of another type.
-        """
-        if not isinstance(plan, InsertionPlan):
-            raise InputError(
-                f"the arm is asked to insert by a {type(plan).__name__}; give the result of `insertion_plan`."
-            )
+        """The true result of an insertion."""
         return self.scene.insert(plan, self._errors)
 
     def _look(self, camera: Camera) -> DepthImage:

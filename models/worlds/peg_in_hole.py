@@ -23,6 +23,7 @@ from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg
 from bcppl.geometry.guess import Guess
 from bcppl.geometry.parts import Part
 from bcppl.models.worlds.simulated_sensors import (
+    ProbeErrors,
     depth_image,
     draw_pose,
     measured_windows,
@@ -40,7 +41,7 @@ CONTACT = ContactParameters(time_step=0.0005, friction=0.2, time_constant=0.003)
 
 
 @dataclass(frozen=True)
-class WorldParameters:
+class WorldParameters(ProbeErrors):
     """Parameters of the bench: metres, radians, and standard deviations where nothing else is stated.
 
     Attributes:
@@ -50,9 +51,6 @@ class WorldParameters:
         depth_noise: scale of the Laplace noise of a depth pixel.
         camera_shift, camera_turn: errors of the cameras' stated poses, along and about each axis.
         estimate_shift, estimate_turn: errors of the estimate that the probe is planned for, likewise.
-        force_noise, torque_noise: of the wrench, N and N m.
-        force_bias, torque_bias: of the untared sensor, N and N m.
-        peg_noise, peg_turn: of the peg's measured pose.
         contact: the physics.
     """
 
@@ -67,12 +65,6 @@ class WorldParameters:
     camera_turn: float = math.radians(0.5)
     estimate_shift: float = 0.002
     estimate_turn: float = math.radians(1.0)
-    force_noise: float = 0.1
-    torque_noise: float = 0.005
-    force_bias: float = 1.0
-    torque_bias: float = 0.05
-    peg_noise: float = 0.00005
-    peg_turn: float = math.radians(0.02)
     contact: ContactParameters = CONTACT
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+import math
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -22,32 +23,22 @@ STEP = 0.005  # s between the command's poses
 _ROUNDED = 12  # steps over which corners are rounded: 60 ms
 
 
-class ProbeErrors(Protocol):
-    """Standard deviations of a wrench sensor and of joint encoders: N, N m, metres, radians."""
+@dataclass(frozen=True)
+class ProbeErrors:
+    """Standard deviations of a wrench sensor and of joint encoders.
 
-    @property
-    def force_noise(self) -> float:
-        """Of each sample."""
+    Attributes:
+        force_noise, torque_noise: of each sample of the wrench, N and N m.
+        force_bias, torque_bias: of the untared wrench sensor, N and N m.
+        peg_noise, peg_turn: of each sample of the peg's measured pose, metres and radians.
+    """
 
-    @property
-    def torque_noise(self) -> float:
-        """Of each sample."""
-
-    @property
-    def force_bias(self) -> float:
-        """Of the untared sensor."""
-
-    @property
-    def torque_bias(self) -> float:
-        """Of the untared sensor."""
-
-    @property
-    def peg_noise(self) -> float:
-        """Of the peg's measured position."""
-
-    @property
-    def peg_turn(self) -> float:
-        """Of the peg's measured orientation."""
+    force_noise: float = 0.1
+    torque_noise: float = 0.005
+    force_bias: float = 1.0
+    torque_bias: float = 0.05
+    peg_noise: float = 0.00005
+    peg_turn: float = math.radians(0.02)
 
 
 def per_axis(linear: float, angular: float) -> Array:
