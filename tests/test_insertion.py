@@ -138,7 +138,7 @@ def test_the_success_probability_is_the_arms_and_rises_with_clearance_and_precis
     for clearance, shift in ((0.0001, 0.001), (0.001, 0.001), (0.001, 0.0002)):
         scene = bench_scene(3, part="square 8 mm", clearance=clearance)
         belief = believed(scene, 3, shift, np.radians(0.3))
-        plan = insertion_plan(belief, scene.part, scene.peg, parameters=InsertionParameters(search_time=3.0))
+        plan = insertion_plan(belief, scene.part, scene.peg, parameters=InsertionParameters(search_time=2.0))
         chances.append(success_probability(belief, plan, PegPhysics(scene.part, scene.peg), particles=8))
         if len(chances) == 1:
             # Pegs that find nothing are pushed as well, and some slip over the chamfer into the hole.

@@ -99,7 +99,6 @@ def test_the_loop_ends_by_gain_by_success_probability_and_by_number() -> None:
             )
         )
 
-    assert rounds(probes=1) == 1
     with pytest.raises(InputError, match="expects no gains"):
         rounds(probes=3, minimum_gain=0.1)  # an order that is drawn
     with pytest.warns(
@@ -185,25 +184,24 @@ def test_measurements_must_be_of_the_chosen_candidate_and_fit_the_recording() ->
             BenchArm(scene).execute(what)  # type: ignore[arg-type]
 
 
-def test_probes_together_last_no_longer_than_they_may() -> None:
+def test_probes_together_last_no_longer_than_they_may_and_as_long_as_that() -> None:
     scene, look, last, _ = seen()
-    begin = probing_loop(model, look, BenchArm(scene), asked, at_random(0), start=last, probes=4, seconds=3.0)
-    made = list(begin)
-    left = 3.0
-    for each in made:
-        assert all(duration_of(candidate) <= left + 1e-9 for candidate in each.candidates)
-        left -= duration_of(each.chosen)
-    assert 0.0 <= left < 3.0 and 1 <= len(made) < 4
-
-
-def test_a_probe_may_last_all_that_is_left() -> None:
-    scene, look, last, _ = seen()
-    only = asked(last.belief, 0)[:1]
-    seconds = duration_of(only[0]) - 5e-10  # rounding must not leave less than none
+    plans = asked(last.belief, 0)
+    longest, shortest = max(plans, key=duration_of), min(plans, key=duration_of)
+    assert duration_of(longest) > duration_of(shortest)
     loop = probing_loop(
-        model, look, BenchArm(scene), lambda *now: only, at_random(0), start=last, seconds=seconds
+        model,
+        look,
+        BenchArm(scene),
+        lambda *now: [longest, shortest],
+        lambda population, found, known: in_given_order(found),
+        start=last,
+        # Rounding must not leave less than nothing.
+        seconds=duration_of(longest) + duration_of(shortest) - 5e-10,
     )
-    assert len(list(loop)) == 1
+    rounds = list(loop)
+    assert [len(each.candidates) for each in rounds] == [2, 1]
+    assert [name_of(each.chosen) for each in rounds] == [name_of(longest), name_of(shortest)]
 
 
 def test_a_probe_that_is_chosen_twice_gets_a_name_of_its_own_and_the_arms_clock_runs_on() -> None:
