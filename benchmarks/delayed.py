@@ -26,7 +26,7 @@ from bcppl.inference.kernels import (
     Move,
     delayed_acceptance,
     metropolis_hastings,
-    rejuvenate,
+    moved_by,
     repeat,
     student_t,
 )
@@ -143,7 +143,7 @@ def chains(
 
     path, acceptances = [where(population)], []
     for _ in range(sweeps):
-        moved = rejuvenate(population, kernel, POSTERIOR)
+        moved = moved_by(population, kernel, POSTERIOR)
         population = moved.population
         acceptances.append(moved.acceptance)
         path.append(where(population))

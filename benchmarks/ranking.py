@@ -27,7 +27,7 @@ from bcppl.inference.design import Ranking, expected_information_gain, linearise
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.inference.population import Population
-from bcppl.inference.schemes import systematic
+from bcppl.inference.resampling import systematic
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.robot.plan import Plan, probe_of

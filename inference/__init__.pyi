@@ -13,12 +13,12 @@ from bcppl.inference import (
 from bcppl.inference.arviz import to_arviz as to_arviz
 from bcppl.inference.chains import Chains as Chains, markov_chains as markov_chains
 from bcppl.inference.collectors import collect as collect
-from bcppl.inference.default import infer as infer
 from bcppl.inference.filters import (
     bayes_contact as bayes_contact,
     guided_smc as guided_smc,
     tempered_smc as tempered_smc,
 )
+from bcppl.inference.filters.default import infer as infer
 from bcppl.inference.filters.smc import Info as Info, Step as Step, smc as smc
 from bcppl.inference.filters.smcp3 import Pair as Pair, smcp3 as smcp3
 from bcppl.inference.filters.step import (
@@ -30,12 +30,19 @@ from bcppl.inference.filters.step import (
 from bcppl.inference.filters.tempering import tempered as tempered
 from bcppl.inference.filters.waste_free import waste_free_moves as waste_free_moves
 from bcppl.inference.importance import (
+    generate_stratified as generate_stratified,
     importance_sampling as importance_sampling,
     tempered_importance_sampling as tempered_importance_sampling,
 )
 from bcppl.inference.population import Population as Population
 from bcppl.inference.progress import watched as watched
 from bcppl.inference.repetitions import Repeated as Repeated, repeated as repeated
-from bcppl.inference.sizing import merged as merged, replicated as replicated, resized as resized
-from bcppl.inference.strata import generate_stratified as generate_stratified
-from bcppl.inference.variance import evidence_variance as evidence_variance
+from bcppl.inference.sizing import merge as merge, replicate as replicate, resize as resize
+from bcppl.inference.summaries import evidence_variance as evidence_variance
+from bcppl.inference.verbs import (
+    initialize as initialize,
+    observations_of as observations_of,
+    rejuvenate as rejuvenate,
+    resample as resample,
+    update as update,
+)

@@ -13,7 +13,7 @@ from bcppl.errors import InputError
 from bcppl.inference.kernels import Kernel, fitted, refuse_other, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
-from bcppl.inference.schemes import Scheme, systematic
+from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace
 from bcppl.traces.shown import shapes

@@ -1,21 +1,24 @@
-"""Importance sampling, plain or tempered: the first step of SMC, or an estimate of evidence and posterior.
+"""Importance sampling, plain, tempered or stratified: the first step of SMC, or an estimate by itself.
 
-Robert and Casella, Monte Carlo Statistical Methods, 2004, section 3.3.
+Robert and Casella, Monte Carlo Statistical Methods, 2004, section 3.3; strata: Cochran, Sampling Techniques,
+1977, chapter 5, as in GenParticleFilters.jl's `pf_initialize`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.inference.filters.step import Stepped
 from bcppl.inference.filters.tempering import Tempered
 from bcppl.inference.population import Population
-from bcppl.traces import Series, generate, propose
+from bcppl.traces import Series, Trace, generate, propose
 
 Program = Callable[..., Any]
 
@@ -83,4 +86,131 @@ def tempered_importance_sampling(
         )
     trace, log_likelihood = generate(program, args, observations, particles)
     prior = Population(trace, torch.zeros_like(log_likelihood))
-    return step.let_in(prior, [a for a in trace.addresses if a not in trace.choices], log_likelihood)
+    return step.temper(prior, [a for a in trace.addresses if a not in trace.choices], log_likelihood)
+
+
+def generate_stratified(
+    program: Program | Series,
+    args: tuple[Any, ...],
+    observations: Mapping[str, Tensor],
+    particles: int,
+    strata: int | Callable[[Tensor], Tensor] | None = None,
+    *,
+    candidates: int = 10,
+) -> Population:
+    """Generate, with the first latent choice of the program drawn by stratum.
+
+    A discrete choice takes each of its values with equally many particles, weighted by the value's
+    probability. A real one with an inverse distribution function is drawn within `strata` intervals of equal
+    probability. For any other, such as a pose, `strata` maps a value to its stratum; then `candidates` times
+    as many particles are drawn from the program, and equally many are kept from each stratum, weighted by its
+    share of the candidates. The estimate of the evidence is unbiased in all three.
+
+    Args:
+        program: a Pyro program.
+        args: its arguments.
+        observations: values by address, as for `generate`.
+        particles: N.
+        strata: the number of intervals, by default N; or a function of values (M, *event) that returns the
+            number of each one's stratum, (M,) int64.
+        candidates: the number for each particle, where `strata` is a function.
+
+    Returns:
+        The population. The variance of its evidence cannot be estimated from its founders.
+
+    Raises:
+        InputError: a count is no whole number, 1 or more, there is no latent choice, there are fewer
+            particles than strata, or no inverse distribution function and no function given.
+    """
+    candidates = whole_number("generate_stratified is given {} candidates for each particle", candidates)
+    if strata is not None and not callable(strata):
+        strata = whole_number("generate_stratified is given {} strata", strata)
+    trace, _ = generate(program, args, observations, particles)
+    if not trace.choices:
+        raise InputError("a program without latent choice cannot be stratified; use generate.")
+    address = next(a for a in trace.addresses if a in trace.choices)
+    if callable(strata):
+        wide = generate(program, args, observations, particles * candidates)
+        return _selected(*wide, strata(wide[0][address]), particles)
+    if trace.distributions[address].has_enumerate_support:
+        return _enumerated(program, args, observations, trace, address)
+    return _by_quantile(program, args, observations, trace, address, particles if strata is None else strata)
+
+
+def _population(trace: Trace, log_weights: Tensor) -> Population:
+    return Population(trace, log_weights, log_pairs=math.inf)
+
+
+def _refuse_more(strata: int, particles: int) -> None:
+    if not 0 < strata <= particles:
+        raise InputError(
+            f"{particles} particles cannot represent {strata} strata; give at least one for each stratum."
+        )
+
+
+def _enumerated(
+    program: Program | Series,
+    args: tuple[Any, ...],
+    observations: Mapping[str, Tensor],
+    trace: Trace,
+    address: str,
+) -> Population:
+    site, particles = trace.distributions[address], trace.particles
+    if len(site.batch_shape) > 1:
+        raise InputError(
+            f"the first latent choice {address!r} is in a plate; "
+            "give strata as a function that maps a value to its stratum."
+        )
+    values = site.enumerate_support(expand=False)
+    values = values.reshape(len(values), *site.event_shape)
+    _refuse_more(len(values), particles)
+    stratum = torch.arange(particles) % len(values)
+    chosen = values[stratum].to(trace[address])
+    started, log_weights = generate(program, args, observations, particles, {address: chosen})
+    share = torch.bincount(stratum).to(torch.float64) / particles
+    return _population(started, log_weights - share.log()[stratum])
+
+
+def _by_quantile(
+    program: Program | Series,
+    args: tuple[Any, ...],
+    observations: Mapping[str, Tensor],
+    trace: Trace,
+    address: str,
+    strata: int,
+) -> Population:
+    site, particles = trace.distributions[address], trace.particles
+    _refuse_more(strata, particles)
+    # Where the strata do not divide N, random ones get one more: each draw is then the program's own.
+    stratum = (torch.arange(particles) + int(torch.randint(strata, ()))) % strata
+    quantile = (stratum + torch.rand(particles, dtype=torch.float64)) / strata
+    try:
+        if site.event_shape or len(site.batch_shape) > 1:
+            raise NotImplementedError
+        chosen = site.icdf(quantile).to(trace[address])
+    except NotImplementedError:
+        raise InputError(
+            f"the first latent choice {address!r} has no inverse distribution function; "
+            "give strata as a function that maps a value to its stratum."
+        ) from None
+    started, log_weights = generate(program, args, observations, particles, {address: chosen})
+    # Each value is a draw of the program; only jointly are they more even than independent draws.
+    return _population(started, log_weights - started.log_prob(address))
+
+
+def _selected(trace: Trace, log_weights: Tensor, stratum: Tensor, particles: int) -> Population:
+    _, stratum, counts = torch.unique(stratum, return_inverse=True, return_counts=True)
+    _refuse_more(len(counts), particles)
+    wanted = torch.full_like(counts, particles // len(counts))
+    wanted[: particles % len(counts)] += 1
+    # Candidates are exchangeable within a stratum, so the first of each are as good as any. A stratum with
+    # fewer than are wanted repeats some of them, each with its share of the weight.
+    kept, log_factors = [], []
+    for number, (count, want) in enumerate(zip(counts.tolist(), wanted.tolist(), strict=True)):
+        members = (stratum == number).nonzero().flatten()
+        kept.append(members[torch.arange(want) % count])
+        each = torch.bincount(torch.arange(want) % count).to(torch.float64)
+        weight = count / len(stratum) * particles / min(count, want) / each
+        log_factors.append(weight.log()[torch.arange(want) % count])
+    index = torch.cat(kept)
+    return _population(trace[index], log_weights[index] + torch.cat(log_factors))

@@ -35,7 +35,7 @@ class Population:
         log_evidence: log of the estimated evidence of all measurements so far; by default the log of the mean
             weight, which is right for what `generate` returns.
         founders: (N,) int64, the particle of the first population that each descends from; by default
-            its own. What `bcppl.inference.variance` reads.
+            its own. What `bcppl.inference.summaries` reads.
         log_pairs: sum over the first population and every resampling since of log M / (M - 1), M the
             particles that were then drawn independently of one another.
         approximation: the filter's approximation of the posterior, an immutable value that guides proposals

@@ -14,11 +14,11 @@ from bcppl.arguments import whole_number
 from bcppl.beliefs import normalised
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
-from bcppl.inference.schemes import Scheme, systematic
+from bcppl.inference.resampling import Scheme, systematic
 from bcppl.traces.series import SeriesTrace
 
 
-def resized(population: Population, count: int, scheme: Scheme = systematic) -> Population:
+def resize(population: Population, count: int, scheme: Scheme = systematic) -> Population:
     """A population resampled to `count` particles of equal weight.
 
     Raises:
@@ -28,7 +28,7 @@ def resized(population: Population, count: int, scheme: Scheme = systematic) -> 
     return population.selected(scheme(population.log_weights, count))
 
 
-def replicated(population: Population, times: int) -> Population:
+def replicate(population: Population, times: int) -> Population:
     """A population with `times` copies of every particle, side by side, of equal weight; nothing is drawn.
 
     Raises:
@@ -38,11 +38,11 @@ def replicated(population: Population, times: int) -> Population:
     return population[torch.arange(len(population)).repeat_interleave(times)]
 
 
-def merged(population: Population) -> Population:
+def merge(population: Population) -> Population:
     """A population whose particles with equal latent values are merged, their weights added.
 
     The first of each keeps its place. After merging copies of different founders the variance of the evidence
-    can no longer be estimated (`bcppl.inference.variance`).
+    can no longer be estimated (`bcppl.inference.summaries`).
 
     Raises:
         InferenceError: no particle has any weight.
@@ -51,7 +51,7 @@ def merged(population: Population) -> Population:
     if isinstance(population.trace, SeriesTrace):
         raise InputError(
             "the particles of a series cannot be merged: those with equal values at the newest step may have "
-            "different pasts; resample instead (`resized`)."
+            "different pasts; resample instead (`resize`)."
         )
     count = len(population)
     weights = normalised(population.log_weights)

@@ -9,6 +9,7 @@ value of each particle's ancestor at that step, with the particle's present weig
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -136,3 +137,32 @@ def probabilities(population: Population, address: Address) -> Probabilities:
     distinct, which = torch.unique(values[carrying], dim=0, return_inverse=True)
     summed = torch.zeros(len(distinct), dtype=torch.float64).index_add_(0, which, weights[carrying])
     return Probabilities(distinct, summed)
+
+
+def evidence_variance(population: Population) -> float:
+    """Relative variance of a run's estimate of the evidence, about that of its log, from its genealogy alone.
+
+    Lee and Whiteley, Variance estimation in the particle filter, Biometrika 105, 2018, eq. 8.
+
+    With multinomial resampling, at fixed times, and fixed exponents and proposals, this times the squared
+    estimate is unbiased for the estimate's variance; with resampling times that depend on the particles it is
+    consistent (Du and Guyader, Variance estimation in adaptive sequential Monte Carlo, Annals of Applied
+    Probability 31, 2021). It assumes independent draws: use `always(multinomial)` or `adaptive(multinomial)`.
+    With systematic or SSP resampling at every step it was three times too small on a walk of five steps. It
+    may be negative where the variance is small, and is imprecise once few founders are left.
+
+    Returns:
+        The relative variance; NaN where all particles with weight share one founder, where founders were
+        merged, or where the initial population was stratified.
+
+    Raises:
+        NoWeightError: no particle has any weight.
+    """
+    weights = normalised(population.log_weights)
+    if math.isinf(population.log_pairs):
+        return math.nan
+    _, founder = torch.unique(population.founders, return_inverse=True)
+    shares = torch.zeros(int(founder.max()) + 1, dtype=torch.float64).index_add_(0, founder, weights)
+    if int((shares > 0).sum()) < 2:
+        return math.nan
+    return 1.0 - math.exp(population.log_pairs) * (1.0 - float(shares @ shares))

@@ -21,13 +21,13 @@ from bcppl.inference.chains import markov_chains
 from bcppl.inference.filters.smcp3 import Pair, moved, smcp3
 from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.filters.waste_free import waste_free_moves
-from bcppl.inference.importance import importance_sampling
+from bcppl.inference.importance import generate_stratified, importance_sampling
 from bcppl.inference.kernels import (
     delayed_acceptance,
     hmc,
     metropolis_hastings,
     mixture,
-    rejuvenate,
+    moved_by,
     repeat,
     student_t,
     until,
@@ -43,7 +43,6 @@ from bcppl.inference.proposals import (
 )
 from bcppl.inference.repetitions import repeated
 from bcppl.inference.resampling import adaptive, always, systematic
-from bcppl.inference.strata import generate_stratified
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Series, Trace, extend, generate, simulate
 
@@ -236,7 +235,7 @@ def test_weights_of_another_type_are_made_float64() -> None:
 def test_an_exponent_for_no_site_is_refused() -> None:
     for kernel in (WALK, hmc("x")):
         with pytest.raises(InputError, match=r"gives site 'z' an exponent, but the program never visits it"):
-            rejuvenate(population(), kernel, Target({"z": 0.5}))
+            moved_by(population(), kernel, Target({"z": 0.5}))
 
 
 def test_an_observed_address_is_not_for_a_proposal() -> None:
@@ -245,7 +244,7 @@ def test_an_observed_address_is_not_for_a_proposal() -> None:
         pyro.sample("y", dist.Normal(trace["x"], 1.0))
 
     with pytest.raises(InputError, match="a proposal samples 'y', which is observed"):
-        rejuvenate(population(), metropolis_hastings(both), POSTERIOR)
+        moved_by(population(), metropolis_hastings(both), POSTERIOR)
     with pytest.raises(InputError, match="the forward program of a pair samples 'y', which is observed"):
         moved(population(), Pair(both, both))
 
@@ -265,7 +264,7 @@ def test_several_poses_at_one_address_are_refused_at_once() -> None:
     for several in (in_a_plate, in_an_event):
         asked(lambda several=several: generate(several, (), {}, 4))
         drawn = Population(simulate(several, (), 4), torch.zeros(4))
-        asked(lambda drawn=drawn: rejuvenate(drawn, metropolis_hastings(drift("pose")), POSTERIOR))
+        asked(lambda drawn=drawn: moved_by(drawn, metropolis_hastings(drift("pose")), POSTERIOR))
         asked(lambda drawn=drawn: drawn.belief("pose"))
     # What is measured of poses may come several at a time.
     measured = simulate(in_a_plate, (), 1)["pose"][0]

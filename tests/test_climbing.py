@@ -19,7 +19,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
 from bcppl.inference.importance import importance_sampling
-from bcppl.inference.kernels import metropolis_hastings, rejuvenate
+from bcppl.inference.kernels import metropolis_hastings, moved_by
 from bcppl.inference.proposals.climbing import Modes, jumps, modes
 from bcppl.inference.targets import POSTERIOR
 from bcppl.rendering.ray_casting import RayCaster
@@ -71,7 +71,7 @@ def test_jumps_leave_the_prior_as_it_is() -> None:
         torch.tensor([0.0, -1.0], dtype=torch.float64),
         scale,
     )
-    moved = rejuvenate(population, metropolis_hastings(jumps("part", wrong)), POSTERIOR, 10)
+    moved = moved_by(population, metropolis_hastings(jumps("part", wrong)), POSTERIOR, 10)
     place = moved.population["part"]
     assert 0.02 < moved.acceptance < 0.9
     assert bool((place[:, :3].abs() <= 0.03).all())

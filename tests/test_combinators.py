@@ -22,7 +22,7 @@ from bcppl.inference.kernels import (
     distinct,
     metropolis_hastings,
     mixture,
-    rejuvenate,
+    moved_by,
     repeat,
     scattered,
     sequence,
@@ -116,7 +116,7 @@ def adding(step: float, share: float, seen: list[Tensor]) -> Kernel:
     return fitted
 
 
-def moved_by(kernel: Kernel, count: int = 4000) -> tuple[Tensor, Tensor]:
+def moves_of(kernel: Kernel, count: int = 4000) -> tuple[Tensor, Tensor]:
     torch.manual_seed(0)
     trace = simulate(lopsided, (), count)
     moved, accepted = kernel(equal_weights(trace))(trace, POSTERIOR)
@@ -144,22 +144,22 @@ def test_sequence_keeps_its_order_and_cycle_draws_one_for_each_move() -> None:
 def test_acceptance_is_the_mean_over_what_was_tried() -> None:
     one, two = adding(1.0, 1.0, []), adding(2.0, 0.25, [])
     for kernel in (sequence(one, two), cycle(one, two)):
-        difference, accepted = moved_by(kernel)
+        difference, accepted = moves_of(kernel)
         torch.testing.assert_close(difference, torch.full_like(difference, 3.0))
         assert bool((accepted == 0.625).all())
-    difference, accepted = moved_by(repeat(two, 3))
+    difference, accepted = moves_of(repeat(two, 3))
     torch.testing.assert_close(difference, torch.full_like(difference, 6.0))
     assert bool((accepted == 0.25).all())
 
 
 def test_mixture_draws_for_each_particle_and_puts_it_back_in_its_place() -> None:
     seen: list[Tensor] = []
-    difference, accepted = moved_by(mixture([adding(1.0, 1.0, seen), adding(2.0, 0.25, seen)], [1.0, 3.0]))
+    difference, accepted = moves_of(mixture([adding(1.0, 1.0, seen), adding(2.0, 0.25, seen)], [1.0, 3.0]))
     share = float((difference.round() == 1.0).double().mean())
     assert share == pytest.approx(0.25, abs=0.03)
     assert torch.equal(accepted, torch.where(difference.round() == 1.0, 1.0, 0.25).double())
     assert sum(len(x) for x in seen) == 4000, "a kernel moves only the particles that drew it"
-    never, _ = moved_by(mixture([adding(1.0, 1.0, []), adding(2.0, 1.0, [])], [0.0, 5.0]))
+    never, _ = moves_of(mixture([adding(1.0, 1.0, []), adding(2.0, 1.0, [])], [0.0, 5.0]))
     assert bool((never.round() == 2.0).all())
 
 
@@ -174,7 +174,7 @@ def test_mixture_draws_for_each_particle_and_puts_it_back_in_its_place() -> None
         (lambda: mixture([]), "no kernel"),
         (lambda: sequence(), "no kernel"),
         (lambda: cycle(), "no kernel"),
-        (lambda: until(), "nothing to wait for"),
+        (lambda: until(), "given no criterion"),
         (lambda: until(distinct=0), "0 distinct"),
         (lambda: until(displacement=2.5), "2.5 variances"),
         (lambda: until(distinct=3, most=0), "0 sweeps"),
@@ -208,11 +208,11 @@ def test_sweeps_until_particles_differ() -> None:
     population = copies(40, 4)
     assert distinct(population) == 4
     kernel, calls = counted(SHORT)
-    done = rejuvenate(population, kernel, POSTERIOR, until(distinct=30)).population
+    done = moved_by(population, kernel, POSTERIOR, until(distinct=30)).population
     assert distinct(done) >= 30
     assert 2 <= len(calls) <= 20
     calls.clear()
-    assert rejuvenate(done, kernel, POSTERIOR, until(distinct=30)).population is done
+    assert moved_by(done, kernel, POSTERIOR, until(distinct=30)).population is done
     assert not calls, "far enough already"
 
 
@@ -220,16 +220,16 @@ def test_sweeps_until_the_start_is_left_behind_and_no_longer_than_allowed() -> N
     torch.manual_seed(4)
     population = copies(200, 200)
     kernel, calls = counted(SHORT)
-    done = rejuvenate(population, kernel, POSTERIOR, until(displacement=0.5)).population
+    done = moved_by(population, kernel, POSTERIOR, until(displacement=0.5)).population
     assert float(displacement(population, done)) >= 0.5
     x, y = population.trace["x"], done.trace["x"]
     share = (y - x).square().mean() / y.var(correction=0)
     assert float(displacement(population, done)) == pytest.approx(float(share))
     calls.clear()
     tiny = metropolis_hastings(drift("x", (1e-5, 1e-4)))
-    rejuvenate(population, counted(tiny)[0], POSTERIOR, until(displacement=0.5, most=2))
+    moved_by(population, counted(tiny)[0], POSTERIOR, until(displacement=0.5, most=2))
     kernel, calls = counted(tiny)
-    rejuvenate(population, kernel, POSTERIOR, until(displacement=0.5, most=2))
+    moved_by(population, kernel, POSTERIOR, until(displacement=0.5, most=2))
     assert len(calls) == 4, "two sweeps of two halves"
 
 
@@ -269,7 +269,7 @@ def test_stopping_together_leaves_no_bias_that_shows_and_each_alone_does() -> No
     together, alone = [], []
     for _ in range(60):
         population = equal_weights(simulate(lopsided, (), 75))
-        done = rejuvenate(population, SHORT, POSTERIOR, until(displacement=0.5)).population
+        done = moved_by(population, SHORT, POSTERIOR, until(displacement=0.5)).population
         together.append(done.trace["x"].mean() - 2.0)
         alone.append(particle_by_particle(population, SHORT).trace["x"].mean() - 2.0)
 
@@ -283,11 +283,11 @@ def test_stopping_together_leaves_no_bias_that_shows_and_each_alone_does() -> No
 
 def test_no_sweeps_leave_a_population_as_it_is_and_fewer_are_refused() -> None:
     population = copies(8, 8)
-    done = rejuvenate(population, SHORT, POSTERIOR, 0)
+    done = moved_by(population, SHORT, POSTERIOR, 0)
     assert done.population is population
     assert math.isnan(done.acceptance)
     with pytest.raises(InputError, match="-1 times"):
-        rejuvenate(population, SHORT, POSTERIOR, -1)
+        moved_by(population, SHORT, POSTERIOR, -1)
 
 
 def test_a_half_without_weight_teaches_all_the_same() -> None:
@@ -299,6 +299,6 @@ def test_a_half_without_weight_teaches_all_the_same() -> None:
     trace = simulate(program, (), 20)
     log_weights = torch.full((20,), -torch.inf, dtype=torch.float64)
     log_weights[3] = 0.0
-    done = rejuvenate(Population(trace, log_weights), metropolis_hastings(drift("x")), POSTERIOR, 5)
+    done = moved_by(Population(trace, log_weights), metropolis_hastings(drift("x")), POSTERIOR, 5)
     assert done.acceptance > 0.0
     assert torch.equal(done.population.log_weights, log_weights)

@@ -17,13 +17,12 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.filters.tempering import tempered
-from bcppl.inference.importance import importance_sampling
-from bcppl.inference.kernels import Move, metropolis_hastings, rejuvenate
+from bcppl.inference.importance import generate_stratified, importance_sampling
+from bcppl.inference.kernels import Move, metropolis_hastings, moved_by
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import never
-from bcppl.inference.sizing import merged
-from bcppl.inference.strata import generate_stratified
+from bcppl.inference.sizing import merge
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Series, Trace, assess, generate, propose, update
 
@@ -57,7 +56,7 @@ def test_what_a_program_observes_of_a_latent_value_is_never_stale() -> None:
     torch.testing.assert_close(moved.log_prob("y"), torch.distributions.Normal(0.0, 1.0).log_prob(moved["x"]))
 
 
-def test_with_no_site_let_in_the_proposals_ratio_still_decides() -> None:
+def test_at_exponent_zero_the_proposals_ratio_still_decides() -> None:
     torch.manual_seed(0)
     trace, _ = generate(uniform, (), {}, 8000)
 
@@ -65,7 +64,7 @@ def test_with_no_site_let_in_the_proposals_ratio_still_decides() -> None:
         pyro.sample("x", dist.Beta(number(3.0), number(1.0)))
 
     start = Population(trace, torch.zeros(8000, dtype=torch.float64))
-    moved = rejuvenate(start, metropolis_hastings(leaning), Target({"x": 0.0}), 3).population
+    moved = moved_by(start, metropolis_hastings(leaning), Target({"x": 0.0}), 3).population
     assert float(moved.trace["x"].mean()) == pytest.approx(0.5, abs=4.5 * 0.29 / math.sqrt(8000))
 
 
@@ -104,7 +103,7 @@ def test_particles_of_a_series_are_not_merged() -> None:
     series = Series(lambda: pyro.sample("a", dist.Bernoulli(number(0.5))), step)
     trace, weight = generate(series, (), {}, 20)
     with pytest.raises(InputError, match="different pasts"):
-        merged(Population(trace, weight))
+        merge(Population(trace, weight))
 
 
 @pytest.mark.parametrize("make", [lambda: dist.Normal(number(0.0), 1.0), lambda: dist.Bernoulli(number(0.5))])
@@ -137,4 +136,4 @@ def test_moves_are_made_after_every_exponent_when_asked() -> None:
         step(start, Observed((1,), {"y": number(0.3)}))
         assert len(asked) == expected, "two halves after each of two exponents"
     unmoved = replace(start, log_weights=torch.zeros(10, dtype=torch.float64))
-    assert rejuvenate(unmoved, walk, POSTERIOR, 0).population is unmoved
+    assert moved_by(unmoved, walk, POSTERIOR, 0).population is unmoved

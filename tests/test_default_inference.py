@@ -10,8 +10,8 @@ import torch
 import bcppl
 from bcppl.cli import loading
 from bcppl.errors import InputError
-from bcppl.inference.default import default_inference
 from bcppl.inference.filters import bayes_contact, guided_smc, tempered_smc
+from bcppl.inference.filters.default import default_inference
 from bcppl.models import look_and_touch, part_in_view, point_probe
 from tests.command_line import short
 

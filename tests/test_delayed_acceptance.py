@@ -19,7 +19,7 @@ from bcppl.inference.kernels import (
     delayed_acceptance,
     metropolis_hastings,
     mixture,
-    rejuvenate,
+    moved_by,
     repeat,
     student_t,
 )
@@ -67,10 +67,10 @@ OBSERVED = {"touch_0": number(1.0), "depth_1": number(-1.0), "touch_2": number(4
 HALF = Target({"touch_0": 0.5, "touch_2": 0.5})
 
 
-def exact(count: int, let_in: float = 1.0) -> Trace:
-    """The posterior by Gauss: precision 2 + 2 let_in."""
-    precision = 2.0 + 2.0 * let_in
-    mean = (-1.0 + let_in * 5.0) / precision
+def exact(count: int, exponent: float = 1.0) -> Trace:
+    """The posterior by Gauss: precision 2 + 2 exponent."""
+    precision = 2.0 + 2.0 * exponent
+    mean = (-1.0 + exponent * 5.0) / precision
     trace, _ = generate(program, (), OBSERVED, count)
     return trace.at({"x": mean + torch.randn(count, dtype=torch.float64) / math.sqrt(precision)})
 
@@ -84,10 +84,10 @@ def leaning(trace: Trace) -> None:
     pyro.sample("x", dist.Normal(0.6 * trace["x"] + 0.1, 0.5))
 
 
-def worst_z(kernel: Kernel, target: Target = POSTERIOR, let_in: float = 1.0, times: int = 2) -> float:
+def worst_z(kernel: Kernel, target: Target = POSTERIOR, exponent: float = 1.0, times: int = 2) -> float:
     torch.manual_seed(1)
     move = kernel(equal_weights(exact(500)))
-    trace = exact(DRAWS, let_in)
+    trace = exact(DRAWS, exponent)
 
     def functions(trace: Trace) -> Tensor:
         x = trace["x"]
@@ -124,8 +124,8 @@ def test_the_target_is_exact(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["two stages", "surrogate", "within others"])
 def test_tempered_targets_are_exact(name: str) -> None:
-    assert worst_z(SOUND_KERNELS[name], HALF, let_in=0.5) < SOUND
-    assert worst_z(SOUND_KERNELS[name], POSTERIOR, let_in=0.5) > BROKEN
+    assert worst_z(SOUND_KERNELS[name], HALF, exponent=0.5) < SOUND
+    assert worst_z(SOUND_KERNELS[name], POSTERIOR, exponent=0.5) > BROKEN
 
 
 # ---- mutants
@@ -250,11 +250,11 @@ def test_a_way_back_that_reads_a_later_stage_is_refused() -> None:
     touch, depth = metropolis_hastings(looking("touch_0")), metropolis_hastings(looking("depth_1"))
     for kernel in (delayed_acceptance(touch), delayed_acceptance(touch, surrogate=student_t("x"))):
         with pytest.raises(InputError, match="touch_0"):
-            rejuvenate(population, kernel, POSTERIOR)
+            moved_by(population, kernel, POSTERIOR)
     with pytest.raises(InputError, match="depth_1"):
-        rejuvenate(population, delayed_acceptance(depth, first="touch_*"), POSTERIOR)
+        moved_by(population, delayed_acceptance(depth, first="touch_*"), POSTERIOR)
     for kernel in (touch, delayed_acceptance(depth), delayed_acceptance(touch, first="touch_0")):
-        rejuvenate(population, kernel, POSTERIOR)
+        moved_by(population, kernel, POSTERIOR)
     assert worst_z(delayed_acceptance(depth)) < SOUND
 
 

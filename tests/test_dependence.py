@@ -21,7 +21,7 @@ from bcppl.distributions.manifold import ContactManifold
 from bcppl.distributions.poses import NormalPose
 from bcppl.distributions.switch import Switch
 from bcppl.geometry.gap import Gap
-from bcppl.inference.kernels import metropolis_hastings, rejuvenate
+from bcppl.inference.kernels import metropolis_hastings, moved_by
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.targets import POSTERIOR
@@ -400,7 +400,7 @@ def test_metropolis_hastings_finds_the_posterior(program: Program, kind: str) ->
     trace = made(program, kind, count)
     population = Population(trace, torch.zeros(count, dtype=torch.float64))
     torch.manual_seed(3)
-    moved = rejuvenate(population, metropolis_hastings(drift("shift", (0.05, 1.0))), POSTERIOR, 40)
+    moved = moved_by(population, metropolis_hastings(drift("shift", (0.05, 1.0))), POSTERIOR, 40)
     found, precision = moved.population.trace, 1.0 + SCALE**-2
     mean = (SEEN["seen"] - found["x"]) / SCALE**2 / precision
     standard = (found["shift"] - mean) * math.sqrt(precision)

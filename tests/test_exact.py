@@ -29,8 +29,7 @@ from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import cycle, metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
-from bcppl.inference.resampling import adaptive, always, never
-from bcppl.inference.schemes import systematic
+from bcppl.inference.resampling import adaptive, always, never, systematic
 from tests.agreement import RUNS, agrees, posterior_agrees
 from tests.invariance import number
 
@@ -264,7 +263,7 @@ def test_waste_free_on_the_points() -> None:
     agrees(errors, 0.05)
 
 
-def test_sites_let_in_one_after_another() -> None:
+def test_sites_tempered_one_after_another() -> None:
     """Two measurements of different cost at once: the cheap one first, each with exponents of its own."""
 
     class Dear(dist.Normal):  # type: ignore[misc]

@@ -23,8 +23,7 @@ from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import cycle, involutive, metropolis_hastings
 from bcppl.inference.proposals import drift
-from bcppl.inference.resampling import adaptive
-from bcppl.inference.schemes import systematic
+from bcppl.inference.resampling import adaptive, systematic
 from bcppl.traces import Trace
 from tests.agreement import RUNS, agrees, posterior_agrees
 from tests.invariance import number

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bcppl.errors import InferenceError
 from bcppl.inference.importance import importance_sampling
-from bcppl.inference.kernels import metropolis_hastings, rejuvenate
+from bcppl.inference.kernels import metropolis_hastings, moved_by
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Proposal, differential_evolution, drift, independent
 from bcppl.inference.targets import POSTERIOR
@@ -54,7 +54,7 @@ MOVES: dict[str, Proposal] = {
 def test_values_that_run_out_of_their_type_are_rejected(prior: str, move: str) -> None:
     torch.manual_seed(1)
     start = importance_sampling(extreme(PRIORS[prior]), (), SEEN, 300)
-    done = rejuvenate(start, metropolis_hastings(MOVES[move]), POSTERIOR, 5)
+    done = moved_by(start, metropolis_hastings(MOVES[move]), POSTERIOR, 5)
     before, after = start.trace["x"], done.population.trace["x"]
     assert done.acceptance > 0.1
     # No move leads to where nothing can be: only what was drawn there is there.
@@ -89,4 +89,4 @@ def test_a_prior_whose_draws_are_all_out_of_range_is_refused() -> None:
         drift("x").fit(start)
     close = importance_sampling(extreme(dist.Beta(torch.tensor(0.01), torch.tensor(0.01))), (), SEEN, 200)
     with pytest.raises(InferenceError, match=r"rounding to torch.float32 put values on the edge"):
-        rejuvenate(close, metropolis_hastings(drift("x")), POSTERIOR)
+        moved_by(close, metropolis_hastings(drift("x")), POSTERIOR)

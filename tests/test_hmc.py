@@ -16,7 +16,7 @@ from bcppl import poses
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
-from bcppl.inference.kernels import delayed_acceptance, hamiltonian, hmc, rejuvenate
+from bcppl.inference.kernels import delayed_acceptance, hamiltonian, hmc, moved_by
 from bcppl.inference.kernels.kernel import Kernel
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace, carried, generate, simulate
@@ -200,7 +200,7 @@ def test_gaussian_chain() -> None:
     trace, _ = generate(chain, (), {"y": number(1.0)}, count)
     names = ("z_1", "z_2", "z_3")
     away = trace.at({a: 3.0 + 2.0 * trace[a] for a in names})
-    done = rejuvenate(equal_weights(away), hmc(*names), POSTERIOR, 12)
+    done = moved_by(equal_weights(away), hmc(*names), POSTERIOR, 12)
     assert done.acceptance > 0.8
     x = torch.stack([done.population.trace[a] for a in names], dim=1)
     variance = vector(0.75, 1.0, 0.75)

@@ -130,7 +130,7 @@ def test_tempering_from_prior_to_posterior_finds_the_exact_evidence() -> None:
     mean = float(every.sum()) / (5 + NOISE**2 / 25.0)
     assert abs(np.mean(means) - mean) < 4 * np.std(means, ddof=1) / math.sqrt(60)
     trace, log_likelihood = generate(plate, (4,), {"y": y}, 60)
-    twice, _ = step.let_in(Population(trace, log_likelihood), ["y", "fixed"], log_likelihood)
+    twice, _ = step.temper(Population(trace, log_likelihood), ["y", "fixed"], log_likelihood)
     assert abs(twice.log_evidence - exact) > 3
 
 

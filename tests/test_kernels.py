@@ -18,7 +18,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
-from bcppl.inference.kernels import Kernel, cycle, metropolis_hastings, rejuvenate, repeat
+from bcppl.inference.kernels import Kernel, cycle, metropolis_hastings, moved_by, repeat
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Fitted, drift
 from bcppl.inference.targets import POSTERIOR, Target
@@ -216,7 +216,7 @@ def test_no_particle_shapes_its_own_proposal(count: int) -> None:
     trace = simulate(program, (), count)
     tags = set(trace["tag"].tolist())
     sweeps = 3
-    done = rejuvenate(equal_weights(trace), metropolis_hastings(Fitted(spying)), POSTERIOR, sweeps)
+    done = moved_by(equal_weights(trace), metropolis_hastings(Fitted(spying)), POSTERIOR, sweeps)
     assert len(learnt) == len(moved) == 2 * sweeps
     for others, mine in zip(learnt, moved, strict=True):
         assert not others & mine and others | mine == tags
@@ -232,7 +232,7 @@ def test_no_particle_shapes_its_own_proposal(count: int) -> None:
 def test_acceptance_is_the_share_that_moved() -> None:
     torch.manual_seed(0)
     trace = correlated_draws(1000)
-    done = rejuvenate(equal_weights(trace), metropolis_hastings(drift("x")), POSTERIOR)
+    done = moved_by(equal_weights(trace), metropolis_hastings(drift("x")), POSTERIOR)
     moved = (done.population.trace["x"] != trace["x"]).any(dim=-1)
     assert done.acceptance == pytest.approx(float(moved.double().mean()))
     assert 0.05 < done.acceptance < 0.95

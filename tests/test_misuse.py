@@ -26,7 +26,7 @@ from bcppl.inference.kernels import (
     hmc,
     metropolis_hastings,
     mixture,
-    rejuvenate,
+    moved_by,
     repeat,
     sequence,
     student_t,
@@ -84,7 +84,7 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
     "mixture": (lambda: mixture(walk, drift("mu")), rf"mixture is given a proposal.* {WRAP}"),
     "repeat": (lambda: repeat(drift("mu"), 2), rf"repeat is given a proposal.* {WRAP}"),  # type: ignore[arg-type]
     "tempered": (lambda: tempered(drift("mu")), rf"tempered is given a proposal.* {WRAP}"),  # type: ignore[arg-type]
-    "rejuvenate": (lambda: rejuvenate(start(), drift("mu"), POSTERIOR), WRAP),  # type: ignore[arg-type]
+    "rejuvenate": (lambda: moved_by(start(), drift("mu"), POSTERIOR), WRAP),  # type: ignore[arg-type]
     "waste free": (lambda: waste_free_moves(drift("mu"), 5), WRAP),  # type: ignore[arg-type]
     "no proposal": (lambda: metropolis_hastings("mu"), r"a str in place of a proposal.* drift"),  # type: ignore[arg-type]
     "a proposal that learns": (

@@ -15,7 +15,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
-from bcppl.inference.kernels import metropolis_hastings, rejuvenate
+from bcppl.inference.kernels import metropolis_hastings, moved_by
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import (
     Continuous,
@@ -224,7 +224,7 @@ def test_mutant_that_is_fitted_to_the_particles_it_moves() -> None:
                 if own:
                     after = equal_weights(kernel(after)(after.trace, POSTERIOR)[0])
                 else:
-                    after = rejuvenate(after, kernel, POSTERIOR).population
+                    after = moved_by(after, kernel, POSTERIOR).population
             changes.append((after.trace["x"].square() - before.trace["x"].square()).mean())
         each = torch.stack(changes)
         return float(each.mean() / (each.std() / math.sqrt(replicates)))
@@ -325,5 +325,5 @@ def test_symmetries_that_cannot_be_are_refused() -> None:
 def test_copies_of_one_particle_teach_what_they_can() -> None:
     trace = simulate(two_modes, (), 1)[[0] * 8]
     for name, make in LEARNING.items():
-        done = rejuvenate(equal_weights(trace), metropolis_hastings(make("pose")), POSTERIOR)
+        done = moved_by(equal_weights(trace), metropolis_hastings(make("pose")), POSTERIOR)
         assert bool(torch.isfinite(done.population.trace.log_prob()).all()), name

@@ -13,8 +13,17 @@ from torch import Tensor
 
 from bcppl.errors import InputError, NotANumberError, NoWeightError
 from bcppl.inference.population import Population
-from bcppl.inference.resampling import adaptive, always, never
-from bcppl.inference.schemes import Scheme, multinomial, residual, ssp, stratified, systematic
+from bcppl.inference.resampling import (
+    Scheme,
+    adaptive,
+    always,
+    multinomial,
+    never,
+    residual,
+    ssp,
+    stratified,
+    systematic,
+)
 from bcppl.traces import generate
 
 SCHEMES: dict[str, Scheme] = {

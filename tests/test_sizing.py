@@ -17,15 +17,13 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.poses import UniformPose
 from bcppl.errors import InputError
-from bcppl.inference import strata
+from bcppl.inference import importance
 from bcppl.inference.filters.step import Observed, steps
 from bcppl.inference.filters.tempering import tempered
-from bcppl.inference.importance import importance_sampling
+from bcppl.inference.importance import generate_stratified, importance_sampling
 from bcppl.inference.population import Population
-from bcppl.inference.resampling import always
-from bcppl.inference.schemes import multinomial, ssp
-from bcppl.inference.sizing import merged, replicated, resized
-from bcppl.inference.strata import generate_stratified
+from bcppl.inference.resampling import always, multinomial, ssp
+from bcppl.inference.sizing import merge, replicate, resize
 
 CHANCES = torch.tensor([0.2, 0.75, 0.05], dtype=torch.float64)
 SEEN = torch.tensor([2.1, 1.9], dtype=torch.float64)
@@ -68,13 +66,13 @@ def estimates(verb: Callable[[Population], Population], runs: int = 200, particl
 
 def coins_merged(population: Population) -> Population:
     """Copies made and merged again, some of them moved apart before."""
-    return merged(replicated(resized(population, 40, multinomial), 2))
+    return merge(replicate(resize(population, 40, multinomial), 2))
 
 
 VERBS: dict[str, Callable[[Population], Population]] = {
-    "grown": lambda p: resized(p, 75),
-    "shrunk": lambda p: resized(p, 12, ssp),
-    "replicated": lambda p: replicated(p, 3),
+    "grown": lambda p: resize(p, 75),
+    "shrunk": lambda p: resize(p, 12, ssp),
+    "replicated": lambda p: replicate(p, 3),
     "merged": coins_merged,
 }
 
@@ -86,12 +84,12 @@ def test_evidence_stays_unbiased(name: str) -> None:
 
 def test_mutants_that_lose_weight() -> None:
     def grown_by_copies_of_equal_weight(population: Population) -> Population:
-        copies = replicated(population, 3)
+        copies = replicate(population, 3)
         return replace(copies, log_weights=torch.zeros_like(copies.log_weights))
 
     def first_copy_only(population: Population) -> Population:
-        chosen = resized(population, 40, multinomial)
-        once = merged(chosen)
+        chosen = resize(population, 40, multinomial)
+        once = merge(chosen)
         return Population(once.trace, torch.zeros_like(once.log_weights), chosen.log_evidence)
 
     assert standard_errors(estimates(grown_by_copies_of_equal_weight, 20)) > 8
@@ -101,9 +99,9 @@ def test_mutants_that_lose_weight() -> None:
 def test_merging_sums_weights_and_keeps_expectations() -> None:
     torch.manual_seed(0)
     population = importance_sampling(which_one, (1,), {"y_0": SEEN[0]}, 20)
-    twice = replicated(population, 4)
+    twice = replicate(population, 4)
     assert len(twice) == 80 and twice.log_evidence == population.log_evidence
-    back = merged(twice)
+    back = merge(twice)
     assert len(back) == 20
     assert torch.equal(back.trace["place"], population.trace["place"]), "the first of each keeps its place"
     torch.testing.assert_close(back.log_weights, population.log_weights)
@@ -111,7 +109,7 @@ def test_merging_sums_weights_and_keeps_expectations() -> None:
     assert back.effective_sample_size == pytest.approx(population.effective_sample_size)
     torch.testing.assert_close(back.trace.log_prob(), population.trace.log_prob())
     with pytest.raises(InputError, match="replicated 0 times"):
-        replicated(population, 0)
+        replicate(population, 0)
 
 
 def started(make: Callable[[], Population], exact: float, runs: int = 150) -> list[float]:
@@ -142,7 +140,7 @@ def test_every_value_of_a_discrete_choice_is_represented(monkeypatch: pytest.Mon
     with pytest.raises(InputError, match="2 particles cannot represent 3 strata"):
         generate_stratified(which_one, (0,), {}, 2)
     # Mutant: the strata's shares are forgotten.
-    monkeypatch.setattr(strata.torch, "bincount", lambda s: torch.full((3,), 31).long())
+    monkeypatch.setattr(importance.torch, "bincount", lambda s: torch.full((3,), 31).long())
     assert standard_errors(started(make, log_evidence(2), 60)) > 8
 
 

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from bcppl.errors import NoWeightError
 from bcppl.inference.filters import bayes_contact, smcp3, tempered_smc
-from bcppl.inference.filters.bayes_contact import drift_and_weigh
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo
 from bcppl.inference.filters.tempering import tempered
@@ -143,7 +142,9 @@ def test_hidden_markov_model(scheme: str) -> None:
 def test_the_baseline_weighs_by_all_measurements(monkeypatch: pytest.MonkeyPatch) -> None:
     values = [number(y) for y in OBSERVED]
     for fit, resample in ((fixed_drift, always()), (drift("x", (0.2, 0.21)), adaptive())):
-        found = ratios(static, values, static_evidence(), drift_and_weigh(fit, resample), 120, 100)
+        found = ratios(
+            static, values, static_evidence(), smcp3.smcp3(smcp3.Pair(fit, fit), resample=resample), 120, 100
+        )
         assert standard_errors(found) < 4
         assert found.std() < 0.8
 
@@ -166,7 +167,7 @@ def test_the_baseline_weighs_by_all_measurements(monkeypatch: pytest.MonkeyPatch
         return PriorOnly(updated.trace, updated.previous, updated.discarded)
 
     monkeypatch.setattr(smcp3, "update", mutant)
-    take = drift_and_weigh(fixed_drift, always())
+    take = smcp3.smcp3(smcp3.Pair(fixed_drift, fixed_drift), resample=always())
     assert standard_errors(ratios(static, values, static_evidence(), take, 200, 100)) > 8
 
 
@@ -178,7 +179,7 @@ def test_mutant_of_the_baseline_without_the_way_back(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(smcp3, "assessed", silent)
     values = [number(y) for y in OBSERVED]
-    take = drift_and_weigh(fixed_drift, always())
+    take = smcp3.smcp3(smcp3.Pair(fixed_drift, fixed_drift), resample=always())
     # A few huge ratios make the mean's own error huge: it is the median that gives this one away.
     assert np.median(ratios(static, values, static_evidence(), take, 50, 100)) > 4
 
@@ -266,7 +267,7 @@ def test_a_particle_without_weight_does_not_come_back_as_not_a_number() -> None:
     torch.manual_seed(0)
     trace, weights = generate(bounded, (0,), {}, 400)
     population = Population(trace, weights)
-    take = drift_and_weigh(fixed_drift, never)
+    take = smcp3.smcp3(smcp3.Pair(fixed_drift, fixed_drift), resample=never)
     for k in range(4):
         population, *_ = take(population, Observed((k + 1,), {f"y_{k}": number(0.0)}))
         assert not bool(torch.isnan(population.log_weights).any())

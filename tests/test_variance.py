@@ -19,10 +19,9 @@ from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.population import Population
-from bcppl.inference.resampling import adaptive, always, never
-from bcppl.inference.schemes import multinomial, systematic
-from bcppl.inference.sizing import merged, replicated, resized
-from bcppl.inference.variance import evidence_variance
+from bcppl.inference.resampling import adaptive, always, multinomial, never, systematic
+from bcppl.inference.sizing import merge, replicate, resize
+from bcppl.inference.summaries import evidence_variance
 
 SEEN = [torch.tensor(v, dtype=torch.float64) for v in (0.8, -0.3, 1.9, 1.2, 0.1)]
 
@@ -107,11 +106,11 @@ def test_founders_go_along() -> None:
     torch.manual_seed(0)
     start = importance_sampling(walk, (1,), {"y_0": SEEN[0]}, 50)
     assert torch.equal(start.founders, torch.arange(50))
-    chosen = resized(start, 30, multinomial)
+    chosen = resize(start, 30, multinomial)
     assert torch.equal(start.trace["x_0"][chosen.founders], chosen.trace["x_0"])
     assert chosen.log_pairs == pytest.approx(math.log(50 / 49) + math.log(30 / 29))
-    assert evidence_variance(replicated(start, 3)) == pytest.approx(evidence_variance(start), rel=1e-9)
-    assert evidence_variance(merged(chosen)) == pytest.approx(evidence_variance(chosen), rel=1e-9)
+    assert evidence_variance(replicate(start, 3)) == pytest.approx(evidence_variance(start), rel=1e-9)
+    assert evidence_variance(merge(chosen)) == pytest.approx(evidence_variance(chosen), rel=1e-9)
     one = start.selected(torch.full((10,), 7))
     assert math.isnan(evidence_variance(one)), "one founder says nothing"
     weights = torch.full((50,), -torch.inf, dtype=torch.float64)
@@ -127,7 +126,7 @@ def test_merging_across_founders_leaves_nothing_to_be_told() -> None:
         pyro.sample("coin", dist.Bernoulli(torch.tensor(0.5, dtype=torch.float64)))
 
     torch.manual_seed(0)
-    both = merged(importance_sampling(coin, (0,), {}, 20))
+    both = merge(importance_sampling(coin, (0,), {}, 20))
     assert len(both) == 2 and math.isnan(evidence_variance(both))
     assert float(torch.softmax(both.log_weights, 0).sum()) == pytest.approx(1.0)
 

@@ -19,7 +19,7 @@ from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import Kernel, Move, metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
-from bcppl.inference.schemes import multinomial
+from bcppl.inference.resampling import multinomial
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace, simulate
 

@@ -18,7 +18,7 @@ from typing import Any
 import bcppl.inference.filters
 import bcppl.models
 from bcppl.errors import InputError
-from bcppl.inference.default import Infer, default_inference
+from bcppl.inference.filters.default import Infer, default_inference
 from bcppl.models.shipped import load_recording
 from bcppl.recordings import Recording, validate
 from bcppl.traces import Model

@@ -12,7 +12,7 @@ from torch import Tensor
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
-from bcppl.inference.schemes import systematic
+from bcppl.inference.resampling import systematic
 
 
 @dataclass(frozen=True, eq=False)

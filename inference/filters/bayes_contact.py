@@ -13,22 +13,9 @@ from collections.abc import Iterator
 from typing import Any
 
 from bcppl.inference.filters.smc import Step, smc
-from bcppl.inference.filters.smcp3 import Pair, moved, smcp3
-from bcppl.inference.filters.step import StepFunction
-from bcppl.inference.population import Population
-from bcppl.inference.proposals import Proposal, drift
-from bcppl.inference.resampling import Resample, adaptive
+from bcppl.inference.filters.smcp3 import Pair, smcp3
+from bcppl.inference.proposals import drift
 from bcppl.traces import Model
-
-
-def drifted(population: Population, proposal: Proposal) -> Population:
-    """Every particle moved by a proposal program and weighted for it; each half learns from the other."""
-    return moved(population, Pair(proposal, proposal))
-
-
-def drift_and_weigh(proposal: Proposal, resample: Resample) -> StepFunction:
-    """A step that moves the particles by a random walk, weights them and, when needed, resamples."""
-    return smcp3(Pair(proposal, proposal), resample=resample)
 
 
 def infer(
@@ -52,5 +39,6 @@ def infer(
         scene: `model.prepare(recording)` unless given.
         start: a step to resume from, as for `bcppl.inference.smc`.
     """
-    step = drift_and_weigh(drift(model.pose, (scale, scale * 1.0001)), adaptive())
+    walk = drift(model.pose, (scale, scale * 1.0001))
+    step = smcp3(Pair(walk, walk))
     return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)

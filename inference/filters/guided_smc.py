@@ -34,7 +34,7 @@ from bcppl.inference.proposals.approximated import (
 )
 from bcppl.inference.proposals.coordinates import continuous_addresses
 from bcppl.inference.resampling import adaptive, never, systematic
-from bcppl.inference.sizing import replicated
+from bcppl.inference.sizing import replicate
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Model, Trace, extend
 
@@ -188,7 +188,7 @@ class Copies(NamedTuple):
             each = 0.0 if reached is None else reached.effective_sample_size / times
             # The estimate is often too large: ask for more copies than would just do.
             times = min(allowed, max(2 * times, math.ceil(1.5 * goal / max(each, goal / self.most))))
-            reached = weighted(replicated(population, times))
+            reached = weighted(replicate(population, times))
         if reached is None or reached.effective_sample_size < self.least * count * times / self.most:
             return None
         effective = reached.effective_sample_size

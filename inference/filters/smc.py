@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -21,9 +21,9 @@ from bcppl.beliefs import Belief
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo
 from bcppl.inference.filters.tempering import tempered
-from bcppl.inference.importance import importance_sampling
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
+from bcppl.inference.verbs import initialize, observations_of
 from bcppl.recordings import Recording, problems
 from bcppl.traces import Model, Series, Trace, extend, generate
 
@@ -173,10 +173,11 @@ def _steps(
     if scene is None:
         _warn_of_problems(recording)
         scene = model.prepare(recording)
+    measurements = recording.measurements
     if start is None:
         state = [torch.Generator().manual_seed(seed).get_state()]
         with _own_state(state, particles):
-            population = importance_sampling(model.program, (scene, []), {}, particles)
+            population = initialize(model, scene, particles)
         if model.pose not in population.trace:
             raise InputError(
                 f"the model's pose is at address {model.pose!r}, which its program never samples; "
@@ -186,20 +187,21 @@ def _steps(
         truth = _Truth(model, scene, recording, population, seed)
         yield start
     else:
-        if start.taken > len(recording.measurements):
+        if start.taken > len(measurements):
             raise InputError(
                 f"a run is to be resumed after {start.taken} measurements, but the recording has "
-                f"{len(recording.measurements)}; give the recording that it was run on."
+                f"{len(measurements)}; give the recording that it was run on."
             )
         state, population, particles = [start.random_state], start.population, len(start.population)
         truth = _Truth(model, scene, recording, population, seed)
-        if start.taken:
-            truth.gap(_observed(model, scene, recording.measurements[: start.taken], {}), population)
-    for count in range(start.taken + 1, len(recording.measurements) + 1):
-        measurement = recording.measurements[count - 1]
+        for observed in observations_of(model, scene, measurements[: start.taken]):
+            truth.gap(observed, population)
+    for count, observed in enumerate(
+        observations_of(model, scene, measurements, start.taken), start.taken + 1
+    ):
+        measurement = measurements[count - 1]
         label = f"{measurement.kind} {count}"
         begun, before = time.perf_counter(), _effort(scene)
-        observed = _observed(model, scene, recording.measurements[:count], population.trace.observations)
         try:
             with _own_state(state, particles):
                 population, happened = step(population, observed)
@@ -220,16 +222,6 @@ def _prior(model: Model, population: Population, random_state: Tensor) -> Step:
     evidence, count = population.log_evidence, len(population)
     info = Info("prior", nothing, evidence, count, nothing, 0.0, {}, happened)
     return Step(belief, info, population, random_state)
-
-
-def _observed(model: Model, scene: Any, measurements: Sequence[Any], known: Mapping[str, Tensor]) -> Observed:
-    """The arguments and the new observations by which all these measurements are assimilated."""
-    if isinstance(model.program, Series):
-        # A step of a series is given the newest measurement alone, under its own addresses.
-        measurements, known = measurements[-1:], {}
-    observations = model.observe(scene, measurements)
-    new = {a: v for a, v in observations.items() if a not in known}
-    return Observed((scene, [m.action for m in measurements]), new)
 
 
 class _Truth:

@@ -87,10 +87,11 @@ def _refuse_no_pair(pair: object) -> None:
         )
 
 
-def moved(population: Population, pair: Pair) -> Population:
-    """The population moved by a pair and weighted for it; the target stays.
+def moved(population: Population, pair: Pair, observed: Observed | None = None) -> Population:
+    """The population moved by a pair, given a measurement if there is one, and weighted for it.
 
-    A program that learns is fitted to the other half of the population.
+    Without a measurement the target stays. A program that learns is fitted to the other half of the
+    population.
 
     Raises:
         InputError: no `Pair` is given, a program gives an address that the other has not, more coordinates
@@ -98,44 +99,6 @@ def moved(population: Population, pair: Pair) -> Population:
         InferenceError: no particle has any weight left.
     """
     _refuse_no_pair(pair)
-    return _by_halves(population, pair, None)
-
-
-def smcp3(pair: Pair, *, resample: Resample | None = None) -> StepFunction:
-    """A step that assimilates a measurement by a pair of programs: move, weight, resample when needed.
-
-    Args:
-        pair: proposes new values for old latent addresses and for those that come with the measurement.
-        resample: when and how; by default systematic below half the effective sample size.
-
-    Returns:
-        The step. It raises what `moved` raises.
-
-    Raises:
-        InputError: no `Pair` is given.
-    """
-    _refuse_no_pair(pair)
-    if resample is None:
-        resample = adaptive()
-    check_resample("smcp3", resample)
-
-    def step(population: Population, observed: Observed) -> Stepped:
-        moved = _by_halves(population, pair, observed)
-        resampled, ancestors = resample(moved)
-        info = StepInfo(
-            resampled=int(ancestors is not None),
-            effective_sample_size_before=moved.effective_sample_size,
-            effective_sample_size=resampled.effective_sample_size,
-            log_evidence=resampled.log_evidence - population.log_evidence,
-            ancestors=ancestors,
-        )
-        return Stepped(resampled, info)
-
-    return step
-
-
-def _by_halves(population: Population, pair: Pair, observed: Observed | None) -> Population:
-    """The population moved by a pair that is fitted, for each half, to the other before the move."""
     count = len(population)
     if not isinstance(pair.forward, Fitted) and not isinstance(pair.backward, Fitted):
         parts = [torch.arange(count)]
@@ -157,6 +120,39 @@ def _by_halves(population: Population, pair: Pair, observed: Observed | None) ->
     # A particle without weight stays without, wherever it is moved.
     log_factor = torch.where(population.log_weights == -torch.inf, 0.0, log_factor)
     return population.with_trace(whole).reweighed(log_factor)
+
+
+def smcp3(pair: Pair, *, resample: Resample | None = None) -> StepFunction:
+    """A step that assimilates a measurement by a pair of programs: move, weight, resample when needed.
+
+    Args:
+        pair: proposes new values for old latent addresses and for those that come with the measurement.
+        resample: when and how; by default systematic below half the effective sample size.
+
+    Returns:
+        The step. It raises what `moved` raises.
+
+    Raises:
+        InputError: no `Pair` is given.
+    """
+    _refuse_no_pair(pair)
+    if resample is None:
+        resample = adaptive()
+    check_resample("smcp3", resample)
+
+    def step(population: Population, observed: Observed) -> Stepped:
+        updated = moved(population, pair, observed)
+        resampled, ancestors = resample(updated)
+        info = StepInfo(
+            resampled=int(ancestors is not None),
+            effective_sample_size_before=updated.effective_sample_size,
+            effective_sample_size=resampled.effective_sample_size,
+            log_evidence=resampled.log_evidence - population.log_evidence,
+            ancestors=ancestors,
+        )
+        return Stepped(resampled, info)
+
+    return step
 
 
 def _fitted(pair: Pair, others: Population) -> tuple[Program, Program]:

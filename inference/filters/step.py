@@ -1,4 +1,4 @@
-"""One step of SMC, a function (population, what was observed) -> (population, what happened), and its loop.
+"""One step of SMC, a function (population, observed) -> (population, info), and the loop over steps.
 
 Any program can be run so, without a recording:
 
@@ -27,7 +27,7 @@ class _Observed(NamedTuple):
 
 
 class Observed(_Observed):
-    """What one step takes in.
+    """New observations, and the program's arguments that go with them.
 
     Attributes:
         args: the program's arguments up to and including the new measurement, as a tuple.
@@ -54,20 +54,20 @@ class Observed(_Observed):
 
 
 class StepInfo(NamedTuple):
-    """What happened in one step.
+    """A record of one step.
 
     Attributes:
         acceptance: the share of proposals accepted, NaN where nothing was moved.
-        exponents: the steps by which the likelihood was let in; the last is 1. Where sites are let in one
-            after another, those of each in turn, each ending with 1.
+        exponents: of tempering, the last 1. Where sites are tempered one after another, those of each in
+            turn, each ending with 1.
         resampled: how many times.
         effective_sample_size_before: just before the last resampling; where there was none, at the end.
         effective_sample_size: at the end.
-        log_evidence: what the step added to the log of the evidence.
+        log_evidence: the increment of the log evidence.
         ancestors: (N,) int64, the particle before the step that each one descends from; None where
             nothing was resampled, and each descends from itself.
-        displacement: how far the particles came since the last resampling, in variances, on the axis on which
-            they came least; NaN where none was made, or where sweeps were not `until(displacement=...)`.
+        displacement: mean squared displacement of the particles since the last resampling, in variances, on
+            the axis on which it is least; NaN without resampling, or without `until(displacement=...)`.
     """
 
     acceptance: float = float("nan")
@@ -89,7 +89,7 @@ class StepInfo(NamedTuple):
 
 
 class Stepped(NamedTuple):
-    """A population that has taken something in, and what happened."""
+    """A population that has assimilated observations, and the record of the step."""
 
     population: Population
     info: StepInfo
@@ -101,16 +101,16 @@ StepFunction = Callable[[Population, Observed], Stepped]
 def steps(
     step: StepFunction, population: Population, observed: Iterable[Observed], *, progress: bool = False
 ) -> Iterator[Stepped]:
-    """The population after each step: an iterator that can be stopped, looked into and gone on with.
+    """The population after each step: an iterator that can be paused, inspected and resumed.
 
-    It draws from torch's own generator, so it goes on bit for bit from a population and torch's state.
+    It draws from torch's own generator, so a population and torch's state resume it bit for bit.
 
     Args:
         step: such as `bcppl.inference.filters.tempering.tempered(...)`.
         population: before the first step, such as that of `importance_sampling(...)`.
-        observed: what each step takes in.
-        progress: show a bar, on a terminal or in a notebook, until the last step is taken. For a loop that
-            runs through: a bar would stay while you stop and look.
+        observed: one for each step.
+        progress: show a bar, on a terminal or in a notebook, until the last step is taken; for a loop that is
+            not paused.
 
     Raises:
         InputError: what is given is no step (a kernel, say), no population, or no list of `Observed`.
@@ -135,7 +135,7 @@ def _stepping(step: StepFunction, population: Population, observed: Iterable[Obs
     for each in observed:
         if not isinstance(each, Observed):
             raise InputError(
-                f"steps is to take in a {type(each).__name__}; give a list of Observed(args, observations)."
+                f"steps is given a {type(each).__name__}; give a list of Observed(args, observations)."
             )
         population, info = step(population, each)
         yield Stepped(population, info)

@@ -1,9 +1,9 @@
-"""The default inference program: SMC with tempering, its moves shaped by the other particles.
+"""The default inference program: tempered SMC, its moves fitted to the other particles.
 
 Half of the moves are random walks, half are drawn from a normal that is fitted to the other half of the
-particles. Where a move costs little (pushes, depth images), a measurement is let in by small steps, with many
-moves of every particle after each. Once moves cost simulations it is let in by larger steps, and the
-particles are moved until they have left where they were resampled. Copy this file to write your own:
+particles. Where a move costs little (pushes, depth images), a measurement is tempered by small steps, with
+many moves of every particle after each. Once moves cost simulations the steps are larger, and the particles
+are moved until they are displaced from where they were resampled. Copy this file to write your own:
 `bcppl run RECORDING --inference FILE.py` takes any file that defines `infer`.
 """
 
@@ -34,22 +34,20 @@ PHYSICS = 2  # the cost of a site that simulates contact (`bcppl.distributions.l
 
 
 def kernel(pose: str, proposals: Sequence[Program] = (), modes: Modes | None = None) -> Kernel:
-    """How a pose is moved: by a random walk, some of its steps long ones, or to wherever the others are.
+    """Random walks of a pose at two scales, and independent moves fitted to the other particles.
 
-    Discrete values (which of several holes it is) are drawn anew from the program.
-
-    Where a program has other latent values that can be moved (a camera's error, a grasp), each of them then
-    walks alone, and all of them together.
+    Discrete values (which of several holes it is) are redrawn from the program. Other continuous latent
+    values (a camera's error, a grasp) walk alone, and together with the pose.
 
     Args:
         pose: its address.
-        proposals: programs that the model's author gives along (`bcppl.traces.Model`); each is used once.
-        modes: that were found; then a third of the moves of the pose are jumps to one of them.
+        proposals: the model's own (`bcppl.traces.Model`); each is used once.
+        modes: if given, a third of the moves of the pose are jumps to one of them.
     """
     # A fifth of the draws are three times as wide as the particles: few particles may have missed a mode.
-    anew = independent(pose, 1, inflation=1.2, wide=(0.2, 3.0))
+    redrawn = independent(pose, 1, inflation=1.2, wide=(0.2, 3.0))
     far = [] if modes is None else [metropolis_hastings(jumps(pose, modes))]
-    alone = mixture([metropolis_hastings(drift(pose, (0.2, 2.0))), metropolis_hastings(anew), *far])
+    alone = mixture([metropolis_hastings(drift(pose, (0.2, 2.0))), metropolis_hastings(redrawn), *far])
 
     def moved(population: Population) -> Move:
         others = [address for address in continuous_addresses(population.trace) if address != pose]
@@ -65,14 +63,14 @@ def kernel(pose: str, proposals: Sequence[Program] = (), modes: Modes | None = N
     given = [metropolis_hastings(p, *([spreads] if takes(p, 2) else [])) for p in proposals]
     shaped = sequence([moved, *given]) if given else moved
 
-    def chosen_anew(population: Population) -> Move:
+    def with_choices(population: Population) -> Move:
         sites = population.trace.distributions
         choices = [a for a in population.trace.choices if support_of(sites[a]).is_discrete]
-        # Without moves between them, resampling alone lets choices die out that the data does not tell apart.
-        again = [metropolis_hastings(prior(choice)) for choice in choices]
-        return sequence([shaped, *again])(population) if choices else shaped(population)
+        # Without moves between them, resampling alone lets choices die out that the data cannot distinguish.
+        redraws = [metropolis_hastings(prior(choice)) for choice in choices]
+        return sequence([shaped, *redraws])(population) if choices else shaped(population)
 
-    return chosen_anew
+    return with_choices
 
 
 def infer(
@@ -87,24 +85,23 @@ def infer(
     scene: Any = None,
     start: Step | None = None,
 ) -> Iterator[Step]:
-    """Beliefs over a recording, one step for each measurement, the prior first.
+    """Beliefs over a recording: first the prior's, then one step for each measurement.
 
     Args:
         model: what explains the recording.
         recording: a `bcppl.recordings.Recording`.
-        particles: how many.
+        particles: N.
         seed: same seed, same beliefs.
         sweeps: moves of every particle after each resampling: without, and with physics in the program. By
             default 12 (6 where the model brings proposals of its own, which go farther), and until the
             particles' mean squared displacement is half their variance on every axis and four of five differ,
             at most 60.
-        share: particles are resampled below this effective sample size, and a likelihood is let in by steps
-            that keep this conditional one, as shares of N: without, and with physics.
-        climbs: how many draws of the prior climb before a measurement is let in, to find the modes between
-            which particles jump (`bcppl.inference.proposals.climbing`; it needs depth images). 0 for
-            none.
-        scene: what `model.prepare(recording)` gives, if it is at hand.
-        start: a step to go on from, as `bcppl.inference.filters.smc.smc` does.
+        share: particles are resampled below this effective sample size, and exponents keep this conditional
+            one, as shares of N: without, and with physics.
+        climbs: number of draws of the prior that climb before a measurement is tempered, to find the modes
+            between which particles jump (`bcppl.inference.proposals.climbing`; it needs depth images).
+        scene: `model.prepare(recording)` unless given.
+        start: a step to resume from, as for `bcppl.inference.smc`.
 
     Raises:
         InputError: a number is out of range.
@@ -125,13 +122,13 @@ def infer(
         return adaptive(systematic, share[by_physics(population.trace)])(population)
 
     def step(population: Population, observed: Observed) -> Stepped:
-        found = None
+        centres = None
         if climbing:
             known = {**population.trace.observations, **observed.observations}
             climbers, _ = generate(model.program, observed.args, known, climbing)
-            found = modes(climbers, model.pose)
+            centres = modes(climbers, model.pose)
         return tempered(
-            kernel(model.pose, model.proposals, found),
+            kernel(model.pose, model.proposals, centres),
             sweeps=lambda trace: moves[by_physics(trace)],
             resample=resample,
             share=lambda trace: share[by_physics(trace)],

@@ -1,4 +1,4 @@
-"""Tempering: a likelihood is let in by steps that the particles can follow, with moves after each.
+"""Tempering: a likelihood is raised to increasing powers, with resampling and moves after each.
 
 The next exponent is the largest whose conditional effective sample size stays above a share of N, found by
 bisection: Zhou, Johansen and Aston, Toward automatic model comparison: an adaptive sequential Monte Carlo
@@ -6,7 +6,7 @@ approach, JCGS 25, 2016, section 3.3.2 (CESS, eq. 3.16). The step is that of Del
 Sequential Monte Carlo samplers, JRSS B 68, 2006, and of Chopin and Papaspiliopoulos, An Introduction to
 Sequential Monte Carlo, 2020, chapter 17.
 
-With fixed exponents, fixed proposals, and moves whose number does not hang on the particles (`always_move`,
+With fixed exponents, fixed proposals, and moves whose number does not depend on the particles (`always_move`,
 or resampling always), the estimate of the evidence is unbiased; otherwise it is consistent only. Evidence
 that contains a surrogate likelihood is a surrogate's.
 """
@@ -22,9 +22,9 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
-from bcppl.inference.exponents import next_exponent
+from bcppl.inference.filters.exponents import next_exponent
 from bcppl.inference.filters.step import Observed, StepInfo, Stepped
-from bcppl.inference.kernels import Kernel, Until, refuse_other, rejuvenate, takes
+from bcppl.inference.kernels import Kernel, Until, moved_by, refuse_other, takes
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Resample, adaptive, check_resample
 from bcppl.inference.targets import POSTERIOR, Target, cost_of
@@ -61,7 +61,7 @@ def resample_move(
         if kernel is None or (ancestors is None and not always_move):
             return Rejuvenated(population, ancestors, None)
         times = sweeps(population.trace) if callable(sweeps) else sweeps
-        moved = rejuvenate(population, kernel, target, times)
+        moved = moved_by(population, kernel, target, times)
         return Rejuvenated(moved.population, ancestors, moved.acceptance, moved.displacement)
 
     return rejuvenation
@@ -96,14 +96,14 @@ class Tempered:
     by_site: bool = False
 
     def __call__(self, population: Population, observed: Observed) -> Stepped:
-        """Take in what was observed, at new addresses."""
+        """Assimilate observations at new addresses."""
         longer, log_likelihood = extend(population.trace, *observed)
-        # Sites that the program itself fixes (`obs=`, `pyro.factor`) are let in with the observations.
+        # Sites that the program itself fixes (`obs=`, `pyro.factor`) are tempered with the observations.
         new = [a for a in longer.since(population.trace) if a not in longer.choices]
-        return self.let_in(population.with_trace(longer), new, log_likelihood)
+        return self.temper(population.with_trace(longer), new, log_likelihood)
 
-    def let_in(self, population: Population, new: Sequence[str], log_likelihood: Tensor) -> Stepped:
-        """Let sites in that the trace has and the weights do not yet count.
+    def temper(self, population: Population, new: Sequence[str], log_likelihood: Tensor) -> Stepped:
+        """Temper sites that the trace has and the weights do not yet count.
 
         Args:
             population: weighed for all other sites.
@@ -163,7 +163,7 @@ def tempered(
     rejuvenation: Rejuvenation | None = None,
     always_move: bool = False,
 ) -> Tempered:
-    """A step that lets a measurement's likelihood in bit by bit, and resamples and moves after each.
+    """A step that tempers the likelihood of a measurement.
 
     Args:
         kernel: moves the particles after each resampling; None leaves them where they are.
@@ -171,15 +171,14 @@ def tempered(
             trace that gives either.
         resample: when and how; by default systematic below half the effective sample size.
         share: tempering keeps the conditional effective sample size above this share of the particles;
-            0 lets a likelihood in at once. A number, or a function of the trace, as `sweeps`.
-        exponents: fixed ones to let the likelihood in by, increasing, the last 1; then `share` counts for
-            nothing.
-        by_site: let the new sites in one after another, in the order of their cost and then of the program,
-            each by exponents of its own; otherwise all at once.
-        always_move: move after each exponent, whether or not that resampled. Whether particles resample hangs
-            on where they are, so moves that are made only then leave a bias of order 1/N in the evidence (one
-            of 2 % with three particles). With it, or resampling always, and with fixed exponents and
-            proposals, the estimate of the evidence is unbiased.
+            with 0 there is one exponent, 1. A number, or a function of the trace, as `sweeps`.
+        exponents: fixed ones, increasing, the last 1; then `share` does not matter.
+        by_site: temper the new sites one after another, in the order of their cost and then of the program,
+            each with exponents of its own; otherwise all together.
+        always_move: move after each exponent, whether or not that resampled. Whether particles are resampled
+            depends on where they are, so moves that are made only then leave a bias of order 1/N in the
+            evidence (one of 2 % with three particles). With it, or resampling always, and with fixed
+            exponents and proposals, the estimate of the evidence is unbiased.
         rejuvenation: in place of `kernel`, `sweeps` and `resample`, such as `waste_free(...)`.
 
     Returns:

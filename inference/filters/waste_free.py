@@ -14,7 +14,7 @@ from bcppl.errors import InputError
 from bcppl.inference.filters.tempering import Rejuvenated, Rejuvenation
 from bcppl.inference.kernels import Kernel, fitted, refuse_other, scattered
 from bcppl.inference.population import Population, log_pair
-from bcppl.inference.schemes import Scheme, systematic
+from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import Target
 
 

@@ -1,4 +1,4 @@
-"""Rejuvenation: every particle of a population is moved by a kernel that the other half is fitted to."""
+"""Rejuvenation: every particle of a population is moved by a kernel that is fitted to the other half."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ class Moved(NamedTuple):
 
 @dataclass(frozen=True)
 class Until:
-    """Sweeps until a population has come far enough: see `until`."""
+    """Sweeps until a population is displaced, or its particles differ: see `until`."""
 
     distinct: int | None
     displacement: float | None
     most: int
 
     def reached(self, start: Population, now: Population) -> bool:
-        """Whether a population that began at `start` has come far enough."""
+        """Whether the criteria hold for a population that began at `start`."""
         if self.distinct is not None and distinct(now) < min(self.distinct, len(now)):
             return False
         return self.displacement is None or bool((displacement(start, now) >= self.displacement).all())
@@ -67,7 +67,7 @@ def until(*, distinct: int | None = None, displacement: float | None = None, mos
         InputError: nothing is asked for, or what no population can reach.
     """
     if distinct is None and displacement is None:
-        raise InputError("until is given nothing to wait for; give distinct, displacement or both.")
+        raise InputError("until is given no criterion; give distinct, displacement or both.")
     if distinct is not None:
         distinct = whole_number("until is to wait for {} distinct particles", distinct)
     if displacement is not None:
@@ -113,7 +113,7 @@ def _coordinates(start: Population, now: Population, address: str) -> tuple[Tens
     return after - before, after
 
 
-def rejuvenate(population: Population, kernel: Kernel, target: Target, sweeps: int | Until = 1) -> Moved:
+def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int | Until = 1) -> Moved:
     """Move every particle, `sweeps` times.
 
     The kernel that moves one half of the population is fitted to the other, so that no particle shapes its

@@ -17,7 +17,7 @@ from bcppl.contact.physics import PegPhysics, Rollout
 from bcppl.geometry.holes import Hole, depth_reached, hole_of, lateral_error
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.waypoints import tip_of
-from bcppl.inference.schemes import systematic
+from bcppl.inference.resampling import systematic
 from bcppl.robot.insertion_plan import InsertionPlan
 from bcppl.robot.plan import Plan, probe_of
 

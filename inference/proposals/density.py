@@ -21,7 +21,7 @@ from bcppl.inference.proposals.spread import (
     covariance_of,
     weighted_places,
 )
-from bcppl.inference.schemes import systematic
+from bcppl.inference.resampling import systematic
 from bcppl.traces import Trace
 
 MOST_FITTED = 1000  # particles; their covariance is accurate to a few percent

@@ -2,7 +2,7 @@
 
 Each particle's new value depends on its own old values only. What a proposal learns from a population is
 fixed before it runs, the same for the forward and the backward density, and comes from other particles than
-those that it moves (`bcppl.inference.kernels.rejuvenate`). So a program must not read `trace["mu"].mean()`:
+those that it moves (`bcppl.inference.kernels.moved_by`). So a program must not read `trace["mu"].mean()`:
 that is for `Fitted`, or for the functions `learned` of `metropolis_hastings(proposal, *learned)`.
 """
 

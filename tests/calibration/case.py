@@ -24,7 +24,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.filters.tempering import tempered
-from bcppl.inference.kernels import Kernel, rejuvenate
+from bcppl.inference.kernels import Kernel, moved_by
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.inference.targets import POSTERIOR
@@ -86,7 +86,7 @@ class Case:
         population = step(Population(trace, log_weights), Observed((1,), {"seen": seen})).population
         if self.kernel is None or self.settling == 0:
             return population
-        return rejuvenate(population, self.kernel, POSTERIOR, self.settling).population
+        return moved_by(population, self.kernel, POSTERIOR, self.settling).population
 
     def simulate_once(self) -> tuple[Tensor, Tensor]:
         """A pose (7,) from the prior, and data drawn there."""

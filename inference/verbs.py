@@ -1,0 +1,105 @@
+"""Verbs on populations; a filter is a loop over them.
+
+    scene = model.prepare(recording)
+    population = initialize(model, scene, particles=75)
+    for observed in observations_of(model, scene, recording.measurements):
+        population = update(population, observed)
+        if population.effective_sample_size < 40:
+            population = rejuvenate(resample(population), kernel)
+
+Others change the number of particles: `resize`, `replicate` and `merge` (`bcppl.inference.sizing`). They draw
+from torch's generator. The loop `bcppl.inference.smc` adds to these a seed of its own, records of each step,
+and resuming. GenParticleFilters.jl has the same verbs (`pf_initialize`, `pf_update!`, `pf_resample!`,
+`pf_rejuvenate!`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from bcppl.inference.filters.smcp3 import Pair, moved
+from bcppl.inference.filters.step import Observed
+from bcppl.inference.importance import importance_sampling
+from bcppl.inference.kernels import Kernel, Until, moved_by
+from bcppl.inference.population import Population
+from bcppl.inference.resampling import Scheme, systematic
+from bcppl.inference.targets import POSTERIOR, Target
+from bcppl.traces import Model, Series, extend
+
+
+def initialize(model: Model, scene: Any, particles: int = 75) -> Population:
+    """Particles of a model's prior, before any measurement.
+
+    For any program, with observations or a proposal of its own, there is `importance_sampling`.
+
+    Args:
+        model: its program is run.
+        scene: `model.prepare(recording)`.
+        particles: N.
+
+    Raises:
+        InputError: the number of particles is no whole number, 1 or more.
+    """
+    return importance_sampling(model.program, (scene, []), {}, particles)
+
+
+def observations_of(
+    model: Model, scene: Any, measurements: Sequence[Any], start: int = 0
+) -> Iterator[Observed]:
+    """What each measurement adds: the program's arguments up to it, and the observations at new addresses.
+
+    Args:
+        model: maps measurements to observations.
+        scene: `model.prepare(recording)`.
+        measurements: of the recording, in the order in which they are assimilated.
+        start: number of measurements that the population has assimilated.
+    """
+    known = set(model.observe(scene, measurements[:start])) if start else set()
+    for count in range(start + 1, len(measurements) + 1):
+        if isinstance(model.program, Series):
+            # A step of a series is given the newest measurement alone, under its own addresses.
+            latest = measurements[count - 1 : count]
+            yield Observed((scene, [latest[0].action]), model.observe(scene, latest))
+            continue
+        observations = model.observe(scene, measurements[:count])
+        new = {address: value for address, value in observations.items() if address not in known}
+        known |= new.keys()
+        yield Observed((scene, [each.action for each in measurements[:count]]), new)
+
+
+def update(population: Population, observed: Observed, pair: Pair | None = None) -> Population:
+    """The population given new observations: weighted by their likelihood, and moved if a pair is given.
+
+    Args:
+        population: of N particles.
+        observed: the program's arguments, and observations at new addresses.
+        pair: forward and backward programs of SMCP3 (Lew et al., AISTATS 2023); without it, latent values
+            that come with the observations are sampled from the program (a bootstrap filter).
+
+    Raises:
+        NoWeightError: no particle has any weight left.
+        NotANumberError: a weight is NaN or +inf.
+    """
+    if pair is not None:
+        return moved(population, pair, observed)
+    trace, log_likelihood = extend(population.trace, *observed)
+    return population.with_trace(trace).reweighed(log_likelihood)
+
+
+def resample(population: Population, scheme: Scheme = systematic) -> Population:
+    """N particles of equal weight, drawn from the population."""
+    return population.selected(scheme(population.log_weights))
+
+
+def rejuvenate(
+    population: Population, kernel: Kernel, target: Target = POSTERIOR, sweeps: int | Until = 1
+) -> Population:
+    """The population with every particle moved `sweeps` times by a kernel that leaves the target invariant.
+
+    Weights and evidence stay. `bcppl.inference.kernels.moved_by` returns acceptance and displacement, too.
+
+    Raises:
+        InputError: what is given is no kernel, or no number of sweeps.
+    """
+    return moved_by(population, kernel, target, sweeps).population
