@@ -283,3 +283,8 @@ def test_a_new_kind_is_ranked_and_laid_out_beside_others(laser: Any) -> None:
     scene = look_and_touch.prepare(with_candidates(recording, found))
     ranking = by_linearised_gain("part", outer_samples=8, seed=0)(last.population, found, scene)
     assert len(ranking) == 6 and all(each.information_gain > 0.0 for each in ranking)
+    # Before the first of its kind is measured.
+    seen = replace(recording, measurements=[m for m in recording.measurements if m.kind == "view"])
+    *_, last = guided_smc.infer(look_and_touch.model, seen, particles=20, seed=1)
+    scene = look_and_touch.prepare(with_candidates(seen, found))
+    assert len(by_linearised_gain("part", outer_samples=4, seed=0)(last.population, found, scene)) == 6

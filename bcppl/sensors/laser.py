@@ -115,6 +115,10 @@ class WristLaser(PlannedAsIs):
         """The range of each laser."""
         return [(f"laser {b.name}", f"{b.near:g} to {b.far:g} m") for b in (m.action for m in measurements)]
 
+    def blank(self, candidate: Beam) -> Distance:
+        """A distance that is not measured yet."""
+        return Distance(math.nan)
+
     def placement(self, candidate: Beam) -> Placement:
         """The laser's pose."""
         return Placement(candidate.world_from_laser, None)
