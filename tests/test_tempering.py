@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InferenceError, InputError
-from bcppl.inference.filters.exponents import conditional_effective_sample_size, next_exponent
+from bcppl.inference.exponents import conditional_effective_sample_size, next_exponent
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.kernels import metropolis_hastings

@@ -195,7 +195,7 @@ def _steps(
         state, population, particles = [start.random_state], start.population, len(start.population)
         truth = _Truth(model, scene, recording, population, seed)
         for observed in observations_of(model, scene, measurements[: start.taken]):
-            truth.gap(observed, population)
+            truth.assimilate(observed)
     for count, observed in enumerate(
         observations_of(model, scene, measurements, start.taken), start.taken + 1
     ):
@@ -210,7 +210,8 @@ def _steps(
         belief = population.belief(model.pose)
         spent = {name: after.since(before[name]) for name, after in _effort(scene).items()}
         elapsed = time.perf_counter() - begun
-        gap = truth.gap(observed, population)
+        truth.assimilate(observed)
+        gap = truth.gap(population)
         evidence, distinct = population.log_evidence, belief.distinct
         info = Info(label, _time(measurement), evidence, distinct, gap, elapsed, spent, happened)
         yield Step(belief, info, population, state[0], count)
@@ -241,14 +242,18 @@ class _Truth:
             one, _ = generate(model.program, (scene, []), {}, 1)
             self.trace = one.at({model.pose: pose})
 
-    def gap(self, observed: Observed, population: Population) -> float:
+    def assimilate(self, observed: Observed) -> None:
+        """Extend its trace."""
+        if self.trace is not None:
+            with _own_state(self.state, 1):
+                self.trace, _ = extend(self.trace, *observed)
+            if set(self.trace.choices) != self.latent:
+                self.trace = None
+
+    def gap(self, population: Population) -> float:
         """Log-likelihood of the truth minus that of the best particle, NaN where the truth is not known."""
-        if set(population.trace.choices) != self.latent:
-            self.trace = None
         if self.trace is None:
             return float("nan")
-        with _own_state(self.state, 1):
-            self.trace, _ = extend(self.trace, *observed)
         addresses = list(population.trace.observations)
         best = population.trace.log_prob(*addresses)[population.log_weights > -torch.inf].max()
         return float(self.trace.log_prob(*addresses) - best)

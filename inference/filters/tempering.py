@@ -22,7 +22,7 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
-from bcppl.inference.filters.exponents import next_exponent
+from bcppl.inference.exponents import next_exponent
 from bcppl.inference.filters.step import Observed, StepInfo, Stepped
 from bcppl.inference.kernels import Kernel, Until, moved_by, refuse_other, takes
 from bcppl.inference.population import Population

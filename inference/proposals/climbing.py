@@ -19,7 +19,7 @@ from bcppl.arguments import whole_number
 from bcppl.distributions.poses import MixturePose, NormalPose
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
-from bcppl.inference.filters.exponents import next_exponent
+from bcppl.inference.exponents import next_exponent
 from bcppl.inference.proposals.coordinates import PoseCoordinates
 from bcppl.inference.proposals.depth_points import depth_aligned
 from bcppl.inference.proposals.proposal import Program
