@@ -7,9 +7,10 @@ from dataclasses import dataclass, fields
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
-Rows = npt.NDArray[np.int64] | npt.NDArray[np.bool_] | slice
+from bcppl.arrays import Indices, Mask
+
+Rows = Indices | Mask | slice
 
 
 @dataclass(frozen=True, eq=False)

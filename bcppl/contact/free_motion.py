@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from bcppl.arrays import Array, Indices, Mask
 from bcppl.contact.array_record import Rows
 from bcppl.contact.stepping import SimulationState, Stepper
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 _OUT_OF_REACH = np.array([[0.0, 0.0, 1e3, 1.0, 0.0, 0.0, 0.0]])
 _MARGIN = 0.0001  # m: for the rounding of a mesh
@@ -93,7 +90,7 @@ class _Boxes:
     world_from_part: Array
     grip_from_peg: Array | None
 
-    def overlap(self, members: Rows, path: Array, grown: Array) -> npt.NDArray[np.bool_]:
+    def overlap(self, members: Rows, path: Array, grown: Array) -> Mask:
         """Whether they may overlap (M, S), for some particles, at poses (M or 1, S, 7) of the grip.
 
         The peg's box is grown by (S,) metres on all sides.

@@ -11,10 +11,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-Array = npt.NDArray[np.float64]
+from bcppl.arrays import Array
 
 
 def springs_in_series(nuisances: Mapping[str, Array], stiffness: Array) -> dict[str, Array]:

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from bcppl.arrays import Array, Mask
 from bcppl.compiled import compiled
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 _ROUNDING = 2e-8  # m: no violation of a constraint
 

@@ -8,15 +8,13 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from bcppl.arguments import number_within
+from bcppl.arrays import Array, Indices
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part, Piece
 from bcppl.robot.motion import Probe
-
-Array = npt.NDArray[np.float64]
 
 # The numbers of MuJoCo's solimp in their order, and their bounds.
 _IMPEDANCE: Mapping[str, dict[str, float]] = {
@@ -255,9 +253,7 @@ def rollout_controls(probe: Probe, times: Array) -> Array:
     return np.concatenate([twist * np.asarray(probe.damping), pose], axis=1)
 
 
-def steps_around(
-    probe: Probe, time_step: float
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
+def steps_around(probe: Probe, time_step: float) -> tuple[Indices, Indices, Array]:
     """The steps before and after each stamp, (T,) each, and the weight (T,) of the second.
 
     Stamps within a nanosecond of a step are taken from that step alone.

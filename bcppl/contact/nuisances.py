@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.poses import as_pose
-
-Array = npt.NDArray[np.float64]
 
 # The free motion does not depend on these: with them alone, all particles share it.
 CONTACT_ONLY = frozenset({"friction", "time_constant", "damping_ratio", "grip_from_peg"})

@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-Array = npt.NDArray[np.float64]
+from bcppl.arrays import Array
 
 # The column of a model's array that holds a parameter.
 _COLUMNS = {

@@ -11,10 +11,10 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from bcppl.arrays import Array, Indices, Mask
 from bcppl.contact.array_record import ArrayRecord
 from bcppl.contact.free_motion import FreeMotion, first_possible_contact, simulate_free_motion
 from bcppl.contact.grasp_compliance import springs_in_series
@@ -27,9 +27,7 @@ from bcppl.geometry.parts import Part
 from bcppl.poses import as_pose
 from bcppl.robot.motion import Probe
 
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Selection = Tensor | Indices | npt.NDArray[np.bool_] | slice
+Selection = Tensor | Indices | Mask | slice
 
 _FARTHEST = 1.0  # m: a peg farther than this from its command has diverged
 _FULL, _HALVED, _DIVERGED = 0, 1, 2
@@ -179,7 +177,7 @@ class Rollout:
         return self._particles.rows[..., POSE]
 
     @property
-    def diverged(self) -> npt.NDArray[np.bool_]:
+    def diverged(self) -> Mask:
         """(N,) simulations that diverged even at half the time step."""
         return np.asarray(self._particles.level == _DIVERGED)
 
@@ -259,9 +257,7 @@ class Rollout:
             self.simulation.effort.amount += len(moving) * stepper.time_step * steps
         self._update(state=state)
 
-    def _sound(
-        self, level: int, members: Indices, first: int, last: int, fresh: Array
-    ) -> npt.NDArray[np.bool_]:
+    def _sound(self, level: int, members: Indices, first: int, last: int, fresh: Array) -> Mask:
         """Members (M,) that did not diverge."""
         moving = self._particles.free[members] < last
         rows, command = fresh[members], self.simulation.steppers[0].commanded(first, last)
@@ -300,6 +296,6 @@ class Rollout:
         )
 
 
-def rows_of(index: Selection) -> Indices | npt.NDArray[np.bool_] | slice:
+def rows_of(index: Selection) -> Indices | Mask | slice:
     """An index tensor, a mask or a slice as numpy takes it."""
     return index.detach().cpu().numpy() if isinstance(index, Tensor) else index

@@ -5,18 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.contact.array_record import ArrayRecord
 from bcppl.contact.nuisances import Nuisances
 from bcppl.contact.physics import PegPhysics, Rollout, Selection, rows_of
 from bcppl.contact.sensing.location import ContactSensing, SensingState
 from bcppl.robot.motion import Probe
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

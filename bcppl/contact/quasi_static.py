@@ -13,23 +13,19 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import trimesh
 from torch import Tensor
 
 from bcppl import poses, quaternions
 from bcppl.arguments import number_within
+from bcppl.arrays import Array, Indices, Mask
 from bcppl.compiled import compiled
 from bcppl.contact.half_spaces import project_onto_half_spaces
 from bcppl.contact.mujoco_model import interpolated_command
 from bcppl.geometry.gap import Frames, PegGap, frames_of
 from bcppl.geometry.parts import Part
 from bcppl.robot.motion import ProbeWindow
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 _LONGEST = 0.001  # m: of a step
 _SHORTEST = 0.0001

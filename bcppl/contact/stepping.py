@@ -10,16 +10,14 @@ from dataclasses import dataclass
 import mujoco
 import mujoco.rollout
 import numpy as np
-import numpy.typing as npt
 
+from bcppl.arrays import Array, Mask
 from bcppl.contact.array_record import ArrayRecord
 from bcppl.contact.grasp_compliance import readings_at_grip
 from bcppl.contact.mujoco_model import SENSOR_COLUMNS, rollout_controls, set_controller, steps_around
 from bcppl.contact.particle_models import ParticleModels
 from bcppl.robot.motion import Probe
 from bcppl.threads import thread_count
-
-Array = npt.NDArray[np.float64]
 
 _CONTROL = int(
     mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
@@ -126,7 +124,7 @@ class Stepper:
         path = rows[2:, POSE].copy()
         return self._at_stamps(rows[None], 2, 0, stamps)[0], SimulationState(every[after], tails), path
 
-    def on_time(self, reached: SimulationState, stamps: int) -> npt.NDArray[np.bool_]:
+    def on_time(self, reached: SimulationState, stamps: int) -> Mask:
         """Whether states (N,) are finite and of the expected time: MuJoCo stops those that diverge."""
         expected = self.time_step * self.step_after(stamps)
         with np.errstate(invalid="ignore"):

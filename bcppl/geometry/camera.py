@@ -12,10 +12,9 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within, whole_number
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.distortion import LARGEST, distorted, undistorted_rays, unfolded
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
-Array = npt.NDArray[np.float64]
+from bcppl.arrays import Array
 
 _TIGHT = 1e-11  # m by which expansion may exceed a region; MuJoCo's single precision resolves 1e-9 m
 _STRAIGHT = 1e-9  # sine of the turning angle below which a vertex counts as collinear

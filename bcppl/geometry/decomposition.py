@@ -17,16 +17,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from bcppl.arguments import number_within, seed_number
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.hausdorff import HausdorffError, bodies_of, hausdorff_error
 from bcppl.geometry.parts import Part, Piece
-
-Array = npt.NDArray[np.float64]
 
 THRESHOLDS = (0.05, 0.02, 0.01)  # CoACD's concavity, for a mesh scaled to a box of side 2
 # Of CoACD's tree search; with its defaults of 150 and 2000, twice the time for as many pieces of equal error.

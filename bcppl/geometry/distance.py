@@ -6,16 +6,13 @@ from typing import NamedTuple
 
 import igl
 import numpy as np
-import numpy.typing as npt
 import torch
 import trimesh
 from torch import Tensor
 
+from bcppl.arrays import Array, Indices
 from bcppl.effort import Effort
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
-Faces = npt.NDArray[np.int64]
 
 _ON_EDGE = 1e-12  # barycentric coordinate up to which a point lies on an edge or a vertex
 # m from the surface up to which the direction to the closest point is rounding: the pseudonormal is used.
@@ -93,7 +90,7 @@ class SignedDistance:
             torch.from_numpy(normal).reshape(*shape, 3),
         )
 
-    def _pseudonormals(self, face: Faces, closest: Array) -> Array:
+    def _pseudonormals(self, face: Indices, closest: Array) -> Array:
         """Pseudonormals (P, 3) at points of the mesh: of a face, an edge or a vertex."""
         corners = self._vertices[self._faces[face]]
         opposite = corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]]

@@ -8,11 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from bcppl.arrays import Array
 from bcppl.compiled import compiled
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
 
 SPACING = 0.001  # m
 _MOST = 2_000_000  # nodes of a grid

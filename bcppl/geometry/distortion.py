@@ -10,11 +10,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
+from bcppl.arrays import Array, Mask
 from bcppl.errors import InputError
-
-Array = npt.NDArray[np.float64]
 
 LARGEST = 1e3  # largest coordinate on the plane z = 1 that is imaged; sixth powers stay finite
 MOST_STEPS = 50  # of Newton's method
@@ -66,7 +64,7 @@ def _jacobian(plane: Array, distortion: tuple[float, ...]) -> tuple[Array, Array
     )
 
 
-def unfolded(plane: Array, distortion: tuple[float, ...]) -> npt.NDArray[np.bool_]:
+def unfolded(plane: Array, distortion: tuple[float, ...]) -> Mask:
     """Whether (...,) the distortion is injective from the optical axis to points (..., 2)."""
     within = np.abs(plane).max(axis=-1) <= LARGEST
     k1, k2, p1, p2, k3 = coefficients(distortion)
@@ -82,7 +80,7 @@ def unfolded(plane: Array, distortion: tuple[float, ...]) -> npt.NDArray[np.bool
     return np.asarray(within)
 
 
-def undistorted(seen: Array, distortion: tuple[float, ...]) -> tuple[Array, npt.NDArray[np.bool_]]:
+def undistorted(seen: Array, distortion: tuple[float, ...]) -> tuple[Array, Mask]:
     """The points (..., 2) whose distorted positions are `seen` (..., 2); whether (...,) they are unique."""
     plane = seen.copy()
     for _ in range(MOST_STEPS):

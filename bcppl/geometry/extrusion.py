@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 import trimesh
 from shapely.affinity import rotate, translate
@@ -18,8 +17,6 @@ from bcppl.errors import InputError
 from bcppl.geometry.cover import Cell, convex_cells, straightened
 from bcppl.geometry.outlines import check_outline, positive, rectangular_outline, round_outline
 from bcppl.geometry.parts import Part, Piece
-
-Array = npt.NDArray[np.float64]
 
 OVERLAP = 0.002  # m, the largest overlap of adjacent prisms
 BEVEL = 0.0001  # m below the end faces at which prisms overlap by that much; deeper than contacts penetrate

@@ -10,11 +10,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arrays import Array, Indices, Mask
 from bcppl.compiled import compiled
 from bcppl.effort import Effort
 from bcppl.geometry.distance import SignedDistance
@@ -31,9 +31,6 @@ from bcppl.geometry.sharp_edges import (
     to_peg_frame,
 )
 from bcppl.threads import parallel_sum, thread_count
-
-Array = npt.NDArray[np.float64]
-Numbers = npt.NDArray[np.int64]
 
 _NEAR = 0.002  # m: below this gap edges are evaluated, and distances exactly where the grid is inexact
 _MARGIN = 0.012  # m around the part that the grid covers
@@ -144,7 +141,7 @@ class _Solids(NamedTuple):
 
     corners: Array
     planes: Array
-    ends: Numbers
+    ends: Indices
     box: Array
 
 
@@ -171,7 +168,7 @@ def _evaluate(
     distance: Array,
     witness: Array,
     normal: Array,
-    rounded: npt.NDArray[np.bool_],
+    rounded: Mask,
 ) -> None:
     corners, planes, box = solids.corners, solids.planes, solids.box
     gradient, start, stop, middle = np.empty(3), np.empty(3), np.empty(3), np.empty(3)

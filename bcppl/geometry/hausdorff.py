@@ -6,15 +6,13 @@ from dataclasses import dataclass
 
 import igl
 import numpy as np
-import numpy.typing as npt
 import torch
 import trimesh
 
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.parts import Part, Piece
-
-Array = npt.NDArray[np.float64]
 
 _BATCH = 4096  # points whose distances to all planes are in memory at once
 

@@ -7,19 +7,17 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 import torch
 from scipy.optimize import minimize_scalar
 from shapely.affinity import rotate, translate
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.layers import cross_section
 from bcppl.geometry.outlines import check_fit
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
 
 _LEVEL = 1e-5  # m: vertices closer in height than this lie on one level
 _LEAST = 0.0005  # m: smallest extent of a hole for a peg

@@ -6,19 +6,17 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 import trimesh
 from scipy.spatial import cKDTree
 
 from bcppl.arguments import number_within
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.cover import Cell, convex_cells, grown_in, polygons_of, straightened
 from bcppl.geometry.extrusion import BEVEL, OVERLAP
 from bcppl.geometry.hausdorff import hausdorff_error
 from bcppl.geometry.parts import Part, Piece
-
-Array = npt.NDArray[np.float64]
 
 _LEVEL = 2e-6  # m: vertices closer in height than this lie on one level; files round to 1e-6
 _FLAT = 2e-3  # radians: faces that differ by less are coplanar, or vertical: rounding again

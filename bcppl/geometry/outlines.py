@@ -7,10 +7,10 @@ import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
 from bcppl.arguments import number_within
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.parts import LARGEST_EXTENT
 
@@ -186,9 +186,7 @@ def positive(what: str, **lengths: float) -> None:
         number_within(f"{what} has {name.replace('_', ' ')} {{}} m", value, above=0.0)
 
 
-def _arc(
-    diameter: float, start: float, stop: float, sides: int, closed: bool = False
-) -> npt.NDArray[np.float64]:
+def _arc(diameter: float, start: float, stop: float, sides: int, closed: bool = False) -> Array:
     """Points on an arc whose chords are as far inside the circle as their corners are outside; ends on it."""
     count = max(1, math.ceil(sides * (stop - start) / (2.0 * math.pi) - 1e-9))
     angles = start + (stop - start) / count * np.arange(count + (not closed))

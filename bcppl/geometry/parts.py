@@ -8,15 +8,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from bcppl import poses
+from bcppl.arrays import Array, Indices
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
     import trimesh
-
-Array = npt.NDArray[np.float64]
 
 LARGEST_EXTENT = 5.0  # m: a larger mesh is in millimetres
 
@@ -51,7 +49,7 @@ class Part:
 
     name: str
     vertices: Array
-    faces: npt.NDArray[np.int64]
+    faces: Indices
     pieces: Sequence[Piece] = ()
     source: str = ""
 

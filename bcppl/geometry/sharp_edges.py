@@ -5,13 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from bcppl.arrays import Array, Indices
 from bcppl.compiled import compiled
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
-Numbers = npt.NDArray[np.int64]
 
 _LONGEST = 0.008  # m; longer edges are subdivided
 _SHARP = np.radians(5.0)  # smallest dihedral angle
@@ -34,7 +31,7 @@ class SharpEdges(NamedTuple):
     ends: Array
     spheres: Array
     groups: Array
-    stops: Numbers
+    stops: Indices
 
 
 def sharp_edges(part: Part) -> SharpEdges:
@@ -57,7 +54,7 @@ def sharp_edges(part: Part) -> SharpEdges:
     return SharpEdges(ends, np.stack([_sphere(each) for each in ends]), groups, stops)
 
 
-def _partitioned(middles: Array, members: Numbers) -> list[Numbers]:
+def _partitioned(middles: Array, members: Indices) -> list[Indices]:
     """Members in compact groups, by recursive bisection across their widest axis."""
     if len(members) <= _GROUP:
         return [members] if len(members) else []

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from bcppl.arrays import Array, Indices, Mask, Numbers
 from bcppl.compiled import compiled
-from bcppl.rendering.scan_conversion import Array, Indices, Mask, Numbers, PosedMesh, Workspace, rasterise
+from bcppl.rendering.scan_conversion import PosedMesh, Workspace, rasterise
 
 
 @compiled

@@ -13,11 +13,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
+from bcppl.arrays import Array, Mask
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

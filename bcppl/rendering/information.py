@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.geometry.camera import Camera
 from bcppl.rendering.part_renderer import PartRenderer
 from bcppl.rendering.region_of_interest import region_of_interest
-
-Array = npt.NDArray[np.float64]
 
 # Steps of the differences; with smaller ones a ray's jumps from face to face dominate.
 STEPS = (5e-4, 5e-4, 5e-4, 5e-3, 5e-3, 5e-3)

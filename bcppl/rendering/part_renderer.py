@@ -12,14 +12,11 @@ import numpy.typing as npt
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arrays import Array, Indices, Mask
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,15 +13,15 @@ from typing import Any
 
 import igl
 import numpy as np
-import numpy.typing as npt
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arrays import Array, Indices, Mask, Numbers
 from bcppl.effort import Effort
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
 from bcppl.rendering.depth_buffers import render_images, render_regions, write_hits
-from bcppl.rendering.part_renderer import Array, Hits, Indices, Mask, PartRenderer
+from bcppl.rendering.part_renderer import Hits, PartRenderer
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.rendering.scan_conversion import Grid, PosedMesh, bound_regions
 from bcppl.threads import parallel_sum, thread_count
@@ -181,7 +181,7 @@ def _batches(start: Indices) -> list[tuple[int, int]]:
     return batches
 
 
-def _counts(rendered: Indices, length: int) -> npt.NDArray[np.int32]:
+def _counts(rendered: Indices, length: int) -> Numbers:
     """The number of rendered rows (or columns) before each one of the image, (length + 1,)."""
     is_rendered = np.zeros(length + 1, dtype=np.int32)
     is_rendered[rendered + 1] = 1

@@ -17,11 +17,12 @@ from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arrays import Array, Indices, Mask
 from bcppl.effort import Effort
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.distortion import pinhole_shifts, undistorted_rays
 from bcppl.geometry.parts import Part
-from bcppl.rendering.part_renderer import Array, Hits, Indices, Mask, PartRenderer
+from bcppl.rendering.part_renderer import Hits, PartRenderer
 
 BATCH = 1 << 14  # rays in one call of Embree: their origins and directions then stay in the cache
 MARGIN = 0.05  # pixels: covers the rounding of the triangles and the rays to single precision

@@ -13,12 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from bcppl.arrays import Array, Indices, Mask, Numbers
 from bcppl.compiled import compiled
-
-Array = npt.NDArray[np.float64]
-Numbers = npt.NDArray[np.int32]
-Indices = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 CLEAR = 1e-6  # pixels squared: farther than rounding outside an edge
 SHORT = 6  # pixels: a shorter run is drawn one by one

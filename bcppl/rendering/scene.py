@@ -12,11 +12,12 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within, whole_number
+from bcppl.arrays import Array, Indices, Mask
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
-from bcppl.rendering.part_renderer import Array, Hits, Indices, Mask, PartRenderer, pixel_mask
+from bcppl.rendering.part_renderer import Hits, PartRenderer, pixel_mask
 from bcppl.rendering.ray_casting import RayCaster
 
 BATCH = 1 << 22  # pixels of all particles that are composed together: 32 MB of depths

@@ -14,17 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import trimesh
 from pytorch_kinematics import chain, frame, transforms
 from pytorch_kinematics.urdf_parser_py import urdf
 from scipy.spatial.transform import Rotation
 
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
 
 MOVING = ("revolute", "continuous", "prismatic")
 MESHES = (".stl", ".obj", ".dae", ".ply")

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.robot.plan import Plan
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import seed_number, whole_number
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.robot.kinematics import Robot
-
-Array = npt.NDArray[np.float64]
 
 NEAR = (0.0005, math.radians(0.5))  # m and rad: tolerance at which a pose is reached
 _LEVER = 0.3  # m per radian in the norm of the error

@@ -13,17 +13,17 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 from bcppl.robot.description import MOVING, Joint, chain_of, part_of, read
 from bcppl.robot.joint_values import check_angles, check_offsets, held_values
 
-Angles = Tensor | npt.NDArray[np.float64] | Sequence[float]
+Angles = Tensor | Array | Sequence[float]
 
 
 class Robot:
@@ -303,7 +303,7 @@ def _float64(given: Angles) -> Tensor:
     return torch.as_tensor(given, dtype=torch.float64)
 
 
-def _pose(matrix: npt.NDArray[np.float64]) -> Tensor:
+def _pose(matrix: Array) -> Tensor:
     """The pose (7,) of a transformation (4, 4)."""
     return poses.from_rotation_matrix(torch.from_numpy(matrix[:3, 3]), torch.from_numpy(matrix[:3, :3]))
 

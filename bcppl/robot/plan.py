@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from bcppl.arguments import number_within
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.robot.motion import Probe
 
-Array = npt.NDArray[np.float64]
 Manner = Literal["free", "guarded", "held", "searching"]
 MANNERS: tuple[Manner, ...] = ("free", "guarded", "held", "searching")
 

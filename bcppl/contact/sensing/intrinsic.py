@@ -19,18 +19,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import log_ndtr
 
+from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing.noise import WrenchNoise, checked_covariance
 from bcppl.contact.sensing.surface import PegSurface
 from bcppl.contact.sensing.surface_posterior import CORNER, EDGE, FACE, Candidates, Nodes, SurfacePosterior
 from bcppl.contact.sensing.units import refuse_millimetres
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 WIDTH = 3.2  # half width of the bundle, in standard deviations (of their bound along the line)
 ACROSS = 19  # lines across the bundle

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.poses import as_pose
-
-Array = npt.NDArray[np.float64]
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 FARTHEST_CENTER = 2.0  # m: a centre farther than this from the sensor comes from torques in N mm

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.signal import butter, sosfilt
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
+from bcppl.arrays import Array, Mask
 from bcppl.contact.array_record import ArrayRecord
 from bcppl.contact.sensing.load import ToolLoad
 from bcppl.contact.sensing.surface import PegSurface
@@ -26,8 +26,6 @@ from bcppl.contact.sensing.units import refuse_millimetres
 from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
 
 _BATCH = 4096  # lines whose distances to all edges are held at once
 
@@ -170,7 +168,7 @@ class ContactSensing:
         cleaned, state = self.clean(wrench, state)
         return self._located(cleaned), state
 
-    def _in_contact(self, cleaned: Array) -> npt.NDArray[np.bool_]:
+    def _in_contact(self, cleaned: Array) -> Mask:
         """Samples (...) of cleaned wrenches (..., 6) with the force of a contact."""
         with np.errstate(invalid="ignore"):
             return np.asarray(np.linalg.norm(cleaned[..., :3], axis=-1) >= self.threshold)

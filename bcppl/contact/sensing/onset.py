@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import gammaln, ive
 
 from bcppl.arguments import number_within, whole_number
+from bcppl.arrays import Array
 from bcppl.errors import InputError
-
-Array = npt.NDArray[np.float64]
 
 _FINE = 0.05  # of the time between samples: the grid of onset times
 _STEPS = {0.0: 0.2, 0.5: 0.05, 1.0: 0.05}  # prior of rise times to a constant force, in samples

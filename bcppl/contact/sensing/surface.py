@@ -13,10 +13,8 @@ from embreex.rtcore_scene import EmbreeScene
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from bcppl.arrays import Array, Indices, Mask
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 SHARP = np.radians(30.0)  # faces that meet at less than this form one smooth surface, edges one smooth curve
 STEP = 2e-5  # m past a crossing where the next ray begins: thinner walls are missed
@@ -134,7 +132,7 @@ class PegSurface:
         return Crossings(*(np.concatenate(column) for column in zip(*batches, strict=True)))
 
     @property
-    def _sharp(self) -> npt.NDArray[np.bool_]:
+    def _sharp(self) -> Mask:
         """Pairs of adjacent triangles that meet at a sharp convex edge."""
         return np.asarray((self.mesh.face_adjacency_angles >= SHARP) & self.mesh.face_adjacency_convex)
 

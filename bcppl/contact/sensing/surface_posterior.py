@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from bcppl.arguments import number_within, whole_number
+from bcppl.arrays import Array, Indices, Mask
 from bcppl.contact.array_record import ArrayRecord
 from bcppl.errors import InputError
-
-Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 FACE, EDGE, CORNER = 0, 1, 2
 
@@ -116,7 +113,7 @@ class SurfacePosterior:
         mass = np.bincount(self.nodes.row[above], self.mass[above], len(self))
         return np.asarray(mass, dtype=np.float64)
 
-    def region(self, level: float) -> npt.NDArray[np.bool_]:
+    def region(self, level: float) -> Mask:
         """Mask (Q,) of the nodes in the credible region: those of the highest likelihood with this mass.
 
         Raises:

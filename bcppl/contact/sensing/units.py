@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from bcppl.arrays import Array
 from bcppl.errors import InputError
-
-Array = npt.NDArray[np.float64]
 
 LONGEST_LEVER = 30.0  # in reaches of the peg; torques that need a longer one are in N mm
 
