@@ -16,8 +16,7 @@ from bcppl import (
 from bcppl.beliefs import Belief as Belief
 from bcppl.errors import InferenceError as InferenceError, InputError as InputError
 from bcppl.geometry.camera import Camera as Camera
-from bcppl.geometry.guess import Guess as Guess
-from bcppl.geometry.parts import Part as Part
+from bcppl.geometry.parts import Guess as Guess, Part as Part
 from bcppl.inference import Population as Population, infer as infer, smc as smc
 from bcppl.recordings import load as load, save as save
 from bcppl.sensors import (

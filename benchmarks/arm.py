@@ -24,7 +24,7 @@ from report import DATA, Row, finish, options, show
 from bcppl import poses
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.geometry.camera import Camera
-from bcppl.geometry.guess import Guess
+from bcppl.geometry.parts import Guess
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.summaries import mean
 from bcppl.models.arm_calibration import (

@@ -30,8 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
-from bcppl.rendering.choice import renderer_for
-from bcppl.rendering.rasterisation import Rasteriser
+from bcppl.rendering.rasterisation import Rasteriser, renderer_for
 from bcppl.rendering.ray_casting import RayCaster
 
 Array = npt.NDArray[np.float64]

@@ -71,7 +71,7 @@ def prepare(
 
     Args:
         recording: of depth images.
-        renderer: makes the renderer of the part, such as `bcppl.rendering.choice.renderer_for`.
+        renderer: makes the renderer of the part, such as `bcppl.rendering.rasterisation.renderer_for`.
         settings: fields of `Settings`.
 
     Raises:

@@ -16,8 +16,7 @@ from bcppl import poses
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
-from bcppl.geometry.guess import Guess
-from bcppl.geometry.parts import Part
+from bcppl.geometry.parts import Guess, Part
 from bcppl.inference.filters.tempered_smc import kernel
 from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.importance import importance_sampling, tempered_importance_sampling

@@ -16,8 +16,7 @@ from bcppl.errors import InputError
 from bcppl.models import grasped_peg, part_in_view, peg_in_hole
 from bcppl.models.worlds import grasped_peg as world
 from bcppl.recordings import Recording, View
-from bcppl.rendering.choice import renderer_for
-from bcppl.rendering.rasterisation import Rasteriser
+from bcppl.rendering.rasterisation import Rasteriser, renderer_for
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import Trace, extend, generate, simulate, update
 

@@ -21,7 +21,7 @@ from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError, NotANumberError
-from bcppl.geometry.guess import Guess
+from bcppl.geometry.parts import Guess
 from bcppl.inference.filters import tempered_smc
 from bcppl.inference.filters.guided_smc import guided, infer, kernel
 from bcppl.inference.filters.smc import Step, smc

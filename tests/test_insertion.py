@@ -25,7 +25,7 @@ from bcppl.inference.resampling import systematic
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, bench_part
 from bcppl.models.worlds.guarded_motion import command_of
-from bcppl.robot.insertion_plan import InsertionPlan
+from bcppl.robot.plan import InsertionPlan
 
 
 def believed(

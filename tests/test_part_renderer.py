@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
-from bcppl.rendering.choice import MOST_FACES, renderer_for
 from bcppl.rendering.part_renderer import PartRenderer
-from bcppl.rendering.rasterisation import Rasteriser
+from bcppl.rendering.rasterisation import MOST_FACES, Rasteriser, renderer_for
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.rendering.scene import SceneRenderer
 from tests.rendered_parts import (

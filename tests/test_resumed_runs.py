@@ -14,7 +14,7 @@ import torch
 
 from bcppl import poses
 from bcppl.beliefs import Belief
-from bcppl.geometry.guess import Guess
+from bcppl.geometry.parts import Guess
 from bcppl.inference.filters import bayes_contact, guided_smc, tempered_smc
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.metrology import three_two_one

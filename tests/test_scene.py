@@ -15,7 +15,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.parts import Part
 from bcppl.rendering import scene as module
-from bcppl.rendering.choice import renderer_for
+from bcppl.rendering.rasterisation import renderer_for
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.rendering.scene import SceneRenderer, background_part, scene_poses
 from tests.rendered_parts import part_of

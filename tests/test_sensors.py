@@ -20,7 +20,7 @@ from bcppl.errors import InputError
 from bcppl.figures import action_in_3d
 from bcppl.geometry.camera import looking_at
 from bcppl.geometry.extrusion import block
-from bcppl.geometry.guess import Guess
+from bcppl.geometry.parts import Guess
 from bcppl.inference.design.rules import by_linearised_gain
 from bcppl.inference.filters import guided_smc, tempered_smc
 from bcppl.inference.planning.candidate_layout import plan_candidates

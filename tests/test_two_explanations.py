@@ -18,8 +18,7 @@ from bcppl.contact.touch import Touch
 from bcppl.distributions.pose_normals import GaussianMixture, matched, widened, widened_mixture
 from bcppl.distributions.poses import UniformPose
 from bcppl.geometry.extrusion import box_peg
-from bcppl.geometry.guess import Guess
-from bcppl.geometry.parts import Part
+from bcppl.geometry.parts import Guess, Part
 from bcppl.inference.approximation import GaussianApproximation
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.laplace import Normal, QuadraticApproximation, quadratic_approximation

@@ -14,7 +14,7 @@ from bcppl import poses
 from bcppl.arguments import number_within, whole_number
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.geometry.distortion import LARGEST, distorted, undistorted_rays, unfolded
+from bcppl.geometry.distortion import LARGEST, Optics, distorted, undistorted_rays, unfolded
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class Camera:
         return any(k != 0.0 for k in self.distortion)
 
     @property
-    def optics(self) -> tuple[int, int, tuple[float, float, float, float], tuple[float, ...]]:
+    def optics(self) -> Optics:
         """Width, height, (fx, fy, cx, cy) and distortion: all that the rays depend on."""
         intrinsics = (float(self.fx), float(self.fy), float(self.cx), float(self.cy))
         return self.width, self.height, intrinsics, tuple(self.distortion)
@@ -89,26 +89,14 @@ class Camera:
     def _check_optics(self) -> None:
         for size, value in (("wide", self.width), ("high", self.height)):
             whole_number(f"camera {self.name!r} is {{}} pixels {size}", value)
-        for name in ("fx", "fy"):
-            number_within(
-                f"camera {self.name!r} has a focal length {name} {{}} pixels (flip mirrored images)",
-                getattr(self, name),
-                above=0.0,
-            )
-        for name in ("cx", "cy"):
-            number_within(
-                f"camera {self.name!r} has its principal point at {name} {{}} pixels", getattr(self, name)
-            )
+        for name, value in (("fx", self.fx), ("fy", self.fy)):
+            what = f"camera {self.name!r} has a focal length {name} {{}} pixels (flip mirrored images)"
+            number_within(what, value, above=0.0)
+        for name, value in (("cx", self.cx), ("cy", self.cy)):
+            number_within(f"camera {self.name!r} has its principal point at {name} {{}} pixels", value)
         near = number_within(f"camera {self.name!r} has a range from {{}} m", self.near, least=0.0)
-        try:
-            ordered = float(self.far) > near
-        except (TypeError, ValueError):
-            ordered = False
-        if not ordered:
-            raise InputError(
-                f"camera {self.name!r} has a range from {self.near} m to {self.far!r} m; give near below "
-                "far, in metres."
-            )
+        if self.far != np.inf:
+            number_within(f"camera {self.name!r} has a range from {near} m to {{}} m", self.far, above=near)
 
     @property
     def instrument(self) -> str:
@@ -123,7 +111,7 @@ class Camera:
                 pixel has no unique ray.
         """
         self._check_optics()
-        return undistorted_rays(*self.optics).copy()
+        return undistorted_rays(self.optics).copy()
 
     def project(self, points: npt.ArrayLike) -> Array:
         """Projections (..., 2) of points (..., 3) in the optical frame (metres): pixels, u then v.
@@ -149,19 +137,11 @@ class Camera:
         Raises:
             InputError: the region is not of whole pixels, is empty or extends beyond the image.
         """
-        left, top, width, height = (
-            whole_number(f"a region of camera {self.name!r} is given {side} {{}}", value, least=least)
-            for side, value, least in (
-                ("left", left, 0),
-                ("top", top, 0),
-                ("width", width, 1),
-                ("height", height, 1),
-            )
-        )
-        if left + width > self.width or top + height > self.height:
+        inside = 0 <= left < left + width <= self.width and 0 <= top < top + height <= self.height
+        if not inside or any(n != int(n) for n in (left, top, width, height)):
             raise InputError(
-                f"a region of {width}×{height} pixels from column {left}, row {top} does not lie within "
-                f"camera {self.name!r} of {self.width}×{self.height} pixels; give one that does."
+                f"a region of {width}×{height} pixels from column {left}, row {top} is empty or not within "
+                f"camera {self.name!r} of {self.width}×{self.height} pixels; give whole pixels in it."
             )
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
@@ -225,11 +205,9 @@ def bin_depth(
         far: upper end of the sensor's range, metres.
 
     Raises:
-        InputError: the image has no two dimensions, or no block fits into it.
+        InputError: no block fits into the image.
     """
     image = np.asarray(depth, dtype=np.float64)
-    if image.ndim != 2:
-        raise InputError(f"a depth image of shape {image.shape} cannot be binned; give one (H, W).")
     height, width = image.shape
     _check_block(k, width, height)
     rows, columns = height // k, width // k
@@ -249,11 +227,7 @@ def bin_depth(
 
 
 def _check_block(k: int, width: int, height: int) -> None:
-    if not (isinstance(k, int | np.integer) and 1 <= k <= min(width, height)):
-        raise InputError(
-            f"an image of {width}×{height} pixels cannot be binned by {k}; give a whole number from 1 to "
-            f"{min(width, height)}."
-        )
+    whole_number(f"an image of {width}×{height} pixels is binned by {{}}", k, most=min(width, height))
 
 
 def looking_at(eye: npt.ArrayLike, point: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> Array:

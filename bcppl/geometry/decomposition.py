@@ -26,6 +26,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.hausdorff import HausdorffError, bodies_of, hausdorff_error
 from bcppl.geometry.parts import Part, Piece
 
+FRACTION = 0.2  # of the clearance that the error may take in either direction
 THRESHOLDS = (0.05, 0.02, 0.01)  # CoACD's concavity, for a mesh scaled to a box of side 2
 # Of CoACD's tree search; with its defaults of 150 and 2000, twice the time for as many pieces of equal error.
 _SEARCH = {"mcts_iterations": 60, "resolution": 1000}
@@ -53,13 +54,12 @@ class Decomposition:
 def decomposed(
     part: Part,
     clearance: float,
-    fraction: float = 0.2,
     thresholds: Sequence[float] = THRESHOLDS,
     seed: int = 0,
     cache: str | Path | None = None,
     progress: bool | None = None,
 ) -> Decomposition:
-    """A convex decomposition of a part with a Hausdorff error of at most a fraction of a clearance.
+    """A convex decomposition of a part with a Hausdorff error of at most a fifth of a clearance.
 
     Bodies of the mesh that are convex are kept, even where they overlap. For the others, thresholds are tried
     in order until the error is small enough. On rounded concave surfaces the error is about the threshold
@@ -77,7 +77,6 @@ def decomposed(
     Args:
         part: with a closed mesh.
         clearance: of the fit that the part is used in, of the diameter, metres.
-        fraction: of the clearance, bounds the error in either direction.
         thresholds: CoACD's, from coarse to fine, 0.01 to 1; a single one is always tried.
         seed: of CoACD's tree search, and of the samples that measure the error.
         cache: the folder of results; None for `bcppl/decompositions` in the user's cache folder.
@@ -85,12 +84,11 @@ def decomposed(
 
     Raises:
         InputError: the mesh is empty, open, inside out or in millimetres; a number is out of range; CoACD is
-            not installed; or the finest pieces are coarser than the fraction of the clearance.
+            not installed; or the finest pieces are coarser than a fifth of the clearance.
     """
     part.check()
     task = f"part {part.name!r} is decomposed"
-    bound = number_within(f"{task} for clearance {{}} m", clearance, above=0.0)
-    bound *= number_within(f"{task} within fraction {{}} of the clearance", fraction, above=0.0)
+    bound = FRACTION * number_within(f"{task} for clearance {{}} m", clearance, above=0.0)
     levels = [
         number_within(f"{task} with threshold {{}}", level, least=_FINEST, most=1.0) for level in thresholds
     ]
@@ -113,14 +111,14 @@ def decomposed(
                 raise InputError(
                     f"part {part.name!r} at threshold {threshold:g} has an error of "
                     f"{1000 * error.largest:.2g} mm, and at {min(levels):g} would still have about "
-                    f"{1000 * expected:.2g} mm, more than {fraction:g} of its clearance of "
+                    f"{1000 * expected:.2g} mm, more than {FRACTION:g} of its clearance of "
                     f"{1000 * clearance:g} mm; extrude it from its exact outline, or try thresholds="
                     f"({min(levels):g},) all the same."
                 )
     best = min(results, key=lambda result: result.error.largest)
     raise InputError(
         f"part {part.name!r} in {len(best.part.pieces)} convex pieces gains {1000 * best.error.added:.2g} mm "
-        f"and loses up to {1000 * best.error.lost:.2g} mm, more than {fraction:g} of its clearance of "
+        f"and loses up to {1000 * best.error.lost:.2g} mm, more than {FRACTION:g} of its clearance of "
         f"{1000 * clearance:g} mm; extrude it from its exact outline, or give finer thresholds or more of it."
     )
 

@@ -14,6 +14,9 @@ import numpy as np
 from bcppl.arrays import Array, Mask
 from bcppl.errors import InputError
 
+# Width, height, (fx, fy, cx, cy) and k1 k2 p1 p2 (k3): all that the rays depend on.
+Optics = tuple[int, int, tuple[float, float, float, float], tuple[float, ...]]
+
 LARGEST = 1e3  # largest coordinate on the plane z = 1 that is imaged; sixth powers stay finite
 MOST_STEPS = 50  # of Newton's method
 EXACT = 1e-12  # residual on the plane z = 1
@@ -98,24 +101,13 @@ def undistorted(seen: Array, distortion: tuple[float, ...]) -> tuple[Array, Mask
 
 
 @lru_cache(maxsize=16)
-def undistorted_rays(
-    width: int,
-    height: int,
-    intrinsics: tuple[float, float, float, float],
-    distortion: tuple[float, ...],
-) -> Array:
+def undistorted_rays(optics: Optics) -> Array:
     """Directions (height * width, 3) of the pixels' rays, z = 1, cached.
-
-    Args:
-        width: of the image, pixels.
-        height: of the image, pixels.
-        intrinsics: fx, fy, cx, cy, pixels.
-        distortion: k1 k2 p1 p2 (k3).
 
     Raises:
         InputError: the number of coefficients is wrong, or they fold the image over.
     """
-    fx, fy, cx, cy = intrinsics
+    width, height, (fx, fy, cx, cy), distortion = optics
     plane, sound = undistorted((_pixels(width, height) - [cx, cy]) / [fx, fy], distortion)
     if not sound.all():
         first = int(np.argmin(sound))
@@ -131,18 +123,13 @@ def undistorted_rays(
 
 
 @lru_cache(maxsize=16)
-def pinhole_shifts(
-    width: int,
-    height: int,
-    intrinsics: tuple[float, float, float, float],
-    distortion: tuple[float, ...],
-) -> Array:
-    """Displacements (height, width, 2) from each pixel to its ray's projection without distortion, pixels.
+def pinhole_shifts(optics: Optics) -> Array:
+    """Displacements (height, width, 2), u then v, from pixels to their rays' projections without distortion.
 
-    u then v, with the arguments of `undistorted_rays`; a renderer bounds a part's outline by them.
+    In pixels; a renderer bounds a part's outline by them.
     """
-    fx, fy, cx, cy = intrinsics
-    rays = undistorted_rays(width, height, intrinsics, distortion)
+    width, height, (fx, fy, cx, cy), _ = optics
+    rays = undistorted_rays(optics)
     shifts = (rays[:, :2] * [fx, fy] + [cx, cy] - _pixels(width, height)).reshape(height, width, 2)
     shifts.setflags(write=False)
     return shifts

@@ -12,7 +12,6 @@ import shapely
 import trimesh
 from shapely.affinity import rotate, translate
 
-from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.geometry.cover import Cell, convex_cells, straightened
 from bcppl.geometry.outlines import check_outline, positive, rectangular_outline, round_outline
@@ -22,9 +21,7 @@ OVERLAP = 0.002  # m, the largest overlap of adjacent prisms
 BEVEL = 0.0001  # m below the end faces at which prisms overlap by that much; deeper than contacts penetrate
 
 
-def extruded(
-    name: str, outline: shapely.Polygon, bottom: float, top: float, source: str = "drawn by bcppl"
-) -> Part:
+def extruded(name: str, outline: shapely.Polygon, bottom: float, top: float) -> Part:
     """The solid extruded along z from an outline in the x-y plane, exact but for rounding.
 
     Its pieces are convex prisms whose union is the solid within 1e-9 m. Along the outline's own sides they
@@ -36,7 +33,6 @@ def extruded(
         outline: metres, with or without holes.
         bottom: z of the lower face, metres.
         top: z of the upper face, metres.
-        source: attribution and licence.
 
     Raises:
         InputError: the outline is empty, crosses itself, is in several pieces, or is probably in millimetres;
@@ -47,21 +43,14 @@ def extruded(
         raise InputError(
             f"part {name!r} would extend from z = {bottom:g} to {top:g} m; give a top above its bottom."
         )
-    return _solid(name, shapely.normalize(outline), convex_cells(outline, OVERLAP), bottom, top, source)
+    return _solid(name, shapely.normalize(outline), convex_cells(outline, OVERLAP), bottom, top)
 
 
-def _solid(
-    name: str,
-    outline: shapely.Polygon,
-    cells: list[Cell],
-    bottom: float,
-    top: float,
-    source: str = "drawn by bcppl",
-) -> Part:
+def _solid(name: str, outline: shapely.Polygon, cells: list[Cell], bottom: float, top: float) -> Part:
     mesh = trimesh.creation.extrude_polygon(outline, top - bottom)
     vertices = np.asarray(mesh.vertices, dtype=np.float64) + np.array([0.0, 0.0, bottom])
     pieces = [_prism(cell, bottom, top) for cell in cells]
-    part = Part(name, vertices, np.asarray(mesh.faces, dtype=np.int64), pieces, source)
+    part = Part(name, vertices, np.asarray(mesh.faces, dtype=np.int64), pieces, "drawn by bcppl")
     part.check()
     return part
 
@@ -116,8 +105,7 @@ def block_with_hole(
         name: the part's name.
 
     Raises:
-        InputError: the outline is not valid, a number is not finite, or the hole does not lie inside the
-            block.
+        InputError: the outline is not valid, or the hole does not lie inside the block.
     """
     return extruded(name, _pierced(hole, size, offset, turn, name), -size[2], 0.0)
 
@@ -155,8 +143,6 @@ def _pierced(
 ) -> shapely.Polygon:
     """The outline of a block with a hole in it."""
     check_outline(hole, f"hole of {name}")
-    for what, value in zip(("turn", "offset along x", "offset along y"), (turn, *offset), strict=True):
-        number_within(f"the hole of {name!r} has {what} {{}}", value)
     placed = translate(rotate(hole, turn, origin=(0.0, 0.0), use_radians=True), *offset)
     outer = rectangular_outline(size[0], size[1])
     if not outer.contains_properly(placed):
@@ -202,14 +188,9 @@ def round_peg(radius: float, length: float, sides: int = 64, name: str = "round 
 
 
 def cylinder_peg(diameter: float, length: float, name: str = "cylindrical peg") -> Part:
-    """A round peg that is an exact cylinder in contact; its frame is that of `box_peg`.
+    """A round peg, in metres, that is an exact cylinder in contact; its frame is that of `box_peg`.
 
     With the tip pressed flat on a plane its centre of pressure is less exact than that of `round_peg`.
-
-    Args:
-        diameter: metres.
-        length: from the sensor to the tip, metres.
-        name: the part's name.
     """
     drawn = extruded(name, round_outline(diameter), -length, 0.0)
     piece = Piece("cylinder", np.array([0.5 * diameter, 0.5 * length]), np.array([0.0, 0.0, -0.5 * length]))

@@ -17,8 +17,7 @@ from bcppl import poses
 from bcppl.arrays import Array, Indices, Mask
 from bcppl.compiled import compiled
 from bcppl.effort import Effort
-from bcppl.geometry.distance import SignedDistance
-from bcppl.geometry.distance_grid import DistanceGrid, distance_grid, interpolated, plane_gradient
+from bcppl.geometry.distance import DistanceGrid, SignedDistance, distance_grid, interpolated, plane_gradient
 from bcppl.geometry.hausdorff import planes_of, solid_of
 from bcppl.geometry.parts import Part
 from bcppl.geometry.sharp_edges import (

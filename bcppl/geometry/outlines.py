@@ -22,24 +22,13 @@ def round_outline(diameter: float, sides: int = SIDES) -> shapely.Polygon:
     """A circle as a regular polygon, as far outside the circle at its corners as inside at its sides.
 
     Either error is radius * tan(pi / (2 * sides))^2: with 64 sides 5 um at a diameter of 16 mm, 48 sides
-    9 um, 32 sides 19 um. A corner lies on the x axis.
-
-    Args:
-        diameter: metres.
-        sides: of the polygon.
+    9 um, 32 sides 19 um. The diameter is in metres, and a corner lies on the x axis.
 
     Raises:
-        InputError: the diameter is not positive or there are fewer than three sides.
+        InputError: the diameter is not positive.
     """
     positive("a round outline", diameter=diameter)
-    if sides < 3:
-        raise InputError(f"a round outline has {sides} sides; give at least three.")
     return shapely.Polygon(_arc(diameter, 0.0, 2.0 * math.pi, sides, closed=True))
-
-
-def roundness_error(diameter: float, sides: int = SIDES) -> float:
-    """The largest distance between `round_outline` and its circle, inwards and outwards, metres."""
-    return 0.5 * diameter * math.tan(math.pi / (2 * sides)) ** 2
 
 
 def rectangular_outline(width: float, breadth: float) -> shapely.Polygon:
@@ -55,13 +44,12 @@ def hexagonal_outline(across_flats: float) -> shapely.Polygon:
     return shapely.Polygon(across_flats / math.sqrt(3.0) * np.stack([np.cos(angles), np.sin(angles)], axis=1))
 
 
-def d_outline(diameter: float, flat: float, sides: int = SIDES) -> shapely.Polygon:
+def d_outline(diameter: float, flat: float) -> shapely.Polygon:
     """A circle with a flat, as of a shaft for a set screw.
 
     Args:
         diameter: of the circle, metres.
         flat: from the flat, which faces +x, to the opposite side of the circle, metres.
-        sides: of the polygon that a full circle would be.
 
     Raises:
         InputError: the flat does not cut the circle.
@@ -73,19 +61,16 @@ def d_outline(diameter: float, flat: float, sides: int = SIDES) -> shapely.Polyg
             "make it less than the diameter."
         )
     half = math.acos(2.0 * flat / diameter - 1.0)
-    return shapely.Polygon(_arc(diameter, half, 2.0 * math.pi - half, sides))
+    return shapely.Polygon(_arc(diameter, half, 2.0 * math.pi - half, SIDES))
 
 
-def keyed_outline(
-    diameter: float, key_width: float, key_height: float, sides: int = SIDES
-) -> shapely.Polygon:
+def keyed_outline(diameter: float, key_width: float, key_height: float) -> shapely.Polygon:
     """A circle with a key towards +x: a keyway in a hole, a feather on a peg.
 
     Args:
         diameter: of the circle, metres.
         key_width: along y, metres.
         key_height: from the circle's farthest point along x to the key's top, metres.
-        sides: of the polygon that a full circle would be.
 
     Raises:
         InputError: the key is as wide as the circle or wider.
@@ -97,7 +82,7 @@ def keyed_outline(
         )
     half = math.asin(key_width / diameter)
     top, side = 0.5 * diameter + key_height, 0.5 * key_width
-    arc = _arc(diameter, half, 2.0 * math.pi - half, sides)
+    arc = _arc(diameter, half, 2.0 * math.pi - half, SIDES)
     return shapely.Polygon(np.concatenate([arc, [[top, -side], [top, side]]]))
 
 

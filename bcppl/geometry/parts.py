@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bcppl import poses
+from bcppl.arguments import number_within
 from bcppl.arrays import Array, Indices
 from bcppl.errors import InputError
 
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
     import trimesh
 
 LARGEST_EXTENT = 5.0  # m: a larger mesh is in millimetres
+LARGEST_UNSCALED = 1.0  # m: the same of a mesh file without a stated scale
 
 
 @dataclass(frozen=True)
@@ -113,9 +117,7 @@ class Part:
         if not np.isfinite(self.vertices).all():
             raise InputError(f"part {self.name!r} has a vertex that is not finite; export its mesh again.")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
-            raise InputError(
-                f"part {self.name!r} has a face with an index of no vertex; export its mesh again."
-            )
+            raise InputError(f"part {self.name!r} has a face without vertices; export its mesh again.")
         if self.extent.max() > LARGEST_EXTENT:
             raise InputError(
                 f"part {self.name!r} is {self.extent.max():.0f} m long: its mesh is probably in millimetres; "
@@ -143,7 +145,6 @@ class Part:
 
     @cached_property
     def _open_edges(self) -> int:
-        """How many edges are not shared by exactly two faces."""
         low, high = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)).astype(np.int64).T
         _, shared = np.unique(low * len(self.vertices) + high, return_counts=True)
         return int((shared != 2).sum())
@@ -166,3 +167,75 @@ def _moved(piece: Piece, rotation: Array, shift: Array, name: str) -> Piece:
         return replace(piece, size=np.rint(steps) @ piece.size, center=center)
     signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
     return Piece("hull", (signs * piece.size + piece.center) @ rotation.T + shift)
+
+
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """A prior's support: poses of the part within bounds of a guessed pose.
+
+    Attributes:
+        world_from_part: (7,) the guessed pose, the centre of the prior.
+        translation: (3,) half widths of a box along the world's axes, metres; 0 fixes an axis.
+        tilt: largest angle between the part's z axis and its guess, radians; 0 fixes it.
+        yaw: largest rotation about the part's z axis, radians; 0 fixes it.
+        angle: if not None, the rotation is uniform within this angle (radians) of the guess, and
+            `tilt` and `yaw` are not used.
+    """
+
+    world_from_part: Array
+    translation: Array
+    tilt: float = 0.0
+    yaw: float = 0.0
+    angle: float | None = None
+
+
+def load_mesh(
+    path: str | Path, name: str | None = None, scale: float | None = None, source: str = ""
+) -> Part:
+    """A part from an OBJ, STL, PLY or other mesh file that trimesh reads, checked, without convex pieces.
+
+    Duplicate vertices, as of STL files and of seams of normals or textures, are merged: otherwise most closed
+    meshes look open. All bodies of a file become one part. A mesh that is inside out is inverted, with a
+    warning. A peg's frame must have its origin at the wrench sensor, above the tip: where the file has it
+    elsewhere, use `Part.moved`.
+
+    Args:
+        path: the file; its coordinates are the part's frame.
+        name: the part's name; None for the file's.
+        scale: metres per unit of the file: 0.001 for millimetres. None assumes metres, and refuses a part
+            longer than 1 m: a small part in millimetres would be a large one in metres.
+        source: attribution and licence.
+
+    Raises:
+        InputError: there is no such file, it holds no mesh, or the mesh is empty, open, or in millimetres.
+    """
+    factor = 1.0 if scale is None else number_within(f"mesh file {path} has scale {{}}", scale, above=0.0)
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"there is no mesh file {path}; give the path of an OBJ, STL or PLY file.")
+    import trimesh
+
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False)
+    except Exception as error:  # every format has its own reader with its own errors
+        raise InputError(
+            f"mesh file {path} cannot be read ({error}); export it again as OBJ or STL."
+        ) from error
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise InputError(f"mesh file {path} holds no triangles; export it again as OBJ or STL.")
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh.remove_unreferenced_vertices()
+    if len(mesh.faces) and mesh.is_watertight and mesh.volume < 0:
+        mesh.invert()
+        warnings.warn(
+            f"mesh file {path} is inside out; its faces are inverted.", RuntimeWarning, stacklevel=2
+        )
+    vertices = factor * np.asarray(mesh.vertices, dtype=np.float64)
+    part = Part(name or path.stem, vertices, np.asarray(mesh.faces, dtype=np.int64), (), source)
+    part.check()
+    if scale is None and part.extent.max() > LARGEST_UNSCALED:
+        raise InputError(
+            f"mesh file {path} is {part.extent.max():.3g} m long if it is in metres; give scale=0.001 if it "
+            "is in millimetres, scale=1.0 if the part is so large."
+        )
+    return part

@@ -1,6 +1,6 @@
 """Measurements on disk: the native file, its checks, and the importers."""
 
-from bcppl.geometry.guess import Guess
+from bcppl.geometry.parts import Guess
 from bcppl.recordings.check import notes, problems, validate
 from bcppl.recordings.describe import describe
 from bcppl.recordings.file import load, save

@@ -8,8 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bcppl.errors import InputError
-from bcppl.geometry.guess import Guess
-from bcppl.geometry.parts import LARGEST_EXTENT
+from bcppl.geometry.parts import LARGEST_EXTENT, Guess
 from bcppl.sensors import checks
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.protocol import by_sensor, sensor_for, sensors

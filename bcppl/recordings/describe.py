@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from bcppl.geometry.guess import Guess
-from bcppl.geometry.parts import Part
+from bcppl.geometry.parts import Guess, Part
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.protocol import by_sensor
 

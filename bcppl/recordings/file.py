@@ -31,8 +31,7 @@ import h5py
 import numpy as np
 
 from bcppl.errors import InputError
-from bcppl.geometry.guess import Guess
-from bcppl.geometry.parts import Part, Piece
+from bcppl.geometry.parts import Guess, Part, Piece
 from bcppl.sensors.layout import POSE_UNITS, TEXT, Layout, SharedObjects, link, number, numbers
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.protocol import sensor_named, sensor_of

@@ -153,7 +153,7 @@ class RayCaster(PartRenderer):
         )
         origin = -np.einsum("nji,nj->ni", turned, offset.take(spans.particle, axis=0))
         if camera.is_distorted:
-            rays = undistorted_rays(*camera.optics).take(first_pixel.take(span) + along, axis=0)
+            rays = undistorted_rays(camera.optics).take(first_pixel.take(span) + along, axis=0)
             directions = np.einsum("mji,mj->mi", turned.take(span, axis=0), rays).astype(np.float32)
         else:
             # These gathers are most of the time outside Embree; `take` is four times as fast as brackets.
@@ -181,7 +181,7 @@ def _distortion_shift(camera: Camera, across: float, down: float) -> tuple[Array
     """The least and the largest shift (H,) of across * u + down * v by distortion in each row, pixels."""
     if not camera.is_distorted:
         return 0.0, 0.0
-    shifts = pinhole_shifts(*camera.optics)
+    shifts = pinhole_shifts(camera.optics)
     moved = across * shifts[..., 0] + down * shifts[..., 1]
     return moved.min(axis=1), moved.max(axis=1)
 

@@ -47,7 +47,7 @@ class SceneRenderer:
         Args:
             parts: the parts, for example `[part, *robot.parts]`.
             renderer: makes the renderer of one part: `RayCaster` has the shortest first call;
-                `bcppl.rendering.choice.renderer_for` rasterises meshes that are not too fine.
+                `bcppl.rendering.rasterisation.renderer_for` rasterises meshes that are not too fine.
 
         Raises:
             InputError: there is no part, or the mesh of one is empty or not finite.

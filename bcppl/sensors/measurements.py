@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bcppl.geometry.guess import Guess
-from bcppl.geometry.parts import Part
+from bcppl.geometry.parts import Guess, Part
 from bcppl.sensors.protocol import sensor_of
 
 Array = npt.NDArray[np.float64]

@@ -28,8 +28,7 @@ from bcppl.inference.planning.touching import (
     surface_points,
     touch,
 )
-from bcppl.robot.insertion_plan import InsertionPlan
-from bcppl.robot.plan import Plan
+from bcppl.robot.plan import InsertionPlan, Plan
 from bcppl.sensors import sensor_named, sensors
 from bcppl.sensors.candidates import Candidate
 from bcppl.sensors.protocol import AroundPart

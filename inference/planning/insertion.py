@@ -21,8 +21,7 @@ from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.geometry.holes import Hole, fit_in, hole_of
 from bcppl.geometry.parts import Part
-from bcppl.robot.insertion_plan import InsertionPlan
-from bcppl.robot.plan import Manner, Plan
+from bcppl.robot.plan import InsertionPlan, Manner, Plan
 
 Array = npt.NDArray[np.float64]
 

@@ -18,8 +18,7 @@ from bcppl.geometry.holes import Hole, depth_reached, hole_of, lateral_error
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.waypoints import tip_of
 from bcppl.inference.resampling import systematic
-from bcppl.robot.insertion_plan import InsertionPlan
-from bcppl.robot.plan import Plan, probe_of
+from bcppl.robot.plan import InsertionPlan, Plan, probe_of
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

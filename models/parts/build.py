@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from bcppl.geometry.layers import prismatic
-from bcppl.geometry.meshes import load_mesh
+from bcppl.geometry.parts import load_mesh
 from bcppl.models.parts import SHAPES
 
 SOURCE = (

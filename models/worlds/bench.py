@@ -21,8 +21,7 @@ from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.extrusion import block
-from bcppl.geometry.guess import Guess
-from bcppl.geometry.parts import Part
+from bcppl.geometry.parts import Guess, Part
 from bcppl.models.worlds.bench_parts import PARTS, BenchPart, bench_part
 from bcppl.models.worlds.bench_sensors import SensorErrors
 from bcppl.models.worlds.guarded_motion import Execution, execute, stamps_of
@@ -31,8 +30,7 @@ from bcppl.models.worlds.occlusion import occluder
 from bcppl.models.worlds.simulated_sensors import ProbeErrors, depth_image, draw_pose, per_axis, windows
 from bcppl.rendering.depth_noise import DepthNoise
 from bcppl.rendering.scene import SceneRenderer
-from bcppl.robot.insertion_plan import InsertionPlan
-from bcppl.robot.plan import Plan
+from bcppl.robot.plan import InsertionPlan, Plan
 from bcppl.sensors import DepthImage, Measurement, Recording, View
 
 Array = npt.NDArray[np.float64]

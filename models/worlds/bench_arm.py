@@ -13,7 +13,7 @@ from bcppl.geometry.camera import Camera
 from bcppl.models.worlds.bench import BenchScene
 from bcppl.models.worlds.inserting import InsertionResult
 from bcppl.models.worlds.simulated_sensors import depth_image, per_axis
-from bcppl.robot.insertion_plan import InsertionPlan
+from bcppl.robot.plan import InsertionPlan
 from bcppl.sensors import DepthImage, Measurement
 from bcppl.sensors.candidates import Candidate, motion_of
 

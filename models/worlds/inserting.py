@@ -12,7 +12,7 @@ from bcppl import poses
 from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.geometry.parts import Part
 from bcppl.models.worlds.guarded_motion import TARE, execute, stamps_of
-from bcppl.robot.insertion_plan import InsertionPlan
+from bcppl.robot.plan import InsertionPlan
 
 Array = npt.NDArray[np.float64]
 

@@ -20,8 +20,7 @@ from bcppl.contact.physics import PegPhysics
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg
-from bcppl.geometry.guess import Guess
-from bcppl.geometry.parts import Part
+from bcppl.geometry.parts import Guess, Part
 from bcppl.models.worlds.simulated_sensors import (
     ProbeErrors,
     depth_image,

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
-from bcppl.geometry.guess import Guess
-from bcppl.geometry.parts import Part
+from bcppl.geometry.parts import Guess, Part
 from bcppl.models.point_probe import point_probe, prepare
 from bcppl.poses import identity, rotation_matrix, transform
 from bcppl.recordings.importers.point_probe import prism

@@ -15,7 +15,7 @@ import torch
 from bcppl import poses
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.extrusion import block_with_square_hole
-from bcppl.geometry.guess import Guess
+from bcppl.geometry.parts import Guess
 from bcppl.models.worlds.peg_in_hole import GUESS, cameras, table
 from bcppl.models.worlds.simulated_sensors import depth_image, draw_pose, perturbed
 from bcppl.rendering.depth_noise import DepthNoise

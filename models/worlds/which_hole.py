@@ -19,8 +19,7 @@ from bcppl.contact.physics import PegPhysics
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.extrusion import box_peg
-from bcppl.geometry.guess import Guess
-from bcppl.geometry.parts import Part, Piece
+from bcppl.geometry.parts import Guess, Part, Piece
 from bcppl.models.which_hole import HOLES, PITCH
 from bcppl.models.worlds import peg_in_hole as bench
 from bcppl.models.worlds.simulated_sensors import depth_image, draw_pose, measured_windows, perturbed

@@ -22,10 +22,10 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from bcppl.arrays import Array, Indices
+from bcppl.contact.sensing.load import refuse_millimetres
 from bcppl.contact.sensing.noise import WrenchNoise, checked_covariance
 from bcppl.contact.sensing.surface import PegSurface
 from bcppl.contact.sensing.surface_posterior import CORNER, EDGE, FACE, Candidates, Nodes, SurfacePosterior
-from bcppl.contact.sensing.units import refuse_millimetres
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 

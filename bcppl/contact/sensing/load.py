@@ -13,6 +13,7 @@ from bcppl.poses import as_pose
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 FARTHEST_CENTER = 2.0  # m: a centre farther than this from the sensor comes from torques in N mm
+LONGEST_LEVER = 30.0  # in reaches of the peg; torques that need a longer one are in N mm
 TURNED = 0.05  # lower bound of the second singular value of gravity's directions, over gravity
 
 
@@ -201,3 +202,24 @@ def _check_gravity(gravity: tuple[float, float, float]) -> None:
     size = float(np.linalg.norm(gravity))
     if np.shape(gravity) != (3,) or not 0 < size < np.inf:
         raise InputError(f"gravity is {gravity!r}; give three m/s^2 in the world, (0, 0, -9.80665), say.")
+
+
+def refuse_millimetres(wrench: Array, reach: float) -> None:
+    """Refuse tared wrenches (M, 6) in contact whose torques are in N mm, unless they are fewer than three.
+
+    Args:
+        wrench: (M, 6) force and torque.
+        reach: the distance of the peg's farthest point from their origin, metres.
+
+    Raises:
+        InputError: the torques are too large to be in N m.
+    """
+    if len(wrench) < 3:
+        return
+    force, torque = np.linalg.norm(wrench[:, :3], axis=1), np.linalg.norm(wrench[:, 3:], axis=1)
+    lever = float(np.median(torque / force))
+    if lever > LONGEST_LEVER * reach:
+        raise InputError(
+            f"the wrenches act {lever:.3g} m from the origin of a peg that ends {reach:.3g} m from it: "
+            "their torques are probably in N mm; scale them by 0.001."
+        )

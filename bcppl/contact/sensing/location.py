@@ -20,9 +20,8 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.arrays import Array, Mask
 from bcppl.contact.array_record import ArrayRecord
-from bcppl.contact.sensing.load import ToolLoad
+from bcppl.contact.sensing.load import ToolLoad, refuse_millimetres
 from bcppl.contact.sensing.surface import PegSurface
-from bcppl.contact.sensing.units import refuse_millimetres
 from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part

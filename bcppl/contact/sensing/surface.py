@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from bcppl.arrays import Array, Indices, Mask
+from bcppl.geometry.distance import closed_mesh
 from bcppl.geometry.parts import Part
 
 SHARP = np.radians(30.0)  # faces that meet at less than this form one smooth surface, edges one smooth curve
@@ -51,16 +51,6 @@ class Edges(NamedTuple):
     chain: Indices
 
 
-def _closed_mesh(part: Part) -> trimesh.Trimesh:
-    """A part's mesh, its duplicate vertices merged and its degenerate triangles left out."""
-    mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
-    if len(part.vertices) and len(part.faces):
-        mesh.merge_vertices(merge_tex=True, merge_norm=True)
-        mesh.update_faces(mesh.nondegenerate_faces())
-    Part(part.name, np.asarray(mesh.vertices), np.asarray(mesh.faces)).check()
-    return mesh
-
-
 class PegSurface:
     """The surface of a part, in its frame.
 
@@ -77,7 +67,7 @@ class PegSurface:
     """
 
     def __init__(self, part: Part) -> None:
-        self.mesh = mesh = _closed_mesh(part)
+        self.mesh = mesh = closed_mesh(part)
         vertices = np.asarray(mesh.vertices, dtype=np.float64)
         self.center = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         self.radius = float(np.linalg.norm(vertices - self.center, axis=1).max())

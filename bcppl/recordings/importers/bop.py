@@ -22,8 +22,7 @@ from scipy.optimize import brentq
 from bcppl.arguments import LARGEST_SEED
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
-from bcppl.geometry.guess import Guess
-from bcppl.geometry.parts import Part
+from bcppl.geometry.parts import Guess, Part
 from bcppl.poses import from_rotation_matrix, identity, retract
 from bcppl.sensors import DepthImage, Measurement, Recording, View
 

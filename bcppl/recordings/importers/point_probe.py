@@ -21,8 +21,7 @@ from torch import Tensor
 from bcppl.arguments import LARGEST_SEED
 from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
-from bcppl.geometry.guess import Guess
-from bcppl.geometry.parts import Part, Piece
+from bcppl.geometry.parts import Guess, Part, Piece
 from bcppl.poses import as_pose, compose, identity, inverse, rotation_matrix
 from bcppl.sensors import Measurement, Push, Recording
 
