@@ -1,4 +1,10 @@
-"""Types of numpy arrays."""
+"""Types of numpy arrays, and dataclasses of arrays that share their first axis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -7,3 +13,40 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Numbers = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
+Rows = Indices | Mask | slice
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayRecord:
+    """Arrays indexed, merged and joined as one; a field is an array, a mapping of them, a record or None."""
+
+    def __getitem__(self, rows: Rows) -> Self:
+        """Some rows of every field."""
+        return self._mapped(lambda value: value[rows])
+
+    def put(self, rows: Rows, other: Self) -> Self:
+        """A copy in which some rows are another record's."""
+        return self._mapped(lambda mine, theirs: _put(mine, rows, theirs), other)
+
+    @classmethod
+    def joined(cls, records: Sequence[Self]) -> Self:
+        """The rows of several records, in their order."""
+        return records[0]._mapped(lambda *each: np.concatenate(each), *records[1:])
+
+    def _mapped(self, function: Any, *others: Self) -> Self:
+        values: dict[str, Any] = {}
+        for name in (field.name for field in fields(self)):
+            each = [getattr(record, name) for record in (self, *others)]
+            if isinstance(each[0], Mapping):
+                values[name] = {key: function(*(value[key] for value in each)) for key in each[0]}
+            else:
+                values[name] = None if each[0] is None else function(*each)
+        return type(self)(**values)
+
+
+def _put(mine: Any, rows: Rows, theirs: Any) -> Any:
+    if isinstance(mine, ArrayRecord):
+        return mine.put(rows, theirs)
+    copy = mine.copy()
+    copy[rows] = theirs
+    return copy

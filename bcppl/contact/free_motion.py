@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bcppl.arrays import Array, Indices, Mask
-from bcppl.contact.array_record import Rows
+from bcppl.arrays import Array, Indices, Mask, Rows
 from bcppl.contact.stepping import SimulationState, Stepper
 from bcppl.geometry.parts import Part
 

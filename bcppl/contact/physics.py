@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bcppl.arrays import Array, Indices, Mask
-from bcppl.contact.array_record import ArrayRecord
+from bcppl.arrays import Array, ArrayRecord, Indices, Mask
 from bcppl.contact.free_motion import FreeMotion, first_possible_contact, simulate_free_motion
 from bcppl.contact.grasp_compliance import springs_in_series
 from bcppl.contact.mujoco_model import SENSOR_COLUMNS, ContactParameters, build_model, check_probe

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.arrays import Array
-from bcppl.contact.array_record import ArrayRecord
+from bcppl.arrays import Array, ArrayRecord
 from bcppl.contact.nuisances import Nuisances
 from bcppl.contact.physics import PegPhysics, Rollout, Selection, rows_of
 from bcppl.contact.sensing.location import ContactSensing, SensingState

@@ -11,8 +11,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-from bcppl.arrays import Array, Mask
-from bcppl.contact.array_record import ArrayRecord
+from bcppl.arrays import Array, ArrayRecord, Mask
 from bcppl.contact.grasp_compliance import readings_at_grip
 from bcppl.contact.mujoco_model import SENSOR_COLUMNS, rollout_controls, set_controller, steps_around
 from bcppl.contact.particle_models import ParticleModels

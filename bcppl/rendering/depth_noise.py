@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
+from bcppl.arguments import number_within
 from bcppl.arrays import Array, Mask
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
@@ -54,16 +55,10 @@ class DepthNoise:
 
     def __post_init__(self) -> None:
         for name in (f.name for f in fields(self) if f.name != "gaussian"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise InputError(f"the depth noise has {name} {value}; give a number of at least 0.")
-            if name in ("dropout", "flying", "edge_dropout") and value > 1.0:
-                raise InputError(f"the depth noise has {name} {value}; give a probability, from 0 to 1.")
-        if not self.grazing_from < self.grazing_to <= math.pi:
-            raise InputError(
-                f"the depth noise loses pixels from {self.grazing_from} to {self.grazing_to} rad; "
-                "give the smaller angle first, in radians."
-            )
+            most = 1.0 if name in ("dropout", "flying", "edge_dropout") else math.inf
+            number_within(f"the depth noise has {name} {{}}", getattr(self, name), least=0.0, most=most)
+        grazing = "the depth noise loses pixels at angles up to grazing_to {} radians"
+        number_within(grazing, self.grazing_to, above=self.grazing_from, most=math.pi)
 
     def sample(self, camera: Camera, depth: npt.ArrayLike, seed: int | np.random.Generator) -> Array:
         """A noisy depth image.
@@ -151,33 +146,20 @@ def _discontinuities(depth: Array, edge: float) -> tuple[Array, Mask]:
     widest = np.zeros(depth.shape)
     beside = np.zeros(depth.shape, dtype=bool)
     for axis in (-1, -2):
-        # Four in a row: o, a | b, p, the discontinuity between a and b.
-        a, b = depth[_slot(depth.ndim, axis, True)], depth[_slot(depth.ndim, axis, False)]
-        o, p = _outer(depth, axis)
+        along, far, size, rim = (np.moveaxis(x, axis, -1) for x in (depth, across, widest, beside))
+        # Four in a row: o, a | b, p, the discontinuity between a and b; at a border o is a, or p is b.
+        padded = np.concatenate([along[..., :1], along, along[..., -1:]], axis=-1)
+        o, a, b, p = padded[..., :-3], padded[..., 1:-2], padded[..., 2:-1], padded[..., 3:]
         gap = np.abs(b - a)
         slant = np.fmax(np.nan_to_num(np.abs(a - o)), np.nan_to_num(np.abs(p - b)))
         step = (gap > edge) & (gap > 2.0 * slant)
-        rim = np.isnan(a) ^ np.isnan(b)
-        for here, there, first in ((a, b, True), (b, a, False)):
-            place = _slot(depth.ndim, axis, first)
-            wider = step & (gap > widest[place])
-            across[place] = np.where(wider, there, across[place])
-            widest[place] = np.where(wider, gap, widest[place])
-            beside[place] |= (step | rim) & np.isfinite(here)
+        marked = step | (np.isnan(a) ^ np.isnan(b))
+        for here, there, place in ((a, b, np.s_[..., :-1]), (b, a, np.s_[..., 1:])):
+            wider = step & (gap > size[place])
+            far[place] = np.where(wider, there, far[place])
+            size[place] = np.where(wider, gap, size[place])
+            rim[place] |= marked & np.isfinite(here)
     return across, beside
-
-
-def _slot(dimensions: int, axis: int, first: bool) -> tuple[slice, ...]:
-    place = [slice(None)] * dimensions
-    place[axis] = slice(None, -1) if first else slice(1, None)
-    return tuple(place)
-
-
-def _outer(depth: Array, axis: int) -> tuple[Array, Array]:
-    """The neighbours beyond each pair of neighbours, the pair's own depth repeated at the border."""
-    moved = np.moveaxis(depth, axis, -1)
-    padded = np.concatenate([moved[..., :1], moved, moved[..., -1:]], axis=-1)
-    return np.moveaxis(padded[..., :-3], -1, axis), np.moveaxis(padded[..., 3:], -1, axis)
 
 
 def _incidence(camera: Camera, depth: Array) -> Array:
@@ -197,13 +179,11 @@ def _incidence(camera: Camera, depth: Array) -> Array:
 
 def _tangent(points: Array, depth: Array, axis: int) -> Array:
     """Tangents (..., H, W, 3) along an image axis, on the side on which the depth changes less."""
-    step = np.full(points.shape, np.nan)
-    change = np.full(depth.shape, np.inf)
-    forward = np.diff(points, axis=axis - 1)
-    size = np.abs(np.diff(depth, axis=axis))
-    for first in (True, False):
-        place = _slot(depth.ndim, axis, first)
-        better = size < change[place]
-        step[place] = np.where(better[..., None], forward, step[place])
-        change[place] = np.where(better, size, change[place])
-    return step
+    points, depth = np.moveaxis(points, axis - 1, -2), np.moveaxis(depth, axis, -1)
+    tangent, change = np.full(points.shape, np.nan), np.full(depth.shape, np.inf)
+    forward, size = np.diff(points, axis=-2), np.abs(np.diff(depth, axis=-1))
+    for side in (slice(-1), slice(1, None)):
+        better = size < change[..., side]
+        tangent[..., side, :] = np.where(better[..., None], forward, tangent[..., side, :])
+        change[..., side] = np.where(better, size, change[..., side])
+    return np.moveaxis(tangent, -2, axis - 1)

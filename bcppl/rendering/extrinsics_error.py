@@ -21,12 +21,8 @@ def _nominal(camera: Camera) -> tuple[Tensor, Tensor]:
 def line_of_sight(camera: Camera, part: Tensor) -> Tensor:
     """Displacements (..., 3), in the world, of the apparent positions of parts for each metre of range bias.
 
-    Args:
-        camera: with its nominal extrinsics.
-        part: (..., 7) world_from_part.
-
-    Returns:
-        Directions along the lines of sight, one metre long along the optical axis.
+    They are along the lines of sight to parts at `world_from_part` (..., 7), and one metre along the optical
+    axis.
     """
     origin, forward = _nominal(camera)
     away = part[..., :3] - origin
@@ -41,12 +37,9 @@ def apparent_covariance(camera: Camera, part: Tensor, shift: float, turn: float)
 
     Args:
         camera: with its nominal extrinsics.
-        part: (..., 7) world_from_part.
+        part: (..., 7) world_from_part, in whose tangent space the covariance is: m^2, m rad, rad^2.
         shift: standard deviation of the error along each of the camera's axes, metres.
         turn: standard deviation of the error about each of them, radians.
-
-    Returns:
-        Covariances in the tangent space at the part's pose: m^2, m rad, rad^2.
     """
     away = part[..., :3] - _nominal(camera)[0]
     unit = torch.eye(3, dtype=torch.float64).expand(*away.shape, 3)
@@ -65,7 +58,7 @@ def apparent_pose(first: Camera, second: Camera, part: Tensor, apparent: Tensor)
     Args:
         first: the instrument at the first viewpoint, with its nominal extrinsics.
         second: the same instrument at the second viewpoint.
-        part: (..., 7) the part's true pose, world_from_part.
+        part: (..., 7) the part's true pose in the world.
         apparent: (..., 7) its apparent pose from the first viewpoint.
     """
     there, here = (torch.as_tensor(c.world_from_camera, dtype=torch.float64) for c in (second, first))

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.arrays import Array, Indices, Mask
+from bcppl.arrays import Array, ArrayRecord, Indices, Mask
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
@@ -20,7 +18,7 @@ from bcppl.geometry.parts import Part
 
 
 @dataclass(frozen=True, eq=False)
-class Hits:
+class Hits(ArrayRecord):
     """The pixels that see a part, for all particles, ordered by particle and then by pixel.
 
     Attributes:
@@ -35,15 +33,6 @@ class Hits:
     depth: Array
     face: Indices | None = None
 
-    @classmethod
-    def joined(cls, batches: Sequence[Self]) -> Self:
-        """The hits of several batches of particles, in their order."""
-        columns: dict[str, Any] = {}
-        for name in cls.__dataclass_fields__:
-            column = [getattr(batch, name) for batch in batches]
-            columns[name] = None if column[0] is None else np.concatenate(column)
-        return cls(**columns)
-
     def images(self, camera: Camera, particles: int) -> Array:
         """Depth images (N, H, W) in metres, +inf where a pixel has no hit."""
         image = np.full((particles, camera.height * camera.width), np.inf)
@@ -55,19 +44,14 @@ class PartRenderer(ABC):
     """Renders the depth of one part at many poses.
 
     Attributes:
-        part: the part.
+        part: the part; its mesh may be open.
         effort: images rendered, rays cast (or fragments tested) and seconds spent so far.
+
+    Raises:
+        InputError: the mesh is empty or not finite.
     """
 
     def __init__(self, part: Part) -> None:
-        """Check the part.
-
-        Args:
-            part: the part; its mesh may be open.
-
-        Raises:
-            InputError: the mesh is empty or not finite.
-        """
         part.check(closed=False)
         self.part = part
         self.effort = Effort()

@@ -36,19 +36,11 @@ class Rasteriser(PartRenderer):
     """Renders the depth of one part by rasterisation, through a distorting lens by ray casting.
 
     Attributes:
-        threads: how many threads share the particles; the result does not depend on it.
+        threads: how many threads share the particles, without an effect on the result; None for one on each
+            core, or the number in OMP_NUM_THREADS.
     """
 
     def __init__(self, part: Part, threads: int | None = None) -> None:
-        """Prepare the mesh.
-
-        Args:
-            part: the part; its mesh may be open.
-            threads: None for one on each core, or the number in OMP_NUM_THREADS.
-
-        Raises:
-            InputError: the mesh is empty or not finite.
-        """
         super().__init__(part)
         self.threads = thread_count() if threads is None else threads
         # Vertices that are doubled at seams are merged: fewer to project, and a closed mesh tests as closed.

@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.arrays import Array, Indices, Mask
+from bcppl.arrays import Array, ArrayRecord, Indices, Mask
 from bcppl.effort import Effort
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.distortion import pinhole_shifts, undistorted_rays
@@ -30,7 +30,7 @@ MISS = 1e30  # m: Embree returns 1e37 for a ray without a hit
 
 
 @dataclass(frozen=True, eq=False)
-class _Spans:
+class _Spans(ArrayRecord):
     """Runs of pixels that may see the part: at most one for each particle and image row.
 
     Attributes:
@@ -44,21 +44,16 @@ class _Spans:
     first: Indices
     length: Indices
 
-    def __getitem__(self, rows: slice) -> _Spans:
-        return _Spans(self.particle[rows], self.row[rows], self.first[rows], self.length[rows])
-
 
 class RayCaster(PartRenderer):
-    """Renders the depth of one part by ray casting.
+    """Renders the depth of one part by ray casting, through any lens.
 
-    Its time is proportional to the number of pixels and hardly depends on the number of faces. Any lens will
-    do.
+    Its time is proportional to the number of pixels and hardly depends on the number of faces.
     """
 
     __caches__ = ("_scene",)  # of the part's mesh
 
     def __init__(self, part: Part) -> None:
-        """Build the bounding volume hierarchy; see `PartRenderer`."""
         super().__init__(part)
         vertices = np.asarray(part.vertices, dtype=np.float64)
         lowest, highest = vertices.min(axis=0), vertices.max(axis=0)

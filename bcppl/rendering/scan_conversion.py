@@ -235,11 +235,11 @@ def cull_faces(mesh: PosedMesh, cull: bool, work: Workspace) -> int:
         flags[n] = ((row[i] != row[j]) | (row[i] != row[k])) & (
             (column[i] != column[j]) | (column[i] != column[k])
         )
-    found = 0
+    covering = 0
     for n in range(len(first)):
-        chosen[found] = n
-        found += flags[n]
-    for m in range(found):
+        chosen[covering] = n
+        covering += flags[n]
+    for m in range(covering):
         n = chosen[m]
         i, j, k = first[n], second[n], third[n]
         top, bottom = min(row[i], row[j], row[k]), max(row[i], row[j], row[k])
@@ -257,7 +257,7 @@ def cull_faces(mesh: PosedMesh, cull: bool, work: Workspace) -> int:
         )
         flags[m] = (not outside) & ((not cull) | (front * area > 0.0))
     kept = 0
-    for m in range(found):
+    for m in range(covering):
         n = chosen[m]
         chosen[kept] = n
         kept += flags[m]
@@ -318,10 +318,8 @@ def rasterise_clipped(
         for m in range(3):
             vertex = mesh.vertices[:, mesh.faces[m, n]]
             for axis in range(3):
-                turn = rotation[axis]
-                point[m, axis] = (
-                    turn[0] * vertex[0] + turn[1] * vertex[1] + turn[2] * vertex[2] + offset[axis]
-                )
+                r = rotation[axis]
+                point[m, axis] = r[0] * vertex[0] + r[1] * vertex[1] + r[2] * vertex[2] + offset[axis]
             ahead += point[m, 2] > near
         if ahead == 0:
             continue
@@ -336,16 +334,12 @@ def rasterise_clipped(
         if ahead == 3:
             fragments += fill_triangle(a + b + c, n, grid, region, buffer, face_buffer)
         elif ahead == 1:
-            b, c = (
-                clip_edge(point[odd], point[left], lens, near),
-                clip_edge(point[odd], point[right], lens, near),
-            )
+            b = clip_edge(point[odd], point[left], lens, near)
+            c = clip_edge(point[odd], point[right], lens, near)
             fragments += fill_triangle(a + b + c, n, grid, region, buffer, face_buffer)
         else:
-            a, d = (
-                clip_edge(point[left], point[odd], lens, near),
-                clip_edge(point[right], point[odd], lens, near),
-            )
+            a = clip_edge(point[left], point[odd], lens, near)
+            d = clip_edge(point[right], point[odd], lens, near)
             fragments += fill_triangle(a + b + c, n, grid, region, buffer, face_buffer)
             fragments += fill_triangle(a + d + c, n, grid, region, buffer, face_buffer)
     return fragments

@@ -50,10 +50,8 @@ class SceneRenderer:
                 `bcppl.rendering.rasterisation.renderer_for` rasterises meshes that are not too fine.
 
         Raises:
-            InputError: there is no part, or the mesh of one is empty or not finite.
+            InputError: the mesh of a part is empty or not finite.
         """
-        if not parts:
-            raise InputError("a scene has no parts; give at least one, or no renderer at all.")
         self.parts = tuple(parts)
         self.effort = Effort()
         built = {key: renderer(part) for key, part in {id(part): part for part in self.parts}.items()}
@@ -101,15 +99,11 @@ class SceneRenderer:
         This is the `background` of the depth likelihoods.
 
         Raises:
-            InputError: as `hits`, or there are poses of several scenes.
+            InputError: as `hits`.
+            ValueError: there are poses of several scenes.
         """
-        image = self.images(camera, world_from_parts)
-        if len(image) != 1:
-            raise InputError(
-                f"a background is of one scene that never moves, not of {len(image)}; give poses "
-                f"({len(self.parts)}, 7)."
-            )
-        return np.where(np.isfinite(image[0]), image[0], np.nan)
+        (image,) = self.images(camera, world_from_parts)
+        return np.where(np.isfinite(image), image, np.nan)
 
     def _poses(self, world_from_parts: Tensor | Array) -> Tensor:
         pose = poses.as_pose(world_from_parts, "world_from_parts")
@@ -153,9 +147,7 @@ def _compose(nearest: Array, owner: npt.NDArray[np.int16], place: Indices, depth
     owner[place] = part
 
 
-def background_part(
-    camera: Camera, depth: npt.ArrayLike, stride: int = 4, jump: float = 0.03, name: str = "background"
-) -> Part:
+def background_part(camera: Camera, depth: npt.ArrayLike, stride: int = 4, jump: float = 0.03) -> Part:
     """A background image as a part in the camera's frame: its pose is `world_from_camera`.
 
     Unlike an image, a part can be rendered from where the camera really is. Blocks of pixels become two
@@ -167,7 +159,6 @@ def background_part(
         depth: (H, W) metres, NaN, 0 or infinite where unknown; rendered, or an average of many images.
         stride: the side of a block, pixels.
         jump: at an edge the depth bends by more than this share of itself from pixel to pixel.
-        name: of the part.
 
     Raises:
         InputError: the image is not the camera's, the camera's intrinsics are invalid, the stride is no whole
@@ -198,7 +189,7 @@ def background_part(
         camera.rays().reshape(camera.height, camera.width, 3)[at] * np.where(known, image, 0.0)[at][..., None]
     )
     used, faces = np.unique(faces, return_inverse=True)
-    return Part(name, corners.reshape(-1, 3)[used], faces.reshape(-1, 3).astype(np.int64))
+    return Part("background", corners.reshape(-1, 3)[used], faces.reshape(-1, 3).astype(np.int64))
 
 
 def _edges(depth: Array, jump: float) -> Mask:
@@ -220,11 +211,9 @@ def _blocks(marked: Mask, rows: Indices, columns: Indices) -> Mask:
 
 
 def scene_poses(*world_from_parts: Tensor) -> Tensor:
-    """Poses of a scene's parts side by side, (N, K, 7).
+    """Poses (N, K, 7) of a scene's parts side by side.
 
-    Args:
-        *world_from_parts: poses (7,) that all particles share, (N, 7) of one part, or (N, k, 7) of several,
-            such as a robot's links.
+    From poses (7,) that all particles share, (N, 7) of one part, or (N, k, 7) of several, such as links.
     """
     each = [p.double() if p.ndim == 3 else p.double()[..., None, :] for p in world_from_parts]
     particles = next((len(p) for p in each if p.ndim == 3), 1)

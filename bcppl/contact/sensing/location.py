@@ -18,8 +18,7 @@ from scipy.signal import butter, sosfilt
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.arrays import Array, Mask
-from bcppl.contact.array_record import ArrayRecord
+from bcppl.arrays import Array, ArrayRecord, Mask
 from bcppl.contact.sensing.load import ToolLoad, refuse_millimetres
 from bcppl.contact.sensing.surface import PegSurface
 from bcppl.contact.touch import Touch

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.arrays import Array, Indices, Mask
-from bcppl.contact.array_record import ArrayRecord
+from bcppl.arrays import Array, ArrayRecord, Indices, Mask
 from bcppl.errors import InputError
 
 FACE, EDGE, CORNER = 0, 1, 2
