@@ -273,7 +273,6 @@ def test_unknown_files_links_joints_and_shapes_are_refused(tmp_path: Path) -> No
         lambda: load_robot("pander"),
         lambda: load_robot("panda", tip="panda_foot"),
         lambda: load_robot("panda", held={"panda_joint9": 0.0}),
-        lambda: load_robot("panda", geometry="colliding"),  # type: ignore[arg-type]
         lambda: panda.base_from_link("panda_hand", angles, link_from_tool=[0.0, 0, 0, 2, 0, 0, 0]),
         lambda: panda.base_from_link("panda_foot", angles),
         lambda: panda.position("panda_foot", angles),

@@ -60,17 +60,10 @@ def _box(part: Part) -> tuple[Array, Array]:
 def first_possible_contact(
     free: FreeMotion, part: Part, peg: Part, world_from_part: Array, grip_from_peg: Array | None = None
 ) -> Indices:
-    """The number of stamps (N,) of free motion, for poses (N, 7) of the part.
+    """The number of stamps (N,) of free motion, for poses (N, 7) of the part and of the peg in the hand.
 
     Up to there the peg's bounding box does not overlap the part's at any step: an axis of the one or of the
     other separates them.
-
-    Args:
-        free: the probe in free motion.
-        part: the part.
-        peg: the peg.
-        world_from_part: (N, 7).
-        grip_from_peg: (N, 7) the peg's pose in the hand; None for the nominal one.
     """
     stamps = len(free.rows)
     if not free.on_time or stamps == 0:

@@ -20,11 +20,8 @@ def springs_in_series(nuisances: Mapping[str, Array], stiffness: Array) -> dict[
     """The nuisance parameters, with the grasp's compliance included in the stiffness and damping.
 
     A spring K with a damper D in series with a compliance C is, for slow motion, a spring K / (1 + C K) with
-    a damper D / (1 + C K)^2: the first two terms of (K + D s) / (1 + C (K + D s)) in s.
-
-    Args:
-        nuisances: from `Nuisances.rows`.
-        stiffness: (6,) the probe's, N/m and N m/rad.
+    a damper D / (1 + C K)^2: the first two terms of (K + D s) / (1 + C (K + D s)) in s. The nuisances are
+    from `Nuisances.rows`, the stiffness (6,) is the probe's, N/m and N m/rad.
     """
     if "grasp_compliance" not in nuisances:
         return dict(nuisances)
@@ -35,14 +32,10 @@ def springs_in_series(nuisances: Mapping[str, Array], stiffness: Array) -> dict[
 
 
 def readings_at_grip(rows: Array, compliance: Array) -> Array:
-    """Pose and wrench at the hand, from those at a peg in compliant grasp.
+    """Poses of the grip in the world, and the wrench in its frame about its origin, (N, T, 13).
 
-    Args:
-        rows: (N, T, 13) pose of the peg in the world, and the environment's wrench on it in its frame.
-        compliance: (N, 6) along and about the grip's axes.
-
-    Returns:
-        (N, T, 13) pose of the grip in the world, and the same wrench in the grip's frame about its origin.
+    From rows of the peg's poses in the world and the environment's wrench on it in its frame, and the grasp's
+    compliance (N, 6) along and about the grip's axes.
     """
     at_grip = rows.copy()
     compliant = (compliance > 0).any(axis=1)

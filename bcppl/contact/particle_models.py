@@ -52,11 +52,7 @@ class ParticleModels:
         self._pools: dict[frozenset[str], list[_Copy]] = {}
 
     def given(self, nuisances: Mapping[str, Array]) -> mujoco.MjModel | list[mujoco.MjModel]:
-        """The models of N particles, valid until the next call; the one model without nuisance parameters.
-
-        Args:
-            nuisances: arrays (N, ...) by name, from `grasp_compliance.springs_in_series`.
-        """
+        """The models of N particles, valid until the next call; the one model without nuisance parameters."""
         if not nuisances:
             return self.model
         particles = len(next(iter(nuisances.values())))

@@ -40,7 +40,14 @@ class PegPhysics:
     command's. Gravity is compensated. Everything is at rest before the first command.
 
     Attributes:
+        part, peg: the solids; the peg's frame has its origin at the wrench sensor.
+        parameters: of the contact and of the arm.
+        share_free_motion: whether the motion before contact is simulated once for all particles; the results
+            are the same to the bit.
         effort: the cost so far: items are rollouts, amount is simulated seconds.
+
+    Raises:
+        InputError: the part or the peg has no convex pieces and is not convex.
     """
 
     def __init__(
@@ -50,18 +57,6 @@ class PegPhysics:
         parameters: ContactParameters | None = None,
         share_free_motion: bool = True,
     ) -> None:
-        """Build the model.
-
-        Args:
-            part: the part.
-            peg: the held peg, its frame's origin at the wrench sensor.
-            parameters: of the contact and of the arm.
-            share_free_motion: whether the motion before contact is simulated once for all particles; the
-                results are the same to the bit.
-
-        Raises:
-            InputError: the part or the peg has no convex pieces and is not convex.
-        """
         self.part, self.peg, self.share_free_motion = part, peg, share_free_motion
         self.parameters = ContactParameters() if parameters is None else parameters
         self.model = build_model(part, peg, self.parameters)

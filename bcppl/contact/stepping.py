@@ -80,18 +80,10 @@ class Stepper:
         first: int,
         last: int,
     ) -> tuple[Array, SimulationState]:
-        """Sensor rows at stamps `first` to `last` (exclusive).
+        """Sensor rows (N, last-first, 13) at stamps `first` to `last` (exclusive), and the states after them.
 
-        Args:
-            begin: states of N particles after `first` stamps.
-            world_from_part: (N, 7).
-            nuisances: arrays (N, ...) by name, from `grasp_compliance.springs_in_series`.
-            first: the first stamp.
-            last: the stamp after the last.
-
-        Returns:
-            Rows (N, last-first, 13) of the peg's pose and the environment's wrench on it; and the states
-            after them.
+        A row is the peg's pose and the environment's wrench on it. The simulations begin in the states after
+        `first` stamps, with nuisances (N, ...) from `grasp_compliance.springs_in_series`.
         """
         start, stop = self.step_after(first), self.step_after(last)
         sensed = np.empty((len(begin.state), stop - start, SENSOR_COLUMNS))
@@ -108,9 +100,8 @@ class Stepper:
     def trajectory(self, world_from_part: Array, stamps: int) -> tuple[Array, SimulationState, Array]:
         """One simulation from the beginning, for a pose (1, 7) of the part.
 
-        Returns:
-            Sensor rows (stamps, 13), the states after 0, 1, ... `stamps` stamps, and the peg's poses (S, 7)
-            at all steps.
+        Sensor rows (stamps, 13), the states after 0, 1, ... `stamps` stamps, and the peg's poses (S, 7) at
+        all steps.
         """
         begin, stop = self.at_rest(1), self.step_after(stamps)
         states, sensed = [begin.state], [begin.tail[0]]

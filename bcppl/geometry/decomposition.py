@@ -144,8 +144,9 @@ def _progress(part: Part, progress: bool | None) -> Iterator[Callable[[str], Non
 def _cached(part: Part, threshold: float, seed: int, cache: str | Path | None) -> Decomposition:
     """A decomposition from the cache, measured again, or computed and written to the cache."""
     version = _version(part)
-    # Not before: platformdirs is installed together with CoACD.
-    folder = _user_cache() if cache is None else Path(cache)
+    import platformdirs  # not before: it is installed together with CoACD
+
+    folder = platformdirs.user_cache_path("bcppl") / "decompositions" if cache is None else Path(cache)
     settings = {"form": _FORM, "coacd": version, "threshold": threshold, "seed": seed, **_SEARCH}
     content = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for array in (part.vertices.astype("<f8"), part.faces.astype("<i8")):
@@ -195,12 +196,6 @@ def _coacd(part: Part, threshold: float, seed: int) -> list[Array]:
             mesh = coacd.Mesh(np.array(body.vertices), np.array(body.faces))
             hulls += coacd.run_coacd(mesh, threshold=threshold, preprocess_mode="off", seed=seed, **_SEARCH)
     return [np.asarray(vertices, dtype=np.float64) for vertices, _ in hulls]
-
-
-def _user_cache() -> Path:
-    import platformdirs
-
-    return platformdirs.user_cache_path("bcppl") / "decompositions"
 
 
 def _write(path: Path, hulls: Sequence[Array]) -> None:

@@ -37,17 +37,15 @@ class SceneRenderer:
     never move are better left to `background`, which renders them once for each camera.
 
     Attributes:
-        parts: the K parts; poses are given in their order.
+        parts: the K parts, such as `[part, *robot.parts]`; poses are given in their order.
         effort: images rendered, rays cast (or fragments tested) and seconds spent so far.
     """
 
     def __init__(self, parts: Sequence[Part], renderer: Callable[[Part], PartRenderer] = RayCaster) -> None:
-        """Build a renderer for each part, one for a part that appears twice.
+        """Build a renderer for each part with `renderer`, one for a part that appears twice.
 
-        Args:
-            parts: the parts, for example `[part, *robot.parts]`.
-            renderer: makes the renderer of one part: `RayCaster` has the shortest first call;
-                `bcppl.rendering.rasterisation.renderer_for` rasterises meshes that are not too fine.
+        `RayCaster` has the shortest first call; `bcppl.rendering.rasterisation.renderer_for` rasterises meshes
+        that are not too fine.
 
         Raises:
             InputError: the mesh of a part is empty or not finite.

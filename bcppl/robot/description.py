@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -104,7 +105,9 @@ def read(file: str | Path) -> Description:
         with contextlib.redirect_stderr(ignored), contextlib.redirect_stdout(ignored):
             robot = urdf.URDF.from_xml_string(file.read_bytes())
         for kind, named in (("joint", robot.joints), ("link", robot.links)):
-            _check_unique(file, kind, [each.name for each in named])
+            for name, count in Counter(each.name for each in named).items():
+                if count > 1:
+                    raise InputError(f"{file} has two {kind}s of the name {name!r}; rename one.")
         links = {link.name: link for link in robot.links}
         joints = {j.child: _joint(j) for j in robot.joints}
     except InputError:
@@ -127,18 +130,10 @@ def read(file: str | Path) -> Description:
     )
 
 
-def _check_unique(file: Path, kind: str, names: Sequence[str]) -> None:
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InputError(f"{file} has two {kind}s of the name {twice[0]!r}; give each a name of its own.")
-
-
 def _ordered(file: Path, links: Sequence[str], joints: Mapping[str, Joint], count: int) -> list[str]:
     """The links, each after its parent, the base first."""
     roots = [name for name in links if name not in joints]
-    unknown = {j.parent for j in joints.values()} | set(joints)
-    unknown -= set(links)
-    if unknown:
+    if unknown := ({j.parent for j in joints.values()} | set(joints)) - set(links):
         raise InputError(
             f"{file} has a joint to the link {min(unknown)!r}, which it does not define; add the link."
         )
@@ -232,20 +227,13 @@ def chain_of(description: Description) -> Any:
     return chain.Chain(frames[description.links[0]], dtype=torch.float64)
 
 
-# ---- meshes
-
-
 def part_of(description: Description, link: str, shapes: Sequence[Shape], folders: Sequence[Path]) -> Part:
     """The shapes of one link as one part, in the link's frame.
 
     Raises:
         InputError: a mesh is missing, unreadable, or not in metres.
     """
-    meshes = []
-    for shape in shapes:
-        mesh = _mesh(description, shape, folders)
-        mesh.apply_transform(shape.link_from_shape)
-        meshes.append(mesh)
+    meshes = [_mesh(description, s, folders).apply_transform(s.link_from_shape) for s in shapes]
     whole: Any = trimesh.util.concatenate(meshes)
     part = Part(
         name=link,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.arguments import seed_number, whole_number
+from bcppl.arguments import seed_number
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.robot.kinematics import Robot
@@ -18,6 +18,7 @@ NEAR = (0.0005, math.radians(0.5))  # m and rad: tolerance at which a pose is re
 _LEVER = 0.3  # m per radian in the norm of the error
 _DAMPING = 1e-4
 _FARTHEST = 0.4  # rad or m, largest change of a joint in one step
+_STARTS = 8  # for each path
 _FIRST, _NEXT = 50, 25  # steps, at most, to the first pose of a path and from one pose to the next
 
 
@@ -27,7 +28,6 @@ def joint_paths(
     base_from_tool: Array,
     link_from_tool: Array | None = None,
     *,
-    tries: int = 8,
     seed: int = 0,
 ) -> Array:
     """Joint angles along paths of poses, within the joint limits.
@@ -42,7 +42,6 @@ def joint_paths(
         link: to which the tool is mounted.
         base_from_tool: (P, K, 7) P paths of K poses in the robot's base frame.
         link_from_tool: (7,) the tool's pose on the link; None for the link's frame.
-        tries: starts for each path.
         seed: of the starts.
 
     Returns:
@@ -51,7 +50,7 @@ def joint_paths(
     Raises:
         InputError: a pose is not valid, the robot has no link of that name, or no joint moves.
     """
-    tries, seed = whole_number("a path is tried from {} starts", tries), seed_number(seed)
+    seed = seed_number(seed)
     goal = poses.as_pose(torch.as_tensor(base_from_tool), "a path of the tool")
     if not robot.joints:
         raise InputError(f"{robot.name} has no joint that moves {link!r}; name another link.")
@@ -61,19 +60,19 @@ def joint_paths(
         for of in ("lower", "upper")
     )
     generator = torch.Generator().manual_seed(seed)
-    share = torch.rand(tries, len(robot.joints), generator=generator, dtype=torch.float64)
+    share = torch.rand(_STARTS, len(robot.joints), generator=generator, dtype=torch.float64)
     share[0] = 0.5
     angles = (low + share * (high - low)).repeat(count, 1)
     mounted = None if link_from_tool is None else torch.as_tensor(link_from_tool)
-    reached = torch.ones(count * tries, dtype=torch.bool)
+    reached = torch.ones(count * _STARTS, dtype=torch.bool)
     path = []
     for k in range(length):
-        target = goal[:, k].repeat_interleave(tries, dim=0)
+        target = goal[:, k].repeat_interleave(_STARTS, dim=0)
         for _ in range(_NEXT if k else _FIRST):
             error, jacobian = _error(robot, link, angles, target, mounted)
             near = _is_near(error)
             # One solution for a path's first pose suffices; afterwards all that have reached theirs go on.
-            if bool(near[reached].all() if k else near.reshape(count, tries).any(dim=1).all()):
+            if bool(near[reached].all() if k else near.reshape(count, _STARTS).any(dim=1).all()):
                 break
             angles = (angles + _step(error, jacobian)).clamp(low, high)
         error, _ = _error(robot, link, angles, target, mounted)
@@ -81,8 +80,8 @@ def joint_paths(
         path.append(angles)
         if not bool(reached.any()):
             return np.full((count, length, len(robot.joints)), np.nan)
-    paths = torch.stack(path, dim=1).reshape(count, tries, length, -1)
-    good = reached.reshape(count, tries)
+    paths = torch.stack(path, dim=1).reshape(count, _STARTS, length, -1)
+    good = reached.reshape(count, _STARTS)
     chosen = paths[torch.arange(count), good.to(torch.int8).argmax(dim=1)]
     chosen[~good.any(dim=1)] = torch.nan
     return np.asarray(chosen.numpy())

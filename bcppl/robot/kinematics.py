@@ -59,8 +59,6 @@ class Robot:
             InputError: the file is missing or no URDF, a link or joint is unknown, or a joint is held at no
                 number or far outside its limits.
         """
-        if geometry not in ("visual", "collision"):
-            raise InputError(f'a robot has no geometry {geometry!r}; give "visual" or "collision".')
         self._description = read(file)
         self._geometry = geometry
         # A single path would be iterated by letters.
@@ -202,13 +200,13 @@ class Robot:
             if any(s.link == link for s in shapes)
         )
 
-    def base_from_parts(self, angles: Angles, offsets: Angles | None = None) -> Tensor:
-        """Poses of `parts`, (..., K, 7) or (N, ..., K, 7), for a renderer of several parts.
+    def base_from_parts(self, angles: Angles) -> Tensor:
+        """Poses (..., K, 7) of `parts`, for a renderer of several parts.
 
         Raises:
             InputError: as `base_from_links`, or a mesh is missing.
         """
-        return self.base_from_links(angles, offsets, [part.name for part in self.parts])
+        return self.base_from_links(angles, links=[part.name for part in self.parts])
 
     def as_part(self, angles: Angles) -> Part:
         """The whole arm at angles (J,) as one rigid part in the base's frame.

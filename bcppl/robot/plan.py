@@ -68,14 +68,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         for name in ("times", "world_from_peg", "stiffness", "damping"):
-            try:
-                numbers = np.asarray(getattr(self, name), dtype=np.float64)
-            except (TypeError, ValueError):
-                raise InputError(
-                    f"plan {self.name!r} has {name} that are no array of numbers; give rows of equal length, "
-                    "in SI units."
-                ) from None
-            object.__setattr__(self, name, numbers)
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         knots = self.times.size if self.times.ndim == 1 else 0
         if knots < 2 or self.world_from_peg.shape != (knots, 7) or len(self.manners) != knots - 1:
             raise InputError(
@@ -84,25 +77,15 @@ class Plan:
             )
         if not (np.isfinite(self.times).all() and (np.diff(self.times) > 0).all()):
             raise InputError(f"plan {self.name!r} has times that do not increase; sort them, in seconds.")
-        lengths = np.linalg.norm(self.world_from_peg[:, 3:], axis=1)
-        if not (np.isfinite(self.world_from_peg).all() and (np.abs(lengths - 1.0) < 1e-3).all()):
+        poses.as_pose(self.world_from_peg, f"a pose of plan {self.name!r}")
+        for manner in set(self.manners) - set(MANNERS):
             raise InputError(
-                f"plan {self.name!r} has a pose that is not finite or has no quaternion of unit length; "
-                "give x y z (m) qw qx qy qz."
+                f"plan {self.name!r} has a motion that is {manner!r}; give one of {', '.join(MANNERS)}."
             )
-        for manner in self.manners:
-            if manner not in MANNERS:
-                raise InputError(
-                    f"plan {self.name!r} has a motion that is {manner!r}; give one of {', '.join(MANNERS)}."
-                )
         lasts = float(self.times[-1] - self.times[0])
-        number_within(
-            f"plan {self.name!r} lasts {lasts:.3g} s and has a rate of {{}} a second",
-            self.rate,
-            least=1.0 / lasts,
-            most=QUICKEST,
-        )
-        self._check_units()
+        sampled = f"plan {self.name!r} lasts {lasts:.3g} s and has a rate of {{}} a second"
+        number_within(sampled, self.rate, least=1.0 / lasts, most=QUICKEST)
+        self._check_units(lasts)
         for name, given in (("stiffness", self.stiffness), ("damping", self.damping)):
             if given.shape != (6,) or not ((given >= 0.0) & (given <= STIFFEST)).all():
                 raise InputError(
@@ -117,13 +100,13 @@ class Plan:
                 "`sink`, less than the depth of the command below the surface."
             )
 
-    def _check_units(self) -> None:
-        lasts, positions = float(self.times[-1] - self.times[0]), self.world_from_peg[:, :3]
+    def _check_units(self, lasts: float) -> None:
         if lasts > LONGEST:
             raise InputError(
                 f"plan {self.name!r} lasts {lasts:.0f} s: its times are probably in milliseconds; "
                 "scale them by 0.001 to seconds."
             )
+        positions = self.world_from_peg[:, :3]
         extent, away = float(np.ptp(positions, axis=0).max()), float(np.abs(positions).max())
         if extent > WIDEST or away > FARTHEST:
             raise InputError(

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.errors import InputError
 from bcppl.robot.motion import ProbeWindow
 
 
@@ -43,19 +42,12 @@ class ContactDetector:
         whole_number("a contact detector has neighbours {}", self.neighbours, least=0)
 
     def __call__(self, force: Tensor, acceleration: Tensor | float = 0.0) -> Tensor:
-        """1 for contact, 0 for none and NaN for undecided, (T,), of tared forces (T, 3) in newtons.
-
-        A force that is NaN, as while taring, is undecided.
+        """1 for contact, 0 for none and NaN for undecided, (T,).
 
         Args:
-            force: (T, 3).
+            force: (T, 3) tared, newtons; one that is NaN, as while taring, is undecided.
             acceleration: (T,) commanded acceleration of the tool, m/s^2.
-
-        Raises:
-            InputError: forces are not (T, 3).
         """
-        if force.ndim != 2 or force.shape[1] != 3:
-            raise InputError(f"forces have shape {tuple(force.shape)}; give (T, 3), in newtons.")
         if len(force) == 0:
             return torch.empty(0, dtype=torch.float64)
         size = force.norm(dim=1)

@@ -21,12 +21,12 @@ from functools import cached_property
 import numpy as np
 from scipy.special import log_ndtr
 
+from bcppl.arguments import number_within
 from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing.load import refuse_millimetres
-from bcppl.contact.sensing.noise import WrenchNoise, checked_covariance
+from bcppl.contact.sensing.noise import WrenchNoise, covariance_of
 from bcppl.contact.sensing.surface import PegSurface
 from bcppl.contact.sensing.surface_posterior import CORNER, EDGE, FACE, Candidates, Nodes, SurfacePosterior
-from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 
 WIDTH = 3.2  # half width of the bundle, in standard deviations (of their bound along the line)
@@ -52,7 +52,7 @@ class IntrinsicSensing:
         shares: prior probabilities of faces, sharp edges and corners.
 
     Raises:
-        InputError: the peg's mesh is empty, open, not finite or in millimetres, or a setting is out of range.
+        InputError: the peg's mesh is empty, open, not finite or in millimetres, or friction is out of range.
     """
 
     peg: Part
@@ -60,12 +60,7 @@ class IntrinsicSensing:
     shares: tuple[float, float, float] = (0.6, 0.3, 0.1)
 
     def __post_init__(self) -> None:
-        if not 0 < self.friction <= 10:
-            raise InputError(f"a contact's friction is {self.friction!r}; give a coefficient from 0 to 10.")
-        if len(self.shares) != 3 or not min(self.shares) >= 0 or not 0 < sum(self.shares) < np.inf:
-            raise InputError(
-                f"faces, edges and corners have shares {self.shares!r}; give three numbers, 0 or more."
-            )
+        number_within("a contact's friction is {}", self.friction, above=0.0, most=10.0)
         _ = self.surface
 
     @cached_property
@@ -95,11 +90,11 @@ class IntrinsicSensing:
             about the line that only several contacts can exert.
 
         Raises:
-            InputError: the covariance does not fit or is not symmetric and positive definite, or torques are
-                in N mm.
+            InputError: torques are in N mm.
+            numpy.linalg.LinAlgError: a covariance is not positive definite.
         """
         wrench = np.asarray(wrench, dtype=np.float64)
-        covariance = checked_covariance(covariance, len(wrench))
+        covariance = covariance_of(covariance)
         rows = np.flatnonzero(np.isfinite(wrench).all(axis=1))
         noise = np.linalg.eigvalsh(_of_rows(covariance, rows)[..., :3, :3])[..., -1]
         clear = np.linalg.norm(wrench[rows, :3], axis=1) > _WEAKEST * np.sqrt(noise)
@@ -130,7 +125,7 @@ class IntrinsicSensing:
             point: (M, 3) in the peg's frame.
             normals: (M, K, 3) outward, of the face there, or of all faces that meet there and between.
         """
-        covariance = checked_covariance(covariance, len(wrench))
+        covariance = covariance_of(covariance)
         score, *_ = self._log_likelihood(wrench, covariance, point, normals)
         level = posterior.mass_above(score)
         return np.where(np.isfinite(posterior.log_evidence), level, 1.0)
@@ -316,8 +311,4 @@ def _of_rows(covariance: Array, rows: Indices) -> Array:
     return covariance if covariance.ndim == 2 else covariance[rows]
 
 
-_EMPTY, _NO_POINTS = np.empty(0), np.empty((0, 3))
-_NO_INDICES = np.empty(0, dtype=np.int64)
-_NO_NODES = Nodes(
-    _NO_INDICES, _NO_INDICES, _NO_INDICES, _NO_POINTS, _NO_POINTS, _EMPTY, _EMPTY, _EMPTY, _EMPTY
-)
+_NO_NODES = Nodes(*np.empty((3, 0), dtype=np.int64), *np.empty((2, 0, 3)), *np.empty((4, 0)))

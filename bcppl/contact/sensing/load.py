@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bcppl.arguments import number_within
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.poses import as_pose
@@ -32,18 +33,9 @@ class ToolLoad:
     gravity: tuple[float, float, float] = STANDARD_GRAVITY
 
     def __post_init__(self) -> None:
-        center = np.asarray(self.center, dtype=np.float64)
-        if not (np.isfinite(self.mass) and self.mass >= 0) or center.shape != (3,):
-            raise InputError(
-                f"a tool's load has mass {self.mass!r} and centre {self.center!r}; "
-                "give kg, 0 or more, and three metres."
-            )
-        if not np.linalg.norm(center) <= FARTHEST_CENTER:
-            raise InputError(
-                f"a tool's centre of mass is {np.linalg.norm(center):.3g} m from the sensor; "
-                "give it in metres, in the sensor's frame."
-            )
-        _check_gravity(self.gravity)
+        number_within("a tool's mass is {} kg", self.mass, least=0.0)
+        away = float(np.linalg.norm(self.center))
+        number_within("a tool's centre of mass is {} m from the sensor", away, most=FARTHEST_CENTER)
 
     def weight(self, world_from_sensor: Array) -> Array:
         """Wrench (..., 6) of the weight, in the sensor's frame about its origin, at poses (..., 7).
@@ -59,11 +51,7 @@ class ToolLoad:
 
 
 def gravity_in(world_from_sensor: Array, gravity: tuple[float, float, float] = STANDARD_GRAVITY) -> Array:
-    """Gravity (..., 3) in the frames of sensors at poses (..., 7), m/s^2.
-
-    Raises:
-        InputError: a pose is not seven finite numbers with a unit quaternion.
-    """
+    """Gravity (..., 3) in the frames of sensors at poses (..., 7), m/s^2."""
     pose = as_pose(world_from_sensor, "a sensor's pose").numpy()
     if pose.size == 0:
         return np.empty((*pose.shape[:-1], 3))
@@ -112,9 +100,7 @@ class LoadEstimate:
         return np.sqrt(np.diagonal(self.covariance))
 
 
-def identify_load(
-    wrench: Array, world_from_sensor: Array, gravity: tuple[float, float, float] = STANDARD_GRAVITY
-) -> LoadEstimate:
+def identify_load(wrench: Array, world_from_sensor: Array) -> LoadEstimate:
     """Mass, centre of mass and the sensor's bias, from readings at rest and free of contact.
 
     With g the gravity in the sensor's frame, force = m g + bias and torque = (m c) x g + bias are linear in
@@ -126,19 +112,13 @@ def identify_load(
     Args:
         wrench: (K, 6) raw readings, force (N) and torque (N m) of the tool's weight on the sensor, in the
             sensor's frame about its origin.
-        world_from_sensor: (K, 7) the sensor's poses.
-        gravity: (3,) in the world, m/s^2.
+        world_from_sensor: (K, 7) the sensor's poses, in a world whose z axis points up.
 
     Raises:
         InputError: fewer than four readings, numbers that are not finite, poses that are not tilted enough, a
             force with the wrong sign, or torques in N mm.
     """
     wrench = np.asarray(wrench, dtype=np.float64)
-    pose = np.asarray(world_from_sensor, dtype=np.float64)
-    if wrench.ndim != 2 or wrench.shape[1:] != (6,) or pose.shape != (len(wrench), 7):
-        raise InputError(
-            f"static readings have shapes {wrench.shape} and {pose.shape}; give (K, 6) and (K, 7)."
-        )
     if len(wrench) < 4:
         raise InputError(
             f"{len(wrench)} static readings do not determine load and bias; give four or more, "
@@ -146,11 +126,10 @@ def identify_load(
         )
     if not np.isfinite(wrench).all():
         raise InputError("a static reading holds a wrench that is not finite; leave it out.")
-    _check_gravity(gravity)
-    pulls = gravity_in(pose, gravity)
+    pulls = gravity_in(world_from_sensor)
     values = np.linalg.svd(pulls - pulls.mean(axis=0), compute_uv=False) / np.sqrt(len(pulls))
     # Directions of gravity in one plane leave the centre's place along a line undetermined.
-    if values[1] < TURNED * np.linalg.norm(gravity):
+    if values[1] < TURNED * np.linalg.norm(STANDARD_GRAVITY):
         raise InputError(
             "the static readings hold the sensor at nearly the same tilt, or tilted about one axis only by "
             "little; add readings tilted by 30 degrees or more about two axes."
@@ -180,7 +159,7 @@ def identify_load(
     jacobian[4:7, 1:4], jacobian[7:, 7:] = np.eye(3), np.eye(3)
     blocks = np.zeros((10, 10))
     blocks[:4, :4], blocks[4:, 4:] = force_covariance, torque_covariance
-    load = ToolLoad(float(mass), (float(center[0]), float(center[1]), float(center[2])), gravity)
+    load = ToolLoad(float(mass), (float(center[0]), float(center[1]), float(center[2])))
     return LoadEstimate(
         load,
         np.concatenate([force_bias, solution[3:]]),
@@ -198,21 +177,10 @@ def _least_squares(design: Array, readings: Array) -> tuple[Array, Array, float]
     return solution, np.asarray(variance * np.linalg.inv(design.T @ design)), float(np.sqrt(variance))
 
 
-def _check_gravity(gravity: tuple[float, float, float]) -> None:
-    size = float(np.linalg.norm(gravity))
-    if np.shape(gravity) != (3,) or not 0 < size < np.inf:
-        raise InputError(f"gravity is {gravity!r}; give three m/s^2 in the world, (0, 0, -9.80665), say.")
-
-
 def refuse_millimetres(wrench: Array, reach: float) -> None:
     """Refuse tared wrenches (M, 6) in contact whose torques are in N mm, unless they are fewer than three.
 
-    Args:
-        wrench: (M, 6) force and torque.
-        reach: the distance of the peg's farthest point from their origin, metres.
-
-    Raises:
-        InputError: the torques are too large to be in N m.
+    The reach is the distance (m) of the peg's farthest point from their origin.
     """
     if len(wrench) < 3:
         return

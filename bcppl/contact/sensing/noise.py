@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import sosfilt
 
+from bcppl.arguments import number_within
 from bcppl.arrays import Array
-from bcppl.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,8 @@ class WrenchNoise:
     torque: float = 0.005
 
     def __post_init__(self) -> None:
-        if not (0 < self.force < np.inf and 0 < self.torque < np.inf):
-            raise InputError(
-                f"a wrench has noise of {self.force!r} N and {self.torque!r} N m; give numbers above 0."
-            )
+        number_within("a wrench has noise of {} N", self.force, above=0.0)
+        number_within("a wrench has noise of {} N m", self.torque, above=0.0)
 
     def covariance(self, share: float = 1.0) -> Array:
         """Covariance (6, 6) of a wrench with a share of a sample's variance.
@@ -39,40 +37,19 @@ class WrenchNoise:
         return share * np.diag([self.force**2] * 3 + [self.torque**2] * 3)
 
 
-def checked_covariance(given: Array | WrenchNoise, wrenches: int) -> Array:
-    """Covariances (6, 6) or (M, 6, 6) of M wrenches, as float64.
-
-    Raises:
-        InputError: the shape does not fit, or one is not symmetric and positive definite.
-    """
+def covariance_of(given: Array | WrenchNoise) -> Array:
+    """Covariances (6, 6) or (M, 6, 6) of wrenches, symmetric to the bit."""
     covariance = given.covariance() if isinstance(given, WrenchNoise) else np.asarray(given, np.float64)
-    if covariance.shape not in ((6, 6), (wrenches, 6, 6)):
-        raise InputError(
-            f"the covariance has shape {covariance.shape} for {wrenches} wrenches; give (6, 6) or (M, 6, 6)."
-        )
-    turned = np.swapaxes(covariance, -1, -2)
-    scale = np.sqrt(np.abs(np.diagonal(covariance, axis1=-2, axis2=-1)))
-    if (np.abs(covariance - turned) > 1e-6 * scale[..., None] * scale[..., None, :]).any():
-        raise InputError("the wrenches' covariance is not symmetric; give one that equals its transpose.")
-    covariance = 0.5 * (covariance + turned)
-    least = np.linalg.eigvalsh(covariance).min(initial=1.0) if np.isfinite(covariance).all() else -1.0
-    if not least > 0:
-        raise InputError("the wrenches' covariance is not positive definite; give every axis some noise.")
-    return covariance
+    return 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
 
 
 def noise_at_rest(wrench: Array) -> WrenchNoise:
     """The noise of samples (n, 6) without contact, estimated from their variance.
 
     Raises:
-        InputError: fewer than five samples, or one that is not finite.
+        InputError: a sample is not finite.
     """
-    wrench = np.asarray(wrench, dtype=np.float64)
-    if len(wrench) < 5 or not np.isfinite(wrench).all():
-        raise InputError(
-            f"wrenches at rest have shape {wrench.shape} or are not finite; give five samples (n, 6) or more."
-        )
-    variance = wrench.var(axis=0, ddof=1)
+    variance = np.asarray(wrench, dtype=np.float64).var(axis=0, ddof=1)
     return WrenchNoise(float(np.sqrt(variance[:3].mean())), float(np.sqrt(variance[3:].mean())))
 
 

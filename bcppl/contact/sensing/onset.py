@@ -112,15 +112,10 @@ class OnsetDetector:
                 finite, as `ContactSensing.tared` returns them while taring, are ignored but counted.
 
         Raises:
-            InputError: shapes do not fit, a later number is not finite, there are no more samples than
+            InputError: times do not increase, a later number is not finite, there are no more samples than
                 `rest`, or these are all equal and `resolution` is 0.
         """
         times, force = np.asarray(times, dtype=np.float64), np.asarray(force, dtype=np.float64)
-        if force.ndim != 2 or times.shape != force.shape[:1]:
-            raise InputError(
-                f"a force of shape {force.shape} at times {times.shape} does not fit; "
-                "give (T, axes) and (T,)."
-            )
         finite = np.asarray(np.isfinite(force).all(axis=1))
         lead = int(finite.argmax()) if finite.any() else len(finite)
         if len(times) - lead <= self.rest:

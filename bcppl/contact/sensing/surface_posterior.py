@@ -8,7 +8,6 @@ import numpy as np
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.arrays import Array, ArrayRecord, Indices, Mask
-from bcppl.errors import InputError
 
 FACE, EDGE, CORNER = 0, 1, 2
 
@@ -118,8 +117,7 @@ class SurfacePosterior:
         Raises:
             InputError: the level is not between 0 and 1.
         """
-        if not 0 < level < 1:
-            raise InputError(f"a credible region of level {level!r} is asked for; give one between 0 and 1.")
+        number_within("a credible region has level {}", level, above=0.0, below=1.0)
         order = np.lexsort((-self.nodes.score, self.nodes.row))
         running = np.cumsum(self.mass[order])
         before = running - self.mass[order]
