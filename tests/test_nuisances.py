@@ -277,7 +277,7 @@ def test_rollouts_are_indexed_and_merged_like_all_their_inputs() -> None:
 @pytest.mark.parametrize(
     ("nuisances", "message"),
     [
-        (Nuisances(friction=numbers(0.3)), r"friction .* shape \(1,\); for 2 particles give \(2,\)"),
+        (Nuisances(friction=numbers(0.3)), r"friction .* shape \(1,\); give \(2,\)"),
         (Nuisances(friction=numbers(0.3, -0.1)), "friction .* negative"),
         (Nuisances(stiffness=numbers(1.0, np.nan)), "stiffness .* not finite"),
         (Nuisances(time_constant=numbers(0.004, 0.0)), "time_constant .* or 0"),

@@ -228,7 +228,8 @@ def test_bad_forces_have_no_onset() -> None:
     for bad, message in (
         (np.zeros((50, 3)), "all equal"),
         (force[:8], "too short"),
-        (force * np.nan, "not finite"),
+        (force * np.nan, "too short"),
+        (np.where(np.arange(50)[:, None] == 30, np.nan, force), "not finite at row 30"),
     ):
         with pytest.raises(InputError, match=message):
             OnsetDetector().onsets(times[: len(bad)], bad)

@@ -90,8 +90,7 @@ class Nuisances:
             shapes = [(particles, *tail) for tail in _SHAPES.get(name, ((),))]
             if row.shape not in shapes:
                 raise InputError(
-                    f"the nuisance parameter {name} has shape {row.shape}; for {particles} particles give "
-                    f"{' or '.join(map(str, shapes))}."
+                    f"nuisance parameter {name} has shape {row.shape}; give {' or '.join(map(str, shapes))}."
                 )
             if name == "grip_from_peg":
                 row = as_pose(row, "the nuisance parameter grip_from_peg").numpy()

@@ -81,8 +81,7 @@ class Camera:
         )
         if pose.ndim != 1:
             raise InputError(
-                f"the world_from_camera of {self.name!r} has shape {tuple(pose.shape)}; a camera has one "
-                "pose (7,): give one camera for each viewpoint."
+                f"camera {self.name!r} has poses of shape {tuple(pose.shape)}; give one pose (7,) a camera."
             )
         return pose
 
@@ -176,10 +175,7 @@ class Camera:
             InputError: the camera has no `wrist_from_camera`, or a pose is not valid.
         """
         if self.wrist_from_camera is None:
-            raise InputError(
-                f"camera {self.name!r} has no wrist_from_camera; give the pose of the optical frame on the "
-                "wrist (the hand-eye calibration)."
-            )
+            raise InputError(f"camera {self.name!r} has no wrist_from_camera; give its hand-eye calibration.")
         there = poses.compose(
             poses.as_pose(torch.as_tensor(np.asarray(world_from_wrist)), "world_from_wrist"),
             poses.as_pose(

@@ -57,8 +57,7 @@ def d_outline(diameter: float, flat: float) -> shapely.Polygon:
     positive("a D-shaped outline", diameter=diameter, flat=flat)
     if flat >= diameter:
         raise InputError(
-            f"the flat of a D-shaped outline is {flat:g} m from the far side of a circle of {diameter:g} m; "
-            "make it less than the diameter."
+            f"a flat {flat:g} m from the far side does not cut a circle of {diameter:g} m; reduce it."
         )
     half = math.acos(2.0 * flat / diameter - 1.0)
     return shapely.Polygon(_arc(diameter, half, 2.0 * math.pi - half, SIDES))
@@ -133,14 +132,12 @@ def check_outline(outline: shapely.Polygon, name: str) -> None:
             x, y = shapely.get_coordinates(shapely.shortest_line(a, b))[0]
             beside = "its border" if a is border else "another"
             raise InputError(
-                f"the outline of {name!r} has a hole that touches {beside} at ({x:.6g}, {y:.6g}) m; move the "
-                "hole, or cut the wall open there."
+                f"the outline of {name!r} has a hole that touches {beside} at ({x:.6g}, {y:.6g}) m; move it."
             )
     low, high = np.reshape(outline.bounds, (2, 2))
     if (high - low).max() > LARGEST_EXTENT:
         raise InputError(
-            f"the outline of {name!r} is {(high - low).max():.0f} m long: it is probably in millimetres; "
-            "scale it by 0.001 to metres."
+            f"the outline of {name!r} is {(high - low).max():.0f} m long, so in millimetres; rescale it."
         )
 
 

@@ -120,22 +120,19 @@ class Part:
             raise InputError(f"part {self.name!r} has a face without vertices; export its mesh again.")
         if self.extent.max() > LARGEST_EXTENT:
             raise InputError(
-                f"part {self.name!r} is {self.extent.max():.0f} m long: its mesh is probably in millimetres; "
-                "scale it by 0.001 to metres."
+                f"part {self.name!r} is {self.extent.max():.0f} m long, so in millimetres; scale it by 0.001."
             )
         if not closed:
             return
         if not self.is_closed:
             raise InputError(
-                f"part {self.name!r} has an open mesh ({self._open_edges} open edges); close its holes, "
-                "or merge duplicate vertices at seams."
+                f"part {self.name!r} has an open mesh ({self._open_edges} open edges); close it, or merge seams."
             )
         first, second, third = np.moveaxis(self.vertices[self.faces], 1, 0)
         volume = float((first * np.cross(second, third)).sum()) / 6.0
         if volume < -1e-9 * self.extent.max() ** 3:
             raise InputError(
-                f"part {self.name!r} has a mesh that is inside out (its volume is {volume:.3g} m^3); "
-                "turn its faces with faces[:, ::-1]."
+                f"part {self.name!r} is inside out ({volume:.3g} m^3); turn its faces with faces[:, ::-1]."
             )
 
     @property
@@ -158,8 +155,7 @@ def _moved(piece: Piece, rotation: Array, shift: Array, name: str) -> Piece:
     if piece.kind == "cylinder":
         if abs(rotation[2, 2]) < 1.0 - 1e-14:
             raise InputError(
-                f"part {name!r} has a cylinder among its pieces, which must stay along z; turn it about z "
-                "only, or construct the part with `extruded`."
+                f"part {name!r} has a cylinder among its pieces, which stays along z; turn it about z only."
             )
         return replace(piece, center=center)
     steps = np.abs(rotation)

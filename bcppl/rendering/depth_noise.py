@@ -77,8 +77,7 @@ class DepthNoise:
         true = np.array(depth, dtype=np.float64)
         if true.shape[-2:] != (camera.height, camera.width) or true.ndim < 2:
             raise InputError(
-                f"a depth image of shape {true.shape} is not camera {camera.name!r}'s; "
-                f"give (..., {camera.height}, {camera.width})."
+                f"a depth image of shape {true.shape} is not camera {camera.name!r}'s; transpose or crop it."
             )
         true[~np.isfinite(true) | (true <= 0.0)] = np.nan
         generator = np.random.default_rng(seed)

@@ -44,8 +44,8 @@ class SceneRenderer:
     def __init__(self, parts: Sequence[Part], renderer: Callable[[Part], PartRenderer] = RayCaster) -> None:
         """Build a renderer for each part with `renderer`, one for a part that appears twice.
 
-        `RayCaster` has the shortest first call; `bcppl.rendering.rasterisation.renderer_for` rasterises meshes
-        that are not too fine.
+        `RayCaster` has the shortest first call; `rasterisation.renderer_for` rasterises meshes that
+        are not too fine.
 
         Raises:
             InputError: the mesh of a part is empty or not finite.
@@ -167,8 +167,7 @@ def background_part(camera: Camera, depth: npt.ArrayLike, stride: int = 4, jump:
     image = np.asarray(depth, dtype=np.float64)
     if image.shape != (camera.height, camera.width):
         raise InputError(
-            f"the background of camera {camera.name!r} has shape {image.shape}; "
-            f"give one of its image's, {(camera.height, camera.width)}."
+            f"the background of camera {camera.name!r} has shape {image.shape}; give one of its image's."
         )
     known = np.isfinite(image) & (image > 0.0)
     rows = np.unique(np.append(np.arange(0, camera.height, stride), camera.height - 1))

@@ -151,8 +151,7 @@ def _ordered(file: Path, links: Sequence[str], joints: Mapping[str, Joint], coun
 def _joint(parsed: Any) -> Joint:
     if parsed.type not in (*MOVING, "fixed"):
         raise InputError(
-            f"joint {parsed.name!r} is {parsed.type}, which is not supported; "
-            "make it revolute, continuous, prismatic or fixed."
+            f"joint {parsed.name!r} is {parsed.type}; make it revolute, continuous, prismatic or fixed."
         )
     axis = np.array([1.0, 0.0, 0.0] if parsed.axis is None else parsed.axis, dtype=np.float64)
     length = float(np.linalg.norm(axis))
@@ -173,8 +172,7 @@ def _joint(parsed: Any) -> Joint:
     upper = float(parsed.limit.upper) if bounded else math.inf
     if not lower <= upper or any(math.isnan(number) for number in (mimics or ())[1:]):
         raise InputError(
-            f"joint {parsed.name!r} has limits {lower:g} to {upper:g} and mimics {mimics}; "
-            "give limits in ascending order, and numbers."
+            f"joint {parsed.name!r} has limits {lower:g} to {upper:g} and mimics {mimics}; correct these."
         )
     return Joint(
         name=parsed.name,
@@ -255,8 +253,7 @@ def _mesh(description: Description, shape: Shape, folders: Sequence[Path]) -> An
         return trimesh.creation.icosphere(3, geometry.radius)
     if not isinstance(geometry, urdf.Mesh):
         raise InputError(
-            f"link {shape.link!r} of {description.file} has a shape that is neither a mesh, a box, "
-            "a cylinder nor a sphere; replace it by one of these."
+            f"link {shape.link!r} of {description.file} has a shape that is no mesh, box, cylinder or sphere."
         )
     tried = list(_candidates(description, geometry.filename, folders))
     file = next((path for path in tried if path.is_file()), None)

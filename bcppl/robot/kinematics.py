@@ -71,8 +71,7 @@ class Robot:
         for joint in moving.values():
             if joint.mimics is not None and joint.mimics[0] not in moving:
                 raise InputError(
-                    f"joint {joint.name!r} of {self.name} mimics {joint.mimics[0]!r}, which does not move; "
-                    "name a movable joint of the URDF file."
+                    f"joint {joint.name!r} of {self.name} mimics {joint.mimics[0]!r}, which does not move."
                 )
         chain = {j.name for j in (self._description.joints if tip is None else self._chain_to(tip))}
         self.joints: tuple[Joint, ...] = tuple(
@@ -219,8 +218,7 @@ class Robot:
         if not self.parts:
             other = "collision" if self._geometry == "visual" else "visual"
             raise InputError(
-                f"no link of {self.name} has a {self._geometry} shape to draw; "
-                f'give geometry="{other}", or a URDF file with shapes.'
+                f'no link of {self.name} has a {self._geometry} shape to draw; give geometry="{other}".'
             )
         base_from_parts = self.base_from_parts(self._values(angles, None).reshape(len(self.joints)))
         vertices = [

@@ -103,8 +103,7 @@ class Plan:
     def _check_units(self, lasts: float) -> None:
         if lasts > LONGEST:
             raise InputError(
-                f"plan {self.name!r} lasts {lasts:.0f} s: its times are probably in milliseconds; "
-                "scale them by 0.001 to seconds."
+                f"plan {self.name!r} lasts {lasts:.0f} s: its times are probably in milliseconds; scale them."
             )
         positions = self.world_from_peg[:, :3]
         extent, away = float(np.ptp(positions, axis=0).max()), float(np.abs(positions).max())

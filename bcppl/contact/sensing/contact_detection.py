@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
+from bcppl.errors import InputError
 from bcppl.robot.motion import ProbeWindow
 
 
@@ -47,7 +48,12 @@ class ContactDetector:
         Args:
             force: (T, 3) tared, newtons; one that is NaN, as while taring, is undecided.
             acceleration: (T,) commanded acceleration of the tool, m/s^2.
+
+        Raises:
+            InputError: forces are not (T, 3).
         """
+        if force.shape[1:] != (3,):
+            raise InputError(f"forces have shape {tuple(force.shape)}; give (T, 3), in newtons.")
         if len(force) == 0:
             return torch.empty(0, dtype=torch.float64)
         size = force.norm(dim=1)

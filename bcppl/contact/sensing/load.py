@@ -85,14 +85,12 @@ class LoadEstimate:
         bias: (6,) the sensor's zero, N and N m.
         covariance: (10, 10) of mass (kg), centre (m) and bias (N, N m), in this order.
         noise: standard deviations of a reading's residuals, N and N m.
-        readings: the number of readings.
     """
 
     load: ToolLoad
     bias: Array
     covariance: Array
     noise: tuple[float, float]
-    readings: int
 
     @property
     def standard_deviation(self) -> Array:
@@ -120,10 +118,7 @@ def identify_load(wrench: Array, world_from_sensor: Array) -> LoadEstimate:
     """
     wrench = np.asarray(wrench, dtype=np.float64)
     if len(wrench) < 4:
-        raise InputError(
-            f"{len(wrench)} static readings do not determine load and bias; give four or more, "
-            "tilted about different axes."
-        )
+        raise InputError(f"{len(wrench)} static readings do not determine load and bias; give four or more.")
     if not np.isfinite(wrench).all():
         raise InputError("a static reading holds a wrench that is not finite; leave it out.")
     pulls = gravity_in(world_from_sensor)
@@ -131,10 +126,9 @@ def identify_load(wrench: Array, world_from_sensor: Array) -> LoadEstimate:
     # Directions of gravity in one plane leave the centre's place along a line undetermined.
     if values[1] < TURNED * np.linalg.norm(STANDARD_GRAVITY):
         raise InputError(
-            "the static readings hold the sensor at nearly the same tilt, or tilted about one axis only by "
-            "little; add readings tilted by 30 degrees or more about two axes."
+            "the static readings have the same tilt; tilt the sensor about two axes by 30 degrees or more."
         )
-    count, unit = len(pulls), np.tile(np.eye(3), (len(pulls), 1))
+    unit = np.tile(np.eye(3), (len(pulls), 1))
     forces = np.column_stack([pulls.reshape(-1), unit])
     # (m c) x g = -[g]x (m c)
     crossed = np.stack([np.cross(axis, pulls) for axis in np.eye(3)], axis=-1).reshape(-1, 3)
@@ -143,8 +137,7 @@ def identify_load(wrench: Array, world_from_sensor: Array) -> LoadEstimate:
     solution, torque_covariance, torque_noise = _least_squares(torques, wrench[:, 3:].reshape(-1))
     if mass <= 0:
         raise InputError(
-            f"the static readings give a mass of {mass:.3g} kg; the forces have the wrong sign, or the load "
-            "is too small: give the weight's force on the sensor."
+            f"the static readings give a mass of {mass:.3g} kg: the forces have the wrong sign or no load."
         )
     center = solution[:3] / mass
     if not np.linalg.norm(center) <= FARTHEST_CENTER:
@@ -165,7 +158,6 @@ def identify_load(wrench: Array, world_from_sensor: Array) -> LoadEstimate:
         np.concatenate([force_bias, solution[3:]]),
         jacobian @ blocks @ jacobian.T,
         (force_noise, torque_noise),
-        count,
     )
 
 

@@ -80,8 +80,7 @@ class ContactSensing:
         whole_number("sensing has tare = {}", self.tare, least=0)
         if self.cutoff is not None and not 0 < self.cutoff < 0.5 * self.rate:
             raise InputError(
-                f"the low-pass cutoff is {self.cutoff} Hz at {self.rate} samples per second; "
-                "give less than half the rate, or None."
+                f"the cutoff is {self.cutoff} Hz; give less than half the rate of {self.rate} Hz, or None."
             )
         _ = self._surface
 

@@ -120,13 +120,11 @@ class OnsetDetector:
         lead = int(finite.argmax()) if finite.any() else len(finite)
         if len(times) - lead <= self.rest:
             raise InputError(
-                f"a force of {len(times) - lead} samples is too short, or not finite; give more than the "
-                f"{self.rest} at rest."
+                f"a force has {len(times) - lead} finite samples; it is too short for {self.rest} at rest."
             )
         if not finite[lead:].all():
             raise InputError(
-                f"a force is not finite at row {lead + int((~finite[lead:]).argmax())}; fill it by "
-                "interpolation, or cut the signal there."
+                f"a force is not finite at row {lead + int((~finite[lead:]).argmax())}; cut it there."
             )
         if not (np.diff(times) > 0).all():
             raise InputError("a force's times do not increase; sort its rows and drop duplicates.")
