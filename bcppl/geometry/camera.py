@@ -86,13 +86,13 @@ class Camera:
         return pose
 
     def _check_optics(self) -> None:
-        for size, value in (("wide", self.width), ("high", self.height)):
-            whole_number(f"camera {self.name!r} is {{}} pixels {size}", value)
+        for size, count in (("wide", self.width), ("high", self.height)):
+            whole_number(f"camera {self.name!r} is {{}} pixels {size}", count)
         for name, value in (("fx", self.fx), ("fy", self.fy)):
             what = f"camera {self.name!r} has a focal length {name} {{}} pixels (flip mirrored images)"
             number_within(what, value, above=0.0)
-        for name, value in (("cx", self.cx), ("cy", self.cy)):
-            number_within(f"camera {self.name!r} has its principal point at {name} {{}} pixels", value)
+        for name, centre in (("cx", self.cx), ("cy", self.cy)):
+            number_within(f"camera {self.name!r} has its principal point at {name} {{}} pixels", centre)
         near = number_within(f"camera {self.name!r} has a range from {{}} m", self.near, least=0.0)
         if self.far != np.inf:
             number_within(f"camera {self.name!r} has a range from {near} m to {{}} m", self.far, above=near)

@@ -126,7 +126,7 @@ class Part:
             return
         if not self.is_closed:
             raise InputError(
-                f"part {self.name!r} has an open mesh ({self._open_edges} open edges); close it, or merge seams."
+                f"part {self.name!r} has an open mesh ({self._open_edges} open edges); close or merge it."
             )
         first, second, third = np.moveaxis(self.vertices[self.faces], 1, 0)
         volume = float((first * np.cross(second, third)).sum()) / 6.0
