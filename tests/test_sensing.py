@@ -6,6 +6,7 @@ import doctest
 import functools
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest

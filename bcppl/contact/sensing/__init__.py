@@ -1,4 +1,4 @@
-"""Intrinsic contact sensing: gravity compensation, tare, onset detection and contact location from wrenches."""
+"""Intrinsic contact sensing: from the wrenches of a wrist sensor to the onset and the location of a contact."""
 
 from bcppl.exports import exported
 
