@@ -1,4 +1,4 @@
-"""Intrinsic contact sensing: from the wrenches of a wrist sensor to the onset and the location of a contact."""
+"""Intrinsic contact sensing: onset and location of a contact from the wrenches of a wrist sensor."""
 
 from bcppl.exports import exported
 
