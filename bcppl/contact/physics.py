@@ -71,11 +71,6 @@ class PegPhysics:
         The free motion is simulated once for all particles unless the controller or the grasp's compliance
         differs between them.
 
-        Args:
-            world_from_part: (N, 7).
-            probe: the arm's motion.
-            nuisances: parameters that differ between the particles; None for none.
-
         Raises:
             InputError: the poses are not (N, 7), finite and with unit quaternions, the probe cannot be
                 simulated, or a nuisance parameter does not fit or is physically impossible.
@@ -109,15 +104,9 @@ class ProbeSimulation:
 
 @dataclass(frozen=True, eq=False)
 class _Particles(ArrayRecord):
-    """The state of N rollouts.
+    """The state of N rollouts: poses (N, 7), nuisances (N, ...), and sensor rows (N, count, 13) so far.
 
-    Attributes:
-        world_from_part: (N, 7).
-        nuisances: by name (N, ...).
-        rows: (N, count, 13) sensor rows at the stamps so far.
-        state: of the simulations.
-        free: (N,) stamps of shared free motion.
-        level: (N,) `_FULL` or `_HALVED` time step, or `_DIVERGED`.
+    `free` (N,) counts stamps of shared free motion; `level` (N,) is `_FULL`, `_HALVED` or `_DIVERGED`.
     """
 
     world_from_part: Array

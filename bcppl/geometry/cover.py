@@ -20,11 +20,9 @@ _ROUNDED = 8  # vertices from which on a hole is enclosed in a box
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """One convex polygon of a cover.
+    """One convex polygon of a cover: its core (C, 2), counter-clockwise, and an expansion (G, 2) of it.
 
-    Attributes:
-        core: (C, 2) its vertices, counter-clockwise; the cores of a cover partition the region.
-        grown: (G, 2) a convex polygon within the region that contains the core.
+    The cores of a cover partition the region; an expansion is convex and lies within the region.
     """
 
     core: Array
@@ -36,11 +34,8 @@ def convex_cells(region: shapely.Polygon | shapely.MultiPolygon, reach: float) -
 
     The partition is a constrained Delaunay triangulation whose diagonals are removed, longest first, while
     cells stay convex: at most four times as many cells as the minimum (Hertel and Mehlhorn 1983). A hole with
-    many vertices is enclosed in a box first, so that the small cells along its sides stay near it.
-
-    Args:
-        region: in metres, valid.
-        reach: largest expansion of a cell across a diagonal, metres.
+    many vertices is enclosed in a box first, so that the small cells along its sides stay near it. A cell
+    expands across a diagonal by `reach` metres at most.
     """
     cells: list[Cell] = []
     for polygon in polygons_of(region):

@@ -38,13 +38,7 @@ _GENTLE = np.deg2rad(30.0)  # dihedral angle below which a concave edge belongs 
 
 @dataclass(frozen=True, eq=False)
 class Decomposition:
-    """A part with convex pieces, and their Hausdorff error.
-
-    Attributes:
-        part: the part with its pieces.
-        error: Hausdorff error of the pieces, metres.
-        threshold: CoACD's concavity threshold; 0 where the mesh's bodies are convex already.
-    """
+    """A part with convex pieces, their Hausdorff error (m), and CoACD's threshold; 0 if it was not needed."""
 
     part: Part
     error: HausdorffError
@@ -67,12 +61,9 @@ def decomposed(
     times too large, no finer one is tried. Flat concave walls may become exact at any threshold, and all are
     tried.
 
-    CoACD's search dominates the time, more so at finer thresholds; the error takes about a second. On two
-    busy cores a torus of 1024 faces took 5 s down to a threshold of 0.05 and 17 s down to 0.02; a drill of
-    nine overlapping bodies, 342 faces, took 0.6 s where their hulls sufficed, 7 s down to 0.02, two minutes
-    down to 0.01.
-
-    Results are cached on disk under a hash of the mesh, the settings and CoACD's version.
+    CoACD's search dominates the time: a torus of 1024 faces took 5 s at a threshold of 0.05 and 12 s more at
+    0.02, a drill of 342 faces 7 s down to 0.02 and two minutes down to 0.01. Results are cached on disk under
+    a hash of the mesh, the settings and CoACD's version.
 
     Args:
         part: with a closed mesh.

@@ -125,13 +125,7 @@ class SignedDistance:
 
 
 class DistanceGrid(NamedTuple):
-    """Signed distances at the nodes of a grid in the part's frame.
-
-    Attributes:
-        low: (3,) the first node, metres.
-        spacing: between nodes, metres.
-        distance: (X, Y, Z) metres, positive outside.
-    """
+    """Signed distances (X, Y, Z), m, at the nodes of a grid in the part's frame, of which `low` is the first."""
 
     low: Array
     spacing: float

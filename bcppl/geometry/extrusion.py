@@ -28,11 +28,7 @@ def extruded(name: str, outline: shapely.Polygon, bottom: float, top: float) -> 
     overlap by up to 2 mm, so that no wall has a seam. On the end faces they meet without overlap: there each
     prism extends into its neighbours as a bevel, 0.1 mm below the face, so that a sliding peg does not catch.
 
-    Args:
-        name: the part's name.
-        outline: metres, with or without holes.
-        bottom: z of the lower face, metres.
-        top: z of the upper face, metres.
+    The outline is in metres, with or without holes; bottom and top are the z of the end faces, metres.
 
     Raises:
         InputError: the outline is empty, crosses itself, is in several pieces, or is probably in millimetres;
@@ -75,14 +71,10 @@ def _convex(outline: shapely.Polygon) -> Cell:
 
 
 def block(size: tuple[float, float, float], name: str = "block") -> Part:
-    """A solid rectangular block.
+    """A solid rectangular block with side lengths along x, y and z in metres.
 
     The part's frame: origin at the centre of the top face, x and y along the sides, z up, out of the
     material.
-
-    Args:
-        size: side lengths along x, y and z, metres.
-        name: the part's name.
     """
     outline = rectangular_outline(size[0], size[1])
     return _solid(name, outline, [_convex(outline)], -size[2], 0.0)

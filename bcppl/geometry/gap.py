@@ -129,13 +129,10 @@ class PegGap:
 
 
 class _Solids(NamedTuple):
-    """A peg as convex solids.
+    """A peg as convex solids: distinct vertices (V, 3), and a bounding box (2, 3).
 
-    Attributes:
-        corners: (V, 3) its distinct vertices, metres.
-        planes: (P, 4) outward unit normals and offsets of all solids.
-        ends: (S,) index after each solid's last plane.
-        box: (2, 3) the bounding box.
+    Planes (P, 4) are the outward unit normals and offsets of all solids, `ends` (S,) the index after each
+    solid's last plane.
     """
 
     corners: Array

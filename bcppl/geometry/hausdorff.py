@@ -36,12 +36,7 @@ class HausdorffError:
 
 
 def hausdorff_error(part: Part, count: int = 20000, seed: int = 0) -> HausdorffError:
-    """The Hausdorff error of a part's pieces, over vertices and uniform samples of both surfaces.
-
-    Args:
-        part: with a closed mesh and pieces.
-        count: of samples on either surface.
-        seed: of the samples.
+    """The Hausdorff error of a part's pieces, over vertices and `count` uniform samples of either surface.
 
     Raises:
         InputError: the mesh is empty, open or not finite, or there are no pieces.

@@ -94,11 +94,9 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None) -> Hole:
 
 
 class Fit(NamedTuple):
-    """How a peg fits a hole.
+    """The insertion pose (7,), the peg's tip in the plane of the part's top, and the clearance in metres.
 
-    Attributes:
-        hole_from_peg: (7,) the insertion pose, the peg's tip in the plane of the part's top.
-        clearance: metres, of the diameter or between opposite flats.
+    The clearance is of the diameter, or between opposite flats.
     """
 
     hole_from_peg: Array

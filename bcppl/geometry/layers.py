@@ -26,13 +26,9 @@ _ROTATIONS = {"x": np.roll(np.eye(3), 2, axis=0), "y": np.roll(np.eye(3), 1, axi
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A slab of a solid between two levels: a prism, or tapered linearly from one section to another.
+    """A slab of a solid between two heights (m): a prism, or tapered linearly from one section to another.
 
-    Attributes:
-        bottom: height of the lower level, metres.
-        top: height of the upper level, metres.
-        low: the section at the bottom.
-        high: the section at the top, vertex by vertex that of the bottom moved; a prism: the same object.
+    The section at the top is vertex by vertex that at the bottom, moved; of a prism it is the same object.
     """
 
     bottom: float

@@ -115,18 +115,10 @@ def segment_distance(
 
     The largest signed distance of a point to the solid's planes is convex and piecewise linear along the
     segment. Where its minimum lies between two planes, the segment crosses the edge between them: the
-    distance is along the common normal of both edges, a convex combination of the planes' normals.
-
-    Args:
-        start: (3,) one end in the peg's frame.
-        stop: (3,) the other end.
-        planes: (P, 4) of the solid: outward unit normal and offset.
-        least: distance from which on the result does not matter.
-        normal: (3,) is set to the solid's outward unit normal at the witness point.
-
-    Returns:
-        The distance, negative inside, exact only if less than `least`; the witness point's parameter along
-        the segment, from 0 to 1.
+    distance is along the common normal of both edges, a convex combination of the planes' normals. It is
+    negative inside, and exact only if less than `least`. Planes (P, 4) are outward unit normals and offsets;
+    the witness point is a parameter along the segment, from 0 to 1, and `normal` (3,) is set to the solid's
+    outward unit normal there.
     """
     low, high = 0.0, 1.0
     at_low, plane_low = _farthest_plane(start, stop, low, planes)

@@ -87,8 +87,7 @@ class PartRenderer(ABC):
         """Depth images (N, H, W) in metres, +inf where a pixel does not see the part.
 
         Raises:
-            InputError: a pose, the camera's too, is not finite or has no unit quaternion, or the camera's
-                intrinsics are invalid.
+            InputError: as `hits`.
         """
         pose = poses.as_pose(world_from_part, "world_from_part").reshape(-1, 7)
         return self.hits(camera, pose).images(camera, len(pose))

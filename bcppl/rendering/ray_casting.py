@@ -31,12 +31,9 @@ MISS = 1e30  # m: Embree returns 1e37 for a ray without a hit
 
 @dataclass(frozen=True, eq=False)
 class _Spans(ArrayRecord):
-    """Runs of pixels that may see the part: at most one for each particle and image row.
+    """Runs of pixels that may see the part, at most one for each particle and image row.
 
-    Attributes:
-        particle, row: (S,) indices of the particle and of the image row.
-        first: (S,) column of the first pixel.
-        length: (S,) pixels, at least 1.
+    Of each (S,) the column of its first pixel, and its length in pixels, at least 1.
     """
 
     particle: Indices

@@ -23,9 +23,8 @@ SHORT = 6  # pixels: a shorter run is drawn one by one
 class Grid(NamedTuple):
     """The rows and columns of an image that are rendered; triangles between them cost next to nothing.
 
-    Attributes:
-        row_after, column_after: (H + 1,) and (W + 1,) how many of them lie before each one of the image.
-        row_at, column_at: (R,) and (C,) their coordinates in the image.
+    `row_after` (H + 1,) and `column_after` (W + 1,) count those before each one of the image; `row_at` (R,)
+    and `column_at` (C,) are their coordinates in the image.
     """
 
     row_after: Numbers
@@ -62,11 +61,8 @@ class PosedMesh(NamedTuple):
 class Workspace(NamedTuple):
     """Arrays that the rasterisation of one pose writes into.
 
-    Attributes:
-        projected: (3, V) u, v and 1/z of the vertices.
-        cells: (2, V) how many rows and columns of the grid lie before them.
-        flags: (F,) one for each face.
-        chosen: (F,) indices of the faces to be drawn, at the front.
+    Of the vertices u, v and 1/z (3, V), and how many rows and columns of the grid lie before them (2, V); of
+    the faces a flag (F,), and at the front of `chosen` (F,) the indices of those to be drawn.
     """
 
     projected: Array

@@ -56,13 +56,7 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """The visual or collision geometry of a link, or one element of it.
-
-    Attributes:
-        link: the name of its link.
-        link_from_shape: (4, 4) transformation.
-        geometry: a mesh, box, cylinder or sphere, as parsed.
-    """
+    """A mesh, box, cylinder or sphere, as parsed, and its transformation (4, 4) in its link's frame."""
 
     link: str
     link_from_shape: Array
@@ -71,15 +65,7 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """The content of a URDF file.
-
-    Attributes:
-        name: of the robot.
-        file: path of the URDF file.
-        links: names of all links, the base first, each after its parent.
-        joints: each after its parent joint.
-        visual, collision: the links' shapes.
-    """
+    """The content of a URDF file; links and joints are ordered from the base, each after its parent."""
 
     name: str
     file: Path

@@ -20,11 +20,7 @@ WOUND = 4.0 * math.pi  # rad: two revolutions, the largest value of a joint with
 
 
 def check_angles(robot: str, joints: Sequence[Joint], values: Tensor) -> None:
-    """Refuse joint angles (..., J) that are not finite, or so far outside the limits that the unit is wrong.
-
-    Raises:
-        InputError: names the joint.
-    """
+    """Refuse joint angles (..., J) that are not finite, or outside the limits by as much as a wrong unit."""
     _check_finite(robot, joints, values, "angles", "leave such stamps out")
     if values.numel() == 0:
         return
@@ -46,9 +42,6 @@ def check_offsets(robot: str, joints: Sequence[Joint], offsets: Tensor) -> None:
 
     A few particles may be anywhere, and so may all within a leapfrog trajectory, whose offsets carry
     gradients.
-
-    Raises:
-        InputError: names the joint.
     """
     _check_finite(robot, joints, offsets, "offsets", "give 0 for a joint without an error")
     if offsets.requires_grad or offsets.numel() == 0:
@@ -64,12 +57,7 @@ def check_offsets(robot: str, joints: Sequence[Joint], offsets: Tensor) -> None:
 
 
 def held_values(robot: str, moving: Mapping[str, Joint], held: Mapping[str, float]) -> dict[str, float]:
-    """The values of fixed joints by name, radians or metres.
-
-    Raises:
-        InputError: a joint is not a moving one of the robot's, or a value is no finite number or far outside
-            the limits.
-    """
+    """The values of fixed joints by name, radians or metres; refused are those far outside the limits."""
     values = {}
     for name, value in held.items():
         if name not in moving:

@@ -226,13 +226,10 @@ class _Places:
 
 @dataclass(frozen=True, eq=False)
 class _Bundle:
-    """The lines of action of M wrenches and their uncertainty.
+    """The lines of action of M wrenches: unit directions, and the points nearest to the peg's middle.
 
-    Attributes:
-        direction: (M, 3) unit vectors along the forces.
-        point: (M, 3) the lines' points nearest to the peg's middle.
-        side: (M, 3, 2) unit vectors across.
-        root: (M, 2, 2) a square root of a bound of the line's covariance across, m.
+    `side` (M, 3, 2) are unit vectors across them, `root` (M, 2, 2) a square root (m) of a bound of the
+    covariance across.
     """
 
     direction: Array

@@ -56,18 +56,8 @@ class OnsetDetector:
     grows linearly, in an unknown direction at an unknown rate, or rises to a constant within a sample. The
     prior is uniform over the samples before the alarm.
 
-    Measured on 1000 contacts each, on three axes of white noise, at any time between two samples, ten samples
-    at rest (z is the time's error over `standard_deviation`, errors in samples):
-
-        force over noise               error       stated         z        |z| < 2
-        steps to 8                 -0.12 (0.32)     0.33    -0.35 (0.96)    98.9 %
-        steps to 4                 -0.58 (1.19)     1.25    -0.41 (0.96)    97.5 %
-        grows by 0.3 in a sample    0.07 (2.07)     2.06     0.18 (1.18)    93.7 %
-        grows by 1 in a sample     -0.01 (0.86)     0.82     0.08 (1.11)    93.0 %
-        grows by 4 in a sample     -0.03 (0.25)     0.24    -0.06 (1.08)    93.7 %
-
-    Standard deviations are in brackets. After a step, `time` is between the last sample before it and the
-    first one after it; it is a little early, because a force may also grow within a sample. The noise
+    In 93 to 99 % of simulated contacts the error of that time was less than two of the stated standard
+    deviations. After a step it is a little early, because a force may also grow within a sample. The noise
     estimated from ten samples is off by a seventh and more: use more where there are.
 
     Attributes:

@@ -22,13 +22,7 @@ MOST_LAYERS = 12  # times that a line may enter the surface
 
 
 class Crossings(NamedTuple):
-    """Points where lines enter a solid.
-
-    Attributes:
-        line: (Q,) index of the line.
-        point: (Q, 3).
-        face: (Q,) index of the triangle.
-    """
+    """Points (Q, 3) where lines enter a solid, and the indices (Q,) of the line and of the triangle."""
 
     line: Indices
     point: Array
@@ -36,13 +30,9 @@ class Crossings(NamedTuple):
 
 
 class Edges(NamedTuple):
-    """Sharp convex edges.
+    """Sharp convex edges (E, 3) from their start, normals (E, 9, 3) from one face's to the other's.
 
-    Attributes:
-        start: (E, 3).
-        extent: (E, 3) from start to end.
-        normals: (E, 9, 3) outward normals, from one face's to the other's.
-        chain: (E,) index of its smooth curve.
+    `chain` (E,) is the index of the smooth curve that an edge belongs to.
     """
 
     start: Array
