@@ -63,8 +63,8 @@ def test_draws_are_those_of_the_density() -> None:
 
 @pytest.mark.parametrize("width", [0.5, 2.0])
 def test_the_truth_is_likelier_than_what_is_off_it(width: float) -> None:
-    found = Silhouette(RENDERER, CAMERA, moved(0.01, 0.08), width).log_prob(shown())
-    assert int(found.argmax()) == 0 and float(found[0] - found[1:].max()) > 1.0
+    log_p = Silhouette(RENDERER, CAMERA, moved(0.01, 0.08), width).log_prob(shown())
+    assert int(log_p.argmax()) == 0 and float(log_p[0] - log_p[1:].max()) > 1.0
 
 
 def test_a_hole_in_the_mask_hardly_moves_the_best_pose() -> None:
@@ -73,11 +73,11 @@ def test_a_hole_in_the_mask_hardly_moves_the_best_pose() -> None:
     row, column = (int(side.double().mean()) for side in sides)
     mask[row - 2 : row + 3, column - 10 : column - 1] = 0.0
     assert float((mask != shown()).sum()) > 35
-    found = Silhouette(RENDERER, CAMERA, moved(0.006, 0.08), 1.0).log_prob(mask)
-    assert int(found.argmax()) == 0
+    log_p = Silhouette(RENDERER, CAMERA, moved(0.006, 0.08), 1.0).log_prob(mask)
+    assert int(log_p.argmax()) == 0
     unknown = torch.where(mask == shown(), mask, torch.nan)
-    told = Silhouette(RENDERER, CAMERA, moved(0.006, 0.08), 1.0).log_prob(unknown)
-    assert int(told.argmax()) == 0 and float(told[0]) > float(found[0]) + 35.0
+    masked = Silhouette(RENDERER, CAMERA, moved(0.006, 0.08), 1.0).log_prob(unknown)
+    assert int(masked.argmax()) == 0 and float(masked[0]) > float(log_p[0]) + 35.0
 
 
 def test_a_rim_moves_a_straight_outline_by_so_many_pixels() -> None:
@@ -117,7 +117,7 @@ def test_a_mask_is_binned_by_most_of_its_pixels() -> None:
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda s: s.log_prob(shown().T), r"shape \(64, 48\); give \(48, 64\) or \(13, 48, 64\)"),
         (lambda s: s.log_prob(255.0 * shown()), "other values than 0 and 1; give 1 where"),
@@ -127,6 +127,6 @@ def test_a_mask_is_binned_by_most_of_its_pixels() -> None:
         (lambda s: binned_mask(np.zeros((4, 4, 3)), 2), "cannot be binned by 2; give one"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_sentence(call: object, said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_what_cannot_be_is_refused_in_one_sentence(call: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         call(Silhouette(RENDERER, CAMERA, moved(0.01, 0.1), 1.0))  # type: ignore[operator]

@@ -63,12 +63,13 @@ def test_on_a_narrow_rim_the_peg_is_lifted_to_the_third_point() -> None:
 
 def test_sides_of_a_block_are_its_four_faces() -> None:
     part = block_with_square_hole((0.06, 0.04, 0.025))
-    found = sides(part, -0.01)
-    assert [round(side.length, 6) for side in found] == [0.06, 0.06, 0.04, 0.04]
-    for side in found:
+    borders = sides(part, -0.01)
+    assert [round(side.length, 6) for side in borders] == [0.06, 0.06, 0.04, 0.04]
+    for side in borders:
         middle = 0.5 * (side.start + side.stop)
         np.testing.assert_allclose(side.normal, middle / np.linalg.norm(middle), atol=1e-9)
-    assert {tuple(np.round(side.normal).astype(int)) for side in found} == {(1, 0), (-1, 0), (0, 1), (0, -1)}
+    normals = {tuple(np.round(side.normal).astype(int)) for side in borders}
+    assert normals == {(1, 0), (-1, 0), (0, 1), (0, -1)}
     assert section(part, -0.01).area == pytest.approx(0.06 * 0.04 - 0.0165**2, rel=1e-6)
 
 
@@ -196,8 +197,8 @@ def gaps(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """The gap to the true part of the commanded peg, and of where the peg truly was."""
     scene, _, motion = carried(seed)
     gap, truth = PegGap(scene.part, scene.peg), torch.from_numpy(scene.truth)[None]
-    found = [gap(truth, torch.from_numpy(path)) for path in (motion.probe.command, motion.world_from_peg)]
-    return found[0].distance[0].numpy(), found[1].distance[0].numpy()
+    gaps = [gap(truth, torch.from_numpy(path)) for path in (motion.probe.command, motion.world_from_peg)]
+    return gaps[0].distance[0].numpy(), gaps[1].distance[0].numpy()
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -32,18 +32,18 @@ def from_above(height: float, name: str = "camera") -> Camera:
 def test_of_a_plane_that_fills_the_image_it_is_the_closed_form() -> None:
     """Each pixel reads the depth of a plane: it informs height and tilt, and nothing else."""
     renderer, camera = RayCaster(block((1.0, 1.0, 0.02))), from_above(0.3)
-    found = pixel_information(renderer, camera, poses.identity(2))
+    information = pixel_information(renderer, camera, poses.identity(2))
     top = 0.3 - float(renderer.part.vertices[:, 2].max())
     rays = np.stack(np.meshgrid((np.arange(80) - 39.5) / 100, (np.arange(60) - 29.5) / 100), -1).reshape(
         -1, 2
     )
     places = torch.from_numpy(top * rays)
-    assert float(found[0, 2, 2]) == pytest.approx(80 * 60, rel=1e-3)
-    assert float(found[0, 2, 6]) == pytest.approx(-80 * 60, rel=1e-3)  # nearer is higher
+    assert float(information[0, 2, 2]) == pytest.approx(80 * 60, rel=1e-3)
+    assert float(information[0, 2, 6]) == pytest.approx(-80 * 60, rel=1e-3)  # nearer is higher
     size = float(places.square().sum())
-    assert float(found[0, 3, 3] + found[0, 4, 4]) == pytest.approx(size, rel=0.01)
-    assert float(found[0, [0, 1, 5]][:, [0, 1, 5]].abs().max()) < 1e-3 * size
-    torch.testing.assert_close(found[0], found[1])
+    assert float(information[0, 3, 3] + information[0, 4, 4]) == pytest.approx(size, rel=0.01)
+    assert float(information[0, [0, 1, 5]][:, [0, 1, 5]].abs().max()) < 1e-3 * size
+    torch.testing.assert_close(information[0], information[1])
 
 
 def test_surfaces_out_of_the_sensors_range_are_uninformative() -> None:

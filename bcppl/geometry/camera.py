@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from torch import Tensor
 
 from bcppl import poses
@@ -76,9 +75,7 @@ class Camera:
                 principal point is not finite, or near is not below far.
         """
         self._check_optics()
-        pose = poses.as_pose(
-            np.asarray(self.world_from_camera, dtype=np.float64), f"the world_from_camera of {self.name!r}"
-        )
+        pose = poses.as_pose(self.world_from_camera, f"the world_from_camera of {self.name!r}")
         if pose.ndim != 1:
             raise InputError(
                 f"camera {self.name!r} has poses of shape {tuple(pose.shape)}; give one pose (7,) a camera."
@@ -177,10 +174,8 @@ class Camera:
         if self.wrist_from_camera is None:
             raise InputError(f"camera {self.name!r} has no wrist_from_camera; give its hand-eye calibration.")
         there = poses.compose(
-            poses.as_pose(torch.as_tensor(np.asarray(world_from_wrist)), "world_from_wrist"),
-            poses.as_pose(
-                torch.as_tensor(np.asarray(self.wrist_from_camera)), f"{self.name!r}'s wrist_from_camera"
-            ),
+            poses.as_pose(world_from_wrist, "world_from_wrist"),
+            poses.as_pose(self.wrist_from_camera, f"{self.name!r}'s wrist_from_camera"),
         )
         return replace(self, name=name or self.name, world_from_camera=there.numpy(), device=self.instrument)
 

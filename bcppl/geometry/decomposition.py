@@ -26,7 +26,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.hausdorff import HausdorffError, bodies_of, hausdorff_error
 from bcppl.geometry.parts import Part, Piece
 
-FRACTION = 0.2  # of the clearance that the error may take in either direction
+FRACTION = 0.2  # of the clearance that the error may use up in either direction
 THRESHOLDS = (0.05, 0.02, 0.01)  # CoACD's concavity, for a mesh scaled to a box of side 2
 # Of CoACD's tree search; with its defaults of 150 and 2000, twice the time for as many pieces of equal error.
 _SEARCH = {"mcts_iterations": 60, "resolution": 1000}

@@ -125,7 +125,7 @@ class SignedDistance:
 
 
 class DistanceGrid(NamedTuple):
-    """Signed distances (X, Y, Z), m, at the nodes of a grid in the part's frame, of which `low` is the first."""
+    """Signed distances (X, Y, Z), m, at the nodes of a grid in the part's frame, of which `low` is first."""
 
     low: Array
     spacing: float

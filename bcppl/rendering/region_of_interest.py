@@ -33,7 +33,7 @@ def region_of_interest(
         InputError: the camera's pose or intrinsics are invalid, or no pixel can show the part.
     """
     camera_from_world = poses.inverse(camera.stated_pose())
-    expected = poses.as_pose(torch.as_tensor(np.asarray(world_from_part)))
+    expected = poses.as_pose(world_from_part)
     middle = torch.as_tensor(0.5 * (part.vertices.min(axis=0) + part.vertices.max(axis=0)))[None]
     there = poses.transform(camera_from_world, poses.transform(expected, middle)).numpy()
     reach = float(np.linalg.norm(part.extent) / 2 + within)
