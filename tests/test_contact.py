@@ -182,7 +182,7 @@ def test_the_normalised_contact_likelihood_is_normalised() -> None:
         assert none == pytest.approx(0.1 if contact is place else 0.8)
 
 
-def test_the_normalised_contact_likelihood_samples_what_it_says() -> None:
+def test_the_normalised_contact_likelihood_samples_from_its_density() -> None:
     torch.manual_seed(4)
     contacts = torch.zeros(300, 100, 3, dtype=torch.float64)
     contacts[:, ::2] = NAN

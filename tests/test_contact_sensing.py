@@ -54,7 +54,7 @@ def test_a_contact_is_located_where_the_force_enters_the_peg() -> None:
         assert np.mean(off > 1e-3) > 0.8
 
 
-def test_a_line_that_misses_by_little_is_taken_to_the_nearest_edge() -> None:
+def test_a_line_that_misses_by_little_is_located_on_the_nearest_edge() -> None:
     points = np.array(
         [[0.009, 0.002, -0.03], [0.0085, -0.0085, -0.03], [0.0081, 0.0, -0.0501], [0.011, 0, -0.03]]
     )
@@ -172,12 +172,12 @@ def test_a_missing_wrench_is_refused_where_a_filter_would_carry_it_on() -> None:
             InputError, match=f"{message}; fill it by interpolation, or cut the recording there"
         ):
             sensing.measure(windows(row, column))
-    # Nothing carries it on where nothing is filtered, unless it is in the zero.
+    # Without a filter no later sample depends on it, unless it is in the tare.
     tared = torch.cat(sensing.tared(windows(50, 4)))
     assert torch.isnan(tared).any(dim=1).nonzero().flatten().tolist() == [*range(10), 50]
     with pytest.raises(InputError, match=r"window 0 .* row 4"):
         sensing.tared(windows(4, 0))
-    # What was simulated and diverged is no contact, as it was.
+    # A simulation that diverged has no contact from there on.
     lost, _ = sensing.contacts(np.where(np.arange(80)[:, None] < 50, signal, np.nan)[None], sensing.start(1))
     assert torch.from_numpy(lost[0]).isfinite().all(dim=-1).nonzero().max() == 49
     pose[7, 2] = np.nan

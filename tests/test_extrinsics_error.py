@@ -28,7 +28,7 @@ CAMERA = camera((0.3, -0.2, 0.35))
 
 
 def seen(by: Camera, error: torch.Tensor, part: torch.Tensor = PART) -> torch.Tensor:
-    """Where a camera that really stands at `stated error` sees the part, taken by its word."""
+    """Where a camera whose true pose is `stated error` places the part, by its stated pose."""
     stated = torch.from_numpy(by.world_from_camera)
     really = poses.compose(stated, poses.retract(poses.identity(), error))
     return poses.compose(stated, poses.compose(poses.inverse(really), part))

@@ -198,7 +198,7 @@ def test_direction_samples_follow_the_density() -> None:
     assert float((torch.histogram(many, edges).hist / 20000 - expected).abs().max()) < 0.012
 
 
-def test_nothing_felt_has_no_direction() -> None:
+def test_no_force_has_no_direction() -> None:
     tips = torch.stack([t(math.nan, math.nan, math.nan), t(-0.0502, 0.0, 0.0)])
     none = direction(shifted(0.0, 0.0), t(1.0, 0.0, 0.0), tips)
     assert none.log_prob(t(math.nan)[0]).tolist() == [0.0, -math.inf]

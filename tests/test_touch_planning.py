@@ -144,7 +144,7 @@ def forces(*sizes: float) -> torch.Tensor:
     return direction * torch.tensor(sizes, dtype=torch.float64)[:, None]
 
 
-def test_a_contact_is_felt_from_one_force_on_and_none_below_another() -> None:
+def test_contact_is_detected_above_one_force_and_excluded_below_another() -> None:
     at_once = ContactDetector(contact=1.5, free=0.8, mass=0.3, neighbours=0)
     detected = at_once(forces(0.0, 0.79, 0.81, 1.49, 1.51, 40.0, NAN))
     np.testing.assert_array_equal(detected.numpy(), [0, 0, NAN, NAN, 1, 1, NAN])

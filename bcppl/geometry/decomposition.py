@@ -83,8 +83,6 @@ def decomposed(
     levels = [
         number_within(f"{task} with threshold {{}}", level, least=_FINEST, most=1.0) for level in thresholds
     ]
-    if not levels:
-        raise InputError(f"{task} without thresholds; give at least one, such as 0.05.")
     seed = seed_number(seed)
     whole = _measured(part, [np.asarray(b.convex_hull.vertices) for b in bodies_of(part.mesh)], 0.0, seed)
     if whole.error.largest <= bound:

@@ -10,7 +10,6 @@ import torch
 import trimesh
 
 from bcppl.arrays import Array
-from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.parts import Part, Piece
 
@@ -39,13 +38,9 @@ def hausdorff_error(part: Part, count: int = 20000, seed: int = 0) -> HausdorffE
     """The Hausdorff error of a part's pieces, over vertices and `count` uniform samples of either surface.
 
     Raises:
-        InputError: the mesh is empty, open or not finite, or there are no pieces.
+        InputError: the mesh is empty, open or not finite.
+        ValueError: the part has no pieces.
     """
-    if not part.pieces:
-        raise InputError(
-            f"part {part.name!r} has no convex pieces whose error could be measured; construct them with "
-            "`extruded`, `prismatic` or `decomposed`."
-        )
     solids = [solid_of(piece) for piece in part.pieces]
     corners = np.concatenate([solid.vertices for solid in solids])
     whole = trimesh.util.concatenate(solids)

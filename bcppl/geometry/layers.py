@@ -61,8 +61,6 @@ def prismatic(part: Part, axis: str = "z", tolerance: float = 5e-6) -> Part:
     """
     part.check()
     number_within(f"part {part.name!r} is decomposed into prisms with tolerance {{}}", tolerance, above=0.0)
-    if axis not in _ROTATIONS:
-        raise InputError(f"the axis of part {part.name!r} is {axis!r}; give 'x', 'y' or 'z'.")
     rotation = _ROTATIONS[axis]
     mesh = trimesh.Trimesh(part.vertices @ rotation.T, part.faces, process=False)
     hull = mesh.convex_hull

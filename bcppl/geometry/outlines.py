@@ -137,7 +137,7 @@ def check_outline(outline: shapely.Polygon, name: str) -> None:
     low, high = np.reshape(outline.bounds, (2, 2))
     if (high - low).max() > LARGEST_EXTENT:
         raise InputError(
-            f"the outline of {name!r} is {(high - low).max():.0f} m long, so in millimetres; rescale it."
+            f"outline {name!r} is {(high - low).max():.0f} m long, probably in millimetres: rescale it."
         )
 
 

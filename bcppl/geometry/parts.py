@@ -120,7 +120,7 @@ class Part:
             raise InputError(f"part {self.name!r} has a face without vertices; export its mesh again.")
         if self.extent.max() > LARGEST_EXTENT:
             raise InputError(
-                f"part {self.name!r} is {self.extent.max():.0f} m long, so in millimetres; scale it by 0.001."
+                f"part {self.name!r} is {self.extent.max():.0f} m long, probably in millimetres; rescale it."
             )
         if not closed:
             return
