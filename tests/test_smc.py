@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Iterator
 from importlib.resources import files
@@ -29,6 +28,7 @@ from bcppl.models.point_probe import model
 from bcppl.recordings import Recording, load
 from bcppl.traces import Trace, generate, update as real_update
 from bcppl.traces.propose import assessed
+from tests import few_moves
 
 
 def number(value: float) -> Tensor:
@@ -204,10 +204,7 @@ def same(first: list[Step], second: list[Step]) -> bool:
     )
 
 
-FEW_MOVES = functools.partial(tempered_smc.infer, sweeps=(2, 2), share=(0.6, 0.6))
-
-
-@pytest.mark.parametrize("infer", [FEW_MOVES, bayes_contact.infer], ids=["tempered", "drifting"])
+@pytest.mark.parametrize("infer", [few_moves.infer, bayes_contact.infer], ids=["tempered", "drifting"])
 def test_the_same_seed_gives_the_same_beliefs_however_the_run_is_interrupted(
     infer: Callable[..., Iterator[Step]], recording: Recording
 ) -> None:
