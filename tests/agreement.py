@@ -13,7 +13,7 @@ from torch import Tensor
 from bcppl.beliefs import normalised
 from bcppl.inference.population import Population
 
-RUNS = 8
+RUNS = 20
 
 
 def agrees(errors: np.ndarray, resolution: float) -> None:
