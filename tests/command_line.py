@@ -9,6 +9,7 @@ from pathlib import Path
 from bcppl.recordings import Recording, load
 
 SHIPPED = Path(str(files("bcppl.models") / "recordings/point_probe_10_pushes.h5"))
+FEW_MOVES = Path(__file__).with_name("few_moves.py")
 PROBE = Path(str(files("bcppl.models") / "point_probe.py"))
 
 

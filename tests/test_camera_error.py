@@ -119,15 +119,13 @@ def test_several_views_share_one_error() -> None:
     torch.testing.assert_close(first.pose, second.pose, rtol=0.0, atol=0.0)
 
 
-def test_beliefs_hold_the_truth_and_are_as_wide_as_the_cameras_errors() -> None:
-    distance = 0.0
-    for seed in (1, 2):
-        recording = simulate_recording(seed)
-        # Fewer moves than the default's: a belief that is not quite there is wide, not sure.
-        *_, last = infer(camera_error.model, recording, seed=seed, sweeps=(4, 4), share=(0.6, 0.6))
-        belief = last.belief
-        off = poses.local(belief.mean, torch.as_tensor(recording.truth))
-        distance += float(off @ torch.linalg.solve(belief.covariance, off))
-        # Two cameras of 2 mm, 0.5 degrees at half a metre and 2 mm of bias: 2 to 4 mm on each axis.
-        assert bool(((belief.spread[:3] > 0.0015) & (belief.spread[:3] < 0.006)).all())
-    assert distance < float(chi2.ppf(0.999, 12))
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
+def test_beliefs_hold_the_truth_and_are_as_wide_as_the_cameras_errors(seed: int) -> None:
+    recording = simulate_recording(seed)
+    # Fewer moves than the default's: a belief that is not quite there is wide, not sure.
+    *_, last = infer(camera_error.model, recording, seed=seed, sweeps=(4, 4), share=(0.6, 0.6))
+    belief = last.belief
+    off = poses.local(belief.mean, torch.as_tensor(recording.truth))
+    assert float(off @ torch.linalg.solve(belief.covariance, off)) < float(chi2.ppf(0.999, 6))
+    # Two cameras of 2 mm, 0.5 degrees at half a metre and 2 mm of bias: 2 to 4 mm on each axis.
+    assert bool(((belief.spread[:3] > 0.0015) & (belief.spread[:3] < 0.006)).all())

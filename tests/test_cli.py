@@ -252,7 +252,7 @@ def test_as_a_program() -> None:
     """The entry point in a process of its own: exit code, and no traceback on either stream."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     ran = subprocess.run(
-        [sys.executable, "-m", "bcppl", "run", "nowhere.h5"],
+        [sys.executable, "-m", "bcppl", "check", "nowhere.h5"],
         capture_output=True,
         text=True,
         env=environment,

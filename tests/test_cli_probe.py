@@ -37,7 +37,7 @@ def saved() -> tuple[bytes, dict[str, bytes]]:
         look = bench_scene(5).look()
         save(look, f"{folder}/look.h5")
         beliefs = {}
-        for k, step in enumerate(infer(model, look, particles=30, seed=0)):
+        for k, step in enumerate(infer(model, look, particles=12, seed=0)):
             path = Path(folder) / f"belief_{k:03d}.h5"
             save_belief(
                 step.belief,
@@ -73,7 +73,7 @@ def ranked(ran: Ran) -> list[tuple[str, float]]:
 
 
 def test_a_recording_is_run_ranked_and_its_best_action_written(bcppl: Callable[..., Ran], here: Path) -> None:
-    words = ("--candidates", KINDS, "--particles", 30, "--outer-samples", 4, "--top", 3)
+    words = ("--candidates", KINDS, "--particles", 12, "--outer-samples", 4, "--top", 3)
     ran = bcppl("probe", "look.h5", *words, "--output", "next.h5")
     assert ran.code == 0, ran.err
     table = ranked(ran)

@@ -17,7 +17,7 @@ from bcppl.cli.run import next_label
 from bcppl.errors import InputError
 from bcppl.recordings import save
 from bcppl.recordings.beliefs import load_belief, load_latent
-from tests.command_line import PROBE, SHIPPED, Ran, short
+from tests.command_line import FEW_MOVES, PROBE, SHIPPED, Ran, short
 
 
 def test_a_users_own_files_are_taken_as_readily_as_names(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
@@ -48,7 +48,8 @@ def test_a_users_own_files_are_taken_as_readily_as_names(bcppl: Callable[..., Ra
 def test_the_same_seed_writes_the_same_beliefs(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(2), tmp_path / "short.h5")
     for out, seed in (("a", 1), ("b", 1), ("c", 2)):
-        assert bcppl("run", "short.h5", "--particles", 8, "--seed", seed, "--out", out).code == 0
+        words = ("--particles", 8, "--inference", FEW_MOVES, "--seed", seed, "--out", out)
+        assert bcppl("run", "short.h5", *words).code == 0
     read = {out: h5py.File(tmp_path / out / "belief_002.h5") for out in "abc"}
     poses = {out: np.array(file["world_from_part"]) for out, file in read.items()}
     assert np.array_equal(poses["a"], poses["b"]) and not np.array_equal(poses["a"], poses["c"])
@@ -68,7 +69,7 @@ def test_what_was_computed_before_a_stop_is_kept(
 ) -> None:
     (tmp_path / "stops.py").write_text(
         "from bcppl.errors import InferenceError, InputError\n"
-        "from bcppl.inference.filters.tempered_smc import infer as whole\n"
+        "from tests.few_moves import infer as whole\n"
         "def infer(*args, **options):\n"
         "    for count, step in enumerate(whole(*args, **options)):\n"
         "        if count == 3:\n"
@@ -125,7 +126,8 @@ model = Model(program=many, prepare=point_probe.prepare, observe=Scene.observed,
 def test_every_latent_site_comes_out(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     (tmp_path / "many.py").write_text(MANY)
     save(short(1), tmp_path / "short.h5")
-    ran = bcppl("run", "short.h5", "--model", "many.py", "--particles", 8, "--out", "out")
+    words = ("--particles", 8, "--inference", FEW_MOVES, "--out", "out")
+    ran = bcppl("run", "short.h5", "--model", "many.py", *words)
     assert ran.code == 0, ran.err
     path = tmp_path / "out/belief_001.h5"
     belief, values = load_belief(path), load_latent(path)
@@ -158,7 +160,7 @@ def test_every_latent_site_comes_out(bcppl: Callable[..., Ran], tmp_path: Path) 
 def test_a_model_of_the_pose_alone_prints_no_other_sites(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     for name, truth in (("known", short(1).truth), ("unknown", None)):
         save(dataclasses.replace(short(1), truth=truth), tmp_path / f"{name}.h5")
-        ran = bcppl("run", f"{name}.h5", "--particles", 4)
+        ran = bcppl("run", f"{name}.h5", "--particles", 4, "--inference", FEW_MOVES)
         assert ran.code == 0 and "other latent values" not in ran.out
         assert ("the recording has no truth" in ran.out) == (name == "unknown")
     path = tmp_path / "runs/known/belief_001.h5"

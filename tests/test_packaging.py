@@ -87,7 +87,7 @@ def test_installed_wheel_finds_a_part_from_an_empty_folder(installed: Path, tmp_
     )
     assert Path(where.strip()).is_relative_to(installed)
     printed = quiet(
-        [sys.executable, "-m", "bcppl", "run", SHIPPED[0]],
+        [sys.executable, "-m", "bcppl", "run", SHIPPED[0], "--particles", "4"],
         tmp_path,
         PYTHONPATH=str(installed),
         OMP_NUM_THREADS="1",

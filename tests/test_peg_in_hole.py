@@ -10,13 +10,14 @@ import pytest
 import torch
 
 from bcppl.cli import loading
-from bcppl.inference.filters import bayes_contact, tempered_smc
+from bcppl.inference.filters import bayes_contact
 from bcppl.models import peg_in_hole
 from bcppl.models.worlds import peg_in_hole as world
 from bcppl.recordings import ProbeWindow, Recording
 from bcppl.sensors.scene import Scene
 from bcppl.sensors.simulated_probe import CONTACT
 from bcppl.traces import Trace, extend, generate, simulate, update
+from tests import few_moves
 
 
 @functools.cache
@@ -112,12 +113,12 @@ def test_windows_of_one_probe_share_one_rollout_per_particle() -> None:
         assert torch.equal(pieces.log_prob(site), whole.log_prob(site)[[2, 0, 1]]), site
 
 
-@pytest.mark.parametrize("infer", [tempered_smc.infer, bayes_contact.infer])
+@pytest.mark.parametrize("infer", [few_moves.infer, bayes_contact.infer])
 def test_same_seed_same_belief_to_the_bit(infer) -> None:  # type: ignore[no-untyped-def]
     short = dataclasses.replace(recorded(), measurements=recorded().measurements[:9])
 
     def last(seed: int) -> torch.Tensor:
-        *_, step = infer(peg_in_hole.model, short, particles=12, seed=seed)
+        *_, step = infer(peg_in_hole.model, short, particles=8, seed=seed)
         return torch.cat([step.belief.world_from_part, step.belief.log_weights[:, None]], dim=1)
 
     first = last(5)

@@ -6,6 +6,7 @@ import importlib
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -251,10 +252,14 @@ def block_and_beams(laser: Any) -> tuple[Recording, torch.Tensor]:
     return Recording(part, guess, measurements, truth=truth.numpy(), model="look_and_touch"), truth
 
 
-@pytest.mark.parametrize("infer", [guided_smc.infer, tempered_smc.infer])
+@pytest.mark.parametrize(
+    "infer",
+    [guided_smc.infer, partial(tempered_smc.infer, sweeps=(4, 4), share=(0.6, 0.6))],
+    ids=["guided", "tempered"],
+)
 def test_a_new_kind_is_inferred_by_guided_and_by_tempered_smc(laser: Any, infer: Any) -> None:
     recording, truth = block_and_beams(laser)
-    *_, last = infer(look_and_touch.model, recording, particles=75, seed=1)
+    *_, last = infer(look_and_touch.model, recording, particles=60, seed=1)
     off = local(last.belief.mean, truth)
     assert float(off[:3].norm()) < 0.0006 and float(off[3:].norm()) < 0.03
     assert float(last.belief.spread[:3].max()) < 0.0006

@@ -130,13 +130,13 @@ def learning(population: Population) -> Callable[[Trace], None]:
     return program
 
 
-def ratios(program: Any, pair: Pair, exact: float, resample: Any, runs: int = 120) -> Any:
+def ratios(program: Any, pair: Pair, exact: float, resample: Any, runs: int = 40) -> Any:
     step = smcp3.smcp3(pair, resample=resample)
     series = isinstance(program, Series)
     found = []
     for seed in range(runs):
         torch.manual_seed(seed)
-        population = Population(*generate(program, () if series else (0,), {}, 60))
+        population = Population(*generate(program, () if series else (0,), {}, 180))
         for k, y in enumerate(OBSERVED):
             args, address = ((), "y") if series else ((k + 1,), f"y_{k}")
             population, info = step(population, Observed(args, {address: number(y)}))
@@ -175,5 +175,5 @@ def test_mutants_have_the_wrong_evidence(
 ) -> None:
     program, pair, exact = STEPS[case]
     monkeypatch.setattr(smcp3, name, mutant)
-    found = ratios(program, pair, exact(), never, 40)
+    found = ratios(program, pair, exact(), never)
     assert standard_errors(found) > 6 or found.std() > 2

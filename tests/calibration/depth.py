@@ -91,7 +91,7 @@ def upright(scale: float = 0.015, believed: float | None = None) -> Case:
 def quick() -> Case:
     """As `planar`, with few particles and a random walk alone: for the ordinary tests."""
     kernel = metropolis_hastings(drift("pose", (0.2, 2.0)))
-    return replace(planar(), kernel=kernel, particles=60, sweeps=5, settling=5)
+    return replace(planar(), kernel=kernel, particles=50, sweeps=3, settling=3)
 
 
 def aligned() -> Case:
