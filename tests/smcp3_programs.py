@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bcppl.inference.kernels.jacobian import log_abs_det_jacobian
 from bcppl.traces import Trace
-from bcppl.traces.propose import assessed
+from bcppl.traces.verbs import assessed
 
 
 def silent(*args: Any) -> Trace:

@@ -163,37 +163,25 @@ def series_trace() -> Trace:
 
 
 @pytest.mark.parametrize("make", [lambda: population().trace, series_trace, population])
-def test_an_index_that_means_no_particle_is_refused(make: Callable[[], Any]) -> None:
+def test_particles_are_indexed_as_the_entries_of_a_tensor(make: Callable[[], Any]) -> None:
     one = make()
-    for wrong, said in (
-        ([], "no particle of 5"),
-        (slice(7, 9), "no particle of 5"),
-        (torch.zeros(5, dtype=torch.bool), "no particle of 5"),
-        ([True, False], "2 truth values, but there are 5"),
-        ([0, 5], "particle 5 was asked for, but there are 5"),
-        (-6, "particle -6 was asked for"),
-        (torch.tensor([0.5]), "give whole numbers"),
-        (None, "asked for by a NoneType"),
-    ):
-        with pytest.raises(InputError, match=said):
+    for wrong in ([True, False], [0, 5], -6, torch.tensor([0.5])):
+        with pytest.raises(IndexError):
             one[wrong]
     for right in (
         [0, 4],
         torch.tensor([-5, -1]),
         (0, 4),
         np.array([0, 4]),
+        slice(0, 5, 4),
         [True, False, False, False, True],
     ):
-        found = one[right]["x"]
-        assert torch.equal(found, one["x"][[0, 4]])
+        assert torch.equal(one[right]["x"], one["x"][[0, 4]])
 
 
 def test_ancestors_and_traces_that_do_not_fit_are_refused() -> None:
-    for wrong, said in (
-        ([5], "particle 5 was asked for"),
-        ([0.5], "give whole numbers"),
-    ):
-        with pytest.raises(InputError, match=said):
+    for wrong in ([5], [0.5]):
+        with pytest.raises(IndexError):
             population().selected(torch.tensor(wrong))
     with pytest.raises(InputError, match="with no particle"):
         population().selected(torch.tensor([], dtype=torch.int64))

@@ -157,7 +157,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: generate(plated, (torch.zeros(3, 1),), {"x": torch.zeros(N, 3)}, N),
         r"'x' has shape \(5, 3\), .* \(3,\); give one value",
     ),
-    "no distribution": (lambda: simulate(sampled_from_a_function, (), N), "'x' is sampled from a function"),
+    "no distribution": (lambda: simulate(sampled_from_a_function, (), N), "'x' .*function; give"),
     "enumerated": (lambda: simulate(enumerated, (), N), "'x' is enumerated"),
     "log-probabilities": (lambda: simulate(wide, (), N).log_prob(), r"'y' has log-probabilities .*\(3, 5\)"),
     "no such site": (lambda: simulate(latent_and_seen, (), N).log_prob("q"), "no address 'q'"),
@@ -189,7 +189,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: simulate(latent_and_seen, (), 2.5),  # type: ignore[arg-type]
         "for 2.5 particles; .* a whole number",
     ),
-    "distribution of torch": (lambda: simulate(of_torch, (), N), "'x' .* torch.*; take it from `pyro.distri"),
+    "distribution of torch": (lambda: simulate(of_torch, (), N), "'x' .* torch.*; give .* `pyro.distri"),
     "data without a last axis": (
         lambda: simulate(line, (torch.zeros(3),), N),
         r"after site 'slope' .* tensor a \(5\) .* tensor b \(3\).*5 particles; .*`\[:, None\]`",

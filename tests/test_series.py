@@ -243,6 +243,12 @@ def state_of(shape: tuple[int, ...]) -> Callable[[], Any]:
     return lambda: {"points": torch.zeros(shape)}
 
 
+def in_a_plate() -> Tensor:
+    with pyro.plate("points", 4):
+        return pyro.sample("x", dist.Normal(number(0.0), 1.0))
+
+
+PLATED = Series(in_a_plate, step)
 REFUSED: dict[str, tuple[Callable[[Any], Any], str]] = {
     "never visited": (lambda t: extend(t, (0.0,), {"q": number(0.0)}), "'q'.* never visits"),
     "wrong shape": (lambda t: extend(t, (0.0,), {"y": torch.zeros(2)}), "'y' has shape"),
@@ -253,6 +259,12 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], str]] = {
         "not begin from the same",
     ),
     "state": (lambda _: simulate(Series(state_of((3, N)), step), (), N), r"shape \(3, 6\) for 6 particles"),
+    "state in a plate": (lambda _: simulate(PLATED, (), N), r"\(4, 6\) .*`.to_event\(1\)`"),
+    "state in a plate of N": (lambda _: simulate(PLATED, (), 4), r"coincidence alone; .*\(4, 5\) .*to_event"),
+    "no return": (
+        lambda _: extend(simulate(Series(init, lambda x, *args: None), (), N), (0.0,), {}),
+        "step returned nothing.* return the next state",
+    ),
 }
 
 
@@ -260,8 +272,9 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], str]] = {
 def test_refusals_say_what_to_do(case: str) -> None:
     act, says = REFUSED[case]
     trace, _ = filtered()
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=says) as caught:
         act(trace)
+    assert ". " not in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_smc_follows_a_pose_that_moves() -> None:

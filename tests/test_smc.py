@@ -27,7 +27,7 @@ from bcppl.inference.resampling import adaptive, always, never, systematic
 from bcppl.models.point_probe import model
 from bcppl.recordings import Recording, load
 from bcppl.traces import Trace, generate, update as real_update
-from bcppl.traces.propose import assessed
+from bcppl.traces.verbs import assessed
 from tests import few_moves
 
 

@@ -3,11 +3,10 @@
 from bcppl.traces.carried import carried
 from bcppl.traces.check import check_program
 from bcppl.traces.model import Model
-from bcppl.traces.propose import Proposed, assess, propose
 from bcppl.traces.series import Series
 from bcppl.traces.trace import Trace
 from bcppl.traces.update import Regenerated, Update, extend, regenerate, update
-from bcppl.traces.verbs import generate, simulate
+from bcppl.traces.verbs import Proposed, assess, generate, propose, simulate
 
 __all__ = [
     "Model",

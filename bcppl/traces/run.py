@@ -23,10 +23,10 @@ from pyro.poutine.subsample_messenger import _Subsample
 from torch import Tensor
 
 from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.shortcuts import drawn
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry, carrying
 from bcppl.traces.explained import explained, unfit, unfit_particles
-from bcppl.traces.shortcuts import drawn
 
 Program = Callable[..., Any]
 PARTICLES = "particles"
@@ -42,7 +42,7 @@ class Run:
         fixed: addresses that the program observes itself (`obs=`, `pyro.factor`).
         carried: simulator states that it used or made.
         result: what it returned.
-        coincident: addresses with a plate or an event axis of N entries (`bcppl.traces.coincidence`).
+        coincident: addresses with a plate or an event axis of N entries (`bcppl.traces.verbs`).
         whole: the first address, if its distribution had N entries before it was expanded to the particles.
     """
 
@@ -192,15 +192,10 @@ class _Recorder(Messenger):
                 f"site {address!r} is scaled or masked by a handler or lies in a subsampled plate, which "
                 "traces do not read; use the distribution's own `.mask()`, or weigh inside a distribution."
             )
-        if not hasattr(distribution, "batch_shape"):
-            raise InputError(
-                f"site {address!r} is sampled from a {type(distribution).__name__}, which has no "
-                "log-probability; give a distribution of `pyro.distributions`."
-            )
         if not isinstance(distribution, TorchDistributionMixin):
+            kind = f"{type(distribution).__module__}.{type(distribution).__name__}"
             raise InputError(
-                f"site {address!r} is sampled from {type(distribution).__module__}."
-                f"{type(distribution).__name__}, which Pyro cannot use; take it from `pyro.distributions`."
+                f"site {address!r} is sampled from a {kind}; give a distribution of `pyro.distributions`."
             )
         self._fits(address, tuple(distribution.batch_shape), message["cond_indep_stack"])
         self.distributions[address] = distribution

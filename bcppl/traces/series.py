@@ -24,8 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
-from inspect import signature
+from functools import cached_property, reduce
 from typing import Any
 
 import torch
@@ -33,7 +32,7 @@ from torch import Tensor
 
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
-from bcppl.traces.indexing import Index
+from bcppl.traces.indexing import Index, composed, indexed
 from bcppl.traces.run import Program, Run
 from bcppl.traces.trace import Trace
 
@@ -50,22 +49,11 @@ class Series:
     A state is a tensor, or a dictionary, list, tuple or named tuple of such, the particle axis first;
     numbers, None and tensors without axes are the same for all particles. Anything else that it holds is
     indexed by (K,) int64.
-
-    Raises:
-        InputError: a part is no function.
     """
 
     init: Callable[..., Any]
     step: Callable[..., Any]
     history: bool = True
-
-    def __post_init__(self) -> None:
-        for name, part in (("init", self.init), ("step", self.step)):
-            if not callable(part):
-                raise InputError(
-                    f"the {name} of a series is of type {type(part).__name__}; "
-                    "give two functions, Series(init, step)."
-                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +68,9 @@ class Stage:
     def __call__(self, *args: Any) -> Any:
         """Run the step from the states of the chosen particles."""
         if self.before is None:
-            return _called("init", self.series.init, args)
+            return self.series.init(*args)
         state = indexed(self.before.state, self.chosen, self.before.particles)
-        after = _called("step", self.series.step, (state, *args))
+        after = self.series.step(state, *args)
         if after is None and state is not None:
             raise InputError(
                 "a series' step returned nothing, but it was given a state; return the next state from it."
@@ -92,10 +80,7 @@ class Stage:
     @cached_property
     def chosen(self) -> Tensor | None:
         """The particles (N,) of the trace before from which the step begins; None for all, in order."""
-        index = None
-        for pick in self.picks:
-            index = composed(index, pick)
-        return index
+        return reduce(composed, self.picks, None)
 
     def take(self, index: Tensor) -> Stage:
         """The same step for the particles at `index` (K,)."""
@@ -112,67 +97,13 @@ class Stage:
         if self.before is None or self.chosen is other.chosen:
             return self
         own = torch.arange(len(mask))
-        first = own if self.chosen is None else self.chosen
-        second = own if other.chosen is None else other.chosen
-        return replace(self, picks=(torch.where(mask, first, second),))
-
-
-def _called(name: str, part: Callable[..., Any], args: tuple[Any, ...]) -> Any:
-    """The result of a part of a series, or an error where it does not take its arguments."""
-    try:
-        return part(*args)
-    except TypeError:
-        _refuse_arguments(name, part, args)
-        raise
-
-
-def _refuse_arguments(name: str, part: Callable[..., Any], args: tuple[Any, ...]) -> None:
-    try:
-        signature(part).bind(*args)
-    except TypeError as error:
-        raise InputError(
-            f"the {name} of a series, {getattr(part, '__name__', part)!r}, does not take the arguments it is "
-            f"given ({error}); write Series(init, step) with init(*args) and step(state, *args)."
-        ) from error
-    except ValueError:
-        # Some callables have no signature to be read.
-        return
+        both = (own if each.chosen is None else each.chosen for each in (self, other))
+        return replace(self, picks=(torch.where(mask, *both),))
 
 
 def runnable(program: Program | Series) -> Program:
     """The program itself, or the first stage of a series."""
     return Stage(program) if isinstance(program, Series) else program
-
-
-def composed(first: Tensor | None, then: Tensor | None) -> Tensor | None:
-    """Choosing by `first`, then by `then`, in one; None chooses all."""
-    return then if first is None else first if then is None else first.index_select(0, then)
-
-
-def indexed(state: Any, index: Tensor | None, particles: int) -> Any:
-    """The states of the particles at `index` (K,), all of them if it is None.
-
-    Raises:
-        InputError: a tensor in the state has not the particle axis first.
-    """
-    if isinstance(state, Tensor):
-        if state.ndim == 0:
-            return state
-        if len(state) != particles:
-            raise InputError(
-                f"a series' state holds a tensor of shape {tuple(state.shape)} for {particles} particles; "
-                "put the particle axis first (sample a vector with `.to_event(1)`, or return "
-                "`.movedim(-1, 0)` of what lies in a plate), and what is the same for all into the arguments."
-            )
-        return state if index is None else state.index_select(0, index)
-    if isinstance(state, Mapping):
-        return {key: indexed(value, index, particles) for key, value in state.items()}
-    if isinstance(state, list | tuple):
-        parts = [indexed(value, index, particles) for value in state]
-        return type(state)(*parts) if hasattr(state, "_fields") else type(state)(parts)
-    if index is None or state is None or isinstance(state, str | int | float):
-        return state
-    return state[index]
 
 
 class Chosen(Mapping[str, Tensor]):
@@ -251,12 +182,10 @@ class SeriesTrace(Trace):
             return self._whole_path()
         values = []
         for address in addresses:
-            if isinstance(address, str):
-                values.append(self._site(address))
-            else:
-                then, index = self._after(address[1])
-                value = then._site(address[0])
-                values.append(value if index is None else value.index_select(0, index))
+            name, number = (address, -1) if isinstance(address, str) else address
+            then, index = self._after(number)
+            value = then._site(name)
+            values.append(value if index is None else value.index_select(0, index))
         return sum(values[1:], values[0])
 
     def _site(self, address: str) -> Tensor:
@@ -286,17 +215,10 @@ class SeriesTrace(Trace):
 
     def _after(self, number: int) -> tuple[SeriesTrace, Tensor | None]:
         """The trace after so many steps, and which of its particles (N,) are ancestors of these."""
-        number = whole_number("step {} of a series was asked for", number, least=-self.steps - 1)
-        wanted = self.steps + 1 + number if number < 0 else number
-        if not 0 <= wanted <= self.steps:
-            raise InputError(
-                f"step {number} of a series was asked for, which has run {self.steps}; give 0 (what `init` "
-                f"drew) to {self.steps}."
-            )
+        what = f"step {{}} of a series was asked for, which has run {self.steps}"
+        wanted = whole_number(what, number, least=-self.steps - 1, most=self.steps) % (self.steps + 1)
         node, index = self, None
-        while node.steps > wanted:
-            if isinstance(node, Forgotten) or node.stage.before is None:
-                raise _forgotten(wanted)
+        while node.steps > wanted and node.stage.before is not None:
             node, index = node.stage.before, composed(node.stage.chosen, index)
         if isinstance(node, Forgotten):
             raise _forgotten(wanted)

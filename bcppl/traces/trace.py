@@ -13,6 +13,7 @@ import pyro
 import torch
 from torch import Tensor
 
+from bcppl.distributions.shortcuts import narrowed
 from bcppl.distributions.support import log_prob_inside, masks, support_of
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
@@ -21,8 +22,6 @@ from bcppl.traces.explained import not_a_number
 from bcppl.traces.hiding import Hiding, refused
 from bcppl.traces.indexing import Index, beside, particles_at
 from bcppl.traces.run import Program, Run, inward, refuse_other_than_tensors, run
-from bcppl.traces.shortcuts import narrowed
-from bcppl.traces.shown import shapes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -48,7 +47,7 @@ class Trace:
     particles: int
     choices: Mapping[str, Tensor]
     observations: Mapping[str, Tensor]
-    carried: Mapping[str, Entry] = field(default_factory=dict)
+    carried: dict[str, Entry] = field(default_factory=dict)
     known: dict[str, Tensor] = field(default_factory=dict, repr=False)
     hidden: frozenset[str] = frozenset()
 
@@ -57,7 +56,7 @@ class Trace:
         """The program run again at these values: that is cheap, and what sites compute is kept in `known`."""
         given = {**self.choices, **self.observations}
         again = run(self.program, self.args, self.particles, given, self.carried)
-        self.carried_states().update(again.carried)
+        self.carried.update(again.carried)
         return again
 
     @classmethod
@@ -84,20 +83,11 @@ class Trace:
     def _keep_run(self, ran: Run) -> None:
         """Keep the run that these values come from, so that the program is not run again for them."""
         self.__dict__["_run"] = ran
-        self.carried_states().update(ran.carried)
-
-    def carried_states(self) -> dict[str, Entry]:
-        """The carried states, as a dictionary that states started later are added to."""
-        assert isinstance(self.carried, dict)
-        return self.carried
+        self.carried.update(ran.carried)
 
     @property
     def distributions(self) -> Mapping[str, Any]:
-        """The distribution of every site at these values, by address in the program's order.
-
-        Raises:
-            InputError: the distribution of a hidden site is asked for.
-        """
+        """The distribution of every site at these values, by address in the program's order."""
         if self.hidden:
             return Hiding(self._run.distributions, self.hidden)
         return MappingProxyType(self._run.distributions)
@@ -129,12 +119,13 @@ class Trace:
             raise refused(address)
         if address not in self.known:
             if address not in self._run.distributions:
-                raise InputError(
-                    f"the program visits no address {address!r}; "
-                    f"it visits {', '.join(self.addresses) or 'none'}."
-                )
+                raise self._unvisited(address)
             self.known[address] = self._evaluated(address)
         return self.known[address]
+
+    def _unvisited(self, address: str) -> InputError:
+        visited = ", ".join(self.addresses) or "none"
+        return InputError(f"the program visits no address {address!r}; it visits {visited}.")
 
     def _evaluated(self, address: str) -> Tensor:
         distribution = self._run.distributions[address]
@@ -197,14 +188,12 @@ class Trace:
         return self.particles
 
     def __repr__(self) -> str:
-        return (
-            f"{type(self).__name__}({self.particles} particles, latent: {shapes(self.choices)}, "
-            f"observed: {shapes(self.observations)})"
-        )
+        latent, observed = shapes(self.choices), shapes(self.observations)
+        return f"{type(self).__name__}({self.particles} particles, latent: {latent}, observed: {observed})"
 
     def where(self, mask: Tensor, other: Trace) -> Trace:
         """This trace where `mask` (N,) is true, the other (same program, same addresses) elsewhere."""
-        shared = set(self.known) & set(other.known)
+        shared = self.known.keys() & other.known.keys()
         return replace(
             self,
             choices={a: torch.where(beside(mask, v), v, other.choices[a]) for a, v in self.choices.items()},
@@ -228,10 +217,7 @@ class Trace:
         """
         hidden = frozenset(addresses)
         for address in sorted(hidden - set(self.addresses)):
-            raise InputError(
-                f"address {address!r} was to be hidden, which the program never visits; "
-                f"it visits {', '.join(self.addresses) or 'none'}."
-            )
+            raise self._unvisited(address)
         secret = replace(self, known=dict(self.known), hidden=self.hidden | hidden)
         secret._keep_run(self._run)
         return secret
@@ -294,32 +280,24 @@ class Trace:
         return revised
 
     def as_replacing(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """New values of latent addresses, of the type of the old ones.
-
-        Raises:
-            InputError: a value is no tensor, has another shape, or is real where the old one is a whole
-                number.
-        """
+        """New values of latent addresses, of the type of the old ones; others than `at` takes are refused."""
         refuse_other_than_tensors(values)
         for address, value in values.items():
-            if not torch.can_cast(value.dtype, self.choices[address].dtype):
+            old = self.choices[address]
+            if not torch.can_cast(value.dtype, old.dtype):
                 raise InputError(
-                    f"the new value of {address!r} is of {value.dtype}, the old one of "
-                    f"{self.choices[address].dtype}; give one of the same kind."
+                    f"the new value of {address!r} is of {value.dtype}, the old one of {old.dtype}; "
+                    "give one of the same kind."
                 )
-            if value.shape != self.choices[address].shape:
+            if value.shape != old.shape:
                 raise InputError(
                     f"the new value of {address!r} has shape {tuple(value.shape)}, "
-                    f"the old one {tuple(self.choices[address].shape)}; give one for each particle."
+                    f"the old one {tuple(old.shape)}; give one for each particle."
                 )
         return {a: value.to(self.choices[a].dtype) for a, value in values.items()}
 
     def refuse_other_than_latent(self, addresses: Iterable[str]) -> None:
-        """Refuse addresses that are not latent.
-
-        Raises:
-            InputError: names one.
-        """
+        """Refuse addresses that are not latent."""
         for address in addresses:
             if address not in self.choices:
                 raise InputError(
@@ -329,11 +307,7 @@ class Trace:
 
 
 def refuse_masked(address: str, distribution: Any) -> None:
-    """Refuse the distribution of a latent site that masks some of its values.
-
-    Raises:
-        InputError: names the address.
-    """
+    """Refuse the distribution of a latent site that masks some of its values."""
     if masks(distribution):
         raise InputError(
             f"site {address!r} is latent and its distribution is masked, so that the target would be "
@@ -360,3 +334,8 @@ def changed(first: Trace, second: Trace, addresses: Iterable[str]) -> Iterator[s
             then.distributions[address], now.distributions[address]
         ):
             yield address
+
+
+def shapes(values: Mapping[str, Tensor]) -> str:
+    """Addresses and the shapes of their values, `x (3,), y (3, 7)`, or `none`."""
+    return ", ".join(f"{address} {tuple(value.shape)}" for address, value in values.items()) or "none"

@@ -1,4 +1,4 @@
-"""The verbs that make traces, Gen's: simulate runs a program forward, generate constrains some of its sites.
+"""The verbs that run programs, Gen's: simulate, generate, and for proposals propose and assess.
 
 Cusumano-Towner et al., Gen: a general-purpose probabilistic programming system with programmable inference,
 PLDI 2019, section 4 (the generative function interface). All of them act on N particles at once.
@@ -7,6 +7,7 @@ PLDI 2019, section 4 (the generative function interface). All of them act on N p
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,10 +16,13 @@ from torch import Tensor
 from bcppl.distributions.support import refuse_several_poses
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
-from bcppl.traces.coincidence import refuse_coincidence
+from bcppl.traces.indexing import indexed
 from bcppl.traces.run import Program, Run, refuse_other_than_tensors, run
 from bcppl.traces.series import Series, SeriesTrace, Stage, runnable
-from bcppl.traces.trace import Trace, refuse_masked
+from bcppl.traces.trace import Trace, refuse_masked, shapes
+
+# A vector that was meant as one event is unlikely to have more entries.
+FEW = 20
 
 
 def simulate(program: Program | Series, args: tuple[Any, ...] = (), particles: int = 1) -> Trace:
@@ -29,8 +33,8 @@ def simulate(program: Program | Series, args: tuple[Any, ...] = (), particles: i
     """
     program = runnable(program)
     ran = run(program, args, particles, {}, {})
-    refuse_coincidence(program, args, particles, ran)
-    return kind_of(program).of_run(program, args, particles, ran, {})
+    _refuse_coincidence(program, args, particles, ran)
+    return _traced(program, args, particles, ran)
 
 
 def generate(
@@ -66,6 +70,63 @@ def generate(
     return trace, log_weight(trace, weighed)
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Proposed:
+    """What `propose` returns.
+
+    Attributes:
+        choices: values by address (N, *event).
+        log_prob: their log-density (N,) under the program.
+        result: what the program returned.
+    """
+
+    choices: Mapping[str, Tensor]
+    log_prob: Tensor
+    result: Any = None
+
+    def __repr__(self) -> str:
+        return f"Proposed({shapes(self.choices)})"
+
+
+def propose(program: Program | Series, args: tuple[Any, ...], particles: int) -> Proposed:
+    """Run a proposal program forward: its choices and their log-density.
+
+    Raises:
+        InputError: the program observes something itself (`obs=`, `pyro.factor`).
+    """
+    trace = simulate(program, args, particles)
+    _refuse_fixed(trace._run)
+    return Proposed(trace.choices, trace.log_prob(), trace.result)
+
+
+def assess(
+    program: Program | Series, args: tuple[Any, ...], choices: Mapping[str, Tensor], particles: int
+) -> Tensor:
+    """Log-density (N,) of a program at given values for all of its choices.
+
+    Raises:
+        InputError: a choice is missing, or an address is never visited.
+    """
+    return assessed(program, args, choices, particles).log_prob()
+
+
+def assessed(
+    program: Program | Series, args: tuple[Any, ...], choices: Mapping[str, Tensor], particles: int
+) -> Trace:
+    """The trace of a program at given values for all of its choices; it raises what `assess` does."""
+    program = runnable(program)
+    ran = run(program, args, particles, choices, {})
+    _refuse_fixed(ran)
+    refuse_unvisited(choices, ran)
+    _refuse_coincidence(program, args, particles, ran)
+    missing = [a for a in ran.values if a not in choices and a not in ran.fixed]
+    if missing:
+        raise InputError(
+            f"assess needs a value for address {missing[0]!r}; give one for every choice of the program."
+        )
+    return _traced(program, args, particles, ran)
+
+
 def constrained(
     program: Program,
     args: tuple[Any, ...],
@@ -85,7 +146,7 @@ def constrained(
     given = {**observations, **choices}
     ran = run(program, args, particles, given, carried or {})
     refuse_unvisited(given, ran)
-    trace = kind_of(program).of_run(program, args, particles, ran, observations)
+    trace = _traced(program, args, particles, ran, observations)
     # The steps of a series after the first visit what that has visited.
     later = isinstance(program, Stage) and program.number > 1
     refuse_unfit(trace, observations, trace.addresses if later else ())
@@ -100,9 +161,15 @@ def log_weight(trace: Trace, addresses: list[str]) -> Tensor:
     return trace.log_prob(*addresses).clone()
 
 
-def kind_of(program: Program) -> type[Trace]:
-    """The class of a program's traces."""
-    return SeriesTrace if isinstance(program, Stage) else Trace
+def _traced(
+    program: Program,
+    args: tuple[Any, ...],
+    particles: int,
+    ran: Run,
+    observations: Mapping[str, Tensor] | None = None,
+) -> Trace:
+    kind = SeriesTrace if isinstance(program, Stage) else Trace
+    return kind.of_run(program, args, particles, ran, observations or {})
 
 
 def copied(observations: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -111,12 +178,17 @@ def copied(observations: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {address: value.detach().clone() for address, value in observations.items()}
 
 
-def refuse_unvisited(given: Iterable[str], ran: Run) -> None:
-    """Refuse a value that was given for an address that was not visited.
+def _refuse_fixed(ran: Run) -> None:
+    """Refuse a program that observes something itself: that has no density of being chosen."""
+    if ran.fixed:
+        raise InputError(
+            f"a program that is to propose or to be assessed observes {min(ran.fixed)!r} itself (`obs=` or "
+            "`pyro.factor`); take that out, and give values as observations."
+        )
 
-    Raises:
-        InputError: names the address.
-    """
+
+def refuse_unvisited(given: Iterable[str], ran: Run) -> None:
+    """Refuse a value that was given for an address that was not visited."""
     missing = [a for a in given if a not in ran.distributions]
     if missing:
         raise InputError(
@@ -134,7 +206,7 @@ def refuse_unfit(trace: Trace, observations: Mapping[str, Tensor], old: Collecti
             and beliefs take one for each particle.
     """
     ran, particles = trace._run, trace.particles
-    refuse_coincidence(trace.program, trace.args, particles, ran, old)
+    _refuse_coincidence(trace.program, trace.args, particles, ran, old)
     for address, value in observations.items():
         site = ran.distributions[address]
         one = (*site.batch_shape[:-1], *site.event_shape)
@@ -146,3 +218,44 @@ def refuse_unfit(trace: Trace, observations: Mapping[str, Tensor], old: Collecti
     for address, value in trace.choices.items():
         if value.shape[-1:] == (7,) and value.ndim != 2 and address not in old:
             refuse_several_poses(address, value, ran.distributions[address])
+
+
+def _refuse_coincidence(
+    program: Program, args: tuple[Any, ...], particles: int, ran: Run, old: Collection[str] = ()
+) -> None:
+    """Run a program once more, for N + 1 particles, where its shapes may fit N of them alone.
+
+    That is where a plate or an axis of an event has N entries, or the first site, of few particles, has N
+    before it is expanded to them; sites at `old` addresses were checked before. All sites are set, the last
+    particle to the first one's values: nothing is drawn and no simulator is run. A proposal that reads a
+    trace is not checked: it is made for the trace's particles.
+    """
+    # A program's first site depends on no sampled value, so that N entries are a coincidence where N is small
+    # and intended where it is large. A later step of a series begins from the state, which has N.
+    begins = particles <= FEW and (not isinstance(program, Stage) or program.before is None)
+    suspects = ran.coincident | ran.whole if begins else ran.coincident
+    if not suspects.difference(old) or any(hasattr(arg, "particles") for arg in args):
+        return
+    index = torch.cat([torch.arange(particles), torch.tensor([0])])
+    given = {
+        a: _one_more(v, ran.distributions[a], index) for a, v in ran.values.items() if a not in ran.fixed
+    }
+    carried = {name: entry.take(index) for name, entry in ran.carried.items()}
+    staged = isinstance(program, Stage)
+    state = torch.get_rng_state()
+    try:
+        again = run(program.take(index) if staged else program, args, particles + 1, given, carried)
+        if staged:
+            indexed(again.result, None, particles + 1)
+    except InputError as error:
+        raise InputError(
+            f"with {particles} particles the shapes fit by coincidence alone; with one more, "
+            f"{str(error).removesuffix('.')}."
+        ) from error
+    finally:
+        torch.set_rng_state(state)
+
+
+def _one_more(value: Tensor, distribution: Any, index: Tensor) -> Tensor:
+    shared = value.ndim == len(distribution.batch_shape) - 1 + len(distribution.event_shape)
+    return value if shared else value[index]

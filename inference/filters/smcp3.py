@@ -44,8 +44,8 @@ from bcppl.inference.resampling import Resample, adaptive, check_resample
 from bcppl.traces import Trace, extend, simulate, update
 from bcppl.traces.anticipated import Anticipated
 from bcppl.traces.gradient import result_with_grad, with_gradients
-from bcppl.traces.propose import assessed
 from bcppl.traces.series import SeriesTrace
+from bcppl.traces.verbs import assessed
 
 OLD, FORWARD, NEW, BACKWARD = "old value", "forward choice", "new value", "backward choice"
 
