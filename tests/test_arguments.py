@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within, seed_number, whole_number
-from bcppl.distributions.poses import NormalPose, UniformPose
+from bcppl.distributions.poses import NormalPose, SwingTwistPose, UniformPose
 from bcppl.errors import InputError
 from bcppl.inference.chains import markov_chains
 from bcppl.inference.filters.smcp3 import Pair, moved, smcp3
@@ -110,6 +110,8 @@ NUMBERS: dict[str, tuple[Callable[[Any], Any], tuple[Any, ...]]] = {
     "turn": (lambda v: Continuous(turn=v), (-0.1, 4.0)),
     "slide": (lambda v: Continuous(slide=v), (-0.1,)),
     "angle": (lambda v: UniformPose(poses.identity(), 0.1, v), (-0.1, 4.0)),
+    "tilt": (lambda v: SwingTwistPose(poses.identity(), 0.1, v, 0.1), (-0.1, 4.0)),
+    "yaw": (lambda v: SwingTwistPose(poses.identity(), 0.1, 0.1, v), (-0.1, 4.0)),
     "half width": (lambda v: UniformPose(poses.identity(), v, 0.1), (-0.1, [0.1, 0.1])),
 }
 

@@ -96,7 +96,7 @@ def test_the_surrogate_s_noise_model() -> None:
     torch.manual_seed(0)
     contacts = torch.zeros(200, 100, 3, dtype=torch.float64)
     contacts[:, ::2] = NAN
-    drawn = ChamferContacts(Felt(contacts), 0, 100, 0.001, 1e-5, noise=(0.0005, 0.1)).sample()
+    drawn = ChamferContacts(Felt(contacts), 0, 100, 0.001, 1e-5, missed=0.1).sample()
     assert torch.isnan(drawn[:, ::2]).all()
     felt = torch.isfinite(drawn[:, 1::2]).all(dim=-1)
     assert float(felt.double().mean()) == pytest.approx(0.9, abs=0.015)

@@ -10,7 +10,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 
-from bcppl.distributions.parameters import Range, check_parameters
+from bcppl.distributions.parameters import check_parameters
 from bcppl.errors import InputError
 
 
@@ -20,11 +20,11 @@ class LazyDistribution(TorchDistribution):
     Subclasses run their simulator in `log_prob` and `sample`, never in `__init__`, so that a program
     can be traced for the price of its Python. A log-probability is evaluated again when an attribute, or
     anything that an attribute holds, has changed (`bcppl.traces.dependence`). Attributes that only cache what
-    the others determine are therefore cached properties, or are named in `__caches__`.
+    the others determine are therefore cached properties, or are named in `__caches__`. A subclass may be a
+    dataclass, with `eq=False`: this class's `__init__`, called at the end of its `__post_init__`, checks the
+    ranges that its fields declare (`bcppl.distributions.parameters`).
 
     Attributes:
-        parameters: the ranges of the attributes that are parameters, by name. They are set before this
-            class's `__init__`, which checks them.
         cost: of a log-probability: 0 arithmetic, 1 rendering, 2 physics. Kernels evaluate the cheap sites
             first and move particles less often where they are expensive.
         broadcasts: whether `log_prob` takes H observations at once, (H, 1, *event_shape), and gives (H, N).
@@ -32,8 +32,6 @@ class LazyDistribution(TorchDistribution):
 
     cost: int = 0
     broadcasts: bool = False
-    parameters: dict[str, Range] = {}
-
     arg_constraints: dict[str, Any] = {}
     support = constraints.real
 

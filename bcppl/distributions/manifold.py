@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -50,6 +51,7 @@ class Quadratic(NamedTuple):
     information: Tensor
 
 
+@dataclass(eq=False, repr=False)
 class ContactManifold(LazyDistribution):
     """Where a held peg was measured to be, and whether it felt the part, over a window of T stamps.
 
@@ -85,28 +87,18 @@ class ContactManifold(LazyDistribution):
     """
 
     cost = 1
-    parameters = {
-        "stamps": COUNT,
-        "noise": POSITIVE,
-        "shared": NONNEGATIVE,
-        "sink": NONNEGATIVE,
-        "outlier": PROBABILITY,
-    }
 
-    def __init__(
-        self,
-        gap: MeasuresGap,
-        pose: Tensor,
-        stamps: int,
-        noise: float,
-        shared: float,
-        sink: float = 0.0,
-        outlier: float = 0.001,
-        motion: Callable[[Tensor], Tensor] | None = None,
-    ) -> None:
-        self.gap, self.pose, self.motion, self.stamps = gap, pose, motion, stamps
-        self.noise, self.shared, self.sink, self.outlier = noise, shared, sink, outlier
-        super().__init__(len(pose), (stamps, 8))
+    gap: MeasuresGap
+    pose: Tensor
+    stamps: int = field(metadata=COUNT)
+    noise: float = field(metadata=POSITIVE)
+    shared: float = field(metadata=NONNEGATIVE)
+    sink: float = field(default=0.0, metadata=NONNEGATIVE)
+    outlier: float = field(default=0.001, metadata=PROBABILITY)
+    motion: Callable[[Tensor], Tensor] | None = None
+
+    def __post_init__(self) -> None:
+        super().__init__(len(self.pose), (self.stamps, 8))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-likelihood (N,) of one window (T, 8), or of one for each particle (N, T, 8)."""

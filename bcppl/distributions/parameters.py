@@ -1,14 +1,15 @@
-"""Ranges of the parameters of a distribution: declared by its class, checked in one place.
+"""Ranges of the parameters of a distribution: declared with its fields, checked in one place.
 
-A class declares them as torch's distributions declare their `arg_constraints`:
-
-    parameters = {"scale": POSITIVE, "outlier": PROBABILITY}
+scale: float = field(metadata=POSITIVE)
+outlier: float = field(default=0.1, metadata=PROBABILITY)
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,6 @@ class Range:
         least: a lower bound that is included.
         below: an upper bound that is excluded.
         most: an upper bound that is included.
-        unit: written behind a value that is refused.
         whole: whether the numbers are whole ones; only `least` bounds these.
         optional: whether None may be given.
         latent: whether a tensor (N,), a value for each particle, may be given. It is not checked: a proposed
@@ -39,17 +39,12 @@ class Range:
     least: float = -math.inf
     below: float = math.inf
     most: float = math.inf
-    unit: str = ""
     whole: bool = False
     optional: bool = False
     latent: bool = False
 
     def checked(self, what: str, value: Any) -> Any:
-        """The value as a float or an int.
-
-        Args:
-            what: the beginning of the sentence that refuses it, {} for the value.
-            value: of the parameter.
+        """The value as a float or an int; `what` begins the sentence that refuses it, {} for the value.
 
         Raises:
             InputError: the value is out of the range.
@@ -64,23 +59,34 @@ class Range:
         return number_within(what, value, **bounds)
 
 
-POSITIVE = Range(above=0.0)
-NONNEGATIVE = Range(least=0.0)
-PROBABILITY = Range(above=0.0, below=1.0)
-COUNT = Range(least=1, whole=True)
+def within(**bounds: Any) -> Mapping[str, Range]:
+    """The metadata of a field with this `Range`."""
+    return {"range": Range(**bounds)}
+
+
+POSITIVE = within(above=0.0)
+NONNEGATIVE = within(least=0.0)
+PROBABILITY = within(above=0.0, below=1.0)
+COUNT = within(least=1, whole=True)
+
+
+@cache
+def ranges(kind: type) -> dict[str, Range]:
+    """The ranges that a class declares with its fields, by name."""
+    declared = fields(kind) if is_dataclass(kind) else ()
+    return {each.name: each.metadata["range"] for each in declared if "range" in each.metadata}
 
 
 def check_parameters(distribution: Any) -> None:
-    """Check the attributes that a distribution's class declares, and make them floats and ints.
+    """Check the fields that declare a range, and make them floats and ints.
 
     Raises:
         InputError: one is out of its range.
     """
-    kind = type(distribution)
-    for name, allowed in kind.parameters.items():
-        value = getattr(distribution, name)
-        what = f"{kind.__name__} has {name} = {{}} {allowed.unit}".rstrip()
-        setattr(distribution, name, allowed.checked(what, value))
+    kind: type = type(distribution)
+    for name, allowed in ranges(kind).items():
+        what = f"{kind.__name__} has {name} = {{}}"
+        setattr(distribution, name, allowed.checked(what, getattr(distribution, name)))
 
 
 def check_shape(

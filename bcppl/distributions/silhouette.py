@@ -8,8 +8,9 @@ misclassified.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,17 +20,15 @@ from torch import Tensor
 
 from bcppl.distributions.depth.camera_image import CameraImage
 from bcppl.distributions.depth.image import DepthDistribution
-from bcppl.distributions.depth.rendering import CachedHits, Mask, RendersDepth
-from bcppl.distributions.parameters import POSITIVE, Range
+from bcppl.distributions.depth.rendering import CachedHits
+from bcppl.distributions.parameters import POSITIVE, within
 from bcppl.errors import InputError
-
-if TYPE_CHECKING:
-    from bcppl.geometry.camera import Camera
 
 _REACH = 3.0  # standard deviations of the outline at which the smoothing is truncated
 _LEAST = 1e-9  # shares of rays are kept this far from 0 and 1, so that the normal's quantiles are finite
 
 
+@dataclass(eq=False, repr=False)
 class Silhouette(CameraImage):
     """A mask whose pixels are independent given the part's pose.
 
@@ -58,24 +57,16 @@ class Silhouette(CameraImage):
     """
 
     latent = ("pose", "rim")
-    parameters = {"width": POSITIVE, "flipped": Range(above=0.0, below=0.5), "temperature": POSITIVE}
 
-    def __init__(
-        self,
-        renderer: RendersDepth,
-        camera: Camera,
-        pose: Tensor,
-        width: float,
-        flipped: float = 0.05,
-        *,
-        rim: Tensor | float = 0.0,
-        temperature: float = 1.0,
-        region: Mask | Tensor | None = None,
-    ) -> None:
-        self.width, self.flipped, self.temperature, self.rim = width, flipped, temperature, rim
-        super().__init__(renderer, camera, pose, region)
-        self._check_shape("a rim", rim, (), self.batch_shape)
-        self._hits = CachedHits(partial(renderer.hits, camera, pose.detach()), None).keep_all()
+    width: float = field(metadata=POSITIVE)
+    flipped: float = field(default=0.05, metadata=within(above=0.0, below=0.5))
+    rim: Tensor | float = field(default=0.0, kw_only=True)
+    temperature: float = field(default=1.0, kw_only=True, metadata=POSITIVE)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_shape("a rim", self.rim, (), self.batch_shape)
+        self._hits = CachedHits(partial(self.renderer.hits, self.camera, self.pose.detach()), None).keep_all()
 
     @classmethod
     def from_depth(

@@ -97,8 +97,8 @@ class Stage:
         if self.before is None or self.chosen is other.chosen:
             return self
         own = torch.arange(len(mask))
-        both = (own if each.chosen is None else each.chosen for each in (self, other))
-        return replace(self, picks=(torch.where(mask, *both),))
+        first, second = (own if each.chosen is None else each.chosen for each in (self, other))
+        return replace(self, picks=(torch.where(mask, first, second),))
 
 
 def runnable(program: Program | Series) -> Program:

@@ -241,11 +241,11 @@ def _refuse_coincidence(
         a: _one_more(v, ran.distributions[a], index) for a, v in ran.values.items() if a not in ran.fixed
     }
     carried = {name: entry.take(index) for name, entry in ran.carried.items()}
-    staged = isinstance(program, Stage)
+    larger = program.take(index) if isinstance(program, Stage) else program
     state = torch.get_rng_state()
     try:
-        again = run(program.take(index) if staged else program, args, particles + 1, given, carried)
-        if staged:
+        again = run(larger, args, particles + 1, given, carried)
+        if isinstance(larger, Stage):
             indexed(again.result, None, particles + 1)
     except InputError as error:
         raise InputError(

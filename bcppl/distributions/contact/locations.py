@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from bcppl.distributions.contact.track import Track, TrackDistribution, log_gaussian
-from bcppl.distributions.parameters import POSITIVE, PROBABILITY, Range
+from bcppl.distributions.contact.track import TrackDistribution, log_gaussian
+from bcppl.distributions.parameters import COUNT, NONNEGATIVE, POSITIVE, PROBABILITY, within
 
 
 def chamfer(a: Tensor, b: Tensor, one_empty: float) -> Tensor:
@@ -42,6 +43,7 @@ def _dense(points: Tensor) -> Tensor:
     return points if bool(inside.all()) else points[..., inside, :]
 
 
+@dataclass(eq=False, repr=False)
 class ChamferContacts(TrackDistribution):
     """Contact locations at the stamps `first` to `last` of a probe: log p = -D_ch / (2 scale^2).
 
@@ -56,29 +58,16 @@ class ChamferContacts(TrackDistribution):
         track, first, last: as for `TrackDistribution`.
         scale: sigma, metres.
         one_empty: D_ch where one set is empty and the other is not, square metres; for example 2 (3 scale)^2.
-        noise: of `sample` alone: the standard deviation of a location along each axis (m), and the
-            probability that a contact is missed.
+        deviation: of `sample` alone: the standard deviation of a location along each axis, metres.
+        missed: of `sample` alone: the probability that a contact is missed.
     """
 
-    parameters = TrackDistribution.parameters | {
-        "scale": POSITIVE,
-        "one_empty": POSITIVE,
-        "deviation": Range(least=0.0),
-        "missed": Range(least=0.0, most=1.0),
-    }
+    entries = 3
 
-    def __init__(
-        self,
-        track: Track,
-        first: int,
-        last: int,
-        scale: float,
-        one_empty: float,
-        noise: tuple[float, float] = (0.0005, 0.02),
-    ) -> None:
-        self.scale, self.one_empty = scale, one_empty
-        self.deviation, self.missed = noise
-        super().__init__(track, first, last, 3)
+    scale: float = field(metadata=POSITIVE)
+    one_empty: float = field(metadata=POSITIVE)
+    deviation: float = field(default=0.0005, metadata=NONNEGATIVE)
+    missed: float = field(default=0.02, metadata=within(least=0.0, most=1.0))
 
     @property
     def log_prob_bound(self) -> float:
@@ -97,6 +86,7 @@ class ChamferContacts(TrackDistribution):
         return torch.where(gone[..., None], math.nan, noisy)
 
 
+@dataclass(eq=False, repr=False)
 class ContactsInTime(TrackDistribution):
     """A contact location or none at every `every`-th stamp of `first` to `last` of a probe: normalised.
 
@@ -119,29 +109,14 @@ class ContactsInTime(TrackDistribution):
     """
 
     broadcasts = True
-    parameters = TrackDistribution.parameters | {
-        "scale": POSITIVE,
-        "missed": PROBABILITY,
-        "false_alarm": PROBABILITY,
-        "outlier": PROBABILITY,
-        "reach": POSITIVE,
-    }
+    entries = 3
 
-    def __init__(
-        self,
-        track: Track,
-        first: int,
-        last: int,
-        scale: float,
-        missed: float = 0.02,
-        false_alarm: float = 0.02,
-        outlier: float = 0.05,
-        reach: float = 0.05,
-        every: int = 10,
-    ) -> None:
-        self.scale, self.missed, self.false_alarm, self.outlier = scale, missed, false_alarm, outlier
-        self.reach, self.every = reach, every
-        super().__init__(track, first, last, 3)
+    scale: float = field(metadata=POSITIVE)
+    missed: float = field(default=0.02, metadata=PROBABILITY)
+    false_alarm: float = field(default=0.02, metadata=PROBABILITY)
+    outlier: float = field(default=0.05, metadata=PROBABILITY)
+    reach: float = field(default=0.05, metadata=POSITIVE)
+    every: int = field(default=10, metadata=COUNT)
 
     def _log_prob(self, value: Tensor) -> Tensor:
         contacts = self.track.window(self.first, self.last)[0][:, self.thinned]

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.contact.track import WIDER, Track, TrackDistribution, contaminated, log_gaussian
-from bcppl.distributions.parameters import POSITIVE
+from bcppl.distributions.contact.track import WIDER, TrackDistribution, contaminated, log_gaussian
+from bcppl.distributions.parameters import COUNT, POSITIVE
 
 OUTLIER = 0.05
 
@@ -21,6 +22,7 @@ def _log_mass_within_pi(scale: float) -> float:
     return math.log(math.erf(a / math.sqrt(2.0)) - math.sqrt(2.0 / math.pi) * a * math.exp(-0.5 * a * a))
 
 
+@dataclass(eq=False, repr=False)
 class PegPose(TrackDistribution):
     """The held peg's measured pose at every `every`-th stamp of `first` to `last` of a probe: normalised.
 
@@ -38,19 +40,11 @@ class PegPose(TrackDistribution):
     """
 
     broadcasts = True
-    parameters = TrackDistribution.parameters | {"translation_scale": POSITIVE, "rotation_scale": POSITIVE}
+    entries = 7
 
-    def __init__(
-        self,
-        track: Track,
-        first: int,
-        last: int,
-        translation_scale: float,
-        rotation_scale: float,
-        every: int = 10,
-    ) -> None:
-        self.translation_scale, self.rotation_scale, self.every = translation_scale, rotation_scale, every
-        super().__init__(track, first, last, 7)
+    translation_scale: float = field(metadata=POSITIVE)
+    rotation_scale: float = field(metadata=POSITIVE)
+    every: int = field(default=10, metadata=COUNT)
 
     @property
     def log_prob_bound(self) -> float:

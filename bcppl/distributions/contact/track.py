@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from bcppl.distributions.lazy import LazyDistribution
-from bcppl.distributions.parameters import COUNT, Range, check_parameters
+from bcppl.distributions.parameters import check_parameters, within
 from bcppl.errors import InputError
 
 S = TypeVar("S", float, Tensor)
@@ -34,6 +35,7 @@ class Track(Protocol):
         """Force (N) and torque (N m) on the peg (N, T, 6), in its frame about its origin, of some stamps."""
 
 
+@dataclass(eq=False, repr=False)
 class TrackDistribution(LazyDistribution):
     """A measurement at the stamps `first` to `last` of a probe, given its simulation for each particle.
 
@@ -43,9 +45,9 @@ class TrackDistribution(LazyDistribution):
         track: the simulated probe.
         first: the first stamp.
         last: the stamp after the last.
-        entries: the number of entries measured at a stamp.
 
     Attributes:
+        entries: the number of entries measured at a stamp.
         every: the stamps whose number is a multiple of this enter the density, since errors are correlated
             in time.
 
@@ -54,17 +56,21 @@ class TrackDistribution(LazyDistribution):
     """
 
     cost = 2
+    entries = 0
     every = 1
-    parameters = {"first": Range(least=0, whole=True), "last": Range(least=0, whole=True), "every": COUNT}
 
-    def __init__(self, track: Track, first: int, last: int, entries: int) -> None:
-        self.track, self.first, self.last = track, first, last
+    track: Track
+    first: int = field(metadata=within(least=0, whole=True))
+    last: int = field(metadata=within(least=0, whole=True))
+
+    def __post_init__(self) -> None:
         check_parameters(self)
-        if first >= last:
+        if self.first >= self.last:
             raise InputError(
-                f"{type(self).__name__} has first = {first} and last = {last}; give first before last."
+                f"{type(self).__name__} has first = {self.first} and last = {self.last}; "
+                "give first before last."
             )
-        super().__init__(len(track), (self.last - self.first, entries))
+        super().__init__(len(self.track), (self.last - self.first, self.entries))
 
     @property
     def thinned(self) -> slice:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from bcppl.distributions.contact.track import WIDER, Track, TrackDistribution, contaminated
-from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE, PROBABILITY, check_shape
+from bcppl.distributions.contact.track import WIDER, TrackDistribution, contaminated
+from bcppl.distributions.parameters import COUNT, NONNEGATIVE, POSITIVE, PROBABILITY, check_shape
 
 
+@dataclass(eq=False, repr=False)
 class Wrench(TrackDistribution):
     """The wrench on the held peg at every `every`-th stamp of `first` to `last` of a probe: normalised.
 
@@ -48,29 +50,18 @@ class Wrench(TrackDistribution):
     """
 
     broadcasts = True
-    parameters = TrackDistribution.parameters | {
-        "force_scale": POSITIVE,
-        "torque_scale": POSITIVE,
-        "relative": NONNEGATIVE,
-        "outlier": PROBABILITY,
-    }
+    entries = 6
 
-    def __init__(
-        self,
-        track: Track,
-        first: int,
-        last: int,
-        force_scale: float,
-        torque_scale: float,
-        relative: float = 0.15,
-        outlier: float = 0.1,
-        every: int = 10,
-        bias: Tensor | None = None,
-    ) -> None:
-        self.force_scale, self.torque_scale, self.relative = force_scale, torque_scale, relative
-        self.outlier, self.every, self.bias = outlier, every, bias
-        super().__init__(track, first, last, 6)
-        check_shape("Wrench", "a bias", bias, (len(track), 6))
+    force_scale: float = field(metadata=POSITIVE)
+    torque_scale: float = field(metadata=POSITIVE)
+    relative: float = field(default=0.15, metadata=NONNEGATIVE)
+    outlier: float = field(default=0.1, metadata=PROBABILITY)
+    every: int = field(default=10, metadata=COUNT)
+    bias: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_shape("Wrench", "a bias", self.bias, (len(self.track), 6))
 
     @property
     def log_prob_bound(self) -> float:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy.typing as npt
 import torch
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from bcppl.geometry.camera import Camera
 
 
+@dataclass(eq=False, repr=False)
 class CameraImage(LazyDistribution):
     """An image (H, W) that a camera takes of parts at the particles' poses.
 
@@ -34,16 +36,15 @@ class CameraImage(LazyDistribution):
     """
 
     cost = 1
-    latent: tuple[str, ...] = ("pose",)
+    latent: ClassVar[tuple[str, ...]] = ("pose",)
 
-    def __init__(
-        self,
-        renderer: RendersDepth,
-        camera: Camera,
-        pose: Tensor,
-        region: Mask | Tensor | None = None,
-    ) -> None:
-        self.renderer, self.camera, self.pose, self.region = renderer, camera, pose, region
+    renderer: RendersDepth
+    camera: Camera
+    pose: Tensor
+    region: Mask | Tensor | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        renderer, camera, pose = self.renderer, self.camera, self.pose
         parts = getattr(renderer, "parts", None)
         each = (7,) if parts is None else (len(parts), 7)
         if pose.shape[1:] != each:
@@ -59,7 +60,7 @@ class CameraImage(LazyDistribution):
                 f"camera {camera.name!r} has the range {camera.near} to {camera.far} m; give 0 <= near < far."
             )
         super().__init__(len(pose), (camera.height, camera.width))
-        self._check_shape("a region", region, self.event_shape)
+        self._check_shape("a region", self.region, self.event_shape)
 
     @property
     def _where(self) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import KW_ONLY, dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,12 +15,9 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from bcppl.distributions.depth.camera_image import CameraImage
 from bcppl.distributions.depth.noise import RobustDepth
 from bcppl.distributions.depth.observed import Observed
-from bcppl.distributions.depth.rendering import Array, Mask, RendersDepth
+from bcppl.distributions.depth.rendering import Array, Mask
 from bcppl.distributions.depth.scanlines import Chain, Line, Lines, draw, gains, scan
-from bcppl.distributions.parameters import COUNT, POSITIVE, PROBABILITY, Range
-
-if TYPE_CHECKING:
-    from bcppl.geometry.camera import Camera
+from bcppl.distributions.parameters import COUNT, POSITIVE, PROBABILITY, within
 
 
 class _Scanned(NamedTuple):
@@ -36,6 +34,7 @@ class _Scanned(NamedTuple):
     of_columns: float
 
 
+@dataclass(eq=False, repr=False)
 class ClutteredDepth(CameraImage):
     """A depth image of a part among unknown clutter whose depth continues from one pixel to the next.
 
@@ -86,53 +85,27 @@ class ClutteredDepth(CameraImage):
         InputError: a shape does not fit, or a parameter is out of its range.
     """
 
-    parameters = {
-        "scale": POSITIVE,
-        "lines": COUNT,
-        "temperature": POSITIVE,
-        "correlation": Range(least=0.0, below=1.0),
-        "rough": PROBABILITY,
-        "step": POSITIVE,
-        "jump": PROBABILITY,
-        "visible": PROBABILITY,
-        "switch": PROBABILITY,
-        "enter": PROBABILITY,
-        "leave": PROBABILITY,
-        "abut": PROBABILITY,
-        "through": PROBABILITY,
-        "rim": Range(least=0, whole=True),
-    }
+    scale: float = field(metadata=POSITIVE)
+    _: KW_ONLY
+    lines: int = field(default=4, metadata=COUNT)
+    temperature: float = field(default=1.0, metadata=POSITIVE)
+    correlation: float = field(default=0.85, metadata=within(least=0.0, below=1.0))
+    rough: float = field(default=0.1, metadata=PROBABILITY)
+    step: float = field(default=0.004, metadata=POSITIVE)
+    jump: float = field(default=0.01, metadata=PROBABILITY)
+    visible: float = field(default=0.8, metadata=PROBABILITY)
+    switch: float = field(default=0.03, metadata=PROBABILITY)
+    enter: float = field(default=0.4, metadata=PROBABILITY)
+    leave: float = field(default=0.2, metadata=PROBABILITY)
+    abut: float = field(default=0.05, metadata=PROBABILITY)
+    through: float = field(default=0.02, metadata=PROBABILITY)
+    rim: int = field(default=3, metadata=within(least=0, whole=True))
 
-    def __init__(
-        self,
-        renderer: RendersDepth,
-        camera: Camera,
-        pose: Tensor,
-        scale: float,
-        *,
-        lines: int = 4,
-        temperature: float = 1.0,
-        correlation: float = 0.85,
-        rough: float = 0.1,
-        step: float = 0.004,
-        jump: float = 0.01,
-        visible: float = 0.8,
-        switch: float = 0.03,
-        enter: float = 0.4,
-        leave: float = 0.2,
-        abut: float = 0.05,
-        through: float = 0.02,
-        rim: int = 3,
-    ) -> None:
-        self.scale, self.lines, self.temperature, self.correlation = scale, lines, temperature, correlation
-        self.rough, self.step, self.jump, self.visible, self.switch = rough, step, jump, visible, switch
-        self.enter, self.leave, self.abut, self.through, self.rim = enter, leave, abut, through, rim
-        super().__init__(renderer, camera, pose)
-        wander = self.scale * math.sqrt(1.0 - self.correlation**2)
-        self.chain = Chain(
-            camera.near, camera.far, self.scale, self.correlation, wander, self.rough, self.step, self.jump,
-            self.visible, self.switch, self.enter, self.leave, self.abut, self.through, self.rim,
-        )  # fmt: skip
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        camera, wander = self.camera, self.scale * math.sqrt(1.0 - self.correlation**2)
+        own = {name: getattr(self, name) for name in Chain._fields[3:]}
+        self.chain = Chain(camera.near, camera.far, wander, **own)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-probability (N,) of a depth image (H, W), or of one for each particle (N, H, W).

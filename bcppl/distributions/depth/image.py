@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,14 +19,12 @@ from bcppl import poses
 from bcppl.distributions.checks import Check
 from bcppl.distributions.depth.camera_image import CameraImage
 from bcppl.distributions.depth.observed import CACHE, Observed
-from bcppl.distributions.depth.rendering import Array, CachedHits, Mask, RendersDepth
-from bcppl.distributions.parameters import POSITIVE, Range
+from bcppl.distributions.depth.rendering import Array, CachedHits
+from bcppl.distributions.parameters import POSITIVE, ranges, within
 from bcppl.errors import InputError
 
-if TYPE_CHECKING:
-    from bcppl.geometry.camera import Camera
 
-
+@dataclass(eq=False, repr=False)
 class DepthDistribution(CameraImage):
     """A depth image whose pixels are independent given the poses, the camera's error and its bias.
 
@@ -56,7 +55,6 @@ class DepthDistribution(CameraImage):
         bias: (N,) or one for all, metres that are added to every rendered depth, the background's too.
         background_is_measured: whether the same sensor measured the background, whose depths then contain the
             bias already; otherwise they are true depths.
-        **own: parameters of the subclass, which it declares with their defaults.
 
     Raises:
         InputError: a shape does not fit; a parameter or the sensor's range is out of range; both
@@ -64,52 +62,34 @@ class DepthDistribution(CameraImage):
     """
 
     latent = ("pose", "camera_error", "bias")
-    parameters = {
-        "scale": POSITIVE,
-        "effective_pixels": Range(above=0.0, optional=True),
-        "temperature": Range(above=0.0, optional=True),
-    }
 
-    def __init__(
-        self,
-        renderer: RendersDepth,
-        camera: Camera,
-        pose: Tensor,
-        scale: float,
-        background: Array | Tensor | None = None,
-        effective_pixels: float | None = None,
-        region: Mask | Tensor | None = None,
-        *,
-        temperature: float | None = None,
-        camera_error: Tensor | None = None,
-        bias: Tensor | float = 0.0,
-        background_is_measured: bool = False,
-        **own: float,
-    ) -> None:
-        self.scale, self.effective_pixels, self.temperature = scale, effective_pixels, temperature
-        self.background, self.background_is_measured = background, background_is_measured
-        self.camera_error, self.bias = camera_error, bias
-        for name, value in own.items():
-            if name not in self.parameters:
-                raise TypeError(f"{type(self).__name__} has no parameter {name!r}")
-            setattr(self, name, value)
-        super().__init__(renderer, camera, pose, region)
+    scale: float = field(metadata=POSITIVE)
+    background: Array | Tensor | None = None
+    effective_pixels: float | None = field(default=None, metadata=within(above=0.0, optional=True))
+    _: KW_ONLY
+    temperature: float | None = field(default=None, metadata=within(above=0.0, optional=True))
+    camera_error: Tensor | None = None
+    bias: Tensor | float = 0.0
+    background_is_measured: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         each = self.batch_shape
-        self._check_shape("a background", background, self.event_shape)
-        self._check_shape("a camera_error (stated_camera_from_camera)", camera_error, (7,), (*each, 7))
-        self._check_shape("a bias", bias, (), each)
-        if temperature is not None and effective_pixels is not None:
+        self._check_shape("a background", self.background, self.event_shape)
+        self._check_shape("a camera_error (stated_camera_from_camera)", self.camera_error, (7,), (*each, 7))
+        self._check_shape("a bias", self.bias, (), each)
+        if self.temperature is not None and self.effective_pixels is not None:
             raise InputError(
                 f"{self._where} has both effective_pixels and temperature, and each is a power of the "
                 "likelihood; give one of them."
             )
-        if camera_error is not None and background is not None:
+        if self.camera_error is not None and self.background is not None:
             raise InputError(
                 f"{self._where} has both a camera_error and a background image, which was rendered from the "
                 "camera's stated pose; give no background, or render it as a part of the scene "
                 "(bcppl.rendering.scene.background_part)."
             )
-        self._log_uniform = -math.log(camera.far - camera.near)
+        self._log_uniform = -math.log(self.camera.far - self.camera.near)
 
     # ---- a subclass defines the density of a pixel
 
@@ -126,7 +106,7 @@ class DepthDistribution(CameraImage):
     @property
     def _settings(self) -> tuple[Any, ...]:
         """All that a pixel's density depends on besides its observed and rendered depth."""
-        values = (getattr(self, name) for name in self.parameters)
+        values = (getattr(self, name) for name in ranges(type(self)))
         return (type(self), self.camera.near, self.camera.far, *values)
 
     @property

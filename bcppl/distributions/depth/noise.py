@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -27,6 +27,7 @@ class LaplaceDepth(DepthDistribution):
         return -(depth - rendered).abs() / self.scale - math.log(2.0 * self.scale)
 
 
+@dataclass(eq=False, repr=False)
 class RobustDepth(DepthDistribution):
     """Laplace noise on every pixel, or, with probability `outlier`, any depth within the sensor's range.
 
@@ -43,8 +44,7 @@ class RobustDepth(DepthDistribution):
         InputError: as `DepthDistribution`, or the outlier's probability is out of range.
     """
 
-    outlier: float = 0.1
-    parameters = DepthDistribution.parameters | {"outlier": PROBABILITY}
+    outlier: float = field(default=0.1, kw_only=True, metadata=PROBABILITY)
 
     def _log_density(self, depth: Tensor, rendered: Tensor) -> Tensor:
         residual = (depth - rendered).abs_()
@@ -57,6 +57,7 @@ class RobustDepth(DepthDistribution):
         )
 
 
+@dataclass(eq=False, repr=False)
 class OccludedDepth(DepthDistribution):
     """Laplace noise, or an occluder in front, or any depth within the sensor's range.
 
@@ -80,12 +81,11 @@ class OccludedDepth(DepthDistribution):
         InputError: as `DepthDistribution`, or a probability is out of range, or their sum is 1 or more.
     """
 
-    occluder: float = 0.1
-    outlier: float = 0.05
-    parameters = DepthDistribution.parameters | {"occluder": PROBABILITY, "outlier": PROBABILITY}
+    occluder: float = field(default=0.1, kw_only=True, metadata=PROBABILITY)
+    outlier: float = field(default=0.05, kw_only=True, metadata=PROBABILITY)
 
-    def __init__(self, *given: Any, **named: Any) -> None:
-        super().__init__(*given, **named)
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if self.occluder + self.outlier >= 1.0:
             raise InputError(
                 f"OccludedDepth has occluder = {self.occluder} and outlier = {self.outlier}; "

@@ -25,9 +25,9 @@ class Chain(NamedTuple):
 
     near: float
     far: float
+    wander: float
     scale: float
     correlation: float
-    wander: float
     rough: float
     step: float
     jump: float

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from bcppl import poses, quaternions
-from bcppl.distributions.parameters import Range, check_parameters
+from bcppl.distributions.parameters import Range
 from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
 
-ANGLE = Range(least=0.0, most=math.pi, unit="rad")
+ANGLE = Range(least=0.0, most=math.pi)
 
 
 class _BoxPose(PoseDistribution):
@@ -27,8 +27,6 @@ class _BoxPose(PoseDistribution):
         rotation: the axes about which it is free, as `Freedom` has them.
         measure: the normalised Haar measure of the rotations.
     """
-
-    parameters: dict[str, Range] = {}
 
     def __init__(self, center: Any, translation: Any, rotation: str, measure: float) -> None:
         try:
@@ -70,11 +68,8 @@ class UniformPose(_BoxPose):
         InputError: a width or the angle is out of range.
     """
 
-    parameters = {"angle": ANGLE}
-
     def __init__(self, center: Any, translation: Any, angle: float, rotation: str = "all") -> None:
-        self.angle = angle
-        check_parameters(self)
+        self.angle = ANGLE.checked("UniformPose has angle = {} rad", angle)
         if self.angle == 0.0:
             rotation = "none"
         ball = (self.angle - math.sin(self.angle)) / math.pi
@@ -133,11 +128,9 @@ class SwingTwistPose(_BoxPose):
         InputError: a limit is out of range, or tilt is free while yaw is held (no Haar measure).
     """
 
-    parameters = {"tilt": ANGLE, "yaw": ANGLE}
-
     def __init__(self, center: Any, translation: Any, tilt: float, yaw: float) -> None:
-        self.tilt, self.yaw = tilt, yaw
-        check_parameters(self)
+        self.tilt = ANGLE.checked("SwingTwistPose has tilt = {} rad", tilt)
+        self.yaw = ANGLE.checked("SwingTwistPose has yaw = {} rad", yaw)
         if self.tilt > 0 and self.yaw == 0:
             raise InputError(
                 "SwingTwistPose has free tilt and held yaw, which have no Haar measure; "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -22,6 +23,7 @@ from bcppl.distributions.touch.placed import (
 UPRIGHT = 1e-6
 
 
+@dataclass(eq=False, repr=False)
 class ForceDirection(LazyDistribution):
     """The direction, in the world's xy plane, of the force that a moving finger exerts on the part.
 
@@ -48,22 +50,17 @@ class ForceDirection(LazyDistribution):
         InputError: the friction or the spread is not positive, or the outlier no probability below 1.
     """
 
-    parameters = {"friction": LATENT_POSITIVE, "spread": LATENT_POSITIVE, "outlier": OUTLIER}
+    distance: Distance | Placed
+    pose: Tensor
+    tip: Tensor
+    motion: Tensor
+    friction: Scale = field(metadata=LATENT_POSITIVE)
+    spread: Scale = field(metadata=LATENT_POSITIVE)
+    outlier: float = field(metadata=OUTLIER)
 
-    def __init__(
-        self,
-        distance: Distance | Placed,
-        pose: Tensor,
-        tip: Tensor,
-        motion: Tensor,
-        friction: Scale,
-        spread: Scale,
-        outlier: float,
-    ) -> None:
-        self.distance, self.pose = distance, pose
-        self.tip, self.motion = tip.expand(len(pose), 3), motion.expand(len(pose), 3)
-        self.friction, self.spread, self.outlier = friction, spread, outlier
-        super().__init__(len(pose), ())
+    def __post_init__(self) -> None:
+        self.tip, self.motion = (each.expand(len(self.pose), 3) for each in (self.tip, self.motion))
+        super().__init__(len(self.pose), ())
 
     def _expected(self) -> tuple[Tensor, Tensor, Tensor]:
         """The expected angle (N,), whether the normal has a direction (N,), and whether there is contact."""

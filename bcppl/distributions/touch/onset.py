@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -41,6 +42,7 @@ def _travelled(path: Path, place: Tensor) -> Tensor:
     return torch.where(touched, inner, torch.inf)
 
 
+@dataclass(eq=False, repr=False)
 class OnsetLocation(LazyDistribution):
     """The location on its path at which a finger first detects contact: (3,) in the world, NaN for never.
 
@@ -67,20 +69,15 @@ class OnsetLocation(LazyDistribution):
         InputError: the spread is not positive, or the outlier no probability below 1.
     """
 
-    parameters = {"spread": LATENT_POSITIVE, "outlier": OUTLIER}
+    distance: Distance | Placed
+    pose: Tensor
+    path: Path
+    offset: Scale
+    spread: Scale = field(metadata=LATENT_POSITIVE)
+    outlier: float = field(metadata=OUTLIER)
 
-    def __init__(
-        self,
-        distance: Distance | Placed,
-        pose: Tensor,
-        path: Path,
-        offset: Scale,
-        spread: Scale,
-        outlier: float,
-    ) -> None:
-        self.distance, self.pose, self.path = distance, pose, path
-        self.offset, self.spread, self.outlier = offset, spread, outlier
-        super().__init__(len(pose), (3,))
+    def __post_init__(self) -> None:
+        super().__init__(len(self.pose), (3,))
 
     def threshold(self) -> tuple[Scale, Scale]:
         """Offset and spread of the threshold, metres."""
@@ -128,6 +125,7 @@ class OnsetLocation(LazyDistribution):
         return torch.where(stray[:, None], anywhere, place)
 
 
+@dataclass(eq=False, repr=False)
 class FreePath(LazyDistribution):
     """Whether the finger moved freely up to the onset: 1 if it did, 0 if not.
 
@@ -147,20 +145,16 @@ class FreePath(LazyDistribution):
         InputError: the spread is not positive.
     """
 
-    parameters = {"spread": LATENT_POSITIVE}
+    distance: Distance | Placed
+    pose: Tensor
+    path: Path
+    onset: Tensor
+    tolerance: Scale
+    spread: Scale = field(metadata=LATENT_POSITIVE)
 
-    def __init__(
-        self,
-        distance: Distance | Placed,
-        pose: Tensor,
-        path: Path,
-        onset: Tensor,
-        tolerance: Scale,
-        spread: Scale,
-    ) -> None:
-        self.distance, self.pose, self.path = distance, pose, path
-        self.onset, self.tolerance, self.spread = onset.expand(len(pose), 3), tolerance, spread
-        super().__init__(len(pose), ())
+    def __post_init__(self) -> None:
+        self.onset = self.onset.expand(len(self.pose), 3)
+        super().__init__(len(self.pose), ())
 
     def _score(self) -> Tensor:
         travelled = _travelled(self.path, self.onset)

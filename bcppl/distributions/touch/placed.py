@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.parameters import Range
+from bcppl.distributions.parameters import within
 
 Distance = Callable[[Tensor], Any]
 Scale = float | Tensor
 
-LATENT_POSITIVE = Range(above=0.0, latent=True)
-OUTLIER = Range(least=0.0, below=1.0)
+LATENT_POSITIVE = within(above=0.0, latent=True)
+OUTLIER = within(least=0.0, below=1.0)
 
 
 class Placed:
