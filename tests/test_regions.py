@@ -101,7 +101,6 @@ def test_regions_by_hand() -> None:
     assert float(whole) == pytest.approx(3 / math.sqrt(60 / 9))
     # Nine draws cannot say what holds 19 in 20.
     assert belief.credible_region(0.95).radius == math.inf
-    assert belief.add_radius(POINTS, 0.5) == pytest.approx(0.002)
     with pytest.raises(InputError, match="every rotation is held"):
         belief.credible_region(0.5, rotation_deviation)
     with pytest.raises(InputError, match="between 0 and 1"):

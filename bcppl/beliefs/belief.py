@@ -14,9 +14,8 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.beliefs import entropy, modes
 from bcppl.beliefs.distances import average_distance
-from bcppl.beliefs.merged import merged
 from bcppl.beliefs.regions import Measure, Region, pose_deviation, region
-from bcppl.beliefs.weights import effective_sample_size, normalised, weighted_quantiles
+from bcppl.beliefs.weights import effective_sample_size, merged, normalised, weighted_quantiles
 from bcppl.errors import InputError
 from bcppl.poses import FREE, Freedom
 
@@ -48,20 +47,13 @@ class Belief:
                 )
             object.__setattr__(self, name, values.to(torch.float64))
         given, weights = tuple(self.world_from_part.shape), tuple(self.log_weights.shape)
-        if len(given) != 2 or given[1] != 7:
+        if given != (len(self.world_from_part), 7) or weights != given[:1]:
             raise InputError(
-                f"a belief is given poses of shape {given}; give (N, 7), each [x y z qw qx qy qz]."
+                f"a belief is given poses of shape {given} and log weights of shape {weights}; give (N, 7), "
+                "each [x y z qw qx qy qz], and (N,)."
             )
-        if weights != given[:1]:
-            raise InputError(
-                f"a belief of {given[0]} poses is given log weights of shape {weights}; give one for each."
-            )
-        finite = torch.isfinite(self.world_from_part).all(dim=1)
-        if not bool(finite.all()):
-            raise InputError(
-                f"pose {int((~finite).nonzero()[0])} of a belief is not finite; give each as "
-                "[x y z qw qx qy qz], in metres."
-            )
+        if len(wrong := (~torch.isfinite(self.world_from_part)).nonzero()):
+            raise InputError(f"pose {int(wrong[0, 0])} of a belief is not finite; give numbers, in metres.")
 
     def __len__(self) -> int:
         return len(self.log_weights)
@@ -122,9 +114,6 @@ class Belief:
 
         Returns:
             (Q, 6), or (6,) for a single probability; 0 along held axes. See `weighted_quantiles`.
-
-        Raises:
-            InputError: a probability is not in [0, 1].
         """
         return weighted_quantiles(self.tangent, self.weights, probabilities)
 
@@ -139,46 +128,25 @@ class Belief:
 
         Args:
             mass: in (0, 1).
-            measure: the distance of a pose from the mean: `pose_deviation`, `translation_deviation`,
-                `rotation_deviation` (standard deviations), `translation_distance` (metres), `rotation_angle`
-                (radians), `average_point_distance(points)` (ADD, metres), or, from the nearest of several
-                modes, `nearest_mode_deviation()`. See `bcppl.beliefs.regions`.
+            measure: the distance of a pose from the mean: one of the functions of `bcppl.beliefs.regions`.
 
         Raises:
             InputError: the mass is not in (0, 1), or every axis of the measure is held.
         """
         return region(self.merged, mass, measure)
 
-    def add_radius(self, points: np.ndarray | Tensor, mass: float) -> float:
-        """The quantile at `mass` of the ADD from the mean pose, metres.
-
-        It is a quantile of the particles; `credible_region` also corrects for their number.
-
-        Args:
-            points: (M, 3) on the part's surface, in its frame.
-            mass: in [0, 1].
-
-        Raises:
-            InputError: the mass is not in [0, 1].
-        """
-        return float(weighted_quantiles(self.add(points, self.mean), self.weights, mass))
-
     def modes(
         self, translation: float = 0.01, rotation: float = 0.2, symmetries: Tensor | None = None
     ) -> list[Mode]:
         """The clusters of the particles, the heaviest first.
 
-        A gap separates two clusters: (metres / translation)^2 + (radians / rotation)^2 > 1 between every
-        particle of one and every particle of the other (`bcppl.beliefs.modes.cluster`).
+        They are those of `bcppl.beliefs.modes.cluster`, which raises errors of its own. Poses that differ by
+        one of the `symmetries` are equivalent, and a mode gathers them about its heaviest particle.
 
         Args:
-            translation: metres.
-            rotation: radians.
-            symmetries: (K, 7) `part_from_part`, a group that leaves the part invariant: poses that differ
-                by one are equivalent, and a mode gathers them about its heaviest particle.
-
-        Raises:
-            InputError: a scale is not positive, or there are more than 10,000 distinct particles.
+            translation: the gap between clusters, metres.
+            rotation: the gap between clusters, radians.
+            symmetries: (K, 7) `part_from_part`, a group that leaves the part invariant.
         """
         whole = self.merged
         label = modes.cluster(whole.world_from_part, translation, rotation, symmetries)
@@ -203,19 +171,14 @@ class Belief:
     def gaussian_entropy(self) -> float:
         """Entropy in nats, against the base measure, of the Gaussian at the mean (`bcppl.beliefs.entropy`).
 
-        It overestimates the entropy of several modes: use `entropy_of_modes`. -inf where the particles do not
-        span the free axes.
+        It overestimates the entropy of several modes: use `entropy_of_modes`.
         """
         return entropy.gaussian_entropy(self)
 
     def nearest_neighbour_entropy(self, neighbours: int = 3) -> float:
-        """The nearest-neighbour estimate of the entropy in nats, against the base measure.
+        """The estimate of the entropy in nats, against the base measure, from the particles' neighbours.
 
-        It assumes no shape, but needs many particles (`bcppl.beliefs.entropy`). -inf where they do not span
-        the free axes.
-
-        Raises:
-            InputError: `neighbours` is below 1.
+        See `bcppl.beliefs.entropy`. It assumes no shape, but needs many particles.
         """
         return entropy.nearest_neighbour_entropy(self, neighbours)
 
@@ -237,12 +200,7 @@ class Belief:
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """A cluster of particles.
-
-    Attributes:
-        mass: its share of the weight.
-        belief: its particles, copies merged: their mean pose, spread and quantiles are the mode's.
-    """
+    """A cluster of particles, copies merged, and its share of the weight."""
 
     mass: float
     belief: Belief

@@ -31,10 +31,7 @@ def weight_entropy(weights: Tensor) -> float:
 
 
 def gaussian_entropy(belief: Belief) -> float:
-    """Entropy of the Gaussian in the tangent space at a belief's mean that has the particles' covariance.
-
-    1/2 log det(2 pi e covariance), plus the mean of log J; -inf where the particles do not span the axes.
-    """
+    """1/2 log det(2 pi e covariance), plus the mean of log J; -inf where particles do not span the axes."""
     tangent, weights, freedom = _merged(belief)
     factor = _cholesky(freedom.coordinates(tangent), weights)
     if factor is None:
@@ -54,7 +51,7 @@ def nearest_neighbour_entropy(belief: Belief, neighbours: int) -> float:
     k neighbours (the particle's own would be counted twice).
 
     It is biased upwards where the density varies within that distance: with few particles and many axes by
-    tenths of a nat and more.
+    tenths of a nat and more. -inf where the particles do not span the axes.
 
     Raises:
         InputError: k is no whole number, 1 or more.
@@ -91,9 +88,8 @@ def _cholesky(coordinates: Tensor, weights: Tensor) -> Tensor | None:
     if not bool((scale > 1e-12).all()):
         return None
     correlation = covariance / torch.outer(scale, scale)
-    if float(torch.linalg.eigvalsh(correlation)[0]) < 1e-10:
-        return None
-    return scale[:, None] * torch.linalg.cholesky(correlation)
+    spans = float(torch.linalg.eigvalsh(correlation)[0]) >= 1e-10
+    return scale[:, None] * torch.linalg.cholesky(correlation) if spans else None
 
 
 def _mean_log_base_density(tangent: Tensor, weights: Tensor, freedom: Freedom) -> float:

@@ -1,4 +1,4 @@
-"""Weights of particles: normalised, counted, and their quantiles."""
+"""Weights of particles: normalised, counted, merged over copies of a pose, and weighted quantiles."""
 
 from __future__ import annotations
 
@@ -72,9 +72,7 @@ def weighted_quantiles(values: Tensor, weights: Tensor, probabilities: object) -
     if not bool(((levels >= 0) & (levels <= 1)).all()):
         raise InputError(f"quantiles have the probabilities {levels.tolist()}; give numbers from 0 to 1.")
     carrying = weights > 0
-    kept = (
-        values[carrying].to(torch.float64).flatten(1) if values.ndim > 1 else values[carrying, None].double()
-    )
+    kept = values[carrying].double().reshape(int(carrying.sum()), -1)
     ordered, order = kept.sort(dim=0)
     cumulative = weights[carrying][order].cumsum(dim=0).T.contiguous()
     points = levels.reshape(1, -1).expand(len(cumulative), -1).contiguous()
@@ -83,3 +81,23 @@ def weighted_quantiles(values: Tensor, weights: Tensor, probabilities: object) -
     right = torch.searchsorted(cumulative, points + ROUNDING, right=True).clamp_max(last)
     quantiles = 0.5 * (ordered.gather(0, left.T) + ordered.gather(0, right.T))
     return quantiles.reshape((*levels.shape, *values.shape[1:]))
+
+
+def merged(world_from_part: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """The distinct poses (K, 7) among those (N, 7) with weight, and their weights (K,).
+
+    Resampling makes copies, and q and -q are the same pose.
+    """
+    carrying = weights > 0
+    distinct, which = distinct_poses(world_from_part[carrying])
+    return distinct, torch.zeros(len(distinct), dtype=weights.dtype).index_add_(0, which, weights[carrying])
+
+
+def distinct_poses(world_from_part: Tensor) -> tuple[Tensor, Tensor]:
+    """The distinct poses (K, 7) among those (N, 7), and the index (N,) int64 of each among them."""
+    turn = world_from_part[:, 3:]
+    # One sign for a quaternion and its opposite: that of its first number that is not 0.
+    first = (turn != 0).to(torch.int8).argmax(dim=1, keepdim=True)
+    upright = torch.cat([world_from_part[:, :3], turn * turn.gather(1, first).sign()], dim=1) + 0.0
+    distinct, which = torch.unique(upright, dim=0, return_inverse=True)
+    return distinct, which

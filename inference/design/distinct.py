@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within
-from bcppl.beliefs.merged import distinct_poses
 from bcppl.beliefs.modes import cluster, nearest
+from bcppl.beliefs.weights import distinct_poses
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.summaries import is_pose, values_at
