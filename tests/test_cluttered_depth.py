@@ -162,8 +162,6 @@ def test_a_pose_that_is_none_and_an_image_of_another_size_are_refused() -> None:
         ClutteredDepth(RENDERER, lens, at((0.0, 0.0, 0.0)), SCALE).log_prob(image[1:])
     with pytest.raises(InputError, match=r"\(3, 6\); give \(N, 7\)"):
         ClutteredDepth(RENDERER, lens, torch.zeros(3, 6), SCALE)
-    with pytest.raises(InputError, match="sample_shape"):
-        ClutteredDepth(RENDERER, lens, at((0.0, 0.0, 0.0)), SCALE).sample(torch.Size([2]))
 
 
 @pytest.mark.skipif(not CLUTTER.is_dir(), reason=f"the BOP scene is not at {CLUTTER}")

@@ -214,21 +214,6 @@ def test_the_plane_is_found_where_it_is_and_mutants_find_it_elsewhere() -> None:
     assert abs(highest(inside_out, ContactManifold)) > 1.5 * SINK
 
 
-@pytest.mark.parametrize(
-    ("numbers", "said"),
-    [
-        ({"noise": 0.0}, "noise = 0"),
-        ({"shared": -1e-5}, "shared = -1e-05"),
-        ({"sink": NAN}, "sink = nan"),
-        ({"outlier": 1.0}, "outlier = 1"),
-    ],
-)
-def test_numbers_out_of_range_are_refused(numbers: dict[str, float], said: str) -> None:
-    given = {"noise": NOISE, "shared": SHARED, "sink": SINK, "outlier": OUTLIER, **numbers}
-    with pytest.raises(InputError, match=said):
-        ContactManifold(ledge, poses.identity(2), 3, **given)
-
-
 def test_another_shape_and_a_draw_are_refused_in_a_sentence() -> None:
     site = manifold(ledge, poses.identity(2), 3)
     with pytest.raises(InputError, match=r"looks at 3 stamps .* shape \(8, 8\)"):

@@ -18,6 +18,7 @@ from bcppl import poses
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose, Wrench
 from bcppl.distributions.depth import ClutteredDepth, LaplaceDepth, OccludedDepth, RobustDepth
 from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.manifold import ContactManifold
 from bcppl.distributions.parameters import Range, ranges
 from bcppl.distributions.silhouette import Silhouette
 from bcppl.distributions.touch import ForceDirection, FreePath, OnsetLocation, Path
@@ -56,6 +57,9 @@ MAKE: dict[type, Callable[..., Any]] = {
         Track(), **{**STAMPS, "translation_scale": 1.0, "rotation_scale": 1.0, **given}
     ),
     Wrench: lambda **given: Wrench(Track(), **{**STAMPS, "force_scale": 1.0, "torque_scale": 1.0, **given}),
+    ContactManifold: lambda **given: ContactManifold(
+        None, POSE, **{"stamps": 3, "noise": 1.0, "shared": 1.0, **given}
+    ),
     LaplaceDepth: depth(LaplaceDepth),
     RobustDepth: depth(RobustDepth),
     OccludedDepth: depth(OccludedDepth),

@@ -121,7 +121,6 @@ def test_a_mask_is_binned_by_most_of_its_pixels() -> None:
     [
         (lambda s: s.log_prob(shown().T), r"shape \(64, 48\); give \(48, 64\) or \(13, 48, 64\)"),
         (lambda s: s.log_prob(255.0 * shown()), "other values than 0 and 1; give 1 where"),
-        (lambda s: s.sample((2,)), "give no sample_shape"),
         (lambda s: Silhouette(RENDERER, CAMERA, s.pose, 1.0, rim=torch.zeros(4)), r"a rim of shape \(4,\)"),
         (lambda s: Silhouette(RENDERER, CAMERA, s.pose * torch.nan, 1.0).sample(), "have a pose that"),
         (lambda s: binned_mask(np.zeros((4, 4, 3)), 2), "cannot be binned by 2; give one"),

@@ -11,7 +11,7 @@ from torch.distributions import MultivariateNormal
 
 _WIDTHS = (1.2, 3.0)  # of the normals that are drawn from, in deviations of the draws before
 _SHARES = (0.85, 0.15)
-_LEAST = 0.15  # of the draws: their effective number, which says how sharp the density may become
+_LEAST = 0.15  # of the draws: their effective number, which bounds how sharp the density may become
 _FASTER = 1.1  # by how much sharper it becomes at least
 _ENOUGH = 0.3  # of the draws: so many effective, and the fit is good
 
@@ -50,8 +50,8 @@ def fitted_normal(
 
     Population Monte Carlo (Cappe, Guillin, Marin and Robert, JCGS 13, 2004) with a tempered target: each
     round draws from a normal, a share of it three times as wide, fitted to the weighted draws before, and
-    lets the density in as far as 15 % of the draws stay effective. Of several modes one is left in the end.
-    It draws from torch's generator.
+    raises the density to the power at which 15 % of the draws stay effective. Of several modes one is left in
+    the end. It draws from torch's generator.
 
     Args:
         log_density: of points (M, d), unnormalised: (M,).
@@ -67,9 +67,9 @@ def fitted_normal(
     log_proposal = prior.log_prob(point)
     exponent = 0.0
     for _ in range(rounds):
-        said, correction = log_density(point), prior.log_prob(point) - log_proposal
-        exponent = _exponent(said, correction, exponent)
-        log_weights = exponent * said + correction
+        target, correction = log_density(point), prior.log_prob(point) - log_proposal
+        exponent = _exponent(target, correction, exponent)
+        log_weights = exponent * target + correction
         fit = _moments(point, torch.softmax(log_weights, dim=0), least)
         if exponent == 1.0 and _effective(log_weights) >= _ENOUGH * len(point):
             break
@@ -92,15 +92,15 @@ def _effective(log_weights: Tensor) -> float:
     return float(1.0 / (weights**2).sum())
 
 
-def _exponent(said: Tensor, correction: Tensor, reached: float) -> float:
+def _exponent(log_density: Tensor, correction: Tensor, reached: float) -> float:
     """The largest exponent up to 1 that leaves enough draws effective, no smaller than what is reached."""
-    goal = _LEAST * len(said)
-    if _effective(said + correction) >= goal:
+    goal = _LEAST * len(log_density)
+    if _effective(log_density + correction) >= goal:
         return 1.0
     low, high = reached, 1.0
     for _ in range(30):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if _effective(middle * said + correction) >= goal else (low, middle)
+        low, high = (middle, high) if _effective(middle * log_density + correction) >= goal else (low, middle)
     # Draws of a normal about two modes would never become effective: sooner or later one is left.
     return min(1.0, max(low, _FASTER * reached, 1e-9))
 

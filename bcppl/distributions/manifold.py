@@ -32,11 +32,7 @@ class Gaps(Protocol):
         """(N, T, 6) its derivatives in the tangent space at the part's poses."""
 
 
-class MeasuresGap(Protocol):
-    """`bcppl.geometry.gap.PegGap`, or what answers alike."""
-
-    def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gaps:  # noqa: D102
-        ...
+MeasuresGap = Callable[[Tensor, Tensor], Gaps]
 
 
 class Quadratic(NamedTuple):
@@ -57,22 +53,23 @@ class ContactManifold(LazyDistribution):
 
     With d the gap between the peg as measured and the part, a stamp with contact has d normal about
     `-sink`, one without has the probability that a gap about d is positive: Phi(d / spread). Errors of d are
-    `noise`, anew at each stamp, and `shared`, the same for all stamps of a window at which there is contact:
-    what is not known of the contact's stiffness and of the geometry. With probability `outlier` a stamp, or
+    `noise`, independent at each stamp, and `shared`, the same for all stamps of a window at which there is
+    contact: unknown stiffness of the contact and unknown geometry. With probability `outlier` a stamp, or
     all contacts of the window together, have nothing to do with the part.
 
     As a density over the peg's poses it is normalised but for a constant: on the manifold of contact the peg
     may be anywhere with equal chance, and off it anywhere that is free. Moving the part moves both along, so
-    the constant does not hang on the part's pose (the manifold particle filter of Koval, Pollard and
+    the constant does not depend on the part's pose (the manifold particle filter of Koval, Pollard and
     Srinivasa, Pose estimation for planar contact manipulation with manifold particle filters, IJRR 34, 2015,
     has the same likelihood). It is a likelihood of the pose of the part, given where the peg got to, and no
-    forecast of where it will get to: it has a `sample` only where it is given a `motion` that is one.
+    prediction of where it will get to: it has a `sample` only where it is given a `motion` that is one.
 
     The event is (T, 8): the measured world_from_peg, then 1 where contact is felt, 0 where there is none, and
-    NaN where that cannot be told.
+    NaN where that is undecided.
 
     Args:
-        gap: measures gaps.
+        gap: `gap(world_from_part, world_from_peg)` of poses (N, 7) and (T, 7) or (N, T, 7), such as
+            `bcppl.geometry.gap.PegGap`.
         pose: (N, 7) world_from_part.
         stamps: T.
         noise: m, of the gap at one stamp: the measured peg's position, and its turn times the peg's length.
@@ -103,8 +100,8 @@ class ContactManifold(LazyDistribution):
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-likelihood (N,) of one window (T, 8), or of one for each particle (N, T, 8)."""
         distance, felt, lost, _ = self._measured(value)
-        found = self._of_contacts(distance, felt == 1.0) + self._of_free(distance, felt == 0.0)
-        return torch.where(lost, torch.nan, found)
+        log_prob = self._of_contacts(distance, felt == 1.0) + self._of_free(distance, felt == 0.0)
+        return torch.where(lost, torch.nan, log_prob)
 
     def quadratic(self, value: Tensor) -> Quadratic:
         """The log-likelihood of a window (T, 8), or of one for each particle (N, T, 8), to second order.
@@ -139,14 +136,14 @@ class ContactManifold(LazyDistribution):
         )
 
     def residual(self, value: Tensor) -> Tensor:
-        """Gaps (N, T) that contradict what was felt, in metres; 0 where free, NaN where nothing can be told.
+        """Gaps (N, T) that contradict the contact signal, metres; 0 where free, NaN where it is undecided.
 
-        Where contact was felt the gap and the sink, elsewhere how deep the peg would have been in the part.
+        At contact the gap and the sink, elsewhere how deep the peg would have been in the part.
         """
         stood, felt = self._read(value)
         distance = self.gap(self.pose, stood).distance
-        found = torch.where(felt == 1.0, distance + self.sink, distance.clamp(max=0.0))
-        return torch.where(torch.isnan(felt), torch.nan, found)
+        residual = torch.where(felt == 1.0, distance + self.sink, distance.clamp(max=0.0))
+        return torch.where(torch.isnan(felt), torch.nan, residual)
 
     def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check | None:
         """The check of a window (T, 8) at P particles (`bcppl.distributions.checks.Checked`).
@@ -168,18 +165,18 @@ class ContactManifold(LazyDistribution):
         return Check(min(1.0, 2.0 * min(whole.probability, outliers)), "contacts", whole.excess)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
-        """Where pegs get to as `motion` says, with errors, (N, T, 8); none is an outlier.
+        """Where pegs get to by `motion`, with errors, (N, T, 8); none is an outlier.
 
         Where a peg touches it sinks in along the contact's normal, and its place there has the common error;
         every stamp's place has `noise` along each axis.
 
         Raises:
-            InputError: no motion was given, or it gives something else.
+            InputError: no motion was given.
         """
         if self.motion is None:
             raise InputError(
-                "ContactManifold weighs poses of the part by where a peg got to and cannot say where it will "
-                "get to; give it a `motion`, such as bcppl.contact.quasi_static.WindowMotion, or "
+                "ContactManifold is a likelihood of the part's pose and does not predict where a peg will get "
+                "to; give it a `motion`, such as bcppl.contact.quasi_static.WindowMotion, or "
                 "simulate the probe with bcppl.contact.probe_rollout.ProbeRollout."
             )
         return self._with_errors(self.motion(self.pose))
@@ -190,9 +187,6 @@ class ContactManifold(LazyDistribution):
 
         All have the same noise, as far as they have as many stamps, so that they are compared by what differs
         between them; torch's generator is left as one of them leaves it.
-
-        Raises:
-            InputError: one of them cannot be sampled.
         """
         kinds = {type(site.motion) for site in sites}
         together = getattr(next(iter(kinds)), "together", None) if len(kinds) == 1 else None
@@ -207,11 +201,6 @@ class ContactManifold(LazyDistribution):
         return drawn
 
     def _with_errors(self, rows: Tensor) -> Tensor:
-        if tuple(rows.shape) != (*self.batch_shape, *self.event_shape):
-            raise InputError(
-                f"ContactManifold's motion gives {tuple(rows.shape)}; "
-                f"give {(*self.batch_shape, *self.event_shape)}: peg pose, and whether it touches."
-            )
         shared = self.shared * torch.randn(len(rows), 1, 1, dtype=torch.float64)
         noise = self.noise * torch.randn(*rows.shape[:2], 3, dtype=torch.float64)
         sound = torch.isfinite(rows).all(dim=2).all(dim=1)
@@ -232,19 +221,19 @@ class ContactManifold(LazyDistribution):
         return value[..., :7], value[..., 7]
 
     def _measured(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor, Gaps | None]:
-        """Distances (N, S), what was felt (N, S), which particles' observations are lost, and the gaps."""
+        """Distances and contact signals (N, S), which particles' observations are lost, and the gaps."""
         stood, felt = self._read(value)
         count = len(self.pose)
         lost = torch.zeros(count, dtype=torch.bool)
         if value.ndim == 3:  # a simulation that failed
             lost = torch.isnan(stood).any(dim=2).any(dim=1)
             stood = torch.where(lost[:, None, None], self.pose[:, None], stood)
-        told = ~torch.isnan(felt).reshape(-1, felt.shape[-1]).all(dim=0)
-        if not bool(told.any()):
+        decided = ~torch.isnan(felt).reshape(-1, felt.shape[-1]).all(dim=0)
+        if not bool(decided.any()):
             none = torch.zeros(count, 0, dtype=torch.float64)
             return none, none, lost, None
-        gaps = self.gap(self.pose, stood[..., told, :])
-        return gaps.distance, felt[..., told].expand(count, -1), lost, gaps
+        gaps = self.gap(self.pose, stood[..., decided, :])
+        return gaps.distance, felt[..., decided].expand(count, -1), lost, gaps
 
     def _of_contacts(self, distance: Tensor, touching: Tensor) -> Tensor:
         count = touching.sum(dim=1, dtype=torch.float64)
@@ -260,5 +249,5 @@ class ContactManifold(LazyDistribution):
     def _of_free(self, distance: Tensor, free: Tensor) -> Tensor:
         score = distance / math.hypot(self.noise, self.shared)
         inlier = log_ndtr(score) + math.log1p(-self.outlier)
-        found = torch.logaddexp(inlier, torch.full_like(inlier, math.log(self.outlier)))
-        return torch.where(free, found, 0.0).sum(dim=1)
+        either = torch.logaddexp(inlier, torch.full_like(inlier, math.log(self.outlier)))
+        return torch.where(free, either, 0.0).sum(dim=1)

@@ -93,13 +93,7 @@ class Switch(LazyDistribution):
         return total
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
-        """One value for each particle, (N, *event_shape).
-
-        Raises:
-            InputError: a sample_shape is given.
-        """
-        if torch.Size(sample_shape) != torch.Size():
-            raise InputError("Switch draws one value for each particle; give no sample_shape.")
+        """One value for each particle, (N, *event_shape)."""
         drawn = [(rows, distribution.sample()) for rows, distribution in self.groups]
         kind = reduce(torch.promote_types, (value.dtype for _, value in drawn))
         values = drawn[0][1].new_empty(self.batch_shape + self.event_shape, dtype=kind)
@@ -142,11 +136,8 @@ def _common_support(groups: list[tuple[Tensor, Any]]) -> Any:
     common = copy(innermost[0])
     for name, value in vars(innermost[0]).items():
         if isinstance(value, int | float | Tensor):
-            setattr(
-                common,
-                name,
-                _spread([(r, vars(s)[name]) for (r, _), s in zip(groups, innermost, strict=True)]),
-            )
+            bounds = [(rows, vars(each)[name]) for (rows, _), each in zip(groups, innermost, strict=True)]
+            setattr(common, name, _spread(bounds))
     wrapped = whole.event_dim - common.event_dim
     return constraints.independent(common, wrapped) if wrapped else common
 
@@ -160,7 +151,6 @@ def _spread(bounds: list[tuple[Tensor, Any]]) -> Any:
     tail = max((bound.shape[1:] for _, bound in each), key=len)
     spread = torch.empty((sum(len(rows) for rows, _ in each), *tail), dtype=torch.float64)
     for rows, bound in each:
-        spread[rows] = (
-            bound if bound.ndim == 0 else bound.reshape(bound.shape + (1,) * (len(tail) + 1 - bound.ndim))
-        )
+        missing = len(tail) + 1 - bound.ndim if bound.ndim else 0
+        spread[rows] = bound.reshape(bound.shape + (1,) * missing)
     return spread

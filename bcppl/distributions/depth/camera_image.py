@@ -93,16 +93,11 @@ class CameraImage(LazyDistribution):
                 )
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
-        """One image for each particle, (N, H, W).
+        """One image for each particle, (N, H, W); only the empty sample_shape is supported.
 
         Raises:
-            InputError: a latent value is not finite, or a sample_shape is given.
+            InputError: a latent value is not finite.
         """
-        if torch.Size(sample_shape) != torch.Size():
-            raise InputError(
-                f"{type(self).__name__} draws one image for each particle; give no sample_shape, but as many "
-                "poses as images."
-            )
         self._check_finite()
         return self._sample()
 

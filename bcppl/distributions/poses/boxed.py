@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from pyro.distributions import TorchDistribution
 from torch import Tensor
-from torch.distributions import constraints
 from torch.special import log_ndtr, ndtr, ndtri
 
 from bcppl import poses
+from bcppl.distributions.poses.base import PoseDistribution
 from bcppl.distributions.poses.normal import NormalPose
 from bcppl.errors import InputError
 
@@ -18,7 +17,7 @@ _LEAST = 1e-300
 _FARTHEST = 30.0  # standard deviations: beyond, the remaining mass of a tail is rounding
 
 
-class BoxedNormal(TorchDistribution):
+class BoxedNormal(PoseDistribution):
     """A normal over poses (`NormalPose`, all axes free), its translation drawn within a box, axis by axis.
 
     Each coordinate is drawn from its conditional given those before, truncated to the box: the simulator of
@@ -37,19 +36,14 @@ class BoxedNormal(TorchDistribution):
         InputError: the box is empty, or as `NormalPose`.
     """
 
-    arg_constraints: dict[str, Any] = {}
-    support = constraints.real_vector
-
     def __init__(self, center: Tensor, covariance: Tensor, low: Tensor, high: Tensor) -> None:
         if not bool((low < high).all()):
             raise InputError(
                 f"BoxedNormal has a box from {low.tolist()} to {high.tolist()} m; "
                 "give the smaller corner first."
             )
-        self.center, self.low, self.high = center, low, high
-        self.normal = NormalPose(center, covariance)
-        self.freedom = self.normal.freedom
-        super().__init__(torch.Size(center.shape[:-1]), torch.Size([7]), validate_args=False)
+        self.low, self.high, self.normal = low, high, NormalPose(center, covariance)
+        super().__init__(center, self.normal.freedom)
 
     @property
     def covariance(self) -> Tensor:
@@ -65,8 +59,6 @@ class BoxedNormal(TorchDistribution):
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Poses (N, 7); only the empty sample_shape is supported."""
-        if torch.Size(sample_shape) != torch.Size():
-            raise InputError("BoxedNormal draws one pose for each particle; give no sample_shape.")
         scale = torch.linalg.cholesky(self.covariance).expand(*self.batch_shape, 6, 6)
         score = torch.randn(*self.batch_shape, 6, dtype=torch.float64)
         uniform = torch.rand(*self.batch_shape, 3, dtype=torch.float64)
