@@ -34,11 +34,7 @@ def whole_number(what: str, value: object, *, least: int = 1, most: int | None =
 
 
 def seed_number(value: object) -> int:
-    """A seed: a whole number from 0 to 2^63 - 1.
-
-    Raises:
-        InputError: it is not one.
-    """
+    """A seed: a whole number from 0 to 2^63 - 1."""
     return whole_number("the seed is {}", value, least=0, most=LARGEST_SEED)
 
 

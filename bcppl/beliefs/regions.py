@@ -76,11 +76,7 @@ class Region:
 
 
 def region(belief: Belief, mass: float, measure: Measure) -> Region:
-    """The credible region of a belief whose copies are merged.
-
-    Raises:
-        InputError: the mass is not in (0, 1).
-    """
+    """The credible region of a belief whose copies are merged."""
     if not 0.0 < mass < 1.0:
         raise InputError(f"a credible region has the mass {mass}; give one between 0 and 1.")
     distance = measure(belief)

@@ -40,11 +40,7 @@ class LazyDistribution(TorchDistribution):
         super().__init__(torch.Size([particles]), torch.Size(event_shape), validate_args=False)
 
     def expand(self, batch_shape: Any, _instance: Any = None) -> LazyDistribution:
-        """Itself: Pyro's plates call this on every site, also when its shape fits already.
-
-        Raises:
-            InputError: the particle axis does not fit.
-        """
+        """Itself: Pyro's plates call this on every site, also when its shape fits already."""
         if torch.Size(batch_shape) == self.batch_shape:
             return self
         raise InputError(

@@ -78,9 +78,6 @@ class ContactManifold(LazyDistribution):
         outlier: a probability.
         motion: where pegs get to, and whether they touch, (N, T, 8) for poses (N, 7) of the part; asked for
             samples only. Such is `bcppl.contact.quasi_static.QuasiStaticMotion`, along a command.
-
-    Raises:
-        InputError: a number is out of range.
     """
 
     cost = 1
@@ -175,9 +172,9 @@ class ContactManifold(LazyDistribution):
         """
         if self.motion is None:
             raise InputError(
-                "ContactManifold is a likelihood of the part's pose and does not predict where a peg will get "
-                "to; give it a `motion`, such as bcppl.contact.quasi_static.WindowMotion, or "
-                "simulate the probe with bcppl.contact.probe_rollout.ProbeRollout."
+                "ContactManifold is a likelihood of the part's pose and predicts no place of a peg; give a "
+                "`motion`, such as bcppl.contact.quasi_static.WindowMotion, or simulate the probe with "
+                "bcppl.contact.probe_rollout.ProbeRollout."
             )
         return self._with_errors(self.motion(self.pose))
 

@@ -44,11 +44,7 @@ class Range:
     latent: bool = False
 
     def checked(self, what: str, value: Any) -> Any:
-        """The value as a float or an int; `what` begins the sentence that refuses it, {} for the value.
-
-        Raises:
-            InputError: the value is out of the range.
-        """
+        """The value as a float or an int; `what` begins the sentence that refuses it, {} for the value."""
         if (self.optional and value is None) or (
             self.latent and isinstance(value, Tensor) and value.ndim > 0
         ):
@@ -78,11 +74,7 @@ def ranges(kind: type) -> dict[str, Range]:
 
 
 def check_parameters(distribution: Any) -> None:
-    """Check the fields that declare a range, and make them floats and ints.
-
-    Raises:
-        InputError: one is out of its range.
-    """
+    """Check the fields that declare a range, and make them floats and ints."""
     kind: type = type(distribution)
     for name, allowed in ranges(kind).items():
         what = f"{kind.__name__} has {name} = {{}}"
@@ -92,11 +84,7 @@ def check_parameters(distribution: Any) -> None:
 def check_shape(
     where: str, name: str, value: Tensor | npt.NDArray[Any] | float | None, *shapes: tuple[int, ...]
 ) -> None:
-    """Check that an array, where one is given, has one of some shapes.
-
-    Raises:
-        InputError: it has another.
-    """
+    """Check that an array, where one is given, has one of some shapes."""
     if isinstance(value, Tensor | np.ndarray) and tuple(value.shape) not in shapes:
         raise InputError(
             f"{where} has {name} of shape {tuple(value.shape)}; give {' or '.join(map(str, shapes))}."

@@ -51,9 +51,6 @@ class Silhouette(CameraImage):
         rim: (N,) or one for all, pixels by which the mask is dilated; below 0, eroded.
         temperature: the divisor of the log-likelihood.
         region: (H, W) pixels that count at all; None for all.
-
-    Raises:
-        InputError: a shape does not fit, or a parameter is out of its range.
     """
 
     latent = ("pose", "rim")
@@ -85,11 +82,7 @@ class Silhouette(CameraImage):
         return silhouette
 
     def probabilities(self) -> npt.NDArray[np.float32]:
-        """The probability (N, H, W) that the mask is 1 at a pixel.
-
-        Raises:
-            InputError: a pose or a rim is not finite.
-        """
+        """The probability (N, H, W) that the mask is 1 at a pixel."""
         self._check_finite()
         pixels = self.event_shape.numel()
         hits = self._hits(np.ones(pixels, dtype=bool))
@@ -115,9 +108,6 @@ class Silhouette(CameraImage):
 
         Args:
             value: 1 where the part is shown, 0 where not, NaN where unknown.
-
-        Raises:
-            InputError: the mask has another shape, or other values; a pose or a rim is not finite.
         """
         self._check_image(value)
         mask = value.detach().numpy()

@@ -37,11 +37,7 @@ def freedom_of(distribution: Any) -> Freedom | None:
 
 
 def refuse_several_poses(address: str, value: Tensor, distribution: Any) -> None:
-    """Refuse a latent site whose values (N, ..., 7) are several poses for each particle.
-
-    Raises:
-        InputError: they are.
-    """
+    """Refuse a latent site whose values (N, ..., 7) are several poses for each particle."""
     if value.ndim != 2 and freedom_of(distribution) is not None:
         raise InputError(
             f"site {address!r} samples poses of shape {tuple(value.shape[1:])} for each particle, in a plate "

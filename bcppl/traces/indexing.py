@@ -30,11 +30,7 @@ def composed(first: Tensor | None, then: Tensor | None) -> Tensor | None:
 
 
 def indexed(state: Any, index: Tensor | None, particles: int) -> Any:
-    """The states of the particles at `index` (K,), all of them if it is None.
-
-    Raises:
-        InputError: a tensor in the state has not the particle axis first.
-    """
+    """The states of the particles at `index` (K,), all of them if it is None."""
     if isinstance(state, Tensor):
         if state.ndim == 0:
             return state

@@ -211,9 +211,6 @@ class Trace:
 
         Asking for the distribution or the log-probability of a hidden site, also after indexing or new
         values, raises an error that names the address. Values stay readable.
-
-        Raises:
-            InputError: the program visits no such address.
         """
         hidden = frozenset(addresses)
         for address in sorted(hidden - set(self.addresses)):

@@ -198,13 +198,7 @@ def refuse_unvisited(given: Iterable[str], ran: Run) -> None:
 
 
 def refuse_unfit(trace: Trace, observations: Mapping[str, Tensor], old: Collection[str]) -> None:
-    """Refuse what does not fit the particles: an observation or the sites at other than `old` addresses.
-
-    Raises:
-        InputError: the program fits N particles by coincidence; an observation is given for each particle,
-            which resampling would not reorder; or a latent pose lies in a plate, while proposals, kernels
-            and beliefs take one for each particle.
-    """
+    """Refuse what does not fit the particles: an observation or the sites at other than `old` addresses."""
     ran, particles = trace._run, trace.particles
     _refuse_coincidence(trace.program, trace.args, particles, ran, old)
     for address, value in observations.items():

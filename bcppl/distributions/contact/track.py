@@ -50,9 +50,6 @@ class TrackDistribution(LazyDistribution):
         entries: the number of entries measured at a stamp.
         every: the stamps whose number is a multiple of this enter the density, since errors are correlated
             in time.
-
-    Raises:
-        InputError: a parameter is out of its range, or `first` is not before `last`.
     """
 
     cost = 2
@@ -78,11 +75,7 @@ class TrackDistribution(LazyDistribution):
         return slice(-self.first % self.every, None, self.every)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-probability (N,) of measurements (T, entries), or of one for each particle (N, T, entries).
-
-        Raises:
-            InputError: there are not as many rows as stamps.
-        """
+        """Log-probability (N,) of measurements (T, entries), or of one for each particle (N, T, entries)."""
         if value.ndim not in (2, 3, 4) or value.shape[-2:] != self.event_shape:
             raise InputError(
                 f"{type(self).__name__} has {self.event_shape[0]} stamps but its observation has shape "

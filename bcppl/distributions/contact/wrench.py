@@ -44,9 +44,6 @@ class Wrench(TrackDistribution):
         every: as for `TrackDistribution`.
         bias: (N, 6) the sensor's reading without contact; None for zero. It may be latent, and differ from
             window to window where the sensor drifts.
-
-    Raises:
-        InputError: a parameter is out of its range, or the bias has another shape.
     """
 
     broadcasts = True

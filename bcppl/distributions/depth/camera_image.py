@@ -30,9 +30,6 @@ class CameraImage(LazyDistribution):
 
     Attributes:
         latent: the names of the attributes that may be latent, and are checked to be finite.
-
-    Raises:
-        InputError: a shape does not fit, or the camera's range is none.
     """
 
     cost = 1
@@ -93,11 +90,7 @@ class CameraImage(LazyDistribution):
                 )
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
-        """One image for each particle, (N, H, W); only the empty sample_shape is supported.
-
-        Raises:
-            InputError: a latent value is not finite.
-        """
+        """One image for each particle, (N, H, W); only the empty sample_shape is supported."""
         self._check_finite()
         return self._sample()
 

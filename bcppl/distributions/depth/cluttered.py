@@ -80,9 +80,6 @@ class ClutteredDepth(CameraImage):
         abut: the probability that the clutter after the part touches it.
         through: the share of pixels that show clutter behind the part.
         rim: pixels.
-
-    Raises:
-        InputError: a shape does not fit, or a parameter is out of its range.
     """
 
     scale: float = field(metadata=POSITIVE)
@@ -108,11 +105,7 @@ class ClutteredDepth(CameraImage):
         self.chain = Chain(camera.near, camera.far, wander, **own)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-probability (N,) of a depth image (H, W), or of one for each particle (N, H, W).
-
-        Raises:
-            InputError: a pose is not finite, or the image has another shape.
-        """
+        """Log-probability (N,) of a depth image (H, W), or of one for each particle (N, H, W)."""
         rows, columns = self._of_lines(value)
         return 0.5 * (rows + columns) / self.temperature
 
@@ -127,9 +120,6 @@ class ClutteredDepth(CameraImage):
         """The valid pixels of an image (H, W), or of one for each particle, where the lines cross.
 
         Alignments use it (`bcppl.inference.proposals.depth_alignment`), `log_prob` does not.
-
-        Raises:
-            InputError: the image has another shape.
         """
         crossings = np.zeros(tuple(self.event_shape), dtype=bool)
         crossings[self.lines // 2 :: self.lines, self.lines // 2 :: self.lines] = True

@@ -146,11 +146,7 @@ class DepthDistribution(CameraImage):
         return np.ascontiguousarray(bias.expand(len(self.pose)).numpy())
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-probability (N,) of a depth image (H, W), or of one for each particle (N, H, W).
-
-        Raises:
-            InputError: a pose, a camera's error or a bias is not finite, or the image has another shape.
-        """
+        """Log-probability (N,) of a depth image (H, W), or of one for each particle (N, H, W)."""
         self._check_finite()
         seen = self.observed(value)
         hits = self._hits(np.asarray(seen.valid.any(axis=0)))
@@ -219,18 +215,14 @@ class DepthDistribution(CameraImage):
 
         They are cached with the image for as long as image, background and region are unchanged. Warns if no
         pixel counts, since the image then does not inform the pose.
-
-        Raises:
-            InputError: the image has another shape.
         """
-        image = value.detach().numpy()
-        background, region = _plain(self.background), _plain(self.region)
+        given = [_numbers(each) for each in (value, self.background, self.region)]
         cached: Observed | None = CACHE.get(value)
-        if cached is not None and cached.matches(self._settings, image, background, region):
+        if cached is not None and cached.matches(self._settings, given):
             return cached
         self._check_image(value)
-        image = np.array(image)
-        depth = image.astype(np.float64, copy=False).reshape(-1, self.event_shape.numel())
+        copies = [None if each is None else np.array(each) for each in given]
+        depth = np.asarray(copies[0], dtype=np.float64).reshape(-1, self.event_shape.numel())
         valid = np.isfinite(depth) & (depth > 0.0) & (depth >= self.camera.near) & (depth <= self.camera.far)
         if self.region is not None:
             valid &= np.asarray(self.region, dtype=bool).reshape(-1)
@@ -247,9 +239,7 @@ class DepthDistribution(CameraImage):
             power = np.minimum(1.0, self.effective_pixels / np.maximum(valid.sum(axis=1), 1))
         elif self.temperature is not None:
             power = power / self.temperature
-        background, region = _copy(background), _copy(region)
-        observed = Observed(image, self._settings, background, region, behind, depth, valid, without, power)
-        CACHE[value] = observed
+        observed = CACHE[value] = Observed(self._settings, copies, behind, depth, valid, without, power)
         return observed
 
     def _warn_uninformative(self, depth: Array) -> None:
@@ -271,10 +261,6 @@ class DepthDistribution(CameraImage):
         )
 
 
-def _plain(values: npt.NDArray[Any] | Tensor | None) -> npt.NDArray[Any] | None:
-    """The numbers themselves, not copied."""
+def _numbers(values: npt.NDArray[Any] | Tensor | None) -> npt.NDArray[Any] | None:
+    """The numbers of a tensor, not copied."""
     return values.detach().numpy() if isinstance(values, Tensor) else values
-
-
-def _copy(values: npt.NDArray[Any] | None) -> npt.NDArray[Any] | None:
-    return None if values is None else np.array(values)

@@ -39,9 +39,6 @@ class RobustDepth(DepthDistribution):
     Args:
         outlier: the probability of an outlier, above 0 and below 1.
         *others, **named: those of `DepthDistribution`.
-
-    Raises:
-        InputError: as `DepthDistribution`, or the outlier's probability is out of range.
     """
 
     outlier: float = field(default=0.1, kw_only=True, metadata=PROBABILITY)
@@ -76,9 +73,6 @@ class OccludedDepth(DepthDistribution):
         occluder: the probability of an occluder in front, above 0 and below 1.
         outlier: the probability of any other depth, above 0 and below 1; their sum is below 1.
         *others, **named: those of `DepthDistribution`.
-
-    Raises:
-        InputError: as `DepthDistribution`, or a probability is out of range, or their sum is 1 or more.
     """
 
     occluder: float = field(default=0.1, kw_only=True, metadata=PROBABILITY)

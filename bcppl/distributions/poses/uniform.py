@@ -63,9 +63,6 @@ class UniformPose(_BoxPose):
         rotation: "all", or one axis "x", "y", "z" of the frame the pose maps from.
 
     The Haar measure of a ball of rotation angle a is (a - sin a) / pi.
-
-    Raises:
-        InputError: a width or the angle is out of range.
     """
 
     def __init__(self, center: Any, translation: Any, angle: float, rotation: str = "all") -> None:

@@ -45,9 +45,6 @@ class ForceDirection(LazyDistribution):
         friction: coefficient of friction.
         spread: radians.
         outlier: probability of a direction that is independent of the part.
-
-    Raises:
-        InputError: the friction or the spread is not positive, or the outlier no probability below 1.
     """
 
     distance: Distance | Placed

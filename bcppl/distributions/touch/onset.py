@@ -64,9 +64,6 @@ class OnsetLocation(LazyDistribution):
         offset: metres; positive where the tip lies inside the part at onset, on average.
         spread: standard deviation of the threshold, metres.
         outlier: probability of an onset that is independent of the part.
-
-    Raises:
-        InputError: the spread is not positive, or the outlier no probability below 1.
     """
 
     distance: Distance | Placed
@@ -140,9 +137,6 @@ class FreePath(LazyDistribution):
         onset: (3,) or (N, 3) the place of contact; NaN for never: the whole path was free.
         tolerance: metres inside the part at which one path in two counts as free.
         spread: metres.
-
-    Raises:
-        InputError: the spread is not positive.
     """
 
     distance: Distance | Placed
