@@ -12,16 +12,10 @@ LARGEST_SEED = 2**63 - 1
 
 
 def whole_number(what: str, value: object, *, least: int = 1, most: int | None = None) -> int:
-    """A whole number in a range, as an int.
-
-    Args:
-        what: the beginning of the sentence, {} where the value stands: "until may make {} sweeps at most".
-        value: given; numpy's and torch's whole numbers count as such, True and 3.0 do not.
-        least: the smallest allowed.
-        most: the largest allowed; None for no bound.
+    """A whole number from `least` to `most` as an int: numpy's and torch's count, True and 3.0 do not.
 
     Raises:
-        InputError: it is not a whole number, or out of the range.
+        InputError: it is another; `what` begins the sentence, {} for the value: "until makes {} sweeps".
     """
     try:
         count = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
@@ -47,18 +41,10 @@ def number_within(
     below: float = math.inf,
     most: float = math.inf,
 ) -> float:
-    """A finite number in a range, as a float.
-
-    Args:
-        what: the beginning of the sentence, {} where the value stands: "adaptive is given threshold {}".
-        value: given.
-        above: a bound that it must exceed.
-        least: the smallest allowed.
-        below: a bound that it must stay under.
-        most: the largest allowed.
+    """A finite number as a float: above and below bounds that are excluded, from `least` to `most`.
 
     Raises:
-        InputError: it is not a number, NaN or infinite, or out of the range.
+        InputError: it is another, NaN or no number; `what` begins the sentence, {} for the value.
     """
     try:
         number = math.nan if isinstance(value, str | bytes | bool) else float(value)  # type: ignore[arg-type]

@@ -52,7 +52,7 @@ def test_rows_are_a_density(place: tuple[float, float, float], rim: int) -> None
     grid = depths(cells)
     images = torch.stack(torch.meshgrid(grid, grid, indexing="ij"), dim=-1).reshape(-1, 1, 2)
     site = ClutteredDepth(RENDERER, lens, at(place).expand(len(images), 7), 0.02, step=0.02, lines=1, rim=rim)
-    volume = float(site.row_log_prob(images).exp().sum()) * (0.6 / cells) ** 2
+    volume = float(site._of_lines(images)[0].exp().sum()) * (0.6 / cells) ** 2
     # Unknown depth goes on beyond the sensor's range in one case of thirty, and the cells are coarse.
     assert 0.96 < volume < 1.01
 
@@ -74,7 +74,7 @@ def test_draws_follow_the_density_of_rows() -> None:
     images = site.sample()
     inside = ((images > 0.2) & (images < 0.8)).all(dim=-1).flatten()
     assert float(inside.double().mean()) > 0.9
-    ratio = (other.row_log_prob(images) - site.row_log_prob(images))[inside].exp()
+    ratio = (other._of_lines(images)[0] - site._of_lines(images)[0])[inside].exp()
     # Draws that leave the range are left out: under both they are about as many.
     assert float(ratio.mean()) == pytest.approx(1.0, abs=4 * float(ratio.std()) / math.sqrt(count) + 0.02)
     assert float(ratio.log().mean()) < -0.5

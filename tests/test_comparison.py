@@ -26,7 +26,7 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.traces import Series, carried, check_program, dependence, generate, update
 from bcppl.traces.carried import Entry
-from bcppl.traces.dependence import Comparison, snapshot
+from bcppl.traces.dependence import comparison, snapshot
 from tests.invariance import number
 
 N = 6
@@ -167,18 +167,18 @@ SAME: dict[str, Callable[[], Any]] = {
 @pytest.mark.parametrize("case", SAME)
 def test_what_is_made_in_the_same_way_is_the_same(case: str) -> None:
     first, second = SAME[case](), SAME[case]()
-    assert Comparison()(first, second) and Comparison()(first, first)
-    assert not Comparison()(first, Holder(second)) and not Comparison()(second, None)
+    assert comparison()(first, second) and comparison()(first, first)
+    assert not comparison()(first, Holder(second)) and not comparison()(second, None)
 
 
 @pytest.mark.parametrize("make", [positive, SAME["categorical"], SAME["logits"], SAME["pose"]])
 def test_what_a_distribution_computed_on_demand_does_not_count(make: Callable[[], Any]) -> None:
-    assert Comparison()(make(), asked(make())) and Comparison()(asked(make()), make())
+    assert comparison()(make(), asked(make())) and comparison()(asked(make()), make())
 
 
 def test_what_is_cached_does_not_count() -> None:
-    assert Comparison()(Caching(1.0), Caching(1.0, last=object(), ask=True))
-    assert not Comparison()(Caching(1.0), Caching(2.0))
+    assert comparison()(Caching(1.0), Caching(1.0, last=object(), ask=True))
+    assert not comparison()(Caching(1.0), Caching(2.0))
 
 
 ONE = torch.complex(t(1.0), t(1.0))
@@ -242,17 +242,17 @@ DIFFERENT: dict[str, Callable[[int], Any]] = {
 @pytest.mark.parametrize("case", DIFFERENT)
 def test_what_differs_or_is_not_understood_is_not_the_same(case: str) -> None:
     first, second = DIFFERENT[case](0), DIFFERENT[case](1)
-    assert not Comparison()(first, second) and not Comparison()(second, first)
-    assert Comparison()(first, first)
-    assert not Comparison()([t(1.0), Holder(first)], [t(1.0), Holder(second)])
+    assert not comparison()(first, second) and not comparison()(second, first)
+    assert comparison()(first, first)
+    assert not comparison()([t(1.0), Holder(first)], [t(1.0), Holder(second)])
 
 
 def test_the_same_tensors_are_compared_once() -> None:
-    same, first, second = Comparison(), t(1.0), t(1.0)
+    same, first, second = comparison(), t(1.0), t(1.0)
     assert same(Holder(first), Holder(second))
     second += 1.0
     assert same((first,), (second,)), "within one comparison of two runs nothing is written to"
-    assert not Comparison()((first,), (second,))
+    assert not comparison()((first,), (second,))
 
 
 # ---- functions as they were
@@ -270,10 +270,10 @@ def test_a_snapshot_is_the_function_as_it_was() -> None:
         functions.append(function)
         then.append(snapshot(function))
     second = list(in_a_loop())[1]
-    assert Comparison()(functions[0], functions[1]), "both have come to see the last value"
-    assert not Comparison()(then[0], functions[0]) and not Comparison()(then[0], second)
-    assert Comparison()(then[1], functions[1]) and Comparison()(then[1], second)
-    assert Comparison()(then[0], snapshot(next(in_a_loop())))
+    assert comparison()(functions[0], functions[1]), "both have come to see the last value"
+    assert not comparison()(then[0], functions[0]) and not comparison()(then[0], second)
+    assert comparison()(then[1], functions[1]) and comparison()(then[1], second)
+    assert comparison()(then[0], snapshot(next(in_a_loop())))
 
 
 def test_a_snapshot_of_what_two_runs_share_stays_the_same() -> None:
@@ -284,10 +284,10 @@ def test_a_snapshot_of_what_two_runs_share_stays_the_same() -> None:
 
     then = snapshot(partial(write))
     write()
-    assert Comparison()(then, partial(write))
-    assert Comparison()(snapshot(recursive(t(1.0))), recursive(t(1.0)))
-    assert not Comparison()(snapshot(recursive(t(1.0))), recursive(t(2.0)))
-    assert Comparison()(snapshot(keyword(t(1.0))), keyword(t(1.0)))
+    assert comparison()(then, partial(write))
+    assert comparison()(snapshot(recursive(t(1.0))), recursive(t(1.0)))
+    assert not comparison()(snapshot(recursive(t(1.0))), recursive(t(2.0)))
+    assert comparison()(snapshot(keyword(t(1.0))), keyword(t(1.0)))
 
 
 # ---- states by what made them

@@ -210,15 +210,12 @@ def test_what_is_written_to_is_read_again(written: str, as_tensors: bool) -> Non
 def test_an_image_of_which_no_pixel_counts_warns_once() -> None:
     site = RobustDepth(RENDERER, CAMERA, POSE, SCALE)
     millimetres = 1000.0 * image()
-    said = "no pixel .* 'above' .* median is .* range 0.05 to 0.6 m: probably millimetres"
-    with pytest.warns(UserWarning, match=said):
+    with pytest.warns(UserWarning, match="no pixel .* 'above' .* range of 0.05 to 0.6 m"):
         site.log_prob(millimetres)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         site.log_prob(millimetres)
         site.log_prob(image())
-    with pytest.warns(UserWarning, match="'above' .* every pixel is missing"):
-        site.log_prob(torch.zeros(18, 24, dtype=torch.float64))
     with pytest.warns(UserWarning, match="region"):
         RobustDepth(RENDERER, CAMERA, POSE, SCALE, region=np.zeros((18, 24), dtype=bool)).log_prob(image())
 

@@ -179,7 +179,7 @@ def test_mutant_without_the_haar_measure_in_the_mixture(monkeypatch: pytest.Monk
             angle = poses.local(self.center, value)[..., 3:].norm(dim=-1)
             return super().log_prob(value) + self.freedom.log_base_density(angle)
 
-    monkeypatch.setattr("bcppl.distributions.poses.mixture.NormalPose", Flat)
+    monkeypatch.setattr("bcppl.distributions.poses.normal.NormalPose", Flat)
     exact, functions = CASES["wide"]
     assert worst_z(exact, independent("pose", 1, inflation=1.2, wide=(0.2, 3.0)), functions) > BROKEN
 

@@ -151,7 +151,7 @@ def test_two_modes_make_a_region_of_two_pieces() -> None:
     places = poses.retract(
         CENTER, torch.stack([torch.zeros(6, dtype=torch.float64), column(0.1, 0, 0, 0, 0, 1)])
     )
-    held, replicates = 0, 200
+    held, replicates = 0, 100
     for _ in range(replicates):
         noise = freedom.embed(0.1 * torch.randn(76, 3, dtype=torch.float64) * freedom.coordinates(SPREAD))
         draws = poses.retract(places[(torch.rand(76) < 0.3).long()], noise)

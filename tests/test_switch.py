@@ -97,7 +97,7 @@ def test_what_does_not_fit_is_refused() -> None:
         Switch(torch.tensor([0.5, 1.0, 1.0]), lambda k, rows: dist.Normal(torch.zeros(len(rows)), 1.0))
     with pytest.raises(InputError, match=r"choice 0 .*values at the given rows"):
         Switch(which, lambda k, rows: dist.Normal(torch.zeros(3), 1.0))
-    with pytest.raises(InputError, match="give all the same shape"):
+    with pytest.raises(InputError, match="events of different shapes"):
         Switch(which, lambda k, rows: dist.Normal(torch.zeros(len(rows), k + 1), 1.0).to_event(1))
 
 

@@ -22,13 +22,9 @@ from bcppl.errors import InputError
 
 @dataclass(frozen=True)
 class Range:
-    """Finite numbers between two bounds.
+    """Finite numbers between bounds, of which `above` and `below` are excluded.
 
     Attributes:
-        above: a lower bound that is excluded.
-        least: a lower bound that is included.
-        below: an upper bound that is excluded.
-        most: an upper bound that is included.
         whole: whether the numbers are whole ones; only `least` bounds these.
         optional: whether None may be given.
         latent: whether a tensor (N,), a value for each particle, may be given. It is not checked: a proposed
@@ -45,9 +41,8 @@ class Range:
 
     def checked(self, what: str, value: Any) -> Any:
         """The value as a float or an int; `what` begins the sentence that refuses it, {} for the value."""
-        if (self.optional and value is None) or (
-            self.latent and isinstance(value, Tensor) and value.ndim > 0
-        ):
+        each = self.latent and isinstance(value, Tensor) and value.ndim > 0
+        if each or (self.optional and value is None):
             return value
         if self.whole:
             return whole_number(what, value, least=int(self.least))

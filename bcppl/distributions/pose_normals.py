@@ -71,7 +71,7 @@ def widened(center: Tensor, covariance: Tensor) -> MixturePose:
 
 
 def widened_mixture(mixture: GaussianMixture) -> MixturePose:
-    """A mixture of M Gaussians for each of N particles, (N, M, 7) and so on, each mixed with a wider one."""
+    """A mixture of M Gaussians for each of N particles, each mixed with a wider one."""
     centers, wide = mixture.centers, WIDTHS[:, None, None] ** 2 * mixture.covariances[..., None, :, :]
     log_weights = mixture.log_weights.log_softmax(dim=-1)[..., None] + SHARES.log()
     return MixturePose(

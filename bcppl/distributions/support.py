@@ -13,21 +13,19 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
 
+WRAPPERS = Independent | ExpandedDistribution | MaskedDistribution
+
 
 def base(distribution: Any) -> Any:
     """The innermost of distributions that only change the shape of another or mask it."""
-    while isinstance(distribution, Independent | ExpandedDistribution | MaskedDistribution):
-        distribution = distribution.base_dist
-    return distribution
+    return base(distribution.base_dist) if isinstance(distribution, WRAPPERS) else distribution
 
 
 def masks(distribution: Any) -> bool:
     """Whether a distribution leaves some values out of its log-probability (`.mask()`)."""
-    while isinstance(distribution, Independent | ExpandedDistribution | MaskedDistribution):
-        if isinstance(distribution, MaskedDistribution) and not torch.as_tensor(distribution._mask).all():
-            return True
-        distribution = distribution.base_dist
-    return False
+    if isinstance(distribution, MaskedDistribution) and not torch.as_tensor(distribution._mask).all():
+        return True
+    return isinstance(distribution, WRAPPERS) and masks(distribution.base_dist)
 
 
 def freedom_of(distribution: Any) -> Freedom | None:
@@ -99,15 +97,11 @@ def _inside(distribution: Any, value: Tensor, masked: bool) -> Tensor:
         return inside | ~torch.as_tensor(distribution._mask, device=value.device) if masked else inside
     if isinstance(distribution, Independent):
         inside = _inside(distribution.base_dist, value, masked)
-        return _every_entry(inside, distribution.reinterpreted_batch_ndims)
+        return ~_any_entry(~inside, distribution.reinterpreted_batch_ndims)
     if isinstance(distribution, ExpandedDistribution):
         return _inside(distribution.base_dist, value, masked)
     support = distribution.support
-    return _every_entry(support.check(value), len(distribution.event_shape) - support.event_dim)
-
-
-def _every_entry(true: Tensor, dimensions: int) -> Tensor:
-    return true.flatten(-dimensions).all(dim=-1) if dimensions > 0 else true
+    return ~_any_entry(~support.check(value), len(distribution.event_shape) - support.event_dim)
 
 
 def _any_entry(true: Tensor, dimensions: int) -> Tensor:

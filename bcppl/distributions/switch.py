@@ -62,13 +62,8 @@ class Switch(LazyDistribution):
                     f"{len(rows)} particles; build it from values at the given rows, `pose[rows]`."
                 )
             self.groups.append((rows, built))
-        shapes = {tuple(built.event_shape) for _, built in self.groups}
-        if len(shapes) > 1:
-            raise InputError(
-                f"the choices of Switch have events of shapes {', '.join(map(str, sorted(shapes)))}; "
-                "give all the same shape."
-            )
         built = [distribution for _, distribution in self.groups]
+        shape = _common("events of different shapes", {tuple(each.event_shape) for each in built})
         costs = sorted({int(getattr(each, "cost", 0)) for each in built})
         if cost is None and len(costs) > 1:
             raise InputError(
@@ -76,8 +71,9 @@ class Switch(LazyDistribution):
                 "give the largest as cost=, which is the cost whatever is chosen."
             )
         self.cost = costs[0] if cost is None else cost
-        self.support, self.freedom = _common_support(self.groups), _common_freedom(built)
-        super().__init__(len(which), shapes.pop())
+        self.support = _common_support(self.groups)
+        self.freedom: Freedom | None = _common("different free axes", {freedom_of(each) for each in built})
+        super().__init__(len(which), shape)
 
     @property
     def log_prob_bound(self) -> float:
@@ -102,14 +98,14 @@ class Switch(LazyDistribution):
         return values
 
 
-def _common_freedom(built: list[Any]) -> Freedom | None:
-    free = {freedom_of(each) for each in built}
-    if len(free) > 1:
+def _common(what: str, values: set[Any]) -> Any:
+    """The one value that all choices have."""
+    if len(values) > 1:
         raise InputError(
-            "the choices of Switch have poses with different free axes, or some have no poses; "
+            f"the choices of Switch have {what}: {', '.join(sorted(map(str, values)))}; "
             "give all the same, or their densities cannot be compared."
         )
-    return free.pop()
+    return values.pop()
 
 
 # Closed and half open supports have the same unbounded coordinates.
@@ -125,13 +121,7 @@ def _common_support(groups: list[tuple[Tensor, Any]]) -> Any:
     """The support of all choices; bounds that differ are spread over the particles."""
     whole = groups[0][1].support
     innermost = [support_of(distribution) for _, distribution in groups]
-    kinds = sorted({_kind(support) for support in innermost})
-    if len(kinds) > 1:
-        raise InputError(
-            f"the choices of Switch have supports of different kinds ({', '.join(kinds)}); "
-            "give all the same kind, or their densities cannot be compared."
-        )
-    if kinds == ["discrete"]:
+    if _common("supports of different kinds", set(map(_kind, innermost))) == "discrete":
         return whole
     common = copy(innermost[0])
     for name, value in vars(innermost[0]).items():

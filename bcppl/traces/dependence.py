@@ -118,21 +118,17 @@ def _equal_tensors(first: Tensor, second: Any) -> bool:
     return torch.equal(first, second)
 
 
-class Comparison:
-    """Compares values of the same two runs of a program; tensors that several share are compared once."""
+def comparison() -> Callable[[Any, Any], bool]:
+    """A comparison of values of the same two runs; tensors that several share are compared once."""
+    known: dict[tuple[int, int], tuple[bool, Any, Any]] = {}
 
-    def __init__(self) -> None:
-        self._equal: dict[tuple[int, int], tuple[bool, Any, Any]] = {}
-
-    def __call__(self, first: Any, second: Any) -> bool:
-        """Whether two values are the same."""
-        return alike(first, second, self._are_equal)
-
-    def _are_equal(self, a: Array, b: Array) -> bool:
+    def are_equal(a: Array, b: Array) -> bool:
         key = id(a), id(b)
-        if key not in self._equal:
-            self._equal[key] = equal(a, b), a, b
-        return self._equal[key][0]
+        if key not in known:
+            known[key] = equal(a, b), a, b
+        return known[key][0]
+
+    return lambda first, second: alike(first, second, are_equal)
 
 
 def snapshot(value: Any) -> Any:

@@ -1,7 +1,4 @@
-"""Programs run with gradients: log-densities and return values that can be differentiated.
-
-Traces are evaluated without gradients. Here a program is run again at values that ask for them.
-"""
+"""Programs run again with gradients, which traces do without: log-densities and results to differentiate."""
 
 from __future__ import annotations
 

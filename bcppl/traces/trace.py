@@ -17,7 +17,7 @@ from bcppl.distributions.shortcuts import narrowed
 from bcppl.distributions.support import log_prob_inside, masks, support_of
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
-from bcppl.traces.dependence import Comparison, equal
+from bcppl.traces.dependence import comparison, equal
 from bcppl.traces.explained import not_a_number
 from bcppl.traces.hiding import Hiding, refused
 from bcppl.traces.indexing import Index, beside, particles_at
@@ -325,7 +325,7 @@ def _of_each_particle(value: Tensor, site: Any, particles: int) -> Tensor:
 
 def changed(first: Trace, second: Trace, addresses: Iterable[str]) -> Iterator[str]:
     """Those of some addresses of two traces whose values or distributions differ."""
-    same, then, now = Comparison(), first._run, second._run
+    same, then, now = comparison(), first._run, second._run
     for address in addresses:
         if not equal(then.values[address], now.values[address]) or not same(
             then.distributions[address], now.distributions[address]

@@ -1,8 +1,4 @@
-"""The verbs that change a trace, Gen's: update takes new values, regenerate samples them from the program.
-
-Cusumano-Towner et al., Gen: a general-purpose probabilistic programming system with programmable inference,
-PLDI 2019, section 4.
-"""
+"""The verbs that change a trace, Gen's: update to new values, regenerate to samples from the program."""
 
 from __future__ import annotations
 
@@ -111,11 +107,10 @@ def extend(
     whose arguments and observations are given; then it is the step's sites that are new.
 
     Args:
-        trace: what is extended.
+        trace: of N particles.
         args: the new arguments.
         observations: values of new addresses; they are copied.
-        choices: values (N, ...) of new latent addresses, such as a proposal gave; those that are left out are
-            sampled from the program.
+        choices: values (N, ...) of new latent addresses, such as a proposal gave.
 
     Returns:
         The longer trace and its log weight (N,): the log-probability of the new observations and of the
@@ -179,13 +174,9 @@ class Regenerated:
 
 
 def regenerate(trace: Trace, addresses: str | Collection[str]) -> Regenerated:
-    """Sample some latent addresses from the program, given the others' values; the arguments stay.
+    """Sample one or several latent addresses from the program, given the others' values; the arguments stay.
 
-    Several are sampled in the order of the program: later ones are given the earlier ones' new values.
-
-    Args:
-        trace: what is changed.
-        addresses: one latent address or several.
+    They are sampled in the order of the program: later ones are given the earlier ones' new values.
 
     Raises:
         InputError: an address is not latent, or the values change which addresses are visited.

@@ -13,7 +13,7 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.support import log_prob_inside
 from bcppl.errors import InferenceError
 from bcppl.traces import Trace
-from bcppl.traces.dependence import Comparison
+from bcppl.traces.dependence import comparison
 from bcppl.traces.run import inward
 
 # Observations times particles that are evaluated together: they then stay in the processor's cache.
@@ -55,7 +55,7 @@ def _independent(trace: Trace, observed: Sequence[str], values: Mapping[str, Ten
     turns = [torch.arange(first, first + trace.particles) for first in range(0, count, trace.particles)]
     for turn in (*turns, *(1 + turn for turn in turns[:1])):
         moved = trace.at({a: values[a][turn % count] for a in observed})
-        same = Comparison()
+        same = comparison()
         independent = [
             a
             for k, a in enumerate(independent)
@@ -68,7 +68,7 @@ def _of_one(trace: Trace, addresses: Sequence[str], values: Mapping[str, Tensor]
     """Log-likelihood (N,) of one observation at sites that depend on the observations before them."""
     shared = {a: v[which] for a, v in values.items()}
     moved = trace.at({a: v.expand(trace.particles, *v.shape) for a, v in shared.items()})
-    same = Comparison()
+    same = comparison()
     total = torch.zeros(trace.particles, dtype=torch.float64)
     for address in addresses:
         before, site = trace.distributions[address], moved.distributions[address]

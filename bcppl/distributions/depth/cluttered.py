@@ -109,13 +109,6 @@ class ClutteredDepth(CameraImage):
         rows, columns = self._of_lines(value)
         return 0.5 * (rows + columns) / self.temperature
 
-    def row_log_prob(self, value: Tensor) -> Tensor:
-        """Log-density (N,) of the rows that are evaluated, with arguments as for `log_prob`.
-
-        With every row evaluated it is a density of the image, the one that `sample` draws from.
-        """
-        return self._of_lines(value)[0]
-
     def observed(self, value: Tensor) -> Observed:
         """The valid pixels of an image (H, W), or of one for each particle, where the lines cross.
 
@@ -127,7 +120,10 @@ class ClutteredDepth(CameraImage):
         return alone.observed(value)
 
     def _of_lines(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Log-densities (N,) of the rows and of the columns."""
+        """Log-densities (N,) of the rows and of the columns.
+
+        With every row evaluated that of the rows is a density of the image, from which `sample` draws.
+        """
         self._check_finite()
         self._check_image(value)
         count = len(self.pose)

@@ -227,7 +227,13 @@ class DepthDistribution(CameraImage):
         if self.region is not None:
             valid &= np.asarray(self.region, dtype=bool).reshape(-1)
         if not valid.any():
-            self._warn_uninformative(depth)
+            near, far = self.camera.near, self.camera.far
+            warnings.warn(
+                f"no pixel of a depth image of camera {self.camera.name!r} counts, which does not inform the "
+                f"pose: all are missing, out of its range of {near:.4g} to {far:.4g} m (millimetres?), or "
+                "outside the region.",
+                stacklevel=3,
+            )
         behind = self._behind
         known = np.isfinite(behind)
         shown = self._log_density(
@@ -241,24 +247,6 @@ class DepthDistribution(CameraImage):
             power = power / self.temperature
         observed = CACHE[value] = Observed(self._settings, copies, behind, depth, valid, without, power)
         return observed
-
-    def _warn_uninformative(self, depth: Array) -> None:
-        """Warn that no pixel of an image (1 or N, H * W) counts, and of the probable reason."""
-        camera, read = self.camera, depth[np.isfinite(depth) & (depth > 0.0)]
-        if not read.size:
-            why = "every pixel is missing"
-        elif not ((read >= camera.near) & (read <= camera.far)).any():
-            median = float(np.median(read))
-            why = f"their median is {median:.4g} m and its range {camera.near:.4g} to {camera.far:.4g} m"
-            if camera.near <= 0.001 * median <= camera.far:
-                why += ": probably millimetres, scale the image by 0.001"
-        else:
-            why = "none within its range lies in the region"
-        warnings.warn(
-            f"no pixel of a depth image of camera {camera.name!r} counts: it does not inform the pose; "
-            f"{why}.",
-            stacklevel=3,
-        )
 
 
 def _numbers(values: npt.NDArray[Any] | Tensor | None) -> npt.NDArray[Any] | None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -47,8 +46,7 @@ class RendersDepth(Protocol):
         """Depth images (N, H, W) in metres, +inf where a pixel does not see the part."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Chosen:
+class _Chosen(NamedTuple):
     """Some of the hits, as `PixelHits`."""
 
     particle: npt.NDArray[np.int64]

@@ -21,7 +21,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 class Chain(NamedTuple):
-    """Parameters of the chain, those of `ClutteredDepth`; lengths in metres."""
+    """Parameters of the chain: those of `ClutteredDepth`, after `wander`; lengths in metres."""
 
     near: float
     far: float

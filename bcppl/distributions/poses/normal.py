@@ -1,4 +1,4 @@
-"""Normals over poses."""
+"""Normals over poses, and mixtures of them with one density."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import math
 from typing import Any
 
 import torch
+from pyro.distributions import TorchDistribution
 from torch import Tensor
-from torch.distributions import MultivariateNormal
+from torch.distributions import MultivariateNormal, constraints
 
 from bcppl import poses
 from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
@@ -36,11 +37,6 @@ class NormalPose(PoseDistribution):
     def __init__(self, center: Any, covariance: Any, freedom: Freedom = FREE) -> None:
         matrix = torch.as_tensor(covariance, dtype=torch.float64)
         if matrix.ndim == 1:
-            if bool((matrix < 0.0).any()):
-                raise InputError(
-                    f"NormalPose has the standard deviations {matrix.tolist()}; "
-                    "give none below 0 (metres, radians)."
-                )
             matrix = torch.diag(matrix**2)
         if matrix.shape[-2:] != (freedom.dimension, freedom.dimension):
             raise InputError(
@@ -98,3 +94,48 @@ class NormalPose(PoseDistribution):
         density = terms[0] if len(terms) == 1 else torch.logsumexp(torch.stack(terms), dim=0)
         possible = (self.freedom.off_axis(tangent) <= HELD) & is_unit(value)
         return torch.where(possible, density, -torch.inf)
+
+
+class MixturePose(TorchDistribution):
+    """A mixture of K normals over poses (`NormalPose`), all with the same free axes.
+
+    Args:
+        log_weights: (K,) or (N, K), unnormalised; -inf for a component without weight.
+        centers: (K, 7) or (N, K, 7).
+        covariance: over the free coordinates, (d, d), (K, d, d) or (N, K, d, d), as `NormalPose` takes it, or
+            standard deviations (d,).
+        freedom: which axes are free.
+    """
+
+    arg_constraints: dict[str, Any] = {}
+    support = constraints.real_vector
+
+    def __init__(
+        self, log_weights: Tensor, centers: Tensor, covariance: Tensor, freedom: Freedom = FREE
+    ) -> None:
+        batch = torch.broadcast_shapes(log_weights.shape[:-1], centers.shape[:-2])
+        self.log_weights = torch.log_softmax(log_weights.to(torch.float64), dim=-1)
+        self.components = NormalPose(centers, covariance, freedom)
+        self.freedom = freedom
+        super().__init__(torch.Size(batch), torch.Size([7]), validate_args=False)
+
+    def expand(self, batch_shape: Any, _instance: Any = None) -> MixturePose:
+        """The same mixture for a batch of draws, one for each particle of a plate."""
+        new = type(self).__new__(type(self))
+        new.__dict__.update(self.__dict__)
+        new.log_weights = self.log_weights.expand(*batch_shape, -1)
+        TorchDistribution.__init__(new, torch.Size(batch_shape), self.event_shape, validate_args=False)
+        return new
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """Poses (*sample_shape, *batch_shape, 7)."""
+        shape = torch.Size(sample_shape) + self.batch_shape
+        chances = self.log_weights.exp().expand(*shape, -1)
+        drawn = torch.multinomial(chances.reshape(-1, chances.shape[-1]), 1).reshape(*shape, 1, 1)
+        each = self.components.expand(torch.Size([*shape, chances.shape[-1]])).sample()
+        return each.gather(-2, drawn.expand(*shape, 1, 7))[..., 0, :]
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (...,) with respect to the base measure; -inf where a held axis differs."""
+        each = self.components.log_prob(value[..., None, :])
+        return torch.logsumexp(self.log_weights + each, dim=-1)
