@@ -8,12 +8,4 @@ from bcppl.distributions.contact.peg_pose import PegPose
 from bcppl.distributions.contact.track import Track, TrackDistribution
 from bcppl.distributions.contact.wrench import Wrench
 
-__all__ = [
-    "ChamferContacts",
-    "ContactsInTime",
-    "PegPose",
-    "Track",
-    "TrackDistribution",
-    "Wrench",
-    "chamfer",
-]
+__all__ = ["ChamferContacts", "ContactsInTime", "PegPose", "Track", "TrackDistribution", "Wrench", "chamfer"]

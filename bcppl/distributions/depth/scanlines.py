@@ -128,14 +128,7 @@ def to_visible(hit: bool, inside: bool, was_inside: bool, chain: Chain) -> tuple
 
 @compiled
 def gain(
-    depth: Array,
-    valid: Mask,
-    rendered: Array,
-    line: Line,
-    first: int,
-    last: int,
-    chain: Chain,
-    lines: Lines,
+    depth: Array, valid: Mask, rendered: Array, line: Line, first: int, last: int, chain: Chain, lines: Lines
 ) -> float:
     """The log-likelihood ratio of a line with the part, rendered at (H * W,), +inf where absent, to none.
 

@@ -10,14 +10,7 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.lazy import LazyDistribution
-from bcppl.distributions.touch.placed import (
-    LATENT_POSITIVE,
-    OUTLIER,
-    Distance,
-    Placed,
-    Scale,
-    distance_at,
-)
+from bcppl.distributions.touch.placed import LATENT_POSITIVE, OUTLIER, Distance, Placed, Scale, distance_at
 
 # A normal with less than this in the world's xy plane has no direction there.
 UPRIGHT = 1e-6
