@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -33,17 +33,11 @@ if TYPE_CHECKING:
     from bcppl.beliefs.belief import Belief
 
 
-@dataclass(frozen=True)
-class Distance:
-    """The distance of poses from a belief's mean.
+class Distance(NamedTuple):
+    """The distance of poses from a belief's mean."""
 
-    Attributes:
-        of: poses (..., 7) to distances (...,).
-        of_particles: (K,) of the belief's own particles, each from the mean of the others.
-    """
-
-    of: Callable[[Tensor], Tensor]
-    of_particles: Tensor
+    of: Callable[[Tensor], Tensor]  # poses (..., 7) to distances (...,)
+    of_particles: Tensor  # (K,) of the belief's own particles, each from the mean of the others
 
 
 # Below this variance, in units of the axes' variances, the particles do not span a direction.

@@ -14,13 +14,8 @@ from bcppl.errors import InputError, NotANumberError, NoWeightError
 def normalised(log_weights: Tensor, impossible: Sequence[str] = ()) -> Tensor:
     """Weights (N,) that sum to 1, from log weights (N,).
 
-    Args:
-        log_weights: unnormalised.
-        impossible: addresses of probability zero at every particle (`bcppl.traces.Trace.impossible`), for
-            the error.
-
     Raises:
-        NoWeightError: no particle has any weight.
+        NoWeightError: no particle has any weight; names the `impossible` addresses (`Trace.impossible`).
         NotANumberError: a weight is NaN or +inf.
     """
     if bool((torch.isnan(log_weights) | (log_weights == torch.inf)).any()):
@@ -60,13 +55,10 @@ def weighted_quantiles(values: Tensor, weights: Tensor, probabilities: object) -
     Args:
         values: (N, *event).
         weights: (N,) normalised.
-        probabilities: one or several in [0, 1].
+        probabilities: one or several; others than from 0 to 1 are refused.
 
     Returns:
         (Q, *event), or (*event) for a single probability; float64, in the units of the values.
-
-    Raises:
-        InputError: a probability is not in [0, 1].
     """
     levels = torch.as_tensor(probabilities, dtype=torch.float64)
     if not bool(((levels >= 0) & (levels <= 1)).all()):

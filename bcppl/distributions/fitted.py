@@ -12,17 +12,13 @@ from torch.distributions import MultivariateNormal
 _WIDTHS = (1.2, 3.0)  # of the normals that are drawn from, in deviations of the draws before
 _SHARES = (0.85, 0.15)
 _LEAST = 0.15  # of the draws: their effective number, which bounds how sharp the density may become
+_ROUNDS = 30  # at most
 _FASTER = 1.1  # by how much sharper it becomes at least
 _ENOUGH = 0.3  # of the draws: so many effective, and the fit is good
 
 
 class FittedNormal(NamedTuple):
-    """A normal in d dimensions.
-
-    Attributes:
-        mean: (d,).
-        covariance: (d, d).
-    """
+    """A normal in d dimensions: mean (d,) and covariance (d, d)."""
 
     mean: Tensor
     covariance: Tensor
@@ -44,7 +40,6 @@ def fitted_normal(
     *,
     draws: int = 200,
     first: int = 400,
-    rounds: int = 30,
 ) -> FittedNormal:
     """The normal after a density times a normal about zero, near its highest mass.
 
@@ -59,14 +54,13 @@ def fitted_normal(
         least: (d,) standard deviations below which no fit goes.
         draws: points in each round.
         first: points in the first.
-        rounds: at most.
     """
     prior = MultivariateNormal(torch.zeros_like(start), torch.diag(start**2), validate_args=False)
     fit = FittedNormal(torch.zeros_like(start), torch.diag(start**2))
     point = prior.sample((first,))
     log_proposal = prior.log_prob(point)
     exponent = 0.0
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         target, correction = log_density(point), prior.log_prob(point) - log_proposal
         exponent = _exponent(target, correction, exponent)
         log_weights = exponent * target + correction

@@ -32,15 +32,10 @@ class GaussianMixture(NamedTuple):
 
 
 class PoseFactor(NamedTuple):
-    """A Gaussian factor over a part's pose.
+    """A Gaussian factor over a part's pose."""
 
-    Attributes:
-        pose: (N, 7) its mean.
-        covariance: (N, 6, 6) in the tangent space at a centre (N, 7), at which it is linearised.
-    """
-
-    pose: Tensor
-    covariance: Callable[[Tensor], Tensor]
+    pose: Tensor  # (N, 7) its mean
+    covariance: Callable[[Tensor], Tensor]  # (N, 6, 6) in the tangent space at a centre (N, 7)
 
 
 def product_of_factors(prior: Any, factors: Sequence[PoseFactor]) -> NormalPose:

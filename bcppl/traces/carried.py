@@ -39,14 +39,12 @@ C = TypeVar("C", bound=Carryable)
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """A state that is carried, and what made it, with which the next run's is compared.
+    """The state of K particles, and the function that made it, with which the next run's is compared.
 
     A tensor or an array that `start` holds has the particles as its first axis if that has as many entries as
     there were particles: it is indexed and merged with them. All else is the same for every particle.
 
     Attributes:
-        state: of the K particles that there are now.
-        start: the function that made it, as it was then.
         particles: how many it was made for.
         index: (K,) which of these the particles are now; None for all of them, in order.
         merged: where states that were made by several functions are merged, what stands now in place of each

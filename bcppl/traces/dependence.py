@@ -45,14 +45,13 @@ _EMPTY = object()
 
 
 def alike(first: Any, second: Any, arrays: Callable[[Any, Any], bool], *, shared: bool = False) -> bool:
-    """Whether two values are the same, their tensors and arrays by a judgement of one's own.
+    """Whether two values are the same, given which tensors and arrays are.
 
     Args:
         first: any value.
-        second: what it is compared with.
-        arrays: whether two tensors or arrays that stand in the same place count as the same; asked until one
-            pair does not.
-        shared: ask for those that are one object too, except within an object that both share.
+        second: any value.
+        arrays: whether two tensors or arrays in the same place are the same; called until one pair is not.
+        shared: call it for those that are one object too, except within an object that both share.
     """
     stack, met = [(first, second)], {}
     try:
@@ -229,20 +228,12 @@ def _paired(first: Any, second: Any) -> list[tuple[Any, Any]]:
 
 
 class _Layout(NamedTuple):
-    """Where the instances of a class keep their parts.
+    """Where the instances of a class keep their parts."""
 
-    Attributes:
-        root: what they are beside their attributes: list, tuple or dict, or object for nothing; None where
-            something is kept that Python does not see.
-        slots: descriptors of `__slots__`, by name.
-        computed: attributes that torch computes from the others, or the others from them.
-        caches: attributes that do not count.
-    """
-
-    root: type | None
-    slots: Mapping[str, Any]
-    computed: frozenset[str]
-    caches: frozenset[str]
+    root: type | None  # list, tuple, dict, or object for none of them; None: more than Python can see
+    slots: Mapping[str, Any]  # descriptors of `__slots__`
+    computed: frozenset[str]  # attributes that torch computes from the others, or the others from them
+    caches: frozenset[str]  # attributes that do not count
 
     def attributes(self, value: Any) -> Mapping[str, Any]:
         """The attributes of an instance that count, by name."""

@@ -64,13 +64,7 @@ def not_a_number(
 
 
 def explained(error: Exception, particles: int, last: str | None) -> Exception:
-    """An error of a program as an InputError, where the particles are its cause.
-
-    Args:
-        error: what was raised.
-        particles: N.
-        last: the address visited last; None if there was none yet.
-    """
+    """An error of a program, after its `last` site, as an InputError where the particles are its cause."""
     if isinstance(error, InputError | InferenceError):
         return error
     message = str(error).partition("\n")[0]

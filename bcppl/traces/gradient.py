@@ -53,10 +53,8 @@ def log_prob_with_grad(
         exponents: by address, as in a tempered target; a site that is not named counts in full.
 
     Returns:
-        (N,) float64, without the sites that depend on none of the values: these add a constant.
-
-    Raises:
-        InputError: a site that depends on the values runs a simulator, or passes no gradient on.
+        (N,) float64, without the sites that depend on none of the values: these add a constant. One that
+        depends on them and runs a simulator, or passes no gradient on, is refused.
     """
     given, before = {**trace.choices, **trace.observations, **values}, trace._run.distributions
     program = differentiable(trace.program)

@@ -161,10 +161,7 @@ class Trace:
         return self.chosen(particles_at(key, self.particles))
 
     def chosen(self, index: Tensor) -> Any:
-        """The trace of the particles at an index (K,) int64 that is known to be in range.
-
-        For callers that made the index, such as resampling; `trace[index]` checks it first.
-        """
+        """The trace of the particles at an index (K,) int64 that is known to be in range."""
         return replace(
             self,
             particles=len(index),
@@ -253,9 +250,7 @@ class Trace:
         observations: Mapping[str, Tensor] | None = None,
         draws_lazy: bool = True,
     ) -> Trace:
-        """The program run again; log-probabilities of sites that are the same are kept.
-
-        What `update` does, without its checks.
+        """The program run again, as `update` does without its checks; log-probabilities that stay are kept.
 
         Args:
             values: (N, ...) of latent addresses.

@@ -18,11 +18,9 @@ from bcppl.traces.verbs import constrained, copied, log_weight, refuse_unfit, re
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """What `update` returns; its log ratio is evaluated when it is asked for.
+    """The trace at new values, arguments and observations, and the previous one.
 
     Attributes:
-        trace: at the new values, arguments and observations.
-        previous: the trace that was updated.
         discarded: the values that were replaced, and those of addresses that are visited no more, by address.
         drawn: the new latent addresses whose values were sampled from the program.
     """
@@ -147,13 +145,7 @@ def undrawn(trace: Trace, args: tuple[Any, ...]) -> Trace:
 
 @dataclass(frozen=True, eq=False)
 class Regenerated:
-    """What `regenerate` returns; its log weight is evaluated when it is asked for.
-
-    Attributes:
-        trace: with the values that were sampled.
-        previous: the trace that was changed.
-        discarded: the values that were replaced, by address.
-    """
+    """The trace with the values that were sampled, the previous one, and the values that were replaced."""
 
     trace: Trace
     previous: Trace
@@ -163,8 +155,7 @@ class Regenerated:
     def log_weight(self) -> Tensor:
         """The Metropolis-Hastings log acceptance ratio (N,) of proposing from the program itself.
 
-        It is log p(new trace) - log p(old trace) over the sites that were not regenerated: the others' cancel
-        against the proposal. Sites that are the same are not evaluated.
+        It is log p(new trace) - log p(old trace) over the sites that were not regenerated.
         """
         total = torch.zeros(self.trace.particles, dtype=torch.float64)
         others = [address for address in self.trace.addresses if address not in self.discarded]

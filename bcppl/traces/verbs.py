@@ -72,13 +72,7 @@ def generate(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Proposed:
-    """What `propose` returns.
-
-    Attributes:
-        choices: values by address (N, *event).
-        log_prob: their log-density (N,) under the program.
-        result: what the program returned.
-    """
+    """Choices by address (N, *event), their log-density (N,) under the program, and its result."""
 
     choices: Mapping[str, Tensor]
     log_prob: Tensor
@@ -135,10 +129,7 @@ def constrained(
     choices: Mapping[str, Tensor],
     carried: Mapping[str, Entry] | None = None,
 ) -> tuple[Trace, list[str]]:
-    """A program run from the beginning, or one step of a series, and the addresses that weigh it.
-
-    See `generate`.
-    """
+    """A program run as by `generate`, or one step of a series, and the addresses that weigh it."""
     observations = copied(observations)
     again = [a for a in choices if a in observations]
     if again:

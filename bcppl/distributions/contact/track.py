@@ -43,8 +43,7 @@ class TrackDistribution(LazyDistribution):
 
     Args:
         track: the simulated probe.
-        first: the first stamp.
-        last: the stamp after the last.
+        first, last: the first stamp, and the one after the last.
 
     Attributes:
         entries: the number of entries measured at a stamp.

@@ -49,15 +49,10 @@ class Line(NamedTuple):
 
 
 class Lines(NamedTuple):
-    """The lines of one direction of an image (H * W,).
+    """The lines of one direction of an image (H * W,)."""
 
-    Attributes:
-        previous: the last depth before each pixel on its line, NaN where there is none, metres.
-        without_part: the density of each pixel without a part, 1 / m.
-    """
-
-    previous: Array
-    without_part: Array
+    previous: Array  # the last depth before each pixel on its line, NaN where there is none, metres
+    without_part: Array  # the density of each pixel without a part, 1 / m
 
 
 def compiled(function: F) -> F:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,14 +19,7 @@ ANGLE = Range(least=0.0, most=math.pi)
 
 
 class _BoxPose(PoseDistribution):
-    """Uniform in a box, times Haar measure restricted to a set of rotations.
-
-    Args:
-        center: (7,) the pose in the middle.
-        translation: half widths (3,) or one for all, metres; 0 holds an axis fixed.
-        rotation: the axes about which it is free, as `Freedom` has them.
-        measure: the normalised Haar measure of the rotations.
-    """
+    """Uniform in a box, times Haar measure restricted to a set of rotations of a normalised `measure`."""
 
     def __init__(self, center: Any, translation: Any, rotation: str, measure: float) -> None:
         try:
@@ -175,21 +168,8 @@ def tilt_and_yaw(center: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
     return tilt, yaw
 
 
-class _Guess(Protocol):
-    @property
-    def world_from_part(self) -> Any: ...
-    @property
-    def translation(self) -> Any: ...
-    @property
-    def tilt(self) -> float: ...
-    @property
-    def yaw(self) -> float: ...
-    @property
-    def angle(self) -> float | None: ...
-
-
-def prior_from_guess(guess: _Guess) -> UniformPose | SwingTwistPose:
-    """The prior that a recording's guess states: uniform within an angle, or within a tilt and a yaw."""
+def prior_from_guess(guess: Any) -> UniformPose | SwingTwistPose:
+    """The prior of a recording's guess: uniform within an angle, or within a tilt and a yaw."""
     if guess.angle is not None:
         return UniformPose(guess.world_from_part, guess.translation, guess.angle)
     return SwingTwistPose(guess.world_from_part, guess.translation, guess.tilt, guess.yaw)

@@ -12,17 +12,11 @@ from bcppl.errors import InputError
 
 
 class Located(NamedTuple):
-    """Positions of places (..., 3) on a path.
+    """The points of a path nearest to places (..., 3); metres."""
 
-    Attributes:
-        travelled: (...,) distance along the path to the point of it that is nearest to the place, metres.
-        direction: (..., 3) unit direction of travel there.
-        off: (...,) distance from the place to that point, metres.
-    """
-
-    travelled: Tensor
-    direction: Tensor
-    off: Tensor
+    travelled: Tensor  # (...,) distance along the path to the point
+    direction: Tensor  # (..., 3) unit direction of travel there
+    off: Tensor  # (...,) distance from the place to the point
 
 
 class Path:
