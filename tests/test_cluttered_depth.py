@@ -160,7 +160,7 @@ def test_a_pose_that_is_none_and_an_image_of_another_size_are_refused() -> None:
         ClutteredDepth(RENDERER, lens, at((0.0, 0.0, 0.0), (math.nan, 0.0, 0.0)), SCALE).log_prob(image)
     with pytest.raises(InputError, match=r"shape \(59, 80\)"):
         ClutteredDepth(RENDERER, lens, at((0.0, 0.0, 0.0)), SCALE).log_prob(image[1:])
-    with pytest.raises(InputError, match=r"\(3, 6\); give \(N, 7\)"):
+    with pytest.raises(InputError, match=r"\(3, 6\); give \(3, 7\)"):
         ClutteredDepth(RENDERER, lens, torch.zeros(3, 6), SCALE)
 
 

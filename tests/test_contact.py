@@ -219,16 +219,3 @@ def test_locations_anywhere_are_in_the_pegs_frame_wherever_the_peg_is() -> None:
         false_alarm=0.9,
     ).sample()
     assert float(drawn[..., 0].nanmean()) == pytest.approx(0.0, abs=0.01)
-
-
-def test_an_observation_has_a_row_for_each_stamp() -> None:
-    track = Felt(torch.zeros(2, 100, 3, dtype=torch.float64), poses.identity(2, 100))
-    for make, numbers in (
-        (lambda **given: ChamferContacts(track, scale=0.001, one_empty=18e-6, **given), 3),
-        (lambda **given: ContactsInTime(track, scale=0.001, **given), 3),
-        (lambda **given: PegPose(track, translation_scale=0.001, rotation_scale=0.01, **given), 7),
-    ):
-        contact = make(first=0, last=100)
-        for rows in (1, 90):
-            with pytest.raises(InputError, match="100 stamps but its observation"):
-                contact.log_prob(torch.zeros(rows, numbers, dtype=torch.float64))

@@ -231,9 +231,9 @@ def test_an_empty_image_says_nothing() -> None:
 def test_bad_input_is_named() -> None:
     scene = SceneRenderer([PART, PART])
     for renderer, pose, said in [
-        (scene, POSE, r"\(N, 2, 7\)"),
-        (RENDERER, scene_poses(POSE, POSE), r"\(N, 7\)"),
-        (scene, scene_poses(POSE, POSE, POSE), "2 parts"),
+        (scene, POSE, r"give \(7, 2, 7\)"),
+        (RENDERER, scene_poses(POSE, POSE), r"give \(7, 7\)"),
+        (scene, scene_poses(POSE, POSE, POSE), r"give \(7, 2, 7\)"),
     ]:
         with pytest.raises(InputError, match=said):
             LaplaceDepth(renderer, CAMERA, pose, SCALE)

@@ -160,7 +160,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "no distribution": (lambda: simulate(sampled_from_a_function, (), N), "'x' .*function; give"),
     "enumerated": (lambda: simulate(enumerated, (), N), "'x' is enumerated"),
     "log-probabilities": (lambda: simulate(wide, (), N).log_prob(), r"'y' has log-probabilities .*\(3, 5\)"),
-    "no such site": (lambda: simulate(latent_and_seen, (), N).log_prob("q"), "no address 'q'"),
+    "no such site": (lambda: simulate(latent_and_seen, (), N).log_prob("q"), "'q' .* never visits"),
     "update of an observation": (
         lambda: updated({"y": ones}),
         "'y' was given or asked for, which is no latent.* x",
@@ -183,7 +183,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: assess(latent_and_seen, (), {"x": ones[:3], "y": ones}, N),
         r"'x' has shape \(3,\); .* particles \(5,\)",
     ),
-    "no particles": (lambda: simulate(latent_and_seen, (), 0), "for 0 particles; give 1 or more"),
+    "no particles": (lambda: simulate(latent_and_seen, (), 0), "for 0 particles; give a whole number, 1"),
     "arguments that are no tuple": (lambda: simulate(growing, 5, 4), "of type int; give a tuple"),  # type: ignore[arg-type]
     "particles that are no number": (
         lambda: simulate(latent_and_seen, (), 2.5),  # type: ignore[arg-type]

@@ -103,7 +103,7 @@ def test_regions_by_hand() -> None:
     assert belief.credible_region(0.95).radius == math.inf
     with pytest.raises(InputError, match="every rotation is held"):
         belief.credible_region(0.5, rotation_deviation)
-    with pytest.raises(InputError, match="between 0 and 1"):
+    with pytest.raises(InputError, match="above 0 and below 1"):
         belief.credible_region(1.0)
 
 

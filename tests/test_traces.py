@@ -263,7 +263,7 @@ def test_a_hidden_site_stays_hidden_whatever_is_made_of_the_trace() -> None:
         each.distributions["a_0"]
     torch.testing.assert_close(secret.log_prob("a_0", "x"), trace.log_prob("a_0", "x"))
     assert "a_1" not in calls and torch.equal(secret["a_1"], trace["a_1"])
-    with pytest.raises(InputError, match="no address 'q'"):
+    with pytest.raises(InputError, match=r"'q' .* never visits"):
         trace.hiding(["q"])
     assert trace.log_prob("a_1").shape == (N,), "the trace itself is as it was"
 

@@ -222,11 +222,11 @@ REFUSED: dict[str, tuple[Callable[[Trace], Any], str]] = {
     "value never visited": (lambda t: update(t, {"z_5": t["x"]}), "'z_5'.* no latent address"),
     "never visited, with arguments": (
         lambda t: update(t, {"z_5": t["x"]}, args=(3,)),
-        "'z_5', which the program never visits",
+        "'z_5' is one the program never visits",
     ),
     "observation never visited": (
         lambda t: update(t, observations=shown(a_5=0.0)),
-        "'a_5', which the program never visits",
+        "'a_5' is one the program never visits",
     ),
     "shape": (lambda t: update(t, {"x": t["x"][:2]}, args=(3,)), r"'x' has shape \(2,\)"),
     "shape of a new value": (lambda t: update(t, {"z_2": t["x"][:2]}, args=(3,)), r"'z_2' has shape \(2,\)"),

@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arguments import number_within
 from bcppl.errors import InputError
 
 # Pairs of particles are one matrix: this many take 0.8 GB.
@@ -45,10 +46,8 @@ def links(
     world_from_part: Tensor, translation: float, rotation: float, symmetries: Tensor | None = None
 ) -> Tensor:
     """The pairs of poses that `cluster` links, bool (N, N), with its arguments and errors."""
-    if not (translation > 0 and rotation > 0):
-        raise InputError(
-            f"modes have the scales {translation} m and {rotation} rad; give two positive numbers."
-        )
+    translation = number_within("modes are to be {} m apart", translation, above=0.0)
+    rotation = number_within("modes are to be {} rad apart", rotation, above=0.0)
     if len(world_from_part) > MOST:
         raise InputError(
             f"modes are given {len(world_from_part)} distinct particles; resample to {MOST} or fewer."

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arguments import number_within
 from bcppl.beliefs.distances import average_distance
 from bcppl.beliefs.modes import cluster
 from bcppl.errors import InputError
@@ -71,8 +72,7 @@ class Region:
 
 def region(belief: Belief, mass: float, measure: Measure) -> Region:
     """The credible region of a belief whose copies are merged."""
-    if not 0.0 < mass < 1.0:
-        raise InputError(f"a credible region has the mass {mass}; give one between 0 and 1.")
+    mass = number_within("a credible region has the mass {}", mass, above=0.0, below=1.0)
     distance = measure(belief)
     count = float(1.0 / (belief.weights**2).sum())
     level = mass * (count + 1.0) / count

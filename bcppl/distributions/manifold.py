@@ -137,7 +137,7 @@ class ContactManifold(LazyDistribution):
 
         At contact the gap and the sink, elsewhere how deep the peg would have been in the part.
         """
-        stood, felt = self._read(value)
+        stood, felt = value[..., :7], value[..., 7]
         distance = self.gap(self.pose, stood).distance
         residual = torch.where(felt == 1.0, distance + self.sink, distance.clamp(max=0.0))
         return torch.where(torch.isnan(felt), torch.nan, residual)
@@ -208,18 +208,9 @@ class ContactManifold(LazyDistribution):
         shift[sound] = noise[sound] + touching * normal * (shared[sound] - self.sink)
         return torch.cat([rows[..., :3] + shift, rows[..., 3:]], dim=-1)
 
-    def _read(self, value: Tensor) -> tuple[Tensor, Tensor]:
-        shapes = tuple(self.event_shape), (*self.batch_shape, *self.event_shape)
-        if tuple(value.shape) not in shapes:
-            raise InputError(
-                f"ContactManifold looks at {self.event_shape[0]} stamps but its observation has shape "
-                f"{tuple(value.shape)}; give ({self.event_shape[0]}, 8): peg pose, and whether it felt it."
-            )
-        return value[..., :7], value[..., 7]
-
     def _measured(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor, Gaps | None]:
         """Distances and contact signals (N, S), which particles' observations are lost, and the gaps."""
-        stood, felt = self._read(value)
+        stood, felt = value[..., :7], value[..., 7]
         count = len(self.pose)
         lost = torch.zeros(count, dtype=torch.bool)
         if value.ndim == 3:  # a simulation that failed

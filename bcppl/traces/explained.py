@@ -39,6 +39,14 @@ def unfit_particles(site: str, particles: int, given: int) -> InputError:
     )
 
 
+def hidden_site(address: str) -> InputError:
+    """The error of a proposal that asks for a hidden site."""
+    return InputError(
+        f"site {address!r} is hidden from a proposal, which asked for its distribution or log-probability; "
+        "let the proposal read earlier sites only."
+    )
+
+
 def not_a_number(
     address: str, log_prob: Tensor, latent: Tensor | None, observed: Tensor | None
 ) -> NotANumberError:

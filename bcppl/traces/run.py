@@ -7,10 +7,9 @@ particle axis comes first: (N, 5, *event), and what is observed of them is (5, *
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from numbers import Integral
 from typing import Any
 
 import pyro
@@ -22,6 +21,7 @@ from pyro.poutine.runtime import _DIM_ALLOCATOR, _PYRO_STACK
 from pyro.poutine.subsample_messenger import _Subsample
 from torch import Tensor
 
+from bcppl.arguments import whole_number
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.shortcuts import drawn
 from bcppl.errors import InputError
@@ -54,6 +54,13 @@ class Run:
     coincident: frozenset[str]
     whole: frozenset[str]
 
+    def refuse_unvisited(self, addresses: Iterable[str]) -> None:
+        """Refuse addresses that the program did not visit."""
+        for address in addresses:
+            if address not in self.distributions:
+                visited = ", ".join(self.distributions) or "none"
+                raise InputError(f"address {address!r} is one the program never visits; it visits {visited}.")
+
 
 def run(
     program: Program,
@@ -78,10 +85,7 @@ def run(
         raise InputError(
             f"a program's arguments are of type {type(args).__name__}; give a tuple of them, `(x,)` for one."
         )
-    if not isinstance(particles, Integral) or isinstance(particles, bool) or particles < 1:
-        raise InputError(
-            f"a program was to be run for {particles} particles; give 1 or more, a whole number."
-        )
+    particles = whole_number("a program was to be run for {} particles", particles)
     refuse_other_than_tensors(given)
     recorder = _Recorder(particles, given, draws_lazy)
     with carrying(carried, particles) as used, torch.no_grad(), pyro.validation_enabled(False):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import UserDict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -18,8 +19,7 @@ from bcppl.distributions.support import log_prob_inside, masks, support_of
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.dependence import comparison, equal
-from bcppl.traces.explained import not_a_number
-from bcppl.traces.hiding import Hiding, refused
+from bcppl.traces.explained import hidden_site, not_a_number
 from bcppl.traces.indexing import Index, beside, particles_at
 from bcppl.traces.run import Program, Run, inward, refuse_other_than_tensors, run
 
@@ -89,7 +89,7 @@ class Trace:
     def distributions(self) -> Mapping[str, Any]:
         """The distribution of every site at these values, by address in the program's order."""
         if self.hidden:
-            return Hiding(self._run.distributions, self.hidden)
+            return _Hiding(self._run.distributions, hidden=self.hidden)
         return MappingProxyType(self._run.distributions)
 
     @property
@@ -116,16 +116,11 @@ class Trace:
 
     def _site(self, address: str) -> Tensor:
         if address in self.hidden:
-            raise refused(address)
+            raise hidden_site(address)
         if address not in self.known:
-            if address not in self._run.distributions:
-                raise self._unvisited(address)
+            self._run.refuse_unvisited([address])
             self.known[address] = self._evaluated(address)
         return self.known[address]
-
-    def _unvisited(self, address: str) -> InputError:
-        visited = ", ".join(self.addresses) or "none"
-        return InputError(f"the program visits no address {address!r}; it visits {visited}.")
 
     def _evaluated(self, address: str) -> Tensor:
         distribution = self._run.distributions[address]
@@ -210,8 +205,7 @@ class Trace:
         values, raises an error that names the address. Values stay readable.
         """
         hidden = frozenset(addresses)
-        for address in sorted(hidden - set(self.addresses)):
-            raise self._unvisited(address)
+        self._run.refuse_unvisited(hidden)
         secret = replace(self, known=dict(self.known), hidden=self.hidden | hidden)
         secret._keep_run(self._run)
         return secret
@@ -296,6 +290,18 @@ class Trace:
                     f"a new value for {address!r} was given or asked for, which is no latent address; "
                     f"latent are {', '.join(self.choices) or 'none'}."
                 )
+
+
+class _Hiding(UserDict[str, Any]):
+    """The distributions of a trace, those at `hidden` addresses named but not given."""
+
+    def __init__(self, distributions: Mapping[str, Any], hidden: frozenset[str]) -> None:
+        self.data, self.hidden = dict(distributions), hidden
+
+    def __getitem__(self, address: str) -> Any:
+        if address in self.hidden:
+            raise hidden_site(address)
+        return self.data[address]
 
 
 def refuse_masked(address: str, distribution: Any) -> None:

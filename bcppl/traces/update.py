@@ -13,7 +13,7 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.traces.series import SeriesTrace
 from bcppl.traces.trace import Trace, changed
-from bcppl.traces.verbs import constrained, copied, log_weight, refuse_unfit, refuse_unvisited
+from bcppl.traces.verbs import constrained, copied, log_weight, refuse_unfit
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ def update(
             raise InputError(f"address {address!r} is latent and given an observation; give it a value.")
     given = {**values, **trace.as_replacing(replaced)}
     new = trace.revised(given, args=args, observations=observations)
-    refuse_unvisited((*values, *observations), new._run)
+    new._run.refuse_unvisited((*values, *observations))
     if args is None and set(new.addresses) != set(trace.addresses):
         raise InputError("new values changed which addresses the program visits; mask sites instead.")
     if args is not None or observations:

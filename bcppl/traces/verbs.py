@@ -6,7 +6,7 @@ PLDI 2019, section 4 (the generative function interface). All of them act on N p
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -111,7 +111,7 @@ def assessed(
     program = runnable(program)
     ran = run(program, args, particles, choices, {})
     _refuse_fixed(ran)
-    refuse_unvisited(choices, ran)
+    ran.refuse_unvisited(choices)
     _refuse_coincidence(program, args, particles, ran)
     missing = [a for a in ran.values if a not in choices and a not in ran.fixed]
     if missing:
@@ -136,7 +136,7 @@ def constrained(
         raise InputError(f"address {again[0]!r} is observed and given a value for each particle; give one.")
     given = {**observations, **choices}
     ran = run(program, args, particles, given, carried or {})
-    refuse_unvisited(given, ran)
+    ran.refuse_unvisited(given)
     trace = _traced(program, args, particles, ran, observations)
     # The steps of a series after the first visit what that has visited.
     later = isinstance(program, Stage) and program.number > 1
@@ -175,16 +175,6 @@ def _refuse_fixed(ran: Run) -> None:
         raise InputError(
             f"a program that is to propose or to be assessed observes {min(ran.fixed)!r} itself (`obs=` or "
             "`pyro.factor`); take that out, and give values as observations."
-        )
-
-
-def refuse_unvisited(given: Iterable[str], ran: Run) -> None:
-    """Refuse a value that was given for an address that was not visited."""
-    missing = [a for a in given if a not in ran.distributions]
-    if missing:
-        raise InputError(
-            f"an observation was given for address {missing[0]!r}, which the program never visits; "
-            f"it visits {', '.join(ran.distributions) or 'none'}."
         )
 
 

@@ -75,11 +75,6 @@ class TrackDistribution(LazyDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-probability (N,) of measurements (T, entries), or of one for each particle (N, T, entries)."""
-        if value.ndim not in (2, 3, 4) or value.shape[-2:] != self.event_shape:
-            raise InputError(
-                f"{type(self).__name__} has {self.event_shape[0]} stamps but its observation has shape "
-                f"{tuple(value.shape)}; give {tuple(self.event_shape)}, a row for each stamp."
-            )
         log_prob = self._log_prob(value.to(torch.float64)[..., self.thinned, :])
         return torch.where(self.track.diverged, -math.inf, log_prob)
 

@@ -41,22 +41,10 @@ class CameraImage(LazyDistribution):
     region: Mask | Tensor | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        renderer, camera, pose = self.renderer, self.camera, self.pose
-        parts = getattr(renderer, "parts", None)
+        parts = getattr(self.renderer, "parts", None)
         each = (7,) if parts is None else (len(parts), 7)
-        if pose.shape[1:] != each:
-            what = (
-                "one world_from_part" if parts is None else f"a world_from_part of each of {len(parts)} parts"
-            )
-            raise InputError(
-                f"{self._where} has a pose of shape {tuple(pose.shape)}; "
-                f"give ({', '.join(map(str, ('N', *each)))}), {what}."
-            )
-        if not camera.far > camera.near >= 0.0:
-            raise InputError(
-                f"camera {camera.name!r} has the range {camera.near} to {camera.far} m; give 0 <= near < far."
-            )
-        super().__init__(len(pose), (camera.height, camera.width))
+        self._check_shape("a pose (world_from_part)", self.pose, (len(self.pose), *each))
+        super().__init__(len(self.pose), (self.camera.height, self.camera.width))
         self._check_shape("a region", self.region, self.event_shape)
 
     @property

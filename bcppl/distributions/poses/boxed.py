@@ -11,7 +11,6 @@ from torch.special import log_ndtr, ndtr, ndtri
 from bcppl import poses
 from bcppl.distributions.poses.base import PoseDistribution
 from bcppl.distributions.poses.normal import NormalPose
-from bcppl.errors import InputError
 
 _LEAST = 1e-300
 _FARTHEST = 30.0  # standard deviations: beyond, the remaining mass of a tail is rounding
@@ -31,17 +30,9 @@ class BoxedNormal(PoseDistribution):
         covariance: (N, 6, 6) or (6, 6).
         low: (3,) the box's least corner, in the world, metres.
         high: (3,) its largest.
-
-    Raises:
-        InputError: the box is empty, or as `NormalPose`.
     """
 
     def __init__(self, center: Tensor, covariance: Tensor, low: Tensor, high: Tensor) -> None:
-        if not bool((low < high).all()):
-            raise InputError(
-                f"BoxedNormal has a box from {low.tolist()} to {high.tolist()} m; "
-                "give the smaller corner first."
-            )
         self.low, self.high, self.normal = low, high, NormalPose(center, covariance)
         super().__init__(center, self.normal.freedom)
 
