@@ -107,13 +107,9 @@ class Belief:
         return self.covariance.diagonal().clamp_min(0.0).sqrt()
 
     def quantiles(self, probabilities: object) -> Tensor:
-        """Weighted quantiles of each tangent coordinate at the mean: metres, then radians.
+        """Weighted quantiles of each tangent coordinate at the mean, metres and radians; 0 along held axes.
 
-        Args:
-            probabilities: one or several in [0, 1].
-
-        Returns:
-            (Q, 6), or (6,) for a single probability; 0 along held axes. See `weighted_quantiles`.
+        They are (Q, 6) for several probabilities in [0, 1], (6,) for one. See `weighted_quantiles`.
         """
         return weighted_quantiles(self.tangent, self.weights, probabilities)
 
@@ -124,11 +120,9 @@ class Belief:
         return Belief(world_from_part, weights.log(), self.freedom)
 
     def credible_region(self, mass: float, measure: Measure = pose_deviation) -> Region:
-        """The region about the mean that contains the truth with probability `mass`.
+        """The region about the mean that contains the truth with probability `mass`, in (0, 1).
 
-        Args:
-            mass: in (0, 1).
-            measure: the distance of a pose from the mean: one of the functions of `bcppl.beliefs.regions`.
+        The distance from the mean, `measure`, is one of the functions of `bcppl.beliefs.regions`.
 
         Raises:
             InputError: the mass is not in (0, 1), or every axis of the measure is held.
@@ -185,11 +179,8 @@ class Belief:
     def add(self, points: np.ndarray | Tensor, truth: np.ndarray | Tensor) -> Tensor:
         """ADD (N,) of every particle, metres: the mean distance of model points from their true positions.
 
-        Args:
-            points: (M, 3) on the part's surface, in its frame.
-            truth: (7,) true `world_from_part`.
-
-        Source: Hinterstoisser et al., Model based training, detection and pose estimation, ACCV 2012, eq. 3.
+        Points (M, 3) lie on the part's surface, in its frame; the true pose (7,) is `world_from_part`
+        (Hinterstoisser et al., Model based training, detection and pose estimation, ACCV 2012, eq. 3).
         """
         return average_distance(self.world_from_part, points, truth)
 

@@ -49,10 +49,9 @@ Measure = Callable[["Belief"], Distance]
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """The poses within `radius` of `center`.
+    """The poses within `radius` of `center`, the belief's mean `world_from_part` (7,).
 
     Attributes:
-        center: (7,) the belief's mean, `world_from_part`.
         radius: in the distance's unit; +inf where the particles are too few for a smaller one.
         mass: the nominal probability that the region contains the truth.
         weight: the share of the belief's weight inside.
@@ -133,10 +132,9 @@ def nearest_mode_deviation(translation: float = 0.01, rotation: float = 0.2) -> 
     def measure(belief: Belief) -> Distance:
         label = cluster(belief.world_from_part, translation, rotation)
         within = [label == k for k in range(int(label.max()) + 1)]
+        pose, log_weights = belief.world_from_part, belief.log_weights
         modes = [
-            pose_deviation(
-                replace(belief, world_from_part=belief.world_from_part[k], log_weights=belief.log_weights[k])
-            )
+            pose_deviation(replace(belief, world_from_part=pose[k], log_weights=log_weights[k]))
             for k in within
         ]
 

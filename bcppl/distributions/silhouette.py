@@ -71,11 +71,7 @@ class Silhouette(CameraImage):
     ) -> Silhouette:
         """The silhouette of the parts of a depth image, by the same camera: both are rendered once, together.
 
-        Args:
-            depth: of the depth image; its region is not the mask's.
-            width: of the outline's position, pixels.
-            flipped: the probability that a pixel is misclassified.
-            others: `rim`, `temperature`, `region`.
+        The region of the depth image is not the mask's.
         """
         silhouette = cls(depth.renderer, depth.camera, depth.apparent_pose, width, flipped, **others)
         silhouette._hits = depth.all_hits()

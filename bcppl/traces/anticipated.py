@@ -28,7 +28,7 @@ class Anticipated:
     Attributes:
         trace: of N particles.
         args: the program's arguments with those of the measurement.
-        observations: values at the measurement's addresses.
+        measured: values at the measurement's addresses.
     """
 
     trace: Trace

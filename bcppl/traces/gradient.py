@@ -92,8 +92,7 @@ def _parameters(before: Any, now: Any) -> tuple[list[Tensor], bool | None]:
         if isinstance(b, Tensor) and b.requires_grad:
             parameters.append(b)
         elif not equal(a, b):
-            # It was taken out of torch and carries no gradient.
-            changed.append(b)
+            changed.append(b)  # it was taken out of torch and carries no gradient
         return True
 
     understood = alike(before, now, met)

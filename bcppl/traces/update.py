@@ -62,7 +62,7 @@ def update(
     given no value are sampled from the program.
 
     Args:
-        trace: what is changed; of a series its newest step.
+        trace: of a series its newest step changes.
         values: (N, ...) of latent addresses, old ones or new.
         args: the program's arguments.
         observations: values of new addresses, or in place of old observations: one for all particles. They

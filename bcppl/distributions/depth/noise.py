@@ -20,7 +20,7 @@ class LaplaceDepth(DepthDistribution):
     b the scale. Where the ray misses the part, r is the background; where that is unknown, the pixel's
     density is uniform over the sensor's range. A wrong pixel costs without bound: see `RobustDepth`.
 
-    Arguments and errors are those of `DepthDistribution`.
+    Arguments are those of `DepthDistribution`.
     """
 
     def _log_density(self, depth: Tensor, rendered: Tensor) -> Tensor:
@@ -36,9 +36,7 @@ class RobustDepth(DepthDistribution):
     is unknown, the uniform alone. The rest is as in `LaplaceDepth`. Beam models of range finders are such
     mixtures: Thrun, Burgard and Fox, Probabilistic Robotics, 6.3.
 
-    Args:
-        outlier: the probability of an outlier, above 0 and below 1.
-        *others, **named: those of `DepthDistribution`.
+    Arguments are those of `DepthDistribution`, and `outlier`, the probability of an outlier.
     """
 
     outlier: float = field(default=0.1, kw_only=True, metadata=PROBABILITY)
@@ -69,10 +67,8 @@ class OccludedDepth(DepthDistribution):
     background is unknown, the uniform alone. It integrates to one over all depths, and over the sensor's
     range but for the Laplace noise beyond it, as `LaplaceDepth` does.
 
-    Args:
-        occluder: the probability of an occluder in front, above 0 and below 1.
-        outlier: the probability of any other depth, above 0 and below 1; their sum is below 1.
-        *others, **named: those of `DepthDistribution`.
+    Arguments are those of `DepthDistribution`, and the probabilities of an occluder in front, `occluder`, and
+    of any other depth, `outlier`, whose sum is below 1.
     """
 
     occluder: float = field(default=0.1, kw_only=True, metadata=PROBABILITY)

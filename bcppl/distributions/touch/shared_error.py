@@ -15,7 +15,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.touch.onset import OnsetLocation
 from bcppl.distributions.touch.path import Path
-from bcppl.distributions.touch.placed import Placed
+from bcppl.distributions.touch.placed import Placed, distance_at
 
 # The residual of an earlier touch is clipped at so many standard deviations.
 CLIPPED = 4.0
@@ -104,16 +104,11 @@ class SharedError:
 
     def _distance(self, place: Tensor) -> Tensor:
         """Signed distance (N,) at a place (3,) or (N, 3); any finite number where that is NaN."""
-        if place.ndim == 1:
-            if bool(place.isnan().any()):
-                return self.placed.pose.new_zeros(len(self.placed.pose))
-            return self.placed.near(place[None])[0][:, 0]
-        there = torch.where(torch.isnan(place), self.placed.pose[:, :3], place)
         pose = self.placed.pose
-        distance: Tensor = self.placed.distance(
-            poses.transform(poses.inverse(pose), there[:, None])[:, 0]
-        ).distance
-        return distance
+        if place.ndim == 1 and bool(place.isnan().any()):
+            return pose.new_zeros(len(pose))
+        there = torch.where(torch.isnan(place), pose[:, :3], place) if place.ndim > 1 else place
+        return distance_at(self.placed, pose, there)[0]
 
 
 class SharedOnset(OnsetLocation):
