@@ -112,7 +112,7 @@ NUMBERS: dict[str, tuple[Callable[[Any], Any], tuple[Any, ...]]] = {
     "angle": (lambda v: UniformPose(poses.identity(), 0.1, v), (-0.1, 4.0)),
     "tilt": (lambda v: SwingTwistPose(poses.identity(), 0.1, v, 0.1), (-0.1, 4.0)),
     "yaw": (lambda v: SwingTwistPose(poses.identity(), 0.1, 0.1, v), (-0.1, 4.0)),
-    "half width": (lambda v: UniformPose(poses.identity(), v, 0.1), (-0.1, [0.1, 0.1])),
+    "half width": (lambda v: UniformPose(poses.identity(), v, 0.1), (-0.1,)),
 }
 
 

@@ -130,7 +130,7 @@ def test_tilt_and_yaw_of_known_rotations() -> None:
         (lambda: Freedom("", "none"), "free"),
         (lambda: SwingTwistPose(poses.identity(), 0.02, 0.1, 0.0), "yaw"),
         (lambda: UniformPose(poses.identity(), 0.02, 200.0), "angle = 200.0 rad"),
-        (lambda: UniformPose(poses.identity(), -0.02, 0.1), "half widths"),
+        (lambda: UniformPose(poses.identity(), -0.02, 0.1), "half width"),
         (lambda: UniformPose([0, 0, 0, 2, 0, 0, 0], 0.02, 0.1), "unit length"),
         (lambda: NormalPose(poses.identity(), [0.1, 0.0], Freedom("x", "z")), "positive definite"),
         (lambda: NormalPose(poses.identity(), [0.1, 0.1]), "free axes"),

@@ -187,9 +187,8 @@ class ContactManifold(LazyDistribution):
         """
         kinds = {type(site.motion) for site in sites}
         together = getattr(next(iter(kinds)), "together", None) if len(kinds) == 1 else None
-        if together is None:
-            moved = [None] * len(sites)
-        else:
+        moved: Sequence[Tensor | None] = [None] * len(sites)
+        if together is not None:
             moved = together([site.motion for site in sites], [site.pose for site in sites])
         state, drawn = torch.get_rng_state(), []
         for site, rows in zip(sites, moved, strict=True):

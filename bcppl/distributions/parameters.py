@@ -13,7 +13,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
@@ -76,11 +75,8 @@ def check_parameters(distribution: Any) -> None:
         setattr(distribution, name, allowed.checked(what, getattr(distribution, name)))
 
 
-def check_shape(
-    where: str, name: str, value: Tensor | npt.NDArray[Any] | float | None, *shapes: tuple[int, ...]
-) -> None:
+def check_shape(where: str, name: str, value: Any, *shapes: tuple[int, ...]) -> None:
     """Check that an array, where one is given, has one of some shapes."""
     if isinstance(value, Tensor | np.ndarray) and tuple(value.shape) not in shapes:
-        raise InputError(
-            f"{where} has {name} of shape {tuple(value.shape)}; give {' or '.join(map(str, shapes))}."
-        )
+        fitting = " or ".join(str(tuple(shape)) for shape in shapes)
+        raise InputError(f"{where} has {name} of shape {tuple(value.shape)}; give {fitting}.")

@@ -10,7 +10,6 @@ from bcppl.distributions.depth.cluttered import ClutteredDepth
 from bcppl.distributions.depth.image import DepthDistribution
 from bcppl.distributions.depth.noise import LaplaceDepth, OccludedDepth, RobustDepth
 from bcppl.distributions.depth.observed import Observed
-from bcppl.distributions.depth.rendering import PixelHits, RendersDepth
 
 __all__ = [
     "ClutteredDepth",
@@ -18,7 +17,5 @@ __all__ = [
     "LaplaceDepth",
     "Observed",
     "OccludedDepth",
-    "PixelHits",
-    "RendersDepth",
     "RobustDepth",
 ]

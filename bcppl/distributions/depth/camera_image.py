@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -51,10 +50,8 @@ class CameraImage(LazyDistribution):
     def _where(self) -> str:
         return f"{type(self).__name__} of camera {self.camera.name!r}"
 
-    def _check_shape(
-        self, name: str, value: npt.NDArray[Any] | Tensor | float | None, *shapes: tuple[int, ...]
-    ) -> None:
-        check_shape(self._where, name, value, *(tuple(shape) for shape in shapes))
+    def _check_shape(self, name: str, value: Any, *shapes: tuple[int, ...]) -> None:
+        check_shape(self._where, name, value, *shapes)
 
     def _check_image(self, value: Tensor) -> None:
         """Check that an observation is one image, or one for each particle."""

@@ -3,14 +3,13 @@
 The attribute `freedom` of each is its free axes; the others are held at the values of its centre.
 """
 
-from bcppl.distributions.poses.base import HELD, UNIT
+from bcppl.distributions.poses.base import HELD
 from bcppl.distributions.poses.boxed import BoxedNormal
 from bcppl.distributions.poses.normal import MixturePose, NormalPose
 from bcppl.distributions.poses.uniform import SwingTwistPose, UniformPose, prior_from_guess, tilt_and_yaw
 
 __all__ = [
     "HELD",
-    "UNIT",
     "BoxedNormal",
     "MixturePose",
     "NormalPose",

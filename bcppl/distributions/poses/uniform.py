@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses, quaternions
+from bcppl.arguments import number_within
 from bcppl.distributions.parameters import Range
 from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
 from bcppl.errors import InputError
@@ -22,16 +23,10 @@ class _BoxPose(PoseDistribution):
     """Uniform in a box, times Haar measure restricted to a set of rotations of a normalised `measure`."""
 
     def __init__(self, center: Any, translation: Any, rotation: str, measure: float) -> None:
-        try:
-            self.widths = torch.as_tensor(translation, dtype=torch.float64).expand(3)
-            usable = bool((torch.isfinite(self.widths) & (self.widths >= 0)).all())
-        except (TypeError, ValueError, RuntimeError):
-            usable = False
-        if not usable:
-            raise InputError(
-                f"{type(self).__name__} has half widths {translation!r}; give one number for all axes, or "
-                "three, in metres: positive, or 0 for a held axis."
-            )
+        what = f"{type(self).__name__} has a half width of {{}} m"
+        each = np.broadcast_to(np.asarray(translation, dtype=object), 3)
+        widths = [number_within(what, width, least=0.0) for width in each]
+        self.widths = torch.tensor(widths, dtype=torch.float64)
         free = "".join(axis for axis, width in zip("xyz", self.widths.tolist(), strict=True) if width > 0)
         super().__init__(poses.as_pose(center, "the centre of a pose prior"), Freedom(free, rotation))
         volume = torch.log(2.0 * self.widths[self.widths > 0])

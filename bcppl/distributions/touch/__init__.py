@@ -8,14 +8,13 @@ where they are latent.
 
 from bcppl.distributions.touch.direction import ForceDirection
 from bcppl.distributions.touch.onset import FreePath, OnsetLocation
-from bcppl.distributions.touch.path import Located, Path
+from bcppl.distributions.touch.path import Path
 from bcppl.distributions.touch.placed import Placed
 from bcppl.distributions.touch.shared_error import SharedError, SharedOnset
 
 __all__ = [
     "ForceDirection",
     "FreePath",
-    "Located",
     "OnsetLocation",
     "Path",
     "Placed",
