@@ -32,7 +32,10 @@ class Gaps(Protocol):
         """(N, T, 6) its derivatives in the tangent space at the part's poses."""
 
 
-MeasuresGap = Callable[[Tensor, Tensor], Gaps]
+class MeasuresGap(Protocol):
+    """`bcppl.geometry.gap.PegGap`, or another that measures gaps at poses (N, 7) and (T, 7) or (N, T, 7)."""
+
+    def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gaps: ...  # noqa: D102
 
 
 class Quadratic(NamedTuple):
@@ -68,8 +71,7 @@ class ContactManifold(LazyDistribution):
     NaN where that is undecided.
 
     Args:
-        gap: `gap(world_from_part, world_from_peg)` of poses (N, 7) and (T, 7) or (N, T, 7), such as
-            `bcppl.geometry.gap.PegGap`.
+        gap: measures gaps.
         pose: (N, 7) world_from_part.
         stamps: T.
         noise: m, of the gap at one stamp: the measured peg's position, and its turn times the peg's length.

@@ -13,7 +13,7 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
 
-WRAPPERS = Independent | ExpandedDistribution | MaskedDistribution
+WRAPPERS = (Independent, ExpandedDistribution, MaskedDistribution)
 
 
 def base(distribution: Any) -> Any:
