@@ -105,14 +105,6 @@ def test_diverged_particles_are_impossible_and_bad_settings_refused() -> None:
         Wrench(track, 2, 1, 0.3, 0.02)
 
 
-def test_an_observation_of_other_stamps_is_refused() -> None:
-    likelihood = Wrench(told(3, stamps=100), 0, 100, 0.3, 0.02)
-    for shape in ((1, 6), (90, 6), (100, 3), (3, 1, 6), (6,)):
-        with pytest.raises(InputError, match="100 stamps but its observation"):
-            likelihood.log_prob(torch.zeros(shape, dtype=torch.float64))
-    assert likelihood.log_prob(torch.zeros(3, 100, 6, dtype=torch.float64)).shape == (3,)
-
-
 def test_the_truth_explains_its_own_wrench_best() -> None:
     """A press near the block's edge: whichever way the block is off, force or torque differ."""
     times, command = np.array([0.0, 0.4, 0.8]), np.tile([0.012, 0.0, 0.06, 1.0, 0, 0, 0], (3, 1))
