@@ -94,7 +94,7 @@ def test_an_image_that_is_missing_says_nothing() -> None:
     scene, program = looked_at()
     still = torch.zeros(3, dtype=torch.float64)
     empty = torch.full_like(of_view(scene), math.nan)
-    with pytest.warns(UserWarning, match="every pixel is missing"):
+    with pytest.warns(UserWarning, match="does not inform the pose, as all are missing"):
         assert surprise(belief(program, (still,), {"depth": empty}))["depth"].probability == 1.0
 
 

@@ -229,9 +229,9 @@ class DepthDistribution(CameraImage):
         if not valid.any():
             near, far = self.camera.near, self.camera.far
             warnings.warn(
-                f"no pixel of a depth image of camera {self.camera.name!r} counts, which does not inform the "
-                f"pose: all are missing, out of its range of {near:.4g} to {far:.4g} m (millimetres?), or "
-                "outside the region.",
+                f"no pixel of a depth image of camera {self.camera.name!r} counts: it does not inform the pose, "
+                f"as all are missing, out of its range of {near:.4g} to {far:.4g} m (millimetres?), or outside "
+                "the region.",
                 stacklevel=3,
             )
         behind = self._behind
