@@ -227,10 +227,10 @@ class DepthDistribution(CameraImage):
         if self.region is not None:
             valid &= np.asarray(self.region, dtype=bool).reshape(-1)
         if not valid.any():
-            near, far = self.camera.near, self.camera.far
+            name, near, far = self.camera.name, self.camera.near, self.camera.far
             warnings.warn(
-                f"no pixel of a depth image of camera {self.camera.name!r} counts: it does not inform the pose, "
-                f"as all are missing, out of its range of {near:.4g} to {far:.4g} m (millimetres?), or outside "
+                f"no pixel of a depth image of camera {name!r} counts: it does not inform the pose, as all "
+                f"are missing, out of its range of {near:.4g} to {far:.4g} m (millimetres?), or outside "
                 "the region.",
                 stacklevel=3,
             )
