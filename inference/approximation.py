@@ -78,14 +78,7 @@ class GaussianApproximation:
     def including(
         self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]
     ) -> GaussianApproximation:
-        """The approximation given one more measurement.
-
-        Args:
-            scene: of the model, which knows the measurement.
-            number: of the measurement in the recording.
-            action: what the robot did.
-            observations: values by address, the measurement's among them.
-        """
+        """The approximation given one more measurement, the `number`-th of the recording."""
         longer = self.updated().deferring(scene, number, action, observations)
         return replace(longer, stale=longer.stale or bool(longer.contacts)).updated()
 
@@ -179,9 +172,7 @@ class GaussianApproximation:
     def conditional(self, trace: Any, values: Mapping[str, Tensor] | None = None) -> Any:
         """The approximate conditional distribution of the pose, given each particle's nuisance parameters.
 
-        Args:
-            trace: of N particles.
-            values: nuisance parameters that it does not have, by address.
+        `values` has those that the trace lacks, by address.
         """
         looked_up = _Values(trace, {} if values is None else values)
         factors: list[PoseFactor] = [

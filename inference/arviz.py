@@ -154,11 +154,7 @@ def _of_chains(arviz: Any, chains: Chains, draws: int | None) -> Any:
 
 
 def import_arviz() -> Any:
-    """The package arviz, imported without its notice about version 1.
-
-    Raises:
-        InputError: it is not installed, or is too new.
-    """
+    """The package arviz, imported without its notice about version 1."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -172,22 +168,14 @@ def import_arviz() -> Any:
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Torch's generator seeded within, and restored afterwards.
-
-    Raises:
-        InputError: the seed is not a whole number, 0 or more.
-    """
+    """Torch's generator seeded within, and restored afterwards."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed_number(seed))
         yield
 
 
 def check_alike(populations: Sequence[Population]) -> None:
-    """Refuse populations that are not of one program and the same observations.
-
-    Raises:
-        InputError: there is none, or they differ; names the run and the difference.
-    """
+    """Refuse populations that are not of one program and the same observations."""
     if not populations:
         raise InputError("no population was given; give one or more.")
     first = populations[0].trace
@@ -207,12 +195,7 @@ def check_alike(populations: Sequence[Population]) -> None:
 
 
 def draw(populations: Sequence[Population], draws: int | None, scheme: Scheme = systematic) -> list[Tensor]:
-    """Indices of equal-weight draws, (draws,) int64 for each population, in random order.
-
-    Raises:
-        InputError: `draws` is not a whole number, 1 or more.
-        NoWeightError: no particle of a population has any weight.
-    """
+    """Indices of equal-weight draws, (draws,) int64 for each population, in random order."""
     draws = min(map(len, populations)) if draws is None else whole_number("{} draws were asked for", draws)
     # A scheme gives ancestors in order; draws in order would look like a chain that does not mix.
     return [scheme(population.log_weights, draws)[torch.randperm(draws)] for population in populations]

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bcppl.arguments import whole_number
-from bcppl.errors import InputError
+from bcppl.arguments import latent_address, whole_number
 from bcppl.inference.kernels import Kernel, fitted, refuse_other, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
@@ -81,11 +80,7 @@ def markov_chains(
     addresses = [addresses] if isinstance(addresses, str) else addresses
     recorded = list(trace.choices if addresses is None else addresses)
     for address in recorded:
-        if address not in trace.choices:
-            raise InputError(
-                f"chains are to record {address!r}, which is no latent address; "
-                f"latent are {', '.join(trace.choices) or 'none'}."
-            )
+        latent_address("chains are to record {}", address, trace.choices)
     order = torch.randperm(count)
     halves = [h for h in (order[: count // 2], order[count // 2 :]) if len(h)]
     moves_of = [fitted(kernel, population[other]) for other in halves[::-1]]

@@ -100,9 +100,5 @@ def distinct(step: Any) -> int:
 
 
 def mean(address: str) -> Callable[[Any], Tensor]:
-    """The weighted mean of a latent address: of a pose (7,), of another value the shape of its event.
-
-    Returns:
-        A function of a step. It raises InputError where no latent site has that address.
-    """
+    """The weighted mean of a latent address: of a pose (7,), of another value the shape of its event."""
     return lambda step: summaries.mean(step.population, address)

@@ -115,12 +115,8 @@ def gauss_newton(
 ) -> tuple[Tensor, Tensor]:
     """The poses (M, 7) of highest posterior density that are reached, and their log-densities (M,).
 
-    Args:
-        sites: the likelihood.
-        starts: (S, 7).
-        prior: of the pose.
-        blurs: metres that are added to the errors at each step, 0 in the end.
-        least: half of the starts are kept at each step, but at least so many.
+    Each step adds one of `blurs` (m) to the errors, 0 in the end, and keeps half of the starts (S, 7), but at
+    least so many.
     """
     center, precision = prior
     pose, density = starts, torch.zeros(len(starts))

@@ -10,6 +10,7 @@ from typing import Any, overload
 import torch
 from torch import Tensor
 
+from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised
 from bcppl.distributions.support import freedom_of, refuse_several_poses
 from bcppl.errors import InferenceError, InputError
@@ -185,11 +186,7 @@ class Population:
         Raises:
             InputError: no latent site has that address, or no pose is there.
         """
-        if address not in self.trace.choices:
-            raise InputError(
-                f"a belief over {address!r} was asked for, which is no latent address; "
-                f"latent are {', '.join(self.trace.choices) or 'none'}."
-            )
+        latent_address("a belief over {} was asked for", address, self.trace.choices)
         poses, site = self.trace[address], self.trace.distributions[address]
         refuse_several_poses(address, poses, site)
         freedom = freedom_of(site)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised, weighted_quantiles
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
@@ -26,18 +27,10 @@ Address = str | tuple[str, int]
 
 
 def values_at(population: Population, address: Address) -> Tensor:
-    """The values (N, *event) at a latent address.
-
-    Raises:
-        InputError: no latent site has that address.
-    """
+    """The values (N, *event) at a latent address."""
     trace = population.trace
     name = address if isinstance(address, str) else address[0]
-    if name not in trace.choices:
-        raise InputError(
-            f"a summary of {name!r} was asked for, which is no latent address; "
-            f"latent are {', '.join(trace.choices) or 'none'}."
-        )
+    latent_address("a summary of {} was asked for", name, trace.choices)
     if isinstance(address, str):
         return trace.choices[address]
     if not isinstance(trace, SeriesTrace):

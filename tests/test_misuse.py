@@ -70,7 +70,7 @@ def steadily(trace: Trace, size: float) -> None:
 
 walk = metropolis_hastings(nudge)
 SEEN = Observed((1,), {"y_0": number(0.4)})
-WRAP = r"wrap it in metropolis_hastings"
+WRAP = r"wrap a proposal in metropolis_hastings"
 anything: Any = None
 
 MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
@@ -107,10 +107,7 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
         r"given a tuple .* Population\(\*\.\.\.\)",
     ),
     "one Observed": (lambda: steps(tempered(), start(), SEEN), "give a list of them"),  # type: ignore[arg-type]
-    "an address instead of Observed": (
-        lambda: list(steps(tempered(), start(), ["y_0"])),
-        "steps is given a str",
-    ),  # type: ignore[list-item]
+    "an address instead of Observed": (lambda: list(steps(tempered(), start(), ["y_0"])), "given a str"),  # type: ignore[list-item]
     "arguments that are no tuple": (lambda: Observed(1, {}), r"given a int .* \(5,\)"),  # type: ignore[arg-type]
     "observations without addresses": (lambda: Observed((1,), number(0.4)), "a Tensor as observations"),  # type: ignore[arg-type]
     "a kernel to temper with": (

@@ -38,11 +38,7 @@ class DistinctParticles:
 
     @classmethod
     def of(cls, population: Population, address: str) -> DistinctParticles:
-        """Those of a population.
-
-        Raises:
-            InputError: no latent site has the address, or all particles with weight have the same value.
-        """
+        """Those of a population; InputError where all particles with weight have the same value."""
         weights = torch.softmax(population.log_weights, 0)
         particles = (weights > 0).nonzero().flatten()
         values, pose = values_at(population, address)[particles], is_pose(population, address)
@@ -72,11 +68,7 @@ class DistinctParticles:
 def separate_modes(
     distinct: Tensor, translation: float, rotation: float, symmetries: Tensor | None = None
 ) -> tuple[Tensor, tuple[float, float]]:
-    """The mode (K,) int64 of each of distinct poses (K, 7), and the gap between modes (m, rad) that was used.
-
-    Raises:
-        InputError: a gap is not positive.
-    """
+    """The mode (K,) int64 of each of distinct poses (K, 7), and the gap between modes (m, rad) in use."""
     number_within("modes are to be separated by {} m", translation, above=0.0)
     number_within("modes are to be separated by {} rad", rotation, above=0.0)
     # A wide belief with few particles has no neighbours within the gap, and that makes no modes of them.

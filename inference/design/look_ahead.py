@@ -70,13 +70,6 @@ def best_second_step(
 
     Each outer sample's observation reweights the particles (N,), and with them the outer samples: with these
     weights and the second draw of the noise, they are the samples of the second step.
-
-    Args:
-        number: of the candidate that is measured first.
-        candidates: all (C), with their second draws.
-        log_weights: (N,) of the population.
-        outer: (S) outer samples.
-        entropy_of: the entropy that is to be reduced.
     """
     seconds = torch.stack([each.second for each in candidates if each.second is not None])
     costs = torch.tensor([each.cost for each in candidates], dtype=torch.float64)

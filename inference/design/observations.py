@@ -84,9 +84,6 @@ class SimulatedCandidate:
 
         A row is NaN where the observation has no probability anywhere: the simulation of that outer sample
         failed, or no particle can explain it.
-
-        Raises:
-            InferenceError: a log-probability is +inf, or all rows are NaN.
         """
         return mark_failures(self.observed, log_likelihoods(self.trace, self.observed, values))
 
@@ -100,15 +97,7 @@ def simulate_candidates(
 ) -> Iterator[SimulatedCandidate]:
     """Every candidate, simulated once at all particles; the noise has the same seed for each.
 
-    Args:
-        trace: of N particles.
-        candidates: those to choose from.
-        arguments: the program's arguments after a candidate, or `BatchedArguments`.
-        latent: new addresses that would not be observed, with wildcards ("bias_*").
-        seed: of new latent values.
-
-    Raises:
-        InputError: a candidate adds nothing to observe, or a batch visits other addresses than a candidate.
+    Addresses that match a pattern in `latent` would not be observed ("bias_*").
     """
     if not isinstance(arguments, BatchedArguments):
         for k, candidate in enumerate(candidates):
@@ -136,11 +125,7 @@ def simulate_candidates(
 
 
 def observed_addresses(number: int, longer: Trace, trace: Trace, latent: Collection[str] = ()) -> list[str]:
-    """The addresses that a candidate adds to a trace, without those that are latent.
-
-    Raises:
-        InputError: there are none.
-    """
+    """The addresses, one at least, that a candidate adds to a trace and that are not latent."""
     added = longer.since(trace)
     observed = [
         a for a in added if a in longer.choices and not any(fnmatchcase(a, pattern) for pattern in latent)
@@ -165,13 +150,7 @@ def seeded(seed: int) -> Iterator[None]:
 class PredictedCandidate:
     """A candidate whose observations come from a predictive sampler; its sites need only `log_prob`.
 
-    Attributes:
-        trace: of the N particles, not extended.
-        number: of the candidate.
-        candidate: as it was given.
-        args: the program's arguments once it is measured.
-        predictive: the sampler.
-        seed: of new latent values.
+    The trace of the N particles is not extended; `args` are the program's once the candidate is measured.
     """
 
     trace: Trace
@@ -182,11 +161,7 @@ class PredictedCandidate:
     seed: int
 
     def draw(self, particles: Tensor, seed: int) -> Observations:
-        """Observations if particles (S,) were the true value.
-
-        Raises:
-            InputError: the sampler gives nothing, or not one value for each of these particles.
-        """
+        """Observations if particles (S,) were the true value."""
         with seeded(seed):
             values = self.predictive(self.candidate, self.trace.chosen(particles))
         wrong = [a for a, v in values.items() if not isinstance(v, Tensor) or len(v) != len(particles)]
@@ -199,12 +174,7 @@ class PredictedCandidate:
         return values
 
     def log_likelihoods(self, values: Observations) -> Tensor:
-        """Log-likelihood (S, N) of every observation at every particle, as `extend` evaluates it.
-
-        Raises:
-            InputError: the program does not visit an address, or a value has the wrong shape.
-            InferenceError: no row could be evaluated.
-        """
+        """Log-likelihood (S, N) of every observation at every particle, as `extend` evaluates it."""
         rows, failure = [], None
         for k in range(len(next(iter(values.values())))):
             try:

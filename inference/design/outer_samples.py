@@ -32,11 +32,7 @@ class OuterSamples:
 
 
 def draw_outer_samples(population: Population, count: int | None) -> OuterSamples:
-    """`count` particles drawn systematically by weight; None: every particle with weight once, by its weight.
-
-    Raises:
-        InputError: the population has no weight, or the count is no whole number, 2 or more.
-    """
+    """`count` particles drawn systematically by weight; None: every one with weight once, by its weight."""
     if not math.isfinite(population.log_total):
         raise InputError(
             "the belief has no weight: every particle's is zero, so that no outer sample can be drawn; widen "

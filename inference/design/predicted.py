@@ -64,12 +64,7 @@ def predict_observations(
     information: Information | None,
     seed: int,
 ) -> list[PredictedObservations]:
-    """Each candidate's predicted observations at the particles of a trace; alike sites are drawn in a batch.
-
-    Raises:
-        InputError: a candidate adds nothing to observe, or a site without a quadratic approximation;
-            `information` gives matrices that are not symmetric, or negative.
-    """
+    """Each candidate's predicted observations at a trace's particles; alike sites are drawn in a batch."""
     predicted: list[PredictedObservations] = []
     for k, candidate in enumerate(candidates):
         args = arguments(candidate)

@@ -151,11 +151,7 @@ def rank(utilities: Sequence[Utility], entropy: float) -> Ranking:
 def checked(
     candidates: Iterable[Any], cost: Costs | None, rate: Cost, horizon: int, seed: int | None
 ) -> tuple[list[Any], list[float], int]:
-    """The candidates, the cost of each in nats, and the seed; None draws one from torch's generator.
-
-    Raises:
-        InputError: there are no candidates, or a cost, a rate, the horizon or the seed is out of range.
-    """
+    """The candidates, the cost of each in nats, and the seed; None draws one from torch's generator."""
     candidates = list(candidates)
     if not candidates:
         raise InputError("there are no candidates to choose from; give one action or more.")
@@ -165,16 +161,10 @@ def checked(
 
 
 def costs_in_nats(candidates: Sequence[Any], cost: Costs | None, rate: Cost) -> list[float]:
-    """The cost of each candidate in nats.
+    """The cost of each candidate in nats; without costs all are free.
 
-    Args:
-        candidates: those to choose from.
-        cost: of a candidate: a number, or several by name ({"time": 2.0, "force": 5.0}). None: all are free.
-        rate: nats for one unit of cost; by name where costs are.
-
-    Raises:
-        InputError: a candidate has no cost, a cost has no rate or a rate no cost, or one of them is no finite
-            number.
+    A cost is a number, or several by name ({"time": 2.0, "force": 5.0}); the rate is nats for one unit of it,
+    by name where costs are.
     """
     if cost is None and rate != 1.0:
         raise InputError(

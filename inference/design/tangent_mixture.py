@@ -45,11 +45,7 @@ class TangentMixture:
     def fit(
         cls, population: Population, address: str, translation: float = 0.01, rotation: float = 0.2
     ) -> TangentMixture:
-        """The Gaussians of `mixture_entropy`: copies are merged, each mode has its particles' covariance.
-
-        Raises:
-            InputError: the address is of no pose, all particles are the same, or they do not span its axes.
-        """
+        """The Gaussians of `mixture_entropy`: copies are merged, each mode has its particles' covariance."""
         if not is_pose(population, address):
             raise InputError(
                 f"{address!r} holds no poses, in whose tangent space information could be summed; "

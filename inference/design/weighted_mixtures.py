@@ -42,11 +42,7 @@ class WeightedMixtures:
         label: Tensor,
         linked: Tensor | None,
     ) -> WeightedMixtures:
-        """Of points whose belief has weights (K,) and modes that are labelled (K,) from 0.
-
-        Raises:
-            InputError: the points do not span the axes within the modes.
-        """
+        """Of points whose belief has weights (K,) and modes that are labelled (K,) from 0."""
         dimension = coordinates.shape[1]
         modes = int(label.max()) + 1
         mass = torch.zeros(modes, dtype=torch.float64).index_add_(0, label, weights)
@@ -112,11 +108,7 @@ class WeightedMixtures:
 
 
 def cholesky_factor(address: str, covariance: Tensor) -> Tensor:
-    """The lower Cholesky factor of a covariance (d, d) of particles.
-
-    Raises:
-        InputError: it is singular.
-    """
+    """The lower Cholesky factor of a covariance (d, d) of particles; InputError where it is singular."""
     scale = covariance.diagonal().clamp_min(0.0).sqrt()
     # A picometre is rounding.
     if bool((scale > 1e-12).all()):

@@ -7,7 +7,7 @@ proposals.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -21,12 +21,22 @@ from bcppl.inference.targets import Target
 from bcppl.traces import Trace
 
 
-def _one_after_another(moves: Sequence[Move], trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-    total = torch.zeros(trace.particles, dtype=torch.float64)
-    for each in moves:
-        trace, accepted = each(trace, target)
-        total = total + accepted
-    return trace, total / len(moves)
+def _one_after_another(kernels: Sequence[Kernel], order: Callable[[int], Iterable[int]]) -> Kernel:
+    """The moves of K kernels by number, in the order that `order(K)` gives for each move."""
+
+    def together(population: Population) -> Move:
+        moves = [fitted(kernel, population) for kernel in kernels]
+
+        def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
+            total, numbers = torch.zeros(trace.particles, dtype=torch.float64), list(order(len(moves)))
+            for number in numbers:
+                trace, accepted = moves[number](trace, target)
+                total = total + accepted
+            return trace, total / len(numbers)
+
+        return move
+
+    return together
 
 
 def _listed(name: str, kernels: Sequence[Kernel | Sequence[Kernel]]) -> list[Kernel]:
@@ -46,13 +56,7 @@ def sequence(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
     Raises:
         InputError: no kernel is given, or something else, such as a proposal.
     """
-    listed = _listed("sequence", kernels)
-
-    def together(population: Population) -> Move:
-        moves = [fitted(kernel, population) for kernel in listed]
-        return lambda trace, target: _one_after_another(moves, trace, target)
-
-    return together
+    return _one_after_another(_listed("sequence", kernels), range)
 
 
 def cycle(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
@@ -63,18 +67,7 @@ def cycle(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
     Raises:
         InputError: no kernel is given, or something else, such as a proposal.
     """
-    listed = _listed("cycle", kernels)
-
-    def together(population: Population) -> Move:
-        moves = [fitted(kernel, population) for kernel in listed]
-
-        def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-            order = torch.randperm(len(moves)).tolist()
-            return _one_after_another([moves[k] for k in order], trace, target)
-
-        return move
-
-    return together
+    return _one_after_another(_listed("cycle", kernels), lambda count: torch.randperm(count).tolist())
 
 
 def mixture(kernels: Sequence[Kernel] | Kernel, *more: Any, weights: Sequence[float] | None = None) -> Kernel:
@@ -95,10 +88,7 @@ def mixture(kernels: Sequence[Kernel] | Kernel, *more: Any, weights: Sequence[fl
     if isinstance(kernels, Sequence) and len(more) == 1 and weights is None and not callable(more[0]):
         weights, more = more[0], ()
     listed = _listed("mixture", (kernels, *more))
-    try:
-        chances = torch.as_tensor([1.0] * len(listed) if weights is None else weights, dtype=torch.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"mixture is given weights {weights!r}; give one number for each kernel.") from None
+    chances = torch.as_tensor([1.0] * len(listed) if weights is None else weights, dtype=torch.float64)
     sound = chances.shape == (len(listed),) and bool((torch.isfinite(chances) & (chances >= 0.0)).all())
     if not sound or not bool(chances.sum() > 0.0):
         raise InputError(
@@ -137,9 +127,4 @@ def repeat(kernel: Kernel, times: int) -> Kernel:
     """
     refuse_other("repeat", kernel)
     times = whole_number("a kernel is to be repeated {} times", times)
-
-    def together(population: Population) -> Move:
-        moves = [fitted(kernel, population)] * times
-        return lambda trace, target: _one_after_another(moves, trace, target)
-
-    return together
+    return _one_after_another([kernel], lambda count: [0] * times)

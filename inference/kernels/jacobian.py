@@ -248,11 +248,7 @@ def refuse_leaving(address: str, chart: Chart, old: Tensor, new: Tensor) -> None
 
 
 def refuse_apart(what: str, first: Point, second: Mapping[Key, Tensor], tolerance: float = 1e-6) -> None:
-    """Refuse a move and its reverse that do not end where they began.
-
-    Raises:
-        InputError: names the address and the particle.
-    """
+    """Refuse a move and its reverse that do not end where they began."""
     for (kind, address), (value, chart) in first.items():
         apart = ~(chart.apart(value, second[kind, address]) <= tolerance)
         if bool(apart.any()):

@@ -92,11 +92,7 @@ class Staged(Target):
 Surrogate = Callable[[Population], Callable[[Trace], Tensor]]
 
 
-def _unscreened(trace: Trace) -> Tensor:
-    return torch.zeros(trace.particles, dtype=torch.float64)
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Screened(Target):
     """A target that accepts in two stages, the first decided by a surrogate of its log-density.
 
@@ -107,7 +103,7 @@ class Screened(Target):
         surrogate: a log-density (N,) of a trace, up to a constant; it reads latent values.
     """
 
-    surrogate: Callable[[Trace], Tensor] = _unscreened
+    surrogate: Callable[[Trace], Tensor]
 
     def accept(self, old: Trace, new: Trace, log_ratio: Tensor) -> tuple[Tensor, Trace]:
         """Which particles take their proposals: see `Target.accept`."""
@@ -209,8 +205,9 @@ def delayed_acceptance(
                 raise InputError(
                     "delayed acceptance cannot divide a target that is a plain function; give a Target."
                 )
-            staged: Target = Staged(target.exponents, patterns, stages - 1)
-            return move(trace, staged if screen is None else Screened(target.exponents, screen))
+            if screen is not None:
+                return move(trace, Screened(exponents=target.exponents, surrogate=screen))
+            return move(trace, Staged(target.exponents, patterns, stages - 1))
 
         return in_stages
 

@@ -103,11 +103,7 @@ def plan_candidates(
 
 
 def require_uncertain(belief: Belief) -> None:
-    """Raise where a belief has no weight, or no uncertainty that a measurement could reduce.
-
-    Raises:
-        InputError: no particle has weight, or all with weight are at one pose.
-    """
+    """Raise InputError where a belief has no weight, or no uncertainty that a measurement could reduce."""
     try:
         distinct = belief.distinct
     except InferenceError as error:

@@ -83,11 +83,7 @@ def feasible(candidates: Iterable[Candidate], constraints: Sequence[Constraint])
 
 
 def require_candidates(candidates: Candidates) -> Candidates:
-    """The candidates, of which there must be one.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The candidates; InputError where there is none."""
     if len(candidates):
         return candidates
     if not candidates.violations:

@@ -54,11 +54,7 @@ class TopPoints(NamedTuple):
 
 
 def section(part: Part, height: float) -> shapely.Polygon:
-    """The cross section of a part at a height z in its frame, the largest piece of it, metres.
-
-    Raises:
-        InputError: the part does not reach there.
-    """
+    """The cross section of a part at a height z in its frame, the largest piece of it, metres."""
     path = part.mesh.section(plane_origin=[0.0, 0.0, height], plane_normal=[0.0, 0.0, 1.0])
     if path is None:
         raise InputError(
@@ -76,9 +72,6 @@ def points_on_top(part: Part, peg: Part, margin: float) -> TopPoints:
     The peg's whole cross section stays on the top, `margin` metres from its outer edge where there is room
     for that, and 2 mm from holes. Of all such triples of candidates, the one with the largest triangle; where
     slides cannot lead far, as on a narrow rim, the peg is lifted to the third.
-
-    Raises:
-        InputError: the top has no room for the peg.
     """
     top = float(part.vertices[:, 2].max())
     outline = section(part, top - _BELOW)

@@ -75,11 +75,7 @@ class PlanningProblem:
 
     @property
     def held_peg(self) -> Part:
-        """The peg.
-
-        Raises:
-            InputError: there is none.
-        """
+        """The peg; InputError where there is none."""
         if self.peg is None:
             raise InputError(
                 "there is no peg to touch the part with; add the peg to the recording, or ask for views."
@@ -88,11 +84,7 @@ class PlanningProblem:
 
     @property
     def peg_gap(self) -> PegGap:
-        """The gap of part and peg.
-
-        Raises:
-            InputError: there is no peg.
-        """
+        """The gap of part and peg."""
         return PegGap(self.part, self.held_peg) if self.gap is None else self.gap
 
     def generator(self, stream: int) -> np.random.Generator:

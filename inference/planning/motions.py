@@ -18,11 +18,7 @@ _SPACING = 0.002  # m between poses of a free path
 
 
 def expected_contacts(plan: Plan) -> list[tuple[Array, Array]]:
-    """The middle of each guarded stroke, where contact is expected.
-
-    Returns:
-        For each guarded motion, the peg's pose (7,) in the middle of it, and its direction (3,) in the world.
-    """
+    """The peg's pose (7,) amid each guarded stroke, and the stroke's direction (3,) in the world."""
     contacts = []
     for k, manner in enumerate(plan.manners):
         way = plan.world_from_peg[k + 1, :3] - plan.world_from_peg[k, :3]

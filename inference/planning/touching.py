@@ -86,11 +86,7 @@ _SHORTER = 0.6  # of the dwell, for each of two touches
 
 
 def surface_points(part: Part, count: int, seed: int = 0) -> list[SurfacePoint]:
-    """Points drawn evenly by area over a part's surface, inner walls and bottom included.
-
-    Raises:
-        InputError: the count is no whole number from 1 to a million, or the part has an empty mesh.
-    """
+    """Points drawn evenly by area over a part's surface, inner walls and bottom included."""
     count = whole_number("{} points of a surface were asked for", count, most=_MOST)
     seed = seed_number(seed)
     part.check(closed=False)

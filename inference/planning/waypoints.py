@@ -53,11 +53,7 @@ class StrokeLimits(Protocol):
 def half_stroke(belief: Belief, position: Array, normal: Array, limits: StrokeLimits) -> float:
     """Half the length (m) of a guarded stroke, in proportion to the uncertainty of the surface's position.
 
-    Args:
-        belief: over world_from_part.
-        position: (3,) on the surface, in the part's frame.
-        normal: (3,) of the surface there, in the part's frame.
-        limits: the proportion and the limits.
+    The position (3,) on the surface and its normal (3,) are in the part's frame.
     """
     positions = poses.transform(belief.world_from_part, torch.as_tensor(position)[None])[:, 0]
     direction = poses.rotation_matrix(belief.mean) @ torch.as_tensor(normal)

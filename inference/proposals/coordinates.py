@@ -16,6 +16,7 @@ from torch.distributions import biject_to, constraints
 from torch.distributions.transforms import IndependentTransform, Transform, identity_transform
 
 from bcppl import poses
+from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief
 from bcppl.distributions.poses import MixturePose, NormalPose
 from bcppl.distributions.support import freedom_of, refuse_several_poses
@@ -53,21 +54,12 @@ class Coordinates(Protocol):
         """The weighted mean, one place."""
 
     def normal(self, center: Tensor, covariance: Tensor, size: Tensor) -> Any:
-        """The distribution of values, one for each particle, that is normal in these coordinates.
-
-        Args:
-            center: places of the N particles.
-            covariance: (d, d).
-            size: (N,) factor of each particle's step.
-        """
+        """The normal in these coordinates at N places, its covariance (d, d) times `size` (N,) squared."""
 
     def mixture(self, log_weights: Tensor, centers: Tensor, covariance: Tensor) -> Any:
-        """A mixture of K such normals.
+        """A mixture of K normals with log weights (K,) or (N, K), at places (K, ...) or (N, K, ...).
 
-        Args:
-            log_weights: (K,) or (N, K).
-            centers: places (K, ...) or (N, K, ...).
-            covariance: (d, d), (K, d, d) or (N, K, d, d).
+        Their covariances are (d, d), (K, d, d) or (N, K, d, d).
         """
 
 
@@ -175,12 +167,7 @@ class OnSupport(dist.TransformedDistribution):
 
 
 class Unflattened(Transform):
-    """From unbounded coordinates (N, d) in float64 to the values (N, *plates, *event) of a site.
-
-    Args:
-        distribution: of the site, (*plates, N) its batch shape.
-        values: (N, *plates, *event), for their shape and type.
-    """
+    """From unbounded coordinates (N, d) in float64 to the values (N, *plates, *event) of a site."""
 
     bijective = True
     domain = constraints.real_vector
@@ -243,17 +230,8 @@ def _is_identity(transform: Transform) -> bool:
 
 
 def coordinates_of(trace: Trace, address: str) -> Coordinates:
-    """The coordinates of a latent address of a trace.
-
-    Raises:
-        InputError: the address is not latent, is discrete, has several poses for each particle, or its
-            support has no unbounded coordinates.
-    """
-    if address not in trace.choices:
-        raise InputError(
-            f"a proposal moves {address!r}, which is no latent address; "
-            f"latent are {', '.join(trace.choices) or 'none'}."
-        )
+    """The coordinates of a latent address of a trace; InputError where it has none."""
+    latent_address("a proposal moves {}", address, trace.choices)
     distribution = trace.distributions[address]
     freedom = freedom_of(distribution)
     value = trace[address]

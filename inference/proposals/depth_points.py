@@ -71,15 +71,7 @@ def depth_aligned(
 ) -> Alignment:
     """The alignment of each particle, about which `depth_alignment` proposes.
 
-    Args:
-        trace: of the particles.
-        address: of the pose.
-        sites: a pattern of the addresses of its depth images.
-        steps: of Gauss-Newton.
-        damping: (d, d) precision over the free axes of the normal prior at the start of a step.
-
-    Raises:
-        InputError: no address matches, or a site is no depth image or of another pose than that at `address`.
+    The damping (d, d) is the precision over the free axes of the normal prior at the start of a step.
     """
     images = matching(trace, "depth_alignment", [sites])
     freedom = freedom_of(trace.distributions[address]) or FREE

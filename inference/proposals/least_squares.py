@@ -99,11 +99,8 @@ def alignment_proposal(
 ) -> Fitted:
     """A proposal about the alignment of each particle.
 
-    Args:
-        address: of the pose.
-        reach: the alignment is damped by a normal prior at the old pose, with the particles' covariance times
-            this squared.
-        align: the alignment of a trace's particles, given the damping (d, d) and the free axes.
+    `align(trace, damping (d, d), free axes)` gives it, damped by a normal prior at the old pose, with the
+    particles' covariance times `reach` squared.
     """
 
     def fit(population: Population) -> Callable[[Trace], None]:
@@ -119,11 +116,7 @@ def alignment_proposal(
 
 
 def matching(trace: Trace, name: str, patterns: Sequence[str]) -> list[str]:
-    """The addresses of a trace that match one of several patterns; `name` is of the alignment.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The addresses of a trace that match one of several patterns; `name` is of the alignment."""
     matched = [a for a in trace.addresses if any(fnmatchcase(a, pattern) for pattern in patterns)]
     if not matched:
         raise InputError(
@@ -143,8 +136,7 @@ def aligned(
         equations: at those poses.
         damping: (d, d) precision of a normal prior there, which makes the step unique.
         freedom: the free axes.
-        information: (N, 6, 6) of the likelihood about the solution, where it differs from the equations'
-            precision, as that of a power likelihood does.
+        information: (N, 6, 6) of the likelihood about the solution, where it is not the equations' precision.
     """
     free = list(freedom.axes)
 

@@ -30,9 +30,6 @@ def weighted_places(population: Population, address: str) -> tuple[Coordinates, 
 
     A draw beyond the range of its type (0 or infinity where values are positive) has no place in unbounded
     coordinates, and is omitted.
-
-    Raises:
-        InferenceError: no particle with weight has a place.
     """
     coordinates = coordinates_of(population.trace, address)
     values = population.trace[address]
