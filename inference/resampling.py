@@ -9,16 +9,25 @@ ordering and convergence of resampling methods, Annals of Statistics 47, 2019.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from bcppl.arguments import number_within, whole_number
+from bcppl.arguments import number_within, seed_number, whole_number
 from bcppl.beliefs import normalised
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Torch's generator seeded within, and restored afterwards."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed_number(seed))
+        yield
 
 
 class Scheme(Protocol):
@@ -149,8 +158,6 @@ Resample = Callable[[Population], tuple[Population, Tensor | None]]
 
 def always(scheme: Scheme = systematic) -> Resample:
     """Resample at every opportunity."""
-    if not callable(scheme):
-        raise InputError(f"resampling is given {scheme!r} in place of a scheme; give one such as systematic.")
 
     def resample(population: Population) -> tuple[Population, Tensor | None]:
         ancestors = scheme(population.log_weights)

@@ -11,7 +11,6 @@ steps.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Any
@@ -22,6 +21,7 @@ from torch import Tensor
 from bcppl.arguments import whole_number
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.design.likelihoods import log_likelihoods, mark_failures
+from bcppl.inference.resampling import seeded
 from bcppl.traces import Trace, extend, regenerate
 
 Arguments = Callable[[Any], tuple[Any, ...]]
@@ -136,14 +136,6 @@ def observed_addresses(number: int, longer: Trace, trace: Trace, latent: Collect
             "give arguments that hold the old measurements and the new one."
         )
     return observed
-
-
-@contextmanager
-def seeded(seed: int) -> Iterator[None]:
-    """Draws within start from a seed; the generator's state is restored afterwards."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        yield
 
 
 @dataclass(frozen=True, eq=False)

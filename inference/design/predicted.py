@@ -11,7 +11,8 @@ from torch import Tensor
 
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
-from bcppl.inference.design.observations import Arguments, observed_addresses, seeded
+from bcppl.inference.design.observations import Arguments, observed_addresses
+from bcppl.inference.resampling import seeded
 from bcppl.traces import Trace
 from bcppl.traces.update import undrawn
 

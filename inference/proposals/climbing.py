@@ -1,9 +1,9 @@
-"""Modes found by climbs from all over the prior, and jumps between them: where the best mode is narrow.
+"""Modes reached by climbs from all over the prior, and jumps between them: where the best mode is narrow.
 
 Tempering follows the mass: where a wide mode holds more of it at a low exponent than a narrow one that wins
 in the end, all particles are in the wide one before that comes to light, and more particles hardly help.
 Climbers do not compete until they have climbed. What they find is used for proposals, accepted by Metropolis
-and Hastings: the posterior weighs the modes, and no answer hangs on how they were found.
+and Hastings: the posterior weighs the modes, and no answer depends on how they were reached.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def modes(start: Trace, address: str, *, most: int = 8) -> Modes:
 
     Args:
         start: of a program with all its observations, its latent values drawn from the prior. The more
-            particles, the narrower a mode may be that is found.
+            particles, the narrower a mode may be that is reached.
         address: of the pose that is moved; other latent values stay as they are.
         most: modes that are kept.
 
@@ -131,21 +131,21 @@ def fitted(trace: Trace, address: str, known: PoseCoordinates, scale: Tensor) ->
     return Modes(centers, covariance, log_mass, scale)
 
 
-def jumps(address: str, found: Modes) -> Program:
+def jumps(address: str, ends: Modes) -> Program:
     """A pose near one of several modes, wherever the particle was: an independent proposal.
 
     Half of the jumps go to all modes alike, half by their mass. Some are wider than the prior: particles
-    where no mode was found could not leave otherwise, for nothing would lead back.
+    where no mode was reached could not leave otherwise, for nothing would lead back.
     """
-    count = len(found.centers)
+    count = len(ends.centers)
     # A mode about which no draw was possible has -inf.
-    mass = torch.softmax(found.log_mass.clamp_min(-1e300), dim=0)
+    mass = torch.softmax(ends.log_mass.clamp_min(-1e300), dim=0)
     chance = (0.5 / count + 0.5 * mass).repeat_interleave(len(WIDTHS))
-    centers = found.centers.repeat_interleave(len(WIDTHS), dim=0)
+    centers = ends.centers.repeat_interleave(len(WIDTHS), dim=0)
     width = torch.tensor(WIDTHS, dtype=torch.float64).repeat(count)
-    around = width[:, None, None] ** 2 * found.covariance.repeat_interleave(len(WIDTHS), dim=0)
-    best = found.centers[found.log_mass.argmax()][None]
-    centers, around = torch.cat([centers, best]), torch.cat([around, torch.diag(WIDE * found.scale**2)[None]])
+    around = width[:, None, None] ** 2 * ends.covariance.repeat_interleave(len(WIDTHS), dim=0)
+    best = ends.centers[ends.log_mass.argmax()][None]
+    centers, around = torch.cat([centers, best]), torch.cat([around, torch.diag(WIDE * ends.scale**2)[None]])
     chance = torch.cat([(1.0 - ANYWHERE) * chance / chance.sum(), chance.new_tensor([ANYWHERE])])
 
     def jump(trace: Trace) -> None:
@@ -159,11 +159,11 @@ def highest(
     known: PoseCoordinates, places: Tensor, density: Tensor, scale: Tensor, most: int, apart: float
 ) -> Tensor:
     """The places (K,) of highest density, none nearer to a higher one than `apart` times the scale (d,)."""
-    found: list[int] = []
+    kept: list[int] = []
     for k in density.argsort(descending=True).tolist():
-        if len(found) == most or (found and not density[k] > -torch.inf):
+        if len(kept) == most or (kept and not density[k] > -torch.inf):
             break
-        steps = known.steps(places[found], places[k]) / scale
+        steps = known.steps(places[kept], places[k]) / scale
         if not bool((steps.norm(dim=-1) < apart).any()):
-            found.append(k)
-    return torch.tensor(found)
+            kept.append(k)
+    return torch.tensor(kept)

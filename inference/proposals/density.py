@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import pyro
@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates
 from bcppl.inference.proposals.proposal import Fitted
@@ -58,16 +57,10 @@ def independent(
     if components is not None:
         components = whole_number("an independent proposal is given {} components", components)
     inflation = number_within("an independent proposal is given the inflation {}", inflation, above=0.0)
-    if not isinstance(wide, Sequence) or len(wide) != 2:
-        raise InputError(
-            f"the wide component of an independent proposal is {wide!r}; give its weight and its width."
-        )
-    share = number_within(
-        "the wide component of an independent proposal has the weight {}", wide[0], above=0.0, below=1.0
-    )
-    width = number_within(
-        "the wide component of an independent proposal has the width {}", wide[1], above=0.0
-    )
+    share, width = wide
+    what = "the wide component of an independent proposal has the"
+    share = number_within(f"{what} weight {{}}", share, above=0.0, below=1.0)
+    width = number_within(f"{what} width {{}}", width, above=0.0)
 
     def fit(population: Population) -> Callable[[Trace], None]:
         known, places, weights = weighted_places(population, address)

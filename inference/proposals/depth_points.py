@@ -22,6 +22,7 @@ from bcppl.inference.proposals.least_squares import (
     Equations,
     aligned,
     alignment_proposal,
+    check_pose,
     matching,
 )
 from bcppl.inference.proposals.proposal import Fitted
@@ -94,11 +95,7 @@ def _equations(trace: Trace, address: str, image: str, pose: Tensor) -> tuple[Eq
             f"depth_alignment is given the site {image!r}, which is a {type(site).__name__} and no depth "
             "image; give those that are as `sites`."
         )
-    if not torch.equal(site.pose, trace[address]):
-        raise InputError(
-            f"depth_alignment moves {address!r}, but the site {image!r} renders another pose; "
-            "give the images of that part as `sites`."
-        )
+    check_pose("depth_alignment", address, image, torch.equal(site.pose, trace[address]))
     seen, camera = site.observed(trace[image]), site.camera
     hits = renderer.hits(camera, pose, counted=np.asarray(seen.valid.any(axis=0)), faces=True)
     hits, multiplicity = _thinned(hits, len(pose))

@@ -126,6 +126,15 @@ def matching(trace: Trace, name: str, patterns: Sequence[str]) -> list[str]:
     return matched
 
 
+def check_pose(name: str, address: str, site: str, same: bool) -> None:
+    """Refuse a site that depends on another pose than that at `address`; `name` is of the alignment."""
+    if not same:
+        raise InputError(
+            f"{name} moves {address!r}, but the site {site!r} depends on another pose; "
+            "give that part's sites as `sites`."
+        )
+
+
 def aligned(
     pose: Tensor, equations: Equations, damping: Tensor, freedom: Freedom, information: Tensor | None = None
 ) -> Alignment:
