@@ -8,6 +8,7 @@ a run that is resumed, branched or repeated gives the same bits.
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -35,12 +36,7 @@ UNSURE = 0.0005  # m: beyond this standard deviation the contact may be with ano
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """The fit of an instrument's first measurement.
-
-    Attributes:
-        action: of the measurement.
-        fit: a Gaussian over the apparent pose and the nuisance parameters.
-    """
+    """The action of an instrument's first measurement, and the Gaussian fitted to that."""
 
     action: Any
     fit: Any
@@ -149,11 +145,8 @@ class GaussianApproximation:
     @cached_property
     def prior(self) -> Normal:
         """The Gaussian given the instruments' fits; the model's prior where there is none."""
-        factors = [
-            self.scene.sensor(each.action).marginal_factor(each.action, each.fit)
-            for each in self.fits.values()
-        ]
-        prior = self.scene.prior
+        prior, sensor = self.scene.prior, self.scene.sensor
+        factors = [sensor(f.action).marginal_factor(f.action, f.fit) for f in self.fits.values()]
         if factors:
             normal = product_of_factors(prior, factors)
             return Normal(normal.center, torch.linalg.inv(normal.covariance))
@@ -174,7 +167,7 @@ class GaussianApproximation:
 
         `values` has those that the trace lacks, by address.
         """
-        looked_up = _Values(trace, {} if values is None else values)
+        looked_up: Any = ChainMap(dict(values or {}), trace)
         factors: list[PoseFactor] = [
             self.scene.sensor(each.action).factor(each.action, looked_up) for each in self.fits.values()
         ]
@@ -196,19 +189,3 @@ class GaussianApproximation:
         if before is self.scene.prior:
             return None
         return matched(before) if isinstance(before, MixturePose) else before
-
-
-class _Values(Mapping[str, Tensor]):
-    """Given values by address, then a trace's."""
-
-    def __init__(self, trace: Any, given: Mapping[str, Tensor]) -> None:
-        self.trace, self.given = trace, given
-
-    def __getitem__(self, address: str) -> Tensor:
-        return self.given[address] if address in self.given else self.trace[address]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter({**self.trace.choices, **self.given})
-
-    def __len__(self) -> int:
-        return len({**self.trace.choices, **self.given})

@@ -16,13 +16,13 @@ from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.inference.chains import Chains
 from bcppl.inference.population import Population
-from bcppl.inference.resampling import Scheme, seeded, systematic
+from bcppl.inference.resampling import seeded, systematic
 from bcppl.inference.summaries import is_pose
 
 POSE_COORDINATES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
-def to_arviz(runs: Any, *, draws: int | None = None, seed: int = 0, scheme: Scheme = systematic) -> Any:
+def to_arviz(runs: Any, *, draws: int | None = None, seed: int = 0) -> Any:
     """Equal-weight draws of every latent address, with their log-likelihoods and sampler statistics.
 
     The draws are resampled from the weighted particles and put in random order, so copies count as draws;
@@ -36,7 +36,6 @@ def to_arviz(runs: Any, *, draws: int | None = None, seed: int = 0, scheme: Sche
         draws: how many of each; by default as many as the smallest population has particles. Of `Chains` the
             last so many, by default all.
         seed: same seed, same draws; torch's own generator is left as it was.
-        scheme: resamples (`bcppl.inference.resampling`).
 
     Returns:
         An `arviz.InferenceData` with the groups
@@ -62,7 +61,7 @@ def to_arviz(runs: Any, *, draws: int | None = None, seed: int = 0, scheme: Sche
     chains = _populations(runs)
     check_alike(chains)
     with seeded(seed):
-        chosen = draw(chains, draws, scheme)
+        chosen = draw(chains, draws)
     first = chains[0].trace
     posterior = {
         address: at_draws([chain.trace.choices[address] for chain in chains], chosen)
@@ -172,11 +171,11 @@ def check_alike(populations: Sequence[Population]) -> None:
                 )
 
 
-def draw(populations: Sequence[Population], draws: int | None, scheme: Scheme = systematic) -> list[Tensor]:
+def draw(populations: Sequence[Population], draws: int | None) -> list[Tensor]:
     """Indices of equal-weight draws, (draws,) int64 for each population, in random order."""
     draws = min(map(len, populations)) if draws is None else whole_number("{} draws were asked for", draws)
-    # A scheme gives ancestors in order; draws in order would look like a chain that does not mix.
-    return [scheme(population.log_weights, draws)[torch.randperm(draws)] for population in populations]
+    # Ancestors come in order; draws in order would look like a chain that does not mix.
+    return [systematic(population.log_weights, draws)[torch.randperm(draws)] for population in populations]
 
 
 def at_draws(values: Sequence[Tensor], chosen: Sequence[Tensor]) -> Tensor:

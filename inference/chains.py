@@ -72,7 +72,9 @@ def markov_chains(
     refuse_other("markov_chains", kernel)
     moves = whole_number("chains are to make {} moves", moves)
     every = whole_number("chains are to be recorded every {} moves", every)
-    population = start if isinstance(start, Population) else _equal(start)
+    if isinstance(start, Trace):
+        start = Population(start, torch.zeros(start.particles, dtype=torch.float64))
+    population = start
     weights = population.log_weights
     if scheme is not None and bool((weights != weights[0]).any()):
         population = population.selected(scheme(weights))
@@ -97,7 +99,3 @@ def markov_chains(
     # Values of a trace are never written to, so they are kept as they are until here.
     stacked = {a: torch.stack(s) if s else trace[a][None][:0] for a, s in draws.items()}
     return Chains(stacked, taken / moves, trace)
-
-
-def _equal(trace: Trace) -> Population:
-    return Population(trace, torch.zeros(trace.particles, dtype=torch.float64))

@@ -43,12 +43,6 @@ class Collected(Generic[S]):
             self._columns[name].append(value)
         return step
 
-    def to_end(self) -> Collected[S]:
-        """Run to the end."""
-        for _ in self:
-            pass
-        return self
-
     @property
     def columns(self) -> dict[str, Any]:
         """By name, (steps, ...) tensors where all values are numbers or tensors of one shape, else lists."""

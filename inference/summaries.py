@@ -25,6 +25,15 @@ from bcppl.traces.series import SeriesTrace
 
 Address = str | tuple[str, int]
 
+COLLAPSED = (
+    "has collapsed to a point: all particles with weight are the same, so no measurement is informative; use "
+    "more particles, or move them apart first (rejuvenation)."
+)
+WEIGHTLESS = (
+    "the belief has no weight: every particle's is zero; widen the prior, use more particles, or check the "
+    "measurements (`bcppl check`)."
+)
+
 
 def values_at(population: Population, address: Address) -> Tensor:
     """The values (N, *event) at a latent address."""
@@ -54,10 +63,8 @@ def _freedom(population: Population, address: Address) -> Freedom | None:
 
 
 def _belief(population: Population, address: Address) -> Belief:
-    freedom = _freedom(population, address)
-    return Belief(
-        values_at(population, address), population.log_weights, FREE if freedom is None else freedom
-    )
+    freedom = _freedom(population, address) or FREE
+    return Belief(values_at(population, address), population.log_weights, freedom)
 
 
 def mean(population: Population, address: Address) -> Tensor:
@@ -84,6 +91,11 @@ def covariance(population: Population, address: Address) -> Tensor:
         return _belief(population, address).covariance
     weights = normalised(population.log_weights)
     values = values_at(population, address).to(torch.float64).reshape(len(weights), -1)
+    return weighted_covariance(values, weights)
+
+
+def weighted_covariance(values: Tensor, weights: Tensor) -> Tensor:
+    """The covariance (D, D) of values (N, D) under normalised weights (N,)."""
     centred = values - weights @ values
     return (weights[:, None] * centred).T @ centred
 
@@ -118,13 +130,9 @@ def probabilities(population: Population, address: Address) -> Probabilities:
     """The probability of each value at a discrete address.
 
     Raises:
-        InputError: no latent site has that address, or it holds poses.
+        InputError: no latent site has that address.
         NoWeightError: no particle has any weight.
     """
-    if is_pose(population, address):
-        raise InputError(
-            f"probabilities of the poses at {address!r} were asked for; ask its belief for modes instead."
-        )
     weights, values = normalised(population.log_weights), values_at(population, address)
     carrying = weights > 0
     distinct, which = torch.unique(values[carrying], dim=0, return_inverse=True)

@@ -12,7 +12,7 @@ from bcppl.beliefs.merged import distinct_poses
 from bcppl.beliefs.modes import cluster, nearest
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
-from bcppl.inference.summaries import is_pose, values_at
+from bcppl.inference.summaries import COLLAPSED, is_pose, values_at
 
 # The gap between modes is at least so many times the median distance of particles to their nearest neighbour.
 SPARSE = 3.0
@@ -48,11 +48,7 @@ class DistinctParticles:
             rows = values.to(torch.float64).reshape(len(values), -1)
             values, index = torch.unique(rows, dim=0, return_inverse=True)
         if len(values) < 2:
-            raise InputError(
-                f"the belief over {address!r} has collapsed to a point: all particles with weight are the "
-                "same, so no measurement is informative; move them apart first (rejuvenation, or more "
-                "particles)."
-            )
+            raise InputError(f"the belief over {address!r} {COLLAPSED}")
         total = torch.zeros(len(values), dtype=torch.float64).index_add_(0, index, weights[particles])
         return cls(values, total, particles, index, pose)
 

@@ -30,8 +30,17 @@ from bcppl.inference.design.observations import (
     SimulatedCandidate,
     simulate_candidates,
 )
-from bcppl.inference.design.outer_samples import draw_outer_samples, mean_and_error, warn_of_failures
-from bcppl.inference.design.ranking import Cost, Costs, Ranking, Utility, checked, rank
+from bcppl.inference.design.ranking import (
+    Cost,
+    Costs,
+    Ranking,
+    Utility,
+    checked,
+    draw_outer_samples,
+    mean_and_error,
+    rank,
+    warn_of_failures,
+)
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded
 

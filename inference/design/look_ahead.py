@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bcppl.inference.design.entropies import EntropyOfWeights
-from bcppl.inference.design.outer_samples import OuterSamples
+from bcppl.inference.design.ranking import OuterSamples
 
 # Outer samples that are less probable than this after the first step are left out of the second.
 UNLIKELY = 1e-6

@@ -62,9 +62,7 @@ class BatchedArguments:
 class SimulatedCandidate:
     """A candidate, simulated at all particles.
 
-    Attributes:
-        trace: of N particles, extended by the candidate; its new sites are latent.
-        observed: the new addresses that would be observed.
+    The trace of N particles is extended by it, its new sites latent; `observed` are those that would be.
     """
 
     trace: Trace
@@ -155,15 +153,7 @@ class PredictedCandidate:
     def draw(self, particles: Tensor, seed: int) -> Observations:
         """Observations if particles (S,) were the true value."""
         with seeded(seed):
-            values = self.predictive(self.candidate, self.trace.chosen(particles))
-        wrong = [a for a, v in values.items() if not isinstance(v, Tensor) or len(v) != len(particles)]
-        if wrong or not values:
-            raise InputError(
-                f"the predictive sampler gives for candidate {self.number} "
-                f"{f'no {len(particles)} values at {wrong[0]!r}' if wrong else 'nothing'}; "
-                "give tensors by address, one value for each particle of the trace that it is given."
-            )
-        return values
+            return self.predictive(self.candidate, self.trace.chosen(particles))
 
     def log_likelihoods(self, values: Observations) -> Tensor:
         """Log-likelihood (S, N) of every observation at every particle, as `extend` evaluates it."""

@@ -10,11 +10,10 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.beliefs import Belief, effective_sample_size
-from bcppl.errors import InputError
 from bcppl.inference.design.distinct import DistinctParticles, separate_modes
 from bcppl.inference.design.weighted_mixtures import cholesky_factor
 from bcppl.inference.population import Population
-from bcppl.inference.summaries import is_pose
+from bcppl.inference.summaries import weighted_covariance
 from bcppl.poses import Freedom
 
 
@@ -46,11 +45,6 @@ class TangentMixture:
         cls, population: Population, address: str, translation: float = 0.01, rotation: float = 0.2
     ) -> TangentMixture:
         """The Gaussians of `mixture_entropy`: copies are merged, each mode has its particles' covariance."""
-        if not is_pose(population, address):
-            raise InputError(
-                f"{address!r} holds no poses, in whose tangent space information could be summed; "
-                "use expected_information_gain."
-            )
         freedom = population.belief(address).freedom
         particles = DistinctParticles.of(population, address)
         distinct, share = particles.values, particles.weights
@@ -64,11 +58,9 @@ class TangentMixture:
             weights = share[inside] / mass
             mean = Belief(distinct[inside], weights.log()).mean
             tangent = poses.local(mean, distinct[inside])
-            coordinates = freedom.coordinates(tangent)
-            away = coordinates - weights @ coordinates
             means.append(mean)
             masses.append(mass)
-            covariances.append((weights[:, None] * away).T @ away)
+            covariances.append(weighted_covariance(freedom.coordinates(tangent), weights))
             bases.append(weights @ freedom.log_base_density(tangent[:, 3:].norm(dim=-1)))
             sizes.append(1.0 / weights.square().sum())
         mass, covariance = torch.stack(masses), torch.stack(covariances)

@@ -80,13 +80,6 @@ class Pair:
     check: bool = False
 
 
-def _refuse_no_pair(pair: object) -> None:
-    if not isinstance(pair, Pair):
-        raise InputError(
-            f"SMCP3 is given a {type(pair).__name__} in place of a pair; give Pair(forward, backward)."
-        )
-
-
 def moved(population: Population, pair: Pair, observed: Observed | None = None) -> Population:
     """The population moved by a pair, given a measurement if there is one, and weighted for it.
 
@@ -94,11 +87,10 @@ def moved(population: Population, pair: Pair, observed: Observed | None = None) 
     population.
 
     Raises:
-        InputError: no `Pair` is given, a program gives an address that the other has not, more coordinates
+        InputError: a program gives an address that the other has not, more coordinates
             than it takes, or (checked) the programs do not undo each other.
         InferenceError: no particle has any weight left.
     """
-    _refuse_no_pair(pair)
     count = len(population)
     if not isinstance(pair.forward, Fitted) and not isinstance(pair.backward, Fitted):
         parts = [torch.arange(count)]
@@ -131,13 +123,8 @@ def smcp3(pair: Pair, *, resample: Resample | None = None) -> StepFunction:
 
     Returns:
         The step. It raises what `moved` raises.
-
-    Raises:
-        InputError: no `Pair` is given.
     """
-    _refuse_no_pair(pair)
-    if resample is None:
-        resample = adaptive()
+    resample = adaptive() if resample is None else resample
     check_resample("smcp3", resample)
 
     def step(population: Population, observed: Observed) -> Stepped:
@@ -165,11 +152,7 @@ def _fitted(pair: Pair, others: Population) -> tuple[Program, Program]:
 def moved_trace(
     forward: Program, backward: Program, old: Trace, observed: Observed | None = None, check: bool = False
 ) -> tuple[Trace, Tensor]:
-    """Particles moved by two programs, with a measurement if there is one, and their log factors (N,).
-
-    Raises:
-        InputError: see `moved`.
-    """
+    """Particles moved by two programs, with a measurement if there is one, and their log factors (N,)."""
     count = old.particles
     shown = old if observed is None else Anticipated(old, *observed)
     # The next step of a series begins from the values of the last, which stay.

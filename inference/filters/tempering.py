@@ -13,7 +13,7 @@ that contains a surrogate likelihood is a surrogate's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -24,7 +24,7 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.exponents import next_exponent
 from bcppl.inference.filters.step import Observed, StepInfo, Stepped
-from bcppl.inference.kernels import Kernel, Until, moved_by, refuse_other, takes
+from bcppl.inference.kernels import Kernel, Until, moved_by, refuse_other
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Resample, adaptive, check_resample
 from bcppl.inference.targets import POSTERIOR, Target, cost_of
@@ -190,11 +190,6 @@ def tempered(
             resampling.
     """
     if kernel is not None:
-        if callable(kernel) and takes(kernel, 2) and not takes(kernel, 1):
-            raise InputError(
-                "tempered is given a function of two arguments in place of a kernel; "
-                "if it is a rejuvenation such as waste_free_moves(...), give it as rejuvenation=..."
-            )
         refuse_other("tempered", kernel)
     if not callable(share):
         share = kept_share(share)
@@ -203,8 +198,6 @@ def tempered(
         sweeps = whole_number("tempering is to move the particles in {} sweeps", sweeps)
     fixed = None
     if exponents is not None:
-        if not isinstance(exponents, Iterable):
-            raise InputError(f"tempering is given the exponents {exponents!r}; give a list, [0.1, 1.0].")
         fixed = tuple(number_within("tempering is given the exponent {}", e) for e in exponents)
     if fixed is not None and (fixed[-1:] != (1.0,) or any(b <= a for a, b in pairwise((0.0, *fixed)))):
         raise InputError(

@@ -77,9 +77,6 @@ def waste_free_moves(
 
 
 def _teachers(population: Population, others: torch.Tensor) -> Population:
-    """What is learned from: all, where the others are none; equal weights, where they have none."""
+    """The others, from which a move learns; all, where there are none."""
     index = others.nonzero().flatten()
-    taught = population[index] if len(index) else population
-    if bool((taught.log_weights > -torch.inf).any()):
-        return taught
-    return replace(taught, log_weights=torch.zeros_like(taught.log_weights))
+    return population[index] if len(index) else population

@@ -14,7 +14,8 @@ from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import Kernel, Move, decided
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Unflattened, VectorCoordinates, coordinates_of
-from bcppl.inference.proposals.spread import FLOOR, covariance_of
+from bcppl.inference.proposals.spread import FLOOR
+from bcppl.inference.summaries import weighted_covariance
 from bcppl.inference.targets import Target
 from bcppl.traces import Trace, update
 from bcppl.traces.gradient import log_prob_with_grad
@@ -186,5 +187,5 @@ def _factor(space: _Unconstrained, population: Population) -> Tensor:
     weights = torch.where(torch.isfinite(position).all(dim=1), weights, 0.0)
     position = torch.nan_to_num(position, 0.0, 0.0, 0.0)
     weights = weights / weights.sum().clamp_min(torch.finfo(torch.float64).tiny)
-    covariance = covariance_of(position, weights)
+    covariance = weighted_covariance(position, weights)
     return torch.linalg.cholesky(0.9 * covariance + 0.1 * torch.diag(covariance.diagonal() + 10 * FLOOR**2))

@@ -106,11 +106,6 @@ def _mapped(involution: Involution, point: Mapping[Key, Tensor]) -> dict[Key, Te
     for (kind, address), value in point.items():
         given[kind][address] = value
     reached = involution(given["latent"], given["choice"])
-    if not isinstance(reached, tuple) or [isinstance(r, Mapping) for r in reached] != [True, True]:
-        raise InputError(
-            "an involution gives back something else than two mappings; "
-            "return (new values by address, new auxiliary choices by address)."
-        )
     after = dict(point)
     for kind, values in zip(given, reached, strict=True):
         for address, value in values.items():

@@ -24,12 +24,7 @@ _WORTH_A_LIFT = 2.0  # a lift is worth it for a triangle so many times as large
 
 
 class Side(NamedTuple):
-    """An upright face, in the part's x-y plane.
-
-    Attributes:
-        start, stop: (2,) its ends, metres.
-        normal: (2,) its outward unit normal.
-    """
+    """An upright face in the part's x-y plane: its ends (2,), metres, and its outward unit normal (2,)."""
 
     start: Array
     stop: Array
@@ -42,11 +37,9 @@ class Side(NamedTuple):
 
 
 class TopPoints(NamedTuple):
-    """Points of contact on a top, in the part's x-y plane.
+    """Points of contact on a top (3, 2), in the part's x-y plane, metres.
 
-    Attributes:
-        positions: (3, 2) metres; a peg can slide from the first to the second.
-        lifted: whether the peg must be lifted from the second to the third; otherwise it can slide.
+    A peg can slide from the first to the second, and on to the third unless it must be `lifted`.
     """
 
     positions: Array

@@ -49,18 +49,9 @@ _REST = 0.15  # s before any motion, for the tare
 
 @dataclass(frozen=True, eq=False)
 class PlanningProblem:
-    """The problem that candidates are planned for.
+    """The problem that candidates are planned for: the arguments of `plan_candidates`.
 
-    Attributes:
-        belief: over world_from_part.
-        part: its z axis points out of its top.
-        peg: the held peg; None for views alone.
-        gap: of part and peg; computed unless given.
-        hole: for searches and attempts; `hole_of(part)` unless given.
-        touch_parameters: of touches and slides.
-        insertion_parameters: of searches and attempts.
-        like: by kind of sensor, an action that its candidates resemble.
-        seed: of the points.
+    `like` has by kind of sensor an action that its candidates resemble.
     """
 
     belief: Belief

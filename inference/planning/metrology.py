@@ -121,14 +121,10 @@ def three_two_one(
 
 
 class _SideTouch(NamedTuple):
-    """A guarded stroke onto a side and a slide along it, in the part's frame: metres.
+    """A guarded stroke onto a side and a slide along it, the tip at a height, in the part's frame: metres.
 
-    Attributes:
-        face: the side.
-        height: z of the tip.
-        clear, stop, press: (3,) the ends of a stroke beside the face, and the depth of the press.
-        inset: of the ends of a slide from the face's.
-        parameters: of the plan.
+    `clear` and `stop` (3,) are the ends of a stroke beside the face, `press` (3,) the depth of the press, and
+    `inset` is of the ends of a slide from the face's.
     """
 
     face: Side

@@ -82,7 +82,7 @@ def not_from_below() -> Constraint:
 def collision_free(gap: PegGap, world_from_part: Array | torch.Tensor) -> Constraint:
     """Plans' free paths do not lead through the part at a pose (7,); see `free_path`."""
     free = _distances(gap, world_from_part, free_path)
-    return Constraint("lead through the part", lambda found: [bool((d > 0.0).all()) for d in free(found)])
+    return Constraint("lead through the part", lambda plans: [bool((d > 0.0).all()) for d in free(plans)])
 
 
 def contact_at_mid_stroke(gap: PegGap, world_from_part: Array | torch.Tensor) -> Constraint:
@@ -94,7 +94,7 @@ def contact_at_mid_stroke(gap: PegGap, world_from_part: Array | torch.Tensor) ->
     met = _distances(gap, world_from_part, middles)
     return Constraint(
         "would meet the part elsewhere or not at all",
-        lambda found: [bool((np.abs(d) < _CONTACT).all()) for d in met(found)],
+        lambda plans: [bool((np.abs(d) < _CONTACT).all()) for d in met(plans)],
     )
 
 

@@ -61,12 +61,7 @@ class TouchParameters(NamedTuple):
 
 
 class SurfacePoint(NamedTuple):
-    """A point of a part's surface, in its frame.
-
-    Attributes:
-        position: (3,) metres.
-        normal: (3,) outward, of unit length.
-    """
+    """A point (3,) of a part's surface, in its frame, metres, and its outward unit normal (3,)."""
 
     position: Array
     normal: Array
@@ -156,14 +151,8 @@ def slide(
 ) -> Plan:
     """A touch after which the peg slides along the surface, pressed on, before it retracts.
 
-    Args:
-        belief: over world_from_part.
-        part: its z axis points out of its top.
-        peg: the held peg.
-        point: where the slide begins.
-        displacement: (3,) along the surface, in the part's frame, metres.
-        parameters: of the touch.
-        name: of the plan.
+    The slide begins at the point; its displacement (3,) is along the surface, in the part's frame, metres.
+    The other arguments are those of `touch`.
 
     Raises:
         InputError: a parameter is out of range.
@@ -191,16 +180,7 @@ def pair(
     parameters: TouchParameters | None = None,
     name: str = "pair",
 ) -> Plan:
-    """Two touches in one plan; between them the peg is lifted over the part.
-
-    Args:
-        belief: over world_from_part.
-        part: its z axis points out of its top.
-        peg: the held peg.
-        first: point of contact.
-        second: point of contact.
-        parameters: of the touches.
-        name: of the plan.
+    """Two touches in one plan; between them the peg is lifted over the part: see `touch`.
 
     Raises:
         InputError: a parameter is out of range.
@@ -226,10 +206,7 @@ def pair(
 class _Stroke(NamedTuple):
     """A guarded stroke onto a point: positions (3,) of the peg's origin, in the part's frame.
 
-    Attributes:
-        above: where it begins and ends, at a safe height above the part.
-        clear, stop: the ends of the stroke.
-        pressed: the end of the command.
+    It begins and ends `above` the part, leads from `clear` to `stop`, and its command ends at `pressed`.
     """
 
     above: Array

@@ -15,7 +15,6 @@ import pyro
 import torch
 from torch import Tensor
 
-from bcppl.arguments import whole_number
 from bcppl.distributions.poses import MixturePose, NormalPose
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
@@ -23,12 +22,14 @@ from bcppl.inference.exponents import next_exponent
 from bcppl.inference.proposals.coordinates import PoseCoordinates
 from bcppl.inference.proposals.depth_points import depth_aligned
 from bcppl.inference.proposals.proposal import Program
-from bcppl.inference.proposals.spread import conditioned, covariance_of
+from bcppl.inference.proposals.spread import conditioned
+from bcppl.inference.summaries import weighted_covariance
 from bcppl.poses import FREE
 from bcppl.traces import Trace
 
 ALIGNMENTS = 4  # of every climber, of two steps each
 WALKERS, STEPS = 24, 80  # the climbers that go on by small steps, and how many steps they try
+MODES = 8  # that are kept
 APART = (0.5, 1.0)  # the least distance of two walkers and of two modes, in standard deviations of the prior
 REACH = 0.5  # of an alignment, likewise
 FIRST, SMALLEST, LARGEST = 0.1, 0.002, 1.0  # sizes of a step, likewise
@@ -54,7 +55,7 @@ class Modes(NamedTuple):
     scale: Tensor
 
 
-def modes(start: Trace, address: str, *, most: int = 8) -> Modes:
+def modes(start: Trace, address: str) -> Modes:
     """The modes that climbs from a trace's particles lead to.
 
     Every climber is aligned with the depth images, several times, and goes back to the best of these places.
@@ -68,13 +69,10 @@ def modes(start: Trace, address: str, *, most: int = 8) -> Modes:
         start: of a program with all its observations, its latent values drawn from the prior. The more
             particles, the narrower a mode may be that is reached.
         address: of the pose that is moved; other latent values stay as they are.
-        most: modes that are kept.
 
     Raises:
-        InputError: no pose is at the address, no depth image is at an address `depth_*`, or `most` is no
-            whole number, 1 or more.
+        InputError: no pose is at the address, or no depth image is at an address `depth_*`.
     """
-    most = whole_number("climbs are to keep {} modes", most)
     if address not in start.choices or start[address].shape != (start.particles, 7):
         raise InputError(f"climbs are to move {address!r}, where the program samples no pose; name one.")
     known = PoseCoordinates(freedom_of(start.distributions[address]) or FREE)
@@ -90,7 +88,7 @@ def modes(start: Trace, address: str, *, most: int = 8) -> Modes:
         pose = torch.where((reached > density)[:, None], trace[address], pose)
         density = torch.maximum(reached, density)
     trace = trace.at({address: pose})
-    kept = highest(known, trace[address], density, scale, max(most, WALKERS), APART[0])
+    kept = highest(known, trace[address], density, scale, WALKERS, APART[0])
     trace, density = trace.chosen(kept), density[kept]
     size = torch.full_like(density, FIRST)
     for _ in range(STEPS):
@@ -101,7 +99,7 @@ def modes(start: Trace, address: str, *, most: int = 8) -> Modes:
         pose = torch.where(higher[:, None], tried[address], trace[address])
         trace, density = trace.at({address: pose}), torch.maximum(density, reached)
         size = torch.where(higher, LONGER * size, SHORTER * size).clamp(SMALLEST, LARGEST)
-    ends = highest(known, trace[address], density, scale, most, APART[1])
+    ends = highest(known, trace[address], density, scale, MODES, APART[1])
     return fitted(trace.chosen(ends), address, known, scale)
 
 
@@ -125,7 +123,7 @@ def fitted(trace: Trace, address: str, known: PoseCoordinates, scale: Tensor) ->
                 continue
             weights = torch.softmax(next_exponent(equal, factor[m], 0.0, KEPT) * factor[m], dim=0)
             center = known.mean(drawn[m], weights)
-            spread = conditioned(covariance_of(known.steps(center, drawn[m]), weights))
+            spread = conditioned(weighted_covariance(known.steps(center, drawn[m]), weights))
             centers = centers.index_copy(0, torch.tensor([m]), center[None])
             covariance = covariance.index_copy(0, torch.tensor([m]), spread[None])
     return Modes(centers, covariance, log_mass, scale)

@@ -1,13 +1,14 @@
 """Unbounded coordinates of a latent value: a pose's tangent space, or the real line for any other support.
 
 A value whose support is bounded (positive numbers, an interval, a simplex) is transformed to an unbounded one
-by torch's bijection for its support, and densities include its Jacobian.
+by torch's bijection for its support, and densities include its Jacobian. A place is a value in the form that
+`normal` and `mixture` take as a centre: a pose (..., 7), or a vector (..., d).
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import pyro.distributions as dist
 import torch
@@ -26,43 +27,6 @@ from bcppl.poses import Freedom
 from bcppl.traces import Trace
 
 
-class Coordinates(Protocol):
-    """Coordinates in which proposals move the value at one latent address.
-
-    A place is a value in the form that `normal` and `mixture` take as a centre: a pose (..., 7), or a vector
-    (..., d) in unbounded coordinates.
-
-    Attributes:
-        dimension: d.
-    """
-
-    dimension: int
-
-    def of(self, trace: Trace) -> Coordinates:
-        """The same for the particles of another trace, since a support may depend on their other values."""
-
-    def places(self, values: Tensor) -> Tensor:
-        """The places, (N, 7) or (N, d), of the particles' values (N, *event)."""
-
-    def steps(self, start: Tensor, end: Tensor) -> Tensor:
-        """The coordinates (..., d) of the steps between places."""
-
-    def stepped(self, start: Tensor, step: Tensor) -> Tensor:
-        """The places after steps (..., d): the inverse of `steps`."""
-
-    def mean(self, places: Tensor, weights: Tensor) -> Tensor:
-        """The weighted mean, one place."""
-
-    def normal(self, center: Tensor, covariance: Tensor, size: Tensor) -> Any:
-        """The normal in these coordinates at N places, its covariance (d, d) times `size` (N,) squared."""
-
-    def mixture(self, log_weights: Tensor, centers: Tensor, covariance: Tensor) -> Any:
-        """A mixture of K normals with log weights (K,) or (N, K), at places (K, ...) or (N, K, ...).
-
-        Their covariances are (d, d), (K, d, d) or (N, K, d, d).
-        """
-
-
 class PoseCoordinates:
     """A pose's free axes, in its tangent space: metres, then radians."""
 
@@ -71,7 +35,7 @@ class PoseCoordinates:
         self.dimension = freedom.dimension
 
     def of(self, trace: Trace) -> PoseCoordinates:
-        """Itself: all particles have the same free axes."""
+        """The same for the particles of another trace: all have the same free axes."""
         return self
 
     def places(self, values: Tensor) -> Tensor:
@@ -79,11 +43,11 @@ class PoseCoordinates:
         return values
 
     def steps(self, start: Tensor, end: Tensor) -> Tensor:
-        """Free coordinates of the tangents from pose to pose."""
+        """The free coordinates (..., d) of the tangents from pose to pose."""
         return self.freedom.coordinates(poses.local(start, end))
 
     def stepped(self, start: Tensor, step: Tensor) -> Tensor:
-        """The poses after tangents."""
+        """The poses after tangents (..., d)."""
         return poses.retract(start, self.freedom.embed(step))
 
     def mean(self, places: Tensor, weights: Tensor) -> Tensor:
@@ -92,11 +56,14 @@ class PoseCoordinates:
         return self.stepped(places[0], self.steps(places[0], mean))
 
     def normal(self, center: Tensor, covariance: Tensor, size: Tensor) -> Any:
-        """A `NormalPose`."""
+        """The `NormalPose` at N places, its covariance (d, d) times `size` (N,) squared."""
         return NormalPose(center, size[:, None, None] ** 2 * covariance, self.freedom)
 
     def mixture(self, log_weights: Tensor, centers: Tensor, covariance: Tensor) -> Any:
-        """A `MixturePose`."""
+        """The `MixturePose` with log weights (K,) or (N, K), at places (K, ...) or (N, K, ...).
+
+        The covariances are (d, d), (K, d, d) or (N, K, d, d).
+        """
         return MixturePose(log_weights, centers, covariance, self.freedom)
 
 
@@ -221,6 +188,9 @@ class Unflattened(Transform):
     def inverse_shape(self, shape: tuple[int, ...]) -> torch.Size:
         """From (N, *plates, *event) to (N, d)."""
         return torch.Size([*shape[: len(shape) - len(self.event)], self.dimension])
+
+
+Coordinates = PoseCoordinates | VectorCoordinates
 
 
 def _is_identity(transform: Transform) -> bool:

@@ -17,10 +17,10 @@ from bcppl.inference.proposals.spread import (
     FLOOR,
     conditioned,
     covariance_about_mean,
-    covariance_of,
     weighted_places,
 )
 from bcppl.inference.resampling import systematic
+from bcppl.inference.summaries import weighted_covariance
 from bcppl.traces import Trace
 
 MOST_FITTED = 1000  # particles; their covariance is accurate to a few percent
@@ -110,7 +110,7 @@ def _maximised(coordinates: Coordinates, places: Tensor, weights: Tensor, compon
     centers = places[_apart(coordinates, places, weights, components)]
     components = len(centers)
     steps = torch.stack([coordinates.steps(center, places) for center in centers])
-    metric = conditioned(covariance_of(steps[0], weights)).diagonal()
+    metric = conditioned(weighted_covariance(steps[0], weights)).diagonal()
     nearest = (steps.square() / metric).sum(dim=-1).argmin(dim=0)
     shares = torch.nn.functional.one_hot(nearest, components).T.to(torch.float64)
     floor = FLOOR**2 * torch.eye(dimension, dtype=torch.float64)
@@ -124,7 +124,7 @@ def _maximised(coordinates: Coordinates, places: Tensor, weights: Tensor, compon
         centers = torch.stack([coordinates.mean(places, each) for each in within])
         covariances = torch.stack(
             [
-                covariance_of(coordinates.steps(center, places), each)
+                weighted_covariance(coordinates.steps(center, places), each)
                 for center, each in zip(centers, within, strict=True)
             ]
         )

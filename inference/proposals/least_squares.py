@@ -36,9 +36,8 @@ SHARES = (0.8, 0.15, 0.05)
 class Equations:
     """The normal equations of N particles.
 
-    Attributes:
-        precision: (N, 6, 6) of the tangent: 1 / m^2, 1 / (m rad), 1 / rad^2.
-        pull: (N, 6) precision times the solution.
+    The precision (N, 6, 6) of the tangent is in 1 / m^2, 1 / (m rad) and 1 / rad^2; the pull (N, 6) is that
+    times the solution.
     """
 
     precision: Tensor
@@ -73,12 +72,7 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """The solution of an alignment.
-
-    Attributes:
-        pose: (N, 7).
-        covariance: (N, d, d) over the free axes.
-    """
+    """The solution of an alignment: poses (N, 7), and covariances (N, d, d) over the free axes."""
 
     pose: Tensor
     covariance: Tensor

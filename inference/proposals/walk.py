@@ -16,7 +16,8 @@ from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import FLOOR, covariance_of, spread_of, weighted_places
+from bcppl.inference.proposals.spread import FLOOR, spread_of, weighted_places
+from bcppl.inference.summaries import weighted_covariance
 from bcppl.traces import Trace
 
 # Shrinkage of correlations: a ridge a tenth as wide as it is long is still followed.
@@ -99,13 +100,9 @@ def joint_drift(*addresses: str, scales: tuple[float, float] = (0.05, 1.0)) -> F
 
 
 class _Link(NamedTuple):
-    """The normal of one address's step, given the steps before it.
+    """The normal of one address's step, given the steps before it (D,).
 
-    Attributes:
-        address: of the latent value.
-        coordinates: of the latent value.
-        gain: (d, D) regression of its mean on the steps before it (D,).
-        covariance: (d, d) given them.
+    Its mean is `gain` (d, D) times these, its covariance (d, d).
     """
 
     address: str
@@ -126,7 +123,7 @@ def _links(population: Population, addresses: tuple[str, ...]) -> list[_Link]:
         known.append(coordinates)
         steps.append(coordinates.steps(coordinates.mean(places, weights), places))
     together = torch.cat(steps, dim=1)
-    covariance = covariance_of(together, weights)
+    covariance = weighted_covariance(together, weights)
     diagonal = torch.diag(covariance.diagonal() + FLOOR**2)
     covariance = ((1.0 - SHRUNK) * covariance + SHRUNK * diagonal) * (2.38**2 / together.shape[1])
     links, end = [], 0
