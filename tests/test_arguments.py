@@ -91,7 +91,7 @@ def test_a_count_that_is_no_whole_number_is_refused(name: str) -> None:
 
 
 NUMBERS: dict[str, tuple[Callable[[Any], Any], tuple[Any, ...]]] = {
-    "threshold": (adaptive, (-0.1, 1.1)),
+    "threshold": (lambda v: adaptive(threshold=v), (-0.1, 1.1)),
     "waste-free threshold": (lambda v: waste_free_moves(WALK, 2, threshold=v), (-0.1,)),
     "share": (lambda v: tempered(WALK, share=v), (-0.1, 1.0)),
     "exponent": (lambda v: Target({"y": v}), (-1.0,)),
