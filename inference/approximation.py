@@ -44,25 +44,16 @@ class Fitted:
 
 @dataclass(frozen=True, eq=False)
 class GaussianApproximation:
-    """The posterior given some measurements, as a mixture of Gaussians.
+    """The posterior given some measurements, as a mixture of Gaussians."""
 
-    Attributes:
-        pose: the address of the part's pose.
-        scene: of the model; it has the prior and the sensors' likelihoods.
-        fits: by instrument.
-        contacts: measurements with a quadratic approximation.
-        quadratic: of the contacts' likelihood; None before the first.
-        relevant: by number of the measurement, whether it is informative near the fits' estimate.
-        stale: whether contacts were added after `quadratic` was computed.
-    """
-
-    pose: str
-    scene: Any
-    fits: Mapping[str, Fitted] = field(default_factory=dict)
-    contacts: tuple[Approximated, ...] = ()
-    quadratic: QuadraticApproximation | None = None
+    pose: str  # the address of the part's pose
+    scene: Any  # of the model; it has the prior and the sensors' likelihoods
+    fits: Mapping[str, Fitted] = field(default_factory=dict)  # by instrument
+    contacts: tuple[Approximated, ...] = ()  # measurements with a quadratic approximation
+    quadratic: QuadraticApproximation | None = None  # of the contacts' likelihood; None before the first
+    # by number of the measurement, whether it is informative near the fits' estimate
     relevant: Mapping[int, bool] = field(default_factory=dict)
-    stale: bool = False
+    stale: bool = False  # whether contacts were added after `quadratic` was computed
 
     def __post_init__(self) -> None:
         if not hasattr(self.scene, "prior") or not hasattr(self.scene, "sensor"):

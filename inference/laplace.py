@@ -38,19 +38,12 @@ class Normal(NamedTuple):
 
 
 class QuadraticApproximation(NamedTuple):
-    """A log-likelihood to second order around each of its M modes, the one of largest weight first.
+    """A log-likelihood to second order around each of its M modes, the one of largest weight first."""
 
-    Attributes:
-        around: (M, 7) the modes.
-        gradient: (M, 6) of minus the log-likelihood in the tangent space at the modes.
-        information: (M, 6, 6) Gauss-Newton approximation of its Hessian.
-        log_likelihood: (M,) at the modes.
-    """
-
-    around: Tensor
-    gradient: Tensor
-    information: Tensor
-    log_likelihood: Tensor
+    around: Tensor  # (M, 7) the modes
+    gradient: Tensor  # (M, 6) of minus the log-likelihood in the tangent space at the modes
+    information: Tensor  # (M, 6, 6) Gauss-Newton approximation of its Hessian
+    log_likelihood: Tensor  # (M,) at the modes
 
     def posterior(self, center: Tensor, precision: Tensor) -> GaussianMixture:
         """The posterior, M components, under Gaussian priors: means (..., 7), precisions (..., 6, 6)."""

@@ -20,21 +20,13 @@ SPARSE = 3.0
 
 @dataclass(frozen=True, eq=False)
 class DistinctParticles:
-    """The distinct values at an address, of the particles with weight.
+    """The distinct values at an address, of the particles with weight."""
 
-    Attributes:
-        values: (K, 7) poses, or (K, d) values of another site.
-        weights: (K,) normalised; those of copies are summed.
-        particles: (P,) int64 the particles with weight.
-        index: (P,) int64 the distinct value that each of them has.
-        is_pose: whether the values are poses.
-    """
-
-    values: Tensor
-    weights: Tensor
-    particles: Tensor
-    index: Tensor
-    is_pose: bool
+    values: Tensor  # (K, 7) poses, or (K, d) values of another site
+    weights: Tensor  # (K,) normalised; those of copies are summed
+    particles: Tensor  # (P,) int64 the particles with weight
+    index: Tensor  # (P,) int64 the distinct value that each of them has
+    is_pose: bool  # whether the values are poses
 
     @classmethod
     def of(cls, population: Population, address: str) -> DistinctParticles:

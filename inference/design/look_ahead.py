@@ -17,36 +17,24 @@ UNLIKELY = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedCandidate:
-    """The likelihoods of a candidate's simulated observations.
+    """The likelihoods of a candidate's simulated observations."""
 
-    Attributes:
-        first: (S, N) log-likelihoods of the outer samples' observations at all particles; rows of NaN failed.
-        second: the same for an independent draw of the noise, used in a second step; None without one.
-        entropies: (S,) after the first draw; NaN where it failed.
-        cost: nats.
-    """
-
+    # (S, N) log-likelihoods of the outer samples' observations at all particles; rows of NaN failed
     first: Tensor
+    # the same for an independent draw of the noise, used in a second step; None without one
     second: Tensor | None
-    entropies: Tensor
-    cost: float
+    entropies: Tensor  # (S,) after the first draw; NaN where it failed
+    cost: float  # nats
 
 
 @dataclass(frozen=True, eq=False)
 class SecondStep:
-    """The best second step under each outer sample.
+    """The best second step under each outer sample."""
 
-    Attributes:
-        gains: (S,) expected information gains, nats; 0 where none is worth its cost, NaN where failed.
-        numbers: (S,) int64 the candidate; -1 for none.
-        costs: (S,) nats.
-        standard_error: of the mean gain, from the inner samples that the second steps share.
-    """
-
-    gains: Tensor
-    numbers: Tensor
-    costs: Tensor
-    standard_error: float
+    gains: Tensor  # (S,) expected information gains, nats; 0 where none is worth its cost, NaN where failed
+    numbers: Tensor  # (S,) int64 the candidate; -1 for none
+    costs: Tensor  # (S,) nats
+    standard_error: float  # of the mean gain, from the inner samples that the second steps share
 
 
 def posterior_entropies(log_weights: Tensor, log_likelihoods: Tensor, entropy_of: EntropyOfWeights) -> Tensor:

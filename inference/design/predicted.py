@@ -23,18 +23,13 @@ Information = Callable[[Any, Trace], Tensor | None]
 
 @dataclass(frozen=True, eq=False)
 class PredictedObservations:
-    """A candidate's predicted observations at S outer samples.
+    """A candidate's predicted observations at S outer samples."""
 
-    Attributes:
-        args: the program's arguments once it is measured.
-        known: (S, 6, 6) its information; None to take it from the sites.
-        sites: those that would be observed, at the outer samples, by address.
-        values: (S, *event) a sample of each, one for each outer sample.
-    """
-
-    args: tuple[Any, ...]
-    known: Tensor | None = None
+    args: tuple[Any, ...]  # the program's arguments once it is measured
+    known: Tensor | None = None  # (S, 6, 6) its information; None to take it from the sites
+    # those that would be observed, at the outer samples, by address
     sites: Mapping[str, Any] = field(default_factory=dict)
+    # (S, *event) a sample of each, one for each outer sample
     values: dict[str, Tensor] = field(default_factory=dict)
 
     def information(self) -> Tensor:

@@ -19,23 +19,14 @@ from bcppl.poses import Freedom
 
 @dataclass(frozen=True, eq=False)
 class TangentMixture:
-    """A Gaussian for each of K modes.
+    """A Gaussian for each of K modes."""
 
-    Attributes:
-        freedom: the d free axes.
-        label: (N,) the mode of each particle; -1 without weight.
-        mean: (K, 7) world_from_part.
-        mass: (K,) probabilities of the modes.
-        factor: (K, d, d) lower Cholesky factors of the covariances.
-        log_base: (K,) the mean log-density of the base measure.
-    """
-
-    freedom: Freedom
-    label: Tensor
-    mean: Tensor
-    mass: Tensor
-    factor: Tensor
-    log_base: Tensor
+    freedom: Freedom  # the d free axes
+    label: Tensor  # (N,) the mode of each particle; -1 without weight
+    mean: Tensor  # (K, 7) world_from_part
+    mass: Tensor  # (K,) probabilities of the modes
+    factor: Tensor  # (K, d, d) lower Cholesky factors of the covariances
+    log_base: Tensor  # (K,) the mean log-density of the base measure
 
     def __len__(self) -> int:
         return len(self.mean)

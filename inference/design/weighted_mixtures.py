@@ -18,19 +18,12 @@ NEGLIGIBLE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class WeightedMixtures:
-    """Distinct points, and which of them are neighbours.
+    """Distinct points, and which of them are neighbours."""
 
-    Attributes:
-        coordinates: (K, d) of each point about the mean of its mode in the belief.
-        log_base: (K,) log-density of the base measure there.
-        floor: (d, d) the covariance of a mode that consists of a single particle.
-        linked: (K, K) float32, 1 where two points are neighbours; None where all are.
-    """
-
-    coordinates: Tensor
-    log_base: Tensor
-    floor: Tensor
-    linked: Tensor | None
+    coordinates: Tensor  # (K, d) of each point about the mean of its mode in the belief
+    log_base: Tensor  # (K,) log-density of the base measure there
+    floor: Tensor  # (d, d) the covariance of a mode that consists of a single particle
+    linked: Tensor | None  # (K, K) float32, 1 where two points are neighbours; None where all are
 
     @classmethod
     def fit(

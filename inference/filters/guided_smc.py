@@ -142,17 +142,11 @@ def guided(
 
 
 class Assimilated(NamedTuple):
-    """A population given one more measurement.
+    """A population given one more measurement."""
 
-    Attributes:
-        population: of N particles.
-        effective: the effective sample size of all copies.
-        origin: (N,) the particle that each copy was made of; None where each is its own.
-    """
-
-    population: Population
-    effective: float
-    origin: Tensor | None
+    population: Population  # of N particles
+    effective: float  # the effective sample size of all copies
+    origin: Tensor | None  # (N,) the particle that each copy was made of; None where each is its own
 
 
 def assimilate(population: Population, observed: Observed, pair: Pair) -> Assimilated | None:

@@ -12,9 +12,7 @@ from shapely.affinity import translate
 
 from bcppl.errors import InputError
 from bcppl.geometry.cover import polygons_of
-from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
+from bcppl.geometry.parts import Array, Part
 
 _BELOW = 0.0002  # m below the top at which its outline is taken
 _HOLE = 0.002  # m

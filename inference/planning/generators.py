@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
@@ -28,12 +27,10 @@ from bcppl.inference.planning.touching import (
     surface_points,
     touch,
 )
-from bcppl.robot.plan import InsertionPlan, Plan
+from bcppl.robot.plan import Array, InsertionPlan, Plan
 from bcppl.sensors import sensor_named, sensors
 from bcppl.sensors.candidates import Candidate
 from bcppl.sensors.protocol import AroundPart
-
-Array = npt.NDArray[np.float64]
 
 # Searches and attempts that take two to three seconds.
 SHORT = InsertionParameters(

@@ -11,7 +11,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
@@ -21,9 +20,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.holes import Hole, fit_in, hole_of
 from bcppl.geometry.parts import Part
 from bcppl.inference.summaries import weighted_covariance
-from bcppl.robot.plan import InsertionPlan, Manner, Plan
-
-Array = npt.NDArray[np.float64]
+from bcppl.robot.plan import Array, InsertionPlan, Manner, Plan
 
 
 class InsertionParameters(NamedTuple):

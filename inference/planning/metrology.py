@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
 from bcppl.beliefs import Belief
@@ -25,9 +24,7 @@ from bcppl.inference.planning.waypoints import (
     top_of,
     upright,
 )
-from bcppl.robot.plan import Manner, Plan
-
-Array = npt.NDArray[np.float64]
+from bcppl.robot.plan import Array, Manner, Plan
 
 _ABOVE = 0.06  # m above the top where the plan begins
 _AWAY = 0.002  # m from the part on the way around it

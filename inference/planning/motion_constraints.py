@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
@@ -19,10 +18,8 @@ from bcppl.inference.planning.constraints import Constraint, per_candidate
 from bcppl.inference.planning.motions import expected_contacts, free_path, pressing_force
 from bcppl.robot.inverse_kinematics import joint_paths
 from bcppl.robot.kinematics import Robot
-from bcppl.robot.plan import Plan
+from bcppl.robot.plan import Array, Plan
 from bcppl.sensors.candidates import Candidate, duration_of, motion_of, placement_of
-
-Array = npt.NDArray[np.float64]
 
 _CONTACT = 0.0005  # m: a peg so near to the part is in contact with it
 

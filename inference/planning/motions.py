@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
 from bcppl import poses
-from bcppl.robot.plan import Plan
-
-Array = npt.NDArray[np.float64]
+from bcppl.robot.plan import Array, Plan
 
 _SPACING = 0.002  # m between poses of a free path
 

@@ -18,9 +18,8 @@ from bcppl.geometry.holes import Hole, depth_reached, hole_of, lateral_error
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.waypoints import tip_of
 from bcppl.inference.resampling import seeded, systematic
-from bcppl.robot.plan import InsertionPlan, Plan, probe_of
+from bcppl.robot.plan import Array, InsertionPlan, Plan, probe_of
 
-Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 _BESIDE = 0.002  # m: a tip farther from the hole's axis is not in the hole

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import trimesh
 
 from bcppl.arguments import number_within, seed_number, whole_number
@@ -23,9 +22,7 @@ from bcppl.inference.planning.waypoints import (
     top_of,
     upright,
 )
-from bcppl.robot.plan import Plan
-
-Array = npt.NDArray[np.float64]
+from bcppl.robot.plan import Array, Plan
 
 
 class TouchParameters(NamedTuple):

@@ -5,19 +5,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.geometry.parts import Part
-from bcppl.robot.plan import Manner
+from bcppl.robot.plan import Array, Manner
 
 if TYPE_CHECKING:
     from bcppl.inference.planning.metrology import MetrologyParameters
     from bcppl.inference.planning.touching import TouchParameters
 
-Array = npt.NDArray[np.float64]
 
 STIFFNESS = (2500.0, 2500.0, 2500.0, 150.0, 150.0, 150.0)
 DAMPING = (120.0, 120.0, 120.0, 2.5, 2.5, 2.5)

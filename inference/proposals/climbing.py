@@ -40,19 +40,12 @@ ANYWHERE, WIDE = 0.1, 4.0  # the share of jumps that go anywhere, and their vari
 
 
 class Modes(NamedTuple):
-    """A normal for each of K modes.
+    """A normal for each of K modes."""
 
-    Attributes:
-        centers: poses (K, 7).
-        covariance: (K, d, d) over the free axes.
-        log_mass: (K,) log of the integral of the joint density, by importance sampling.
-        scale: (d,) standard deviations of where the climbs began.
-    """
-
-    centers: Tensor
-    covariance: Tensor
-    log_mass: Tensor
-    scale: Tensor
+    centers: Tensor  # poses (K, 7)
+    covariance: Tensor  # (K, d, d) over the free axes
+    log_mass: Tensor  # (K,) log of the integral of the joint density, by importance sampling
+    scale: Tensor  # (d,) standard deviations of where the climbs began
 
 
 def modes(start: Trace, address: str) -> Modes:
