@@ -21,6 +21,7 @@ from bcppl.inference.population import Population
 from bcppl.traces import Series, Trace, generate, propose
 
 Program = Callable[..., Any]
+GIVE_STRATA = "give strata as a function that maps a value to its stratum."
 
 
 def importance_sampling(
@@ -155,10 +156,7 @@ def _refuse_more(strata: int, particles: int) -> None:
 def _enumerated(start: Started, trace: Trace, address: str) -> Population:
     site, particles = trace.distributions[address], trace.particles
     if len(site.batch_shape) > 1:
-        raise InputError(
-            f"the first latent choice {address!r} is in a plate; "
-            "give strata as a function that maps a value to its stratum."
-        )
+        raise InputError(f"the first latent choice {address!r} is in a plate; {GIVE_STRATA}")
     values = site.enumerate_support(expand=False)
     values = values.reshape(len(values), *site.event_shape)
     _refuse_more(len(values), particles)
@@ -179,10 +177,8 @@ def _by_quantile(start: Started, trace: Trace, address: str, strata: int) -> Pop
             raise NotImplementedError
         chosen = site.icdf(quantile).to(trace[address])
     except NotImplementedError:
-        raise InputError(
-            f"the first latent choice {address!r} has no inverse distribution function; "
-            "give strata as a function that maps a value to its stratum."
-        ) from None
+        what = f"the first latent choice {address!r} has no inverse distribution function"
+        raise InputError(f"{what}; {GIVE_STRATA}") from None
     started, log_weights = start(chosen)
     # Each value is a draw of the program; only jointly are they more even than independent draws.
     return _population(started, log_weights - started.log_prob(address))

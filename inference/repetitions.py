@@ -65,7 +65,8 @@ class Repeated:
     """Independent runs of one inference; print it for a table.
 
     A run in which no particle has any weight left estimates the evidence by 0, and counts as that, for the
-    mean is biased without it. Means, R-hat and the pooled posterior are those of the other runs.
+    mean is biased without it. Means, R-hat and the pooled posterior are those of the other runs; they raise
+    NoWeightError where all are dead.
 
     Attributes:
         populations: one for each run.
@@ -141,7 +142,6 @@ class Repeated:
 
         Raises:
             InputError: no latent site has that address, or no pose is there.
-            NoWeightError: all runs are dead.
         """
         first = self._alive[0].belief(address)
         each = torch.cat([p.trace.choices[address] for p in self.populations])
@@ -152,7 +152,6 @@ class Repeated:
 
         Raises:
             InputError: no latent site has that address.
-            NoWeightError: all runs are dead.
         """
         alive = self._alive
         if is_pose(alive[0], address):
@@ -199,7 +198,6 @@ class Repeated:
         Raises:
             InputError: ArviZ is not installed, or there are fewer than two runs alive, or fewer than four
                 draws.
-            NoWeightError: all runs are dead.
         """
         arviz, alive = import_arviz(), self._alive
         if len(alive) < 2:

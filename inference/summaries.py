@@ -1,7 +1,8 @@
 """Summaries of a population at any of its latent addresses: moments, quantiles, probabilities.
 
 At the address of a pose (its distribution has a `freedom`) these are the belief's: a mean pose (7,), and six
-tangent coordinates at it, metres and radians, 0 along held axes (`bcppl.beliefs`).
+tangent coordinates at it, metres and radians, 0 along held axes (`bcppl.beliefs`). All raise InputError where
+no latent site has the address, and NoWeightError where no particle has any weight.
 
 Of a long series (`bcppl.traces.Series`) an address may be one with the number of a step, `("x", 3)`: the
 value of each particle's ancestor at that step, with the particle's present weight.
@@ -68,12 +69,7 @@ def _belief(population: Population, address: Address) -> Belief:
 
 
 def mean(population: Population, address: Address) -> Tensor:
-    """The weighted mean (*event) at an address, in its own units; of a discrete one that of its numbers.
-
-    Raises:
-        InputError: no latent site has that address.
-        NoWeightError: no particle has any weight.
-    """
+    """The weighted mean (*event) at an address, in its own units; of a discrete one that of its numbers."""
     if is_pose(population, address):
         return _belief(population, address).mean
     values = values_at(population, address).to(torch.float64)
@@ -81,12 +77,7 @@ def mean(population: Population, address: Address) -> Tensor:
 
 
 def covariance(population: Population, address: Address) -> Tensor:
-    """The weighted covariance (D, D) of the D numbers of a value, in reading order; (6, 6) of a pose.
-
-    Raises:
-        InputError: no latent site has that address.
-        NoWeightError: no particle has any weight.
-    """
+    """The weighted covariance (D, D) of the D numbers of a value, in reading order; (6, 6) of a pose."""
     if is_pose(population, address):
         return _belief(population, address).covariance
     weights = normalised(population.log_weights)
@@ -107,10 +98,6 @@ def quantiles(population: Population, address: Address, probabilities: object) -
         population: weighted particles.
         address: a latent one, or with the number of a step.
         probabilities: one (then there is no first axis) or several in [0, 1]; see `weighted_quantiles`.
-
-    Raises:
-        InputError: no latent site has that address, or a probability is not in [0, 1].
-        NoWeightError: no particle has any weight.
     """
     if is_pose(population, address):
         return _belief(population, address).quantiles(probabilities)
@@ -127,12 +114,7 @@ class Probabilities(NamedTuple):
 
 
 def probabilities(population: Population, address: Address) -> Probabilities:
-    """The probability of each value at a discrete address.
-
-    Raises:
-        InputError: no latent site has that address.
-        NoWeightError: no particle has any weight.
-    """
+    """The probability of each value at a discrete address."""
     weights, values = normalised(population.log_weights), values_at(population, address)
     carrying = weights > 0
     distinct, which = torch.unique(values[carrying], dim=0, return_inverse=True)

@@ -2,7 +2,7 @@
 
 Tierney, Markov chains for exploring posterior distributions, Annals of Statistics 22, 1994, section 2.4. The
 choice of the next kernel does not depend on where the particles are. The acceptance is the mean over the
-proposals.
+proposals. All raise InputError where no kernel is given, or something else, such as a proposal.
 """
 
 from __future__ import annotations
@@ -51,11 +51,7 @@ def _listed(name: str, kernels: Sequence[Kernel | Sequence[Kernel]]) -> list[Ker
 
 
 def sequence(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
-    """One kernel after another, in the order given, one by one or as a list.
-
-    Raises:
-        InputError: no kernel is given, or something else, such as a proposal.
-    """
+    """One kernel after another, in the order given, one by one or as a list."""
     return _one_after_another(_listed("sequence", kernels), range)
 
 
@@ -63,9 +59,6 @@ def cycle(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
     """Each kernel once, in an order that is drawn for each move: Tierney's random permutation scan.
 
     A fixed order of reversible kernels is not reversible; a random one is.
-
-    Raises:
-        InputError: no kernel is given, or something else, such as a proposal.
     """
     return _one_after_another(_listed("cycle", kernels), lambda count: torch.randperm(count).tolist())
 
@@ -82,8 +75,7 @@ def mixture(kernels: Sequence[Kernel] | Kernel, *more: Any, weights: Sequence[fl
         weights: their probabilities, up to a factor; equal by default.
 
     Raises:
-        InputError: no kernel is given, or something else, such as a proposal; or the weights are not one for
-            each, finite, and not negative.
+        InputError: the weights are not one for each, finite, and not negative.
     """
     if isinstance(kernels, Sequence) and len(more) == 1 and weights is None and not callable(more[0]):
         weights, more = more[0], ()
@@ -123,7 +115,7 @@ def repeat(kernel: Kernel, times: int) -> Kernel:
     `bcppl.inference.kernels.until`.
 
     Raises:
-        InputError: what is given is no kernel, or the times are no whole number, 1 or more.
+        InputError: the times are no whole number, 1 or more.
     """
     refuse_other("repeat", kernel)
     times = whole_number("a kernel is to be repeated {} times", times)
