@@ -159,7 +159,9 @@ def moved_trace(
     latent: Values = {} if observed is not None and isinstance(old, SeriesTrace) else old.choices
     chosen = simulate(forward, (shown,), count)
     _refuse_observed("forward", chosen.choices, shown)
-    values, back = _read(chosen.result, chosen.choices, latent, lambda: _brought(shown))
+    values, back = _read(
+        chosen.result, chosen.choices, latent, lambda: shown.brought if isinstance(shown, Anticipated) else []
+    )
     new, log_ratio = _updated(old, values, observed)
     fresh = [a for a in values if a not in latent]
     reverse = assessed(backward, (new,), back, count)
@@ -206,11 +208,6 @@ def _updated(old: Trace, values: Values, observed: Observed | None) -> tuple[Tra
     else:
         updated = update(old, values, args=observed.args, observations=observed.observations)
     return updated.trace, updated.log_ratio
-
-
-def _brought(shown: Trace | Anticipated) -> list[str]:
-    """The latent addresses that come with the measurement."""
-    return shown.brought if isinstance(shown, Anticipated) else []
 
 
 def _refuse_observed(which: str, choices: Values, seen: Trace | Anticipated) -> None:

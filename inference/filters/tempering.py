@@ -111,7 +111,9 @@ class Tempered:
             log_likelihood: their log-probability (N,).
         """
         start = population.log_evidence
-        groups = [[a] for a in _by_cost(population.trace, new)] if self.by_site and new else [list(new)]
+        sites = population.trace.distributions
+        ordered = sorted(new, key=lambda address: cost_of(sites[address]))
+        groups = [[a] for a in ordered] if self.by_site and new else [list(new)]
         done, acceptances, ancestors, before, resampled = [], [], None, None, 0
         displacement = float("nan")
         for number, group in enumerate(groups):
@@ -214,7 +216,3 @@ def tempered(
             "a step is given a rejuvenation beside a kernel or a resampling; give one or the other."
         )
     return Tempered(rejuvenation, _Schedule(share, fixed), by_site)
-
-
-def _by_cost(trace: Trace, addresses: Sequence[str]) -> list[str]:
-    return sorted(addresses, key=lambda address: cost_of(trace.distributions[address]))
