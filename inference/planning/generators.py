@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
@@ -27,7 +28,7 @@ from bcppl.inference.planning.touching import (
     surface_points,
     touch,
 )
-from bcppl.robot.plan import Array, InsertionPlan, Plan
+from bcppl.robot.plan import InsertionPlan, Plan
 from bcppl.sensors import sensor_named, sensors
 from bcppl.sensors.candidates import Candidate
 from bcppl.sensors.protocol import AroundPart

@@ -15,12 +15,13 @@ import torch
 
 from bcppl import poses
 from bcppl.arguments import number_within
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.geometry.holes import Hole, fit_in, hole_of
 from bcppl.geometry.parts import Part
 from bcppl.inference.summaries import weighted_covariance
-from bcppl.robot.plan import Array, InsertionPlan, Manner, Plan
+from bcppl.robot.plan import InsertionPlan, Manner, Plan
 
 
 class InsertionParameters(NamedTuple):

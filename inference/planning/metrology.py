@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.faces import Side, TopPoints, points_on_top, section, sides
@@ -24,7 +25,7 @@ from bcppl.inference.planning.waypoints import (
     top_of,
     upright,
 )
-from bcppl.robot.plan import Array, Manner, Plan
+from bcppl.robot.plan import Manner, Plan
 
 _ABOVE = 0.06  # m above the top where the plan begins
 _AWAY = 0.002  # m from the part on the way around it

@@ -11,6 +11,7 @@ import torch
 
 from bcppl import poses
 from bcppl.arguments import number_within
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.parts import Part
@@ -18,7 +19,7 @@ from bcppl.inference.planning.constraints import Constraint, per_candidate
 from bcppl.inference.planning.motions import expected_contacts, free_path, pressing_force
 from bcppl.robot.inverse_kinematics import joint_paths
 from bcppl.robot.kinematics import Robot
-from bcppl.robot.plan import Array, Plan
+from bcppl.robot.plan import Plan
 from bcppl.sensors.candidates import Candidate, duration_of, motion_of, placement_of
 
 _CONTACT = 0.0005  # m: a peg so near to the part is in contact with it

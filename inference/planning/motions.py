@@ -9,7 +9,8 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 
 from bcppl import poses
-from bcppl.robot.plan import Array, Plan
+from bcppl.arrays import Array
+from bcppl.robot.plan import Plan
 
 _SPACING = 0.002  # m between poses of a free path
 

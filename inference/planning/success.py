@@ -12,13 +12,14 @@ import torch
 
 from bcppl import poses
 from bcppl.arguments import whole_number
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.contact.physics import PegPhysics, Rollout
 from bcppl.geometry.holes import Hole, depth_reached, hole_of, lateral_error
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.waypoints import tip_of
 from bcppl.inference.resampling import seeded, systematic
-from bcppl.robot.plan import Array, InsertionPlan, Plan, probe_of
+from bcppl.robot.plan import InsertionPlan, Plan, probe_of
 
 Mask = npt.NDArray[np.bool_]
 

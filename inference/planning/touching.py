@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 
 from bcppl.arguments import number_within, seed_number, whole_number
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.waypoints import (
@@ -22,7 +23,7 @@ from bcppl.inference.planning.waypoints import (
     top_of,
     upright,
 )
-from bcppl.robot.plan import Array, Plan
+from bcppl.robot.plan import Plan
 
 
 class TouchParameters(NamedTuple):

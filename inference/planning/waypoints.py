@@ -8,9 +8,10 @@ import numpy as np
 import torch
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.geometry.parts import Part
-from bcppl.robot.plan import Array, Manner
+from bcppl.robot.plan import Manner
 
 if TYPE_CHECKING:
     from bcppl.inference.planning.metrology import MetrologyParameters

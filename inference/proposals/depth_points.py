@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within, whole_number
+from bcppl.arrays import Array
 from bcppl.distributions.depth import ClutteredDepth, LaplaceDepth, RobustDepth
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
@@ -30,7 +31,6 @@ from bcppl.poses import FREE, Freedom
 from bcppl.rendering.part_renderer import Hits
 from bcppl.traces import Trace
 
-Array = npt.NDArray[np.float64]
 Ids = npt.NDArray[np.int64]
 
 FARTHEST = 10.0  # the largest scale of residuals, in scales of the depth's noise
