@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Collection
 
 from bcppl.errors import InputError
 
@@ -55,6 +56,17 @@ def number_within(
     bounds = [(above, "above"), (least, "at least"), (below, "below"), (most, "at most")]
     asked = " and ".join(f"{name} {bound:g}" for bound, name in bounds if math.isfinite(bound))
     raise InputError(f"{_named(what, value)}; give a finite number{' ' * bool(asked)}{asked}.")
+
+
+def latent_address(what: str, address: str, latent: Collection[str]) -> None:
+    """Refuse an address that is not among the latent ones; `what` begins the sentence, {} the address.
+
+    Raises:
+        InputError: names the address and the latent ones.
+    """
+    if address not in latent:
+        listed = ", ".join(latent) or "none"
+        raise InputError(f"{_named(what, address)}, which is no latent address; latent are {listed}.")
 
 
 def _named(what: str, value: object) -> str:

@@ -8,6 +8,7 @@ a run that is resumed, branched or repeated gives the same bits.
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -35,12 +36,7 @@ UNSURE = 0.0005  # m: beyond this standard deviation the contact may be with ano
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """The fit of an instrument's first measurement.
-
-    Attributes:
-        action: of the measurement.
-        fit: a Gaussian over the apparent pose and the nuisance parameters.
-    """
+    """The action of an instrument's first measurement, and the Gaussian fitted to that."""
 
     action: Any
     fit: Any
@@ -48,25 +44,16 @@ class Fitted:
 
 @dataclass(frozen=True, eq=False)
 class GaussianApproximation:
-    """The posterior given some measurements, as a mixture of Gaussians.
+    """The posterior given some measurements, as a mixture of Gaussians."""
 
-    Attributes:
-        pose: the address of the part's pose.
-        scene: of the model; it has the prior and the sensors' likelihoods.
-        fits: by instrument.
-        contacts: measurements with a quadratic approximation.
-        quadratic: of the contacts' likelihood; None before the first.
-        relevant: by number of the measurement, whether it is informative near the fits' estimate.
-        stale: whether contacts were added after `quadratic` was computed.
-    """
-
-    pose: str
-    scene: Any
-    fits: Mapping[str, Fitted] = field(default_factory=dict)
-    contacts: tuple[Approximated, ...] = ()
-    quadratic: QuadraticApproximation | None = None
+    pose: str  # the address of the part's pose
+    scene: Any  # of the model; it has the prior and the sensors' likelihoods
+    fits: Mapping[str, Fitted] = field(default_factory=dict)  # by instrument
+    contacts: tuple[Approximated, ...] = ()  # measurements with a quadratic approximation
+    quadratic: QuadraticApproximation | None = None  # of the contacts' likelihood; None before the first
+    # by number of the measurement, whether it is informative near the fits' estimate
     relevant: Mapping[int, bool] = field(default_factory=dict)
-    stale: bool = False
+    stale: bool = False  # whether contacts were added after `quadratic` was computed
 
     def __post_init__(self) -> None:
         if not hasattr(self.scene, "prior") or not hasattr(self.scene, "sensor"):
@@ -78,14 +65,7 @@ class GaussianApproximation:
     def including(
         self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]
     ) -> GaussianApproximation:
-        """The approximation given one more measurement.
-
-        Args:
-            scene: of the model, which knows the measurement.
-            number: of the measurement in the recording.
-            action: what the robot did.
-            observations: values by address, the measurement's among them.
-        """
+        """The approximation given one more measurement, the `number`-th of the recording."""
         longer = self.updated().deferring(scene, number, action, observations)
         return replace(longer, stale=longer.stale or bool(longer.contacts)).updated()
 
@@ -156,11 +136,8 @@ class GaussianApproximation:
     @cached_property
     def prior(self) -> Normal:
         """The Gaussian given the instruments' fits; the model's prior where there is none."""
-        factors = [
-            self.scene.sensor(each.action).marginal_factor(each.action, each.fit)
-            for each in self.fits.values()
-        ]
-        prior = self.scene.prior
+        prior, sensor = self.scene.prior, self.scene.sensor
+        factors = [sensor(f.action).marginal_factor(f.action, f.fit) for f in self.fits.values()]
         if factors:
             normal = product_of_factors(prior, factors)
             return Normal(normal.center, torch.linalg.inv(normal.covariance))
@@ -179,11 +156,9 @@ class GaussianApproximation:
     def conditional(self, trace: Any, values: Mapping[str, Tensor] | None = None) -> Any:
         """The approximate conditional distribution of the pose, given each particle's nuisance parameters.
 
-        Args:
-            trace: of N particles.
-            values: nuisance parameters that it does not have, by address.
+        `values` has those that the trace lacks, by address.
         """
-        looked_up = _Values(trace, {} if values is None else values)
+        looked_up: Any = ChainMap(dict(values or {}), trace)
         factors: list[PoseFactor] = [
             self.scene.sensor(each.action).factor(each.action, looked_up) for each in self.fits.values()
         ]
@@ -205,19 +180,3 @@ class GaussianApproximation:
         if before is self.scene.prior:
             return None
         return matched(before) if isinstance(before, MixturePose) else before
-
-
-class _Values(Mapping[str, Tensor]):
-    """Given values by address, then a trace's."""
-
-    def __init__(self, trace: Any, given: Mapping[str, Tensor]) -> None:
-        self.trace, self.given = trace, given
-
-    def __getitem__(self, address: str) -> Tensor:
-        return self.given[address] if address in self.given else self.trace[address]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter({**self.trace.choices, **self.given})
-
-    def __len__(self) -> int:
-        return len({**self.trace.choices, **self.given})

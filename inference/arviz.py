@@ -4,32 +4,25 @@ from __future__ import annotations
 
 import importlib
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from bcppl.arguments import seed_number, whole_number
+from bcppl.arguments import whole_number
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.inference.chains import Chains
 from bcppl.inference.population import Population
-from bcppl.inference.resampling import Scheme, systematic
+from bcppl.inference.resampling import seeded, systematic
 from bcppl.inference.summaries import is_pose
 
 POSE_COORDINATES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
-def to_arviz(
-    runs: Any,
-    *,
-    draws: int | None = None,
-    seed: int = 0,
-    scheme: Scheme = systematic,
-) -> Any:
+def to_arviz(runs: Any, *, draws: int | None = None, seed: int = 0) -> Any:
     """Equal-weight draws of every latent address, with their log-likelihoods and sampler statistics.
 
     The draws are resampled from the weighted particles and put in random order, so copies count as draws;
@@ -43,7 +36,6 @@ def to_arviz(
         draws: how many of each; by default as many as the smallest population has particles. Of `Chains` the
             last so many, by default all.
         seed: same seed, same draws; torch's own generator is left as it was.
-        scheme: resamples (`bcppl.inference.resampling`).
 
     Returns:
         An `arviz.InferenceData` with the groups
@@ -54,8 +46,8 @@ def to_arviz(
         - log_likelihood: of every observed address, (chain, draw).
         - sample_stats: (chain, draw) `lp`, the log-probability of all sites; `log_weight`, unnormalised, of
           the drawn particle; `particle`, its index; `founder`, the index of its ancestor in the first
-          population. (chain,) `log_evidence`,
-          `effective_sample_size` and `distinct_particles`, the last the number of different particles drawn.
+          population. (chain,) `log_evidence`, `effective_sample_size` and `distinct_particles`, the last the
+          number of different particles drawn.
         - observed_data: the observations.
 
     Raises:
@@ -69,16 +61,16 @@ def to_arviz(
     chains = _populations(runs)
     check_alike(chains)
     with seeded(seed):
-        chosen = draw(chains, draws, scheme)
+        chosen = draw(chains, draws)
     first = chains[0].trace
     posterior = {
         address: at_draws([chain.trace.choices[address] for chain in chains], chosen)
         for address in first.choices
     }
-    posed = _posed(chains[0], posterior)
-    observed = [address for address in first.addresses if address not in first.choices]
     log_likelihood = {
-        address: at_draws([chain.trace.log_prob(address) for chain in chains], chosen) for address in observed
+        address: at_draws([chain.trace.log_prob(address) for chain in chains], chosen)
+        for address in first.addresses
+        if address not in first.choices
     }
     sample_stats = {
         "lp": at_draws([chain.trace.log_prob() for chain in chains], chosen),
@@ -86,13 +78,8 @@ def to_arviz(
         "particle": torch.stack(chosen),
         "founder": at_draws([chain.founders for chain in chains], chosen),
     }
-    data = arviz.from_dict(
-        posterior=_numpy(posterior),
-        log_likelihood=_numpy(log_likelihood) or None,
-        sample_stats=_numpy(sample_stats),
-        observed_data=_numpy(dict(first.observations)) or None,
-        coords={"pose": list(POSE_COORDINATES)} if posed else None,
-        dims={address: ["pose"] for address in posed},
+    data = _inference_data(
+        arviz, chains[0], posterior, log_likelihood=_numpy(log_likelihood), sample_stats=_numpy(sample_stats)
     )
     data.sample_stats["log_evidence"] = ("chain", [chain.log_evidence for chain in chains])
     sizes = [chain.effective_sample_size for chain in chains]
@@ -111,26 +98,30 @@ def _populations(runs: Any) -> list[Population]:
             f"a {type(runs).__name__} was given; give a population, a step of SMC, runs or chains."
         )
     given = list(runs)
-    each: list[Population] = []
-    for one in given:
-        population = getattr(one, "population", one)
-        if not isinstance(population, Population):
-            raise InputError(
-                f"a {type(one).__name__} was given in place of a population; "
-                "give populations, steps of SMC, runs or chains."
-            )
-        each.append(population)
+    each = [population_of(one, "populations, steps of SMC, runs or chains") for one in given]
     # An iterator over the steps of one run; populations are those of several.
     of_one = isinstance(runs, Iterator) and not any(isinstance(one, Population) for one in given)
     return each[-1:] if of_one else each
 
 
-def _posed(population: Population, posterior: dict[str, Tensor]) -> list[str]:
-    """The addresses that hold poses; their quaternions are given one sign."""
+def population_of(given: Any, asked: str) -> Population:
+    """The population that is given, or that what is given has, such as a step of SMC."""
+    population = getattr(given, "population", given)
+    if not isinstance(population, Population):
+        raise InputError(f"a {type(given).__name__} was given in place of a population; give {asked}.")
+    return population
+
+
+def _inference_data(arviz: Any, population: Population, posterior: dict[str, Tensor], **groups: Any) -> Any:
+    """Draws by address, the quaternions of poses with one sign, the observations, and other groups."""
     posed = [address for address in posterior if is_pose(population, address)]
-    for address in posed:
-        posterior[address] = _one_sign(posterior[address])
-    return posed
+    return arviz.from_dict(
+        posterior=_numpy({a: _one_sign(v) if a in posed else v for a, v in posterior.items()}),
+        observed_data=_numpy(population.trace.observations) or None,
+        coords={"pose": list(POSE_COORDINATES)} if posed else None,
+        dims={address: ["pose"] for address in posed},
+        **{name: group or None for name, group in groups.items()},
+    )
 
 
 def _of_chains(arviz: Any, chains: Chains, draws: int | None) -> Any:
@@ -140,25 +131,15 @@ def _of_chains(arviz: Any, chains: Chains, draws: int | None) -> Any:
     last = Population(chains.trace, torch.zeros(len(chains.trace), dtype=torch.float64))
     # Chains are recorded move by move.
     posterior = {address: states[-draws:].movedim(1, 0) for address, states in chains.draws.items()}
-    posed = _posed(last, posterior)
-    data = arviz.from_dict(
-        posterior=_numpy(posterior),
-        sample_stats=_numpy({"acceptance": chains.acceptance[:, None].expand(-1, draws)}),
-        observed_data=_numpy(dict(chains.trace.observations)) or None,
-        coords={"pose": list(POSE_COORDINATES)} if posed else None,
-        dims={address: ["pose"] for address in posed},
-    )
+    acceptance = chains.acceptance[:, None].expand(-1, draws)
+    data = _inference_data(arviz, last, posterior, sample_stats=_numpy({"acceptance": acceptance}))
     # A group starts with the values that have both dimensions.
     data.sample_stats["acceptance"] = ("chain", chains.acceptance.numpy())
     return data
 
 
 def import_arviz() -> Any:
-    """The package arviz, imported without its notice about version 1.
-
-    Raises:
-        InputError: it is not installed, or is too new.
-    """
+    """The package arviz, imported without its notice about version 1."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -170,24 +151,8 @@ def import_arviz() -> Any:
     return arviz
 
 
-@contextmanager
-def seeded(seed: int) -> Iterator[None]:
-    """Torch's generator seeded within, and restored afterwards.
-
-    Raises:
-        InputError: the seed is not a whole number, 0 or more.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed_number(seed))
-        yield
-
-
 def check_alike(populations: Sequence[Population]) -> None:
-    """Refuse populations that are not of one program and the same observations.
-
-    Raises:
-        InputError: there is none, or they differ; names the run and the difference.
-    """
+    """Refuse populations that are not of one program and the same observations."""
     if not populations:
         raise InputError("no population was given; give one or more.")
     first = populations[0].trace
@@ -206,16 +171,11 @@ def check_alike(populations: Sequence[Population]) -> None:
                 )
 
 
-def draw(populations: Sequence[Population], draws: int | None, scheme: Scheme = systematic) -> list[Tensor]:
-    """Indices of equal-weight draws, (draws,) int64 for each population, in random order.
-
-    Raises:
-        InputError: `draws` is not a whole number, 1 or more.
-        NoWeightError: no particle of a population has any weight.
-    """
+def draw(populations: Sequence[Population], draws: int | None) -> list[Tensor]:
+    """Indices of equal-weight draws, (draws,) int64 for each population, in random order."""
     draws = min(map(len, populations)) if draws is None else whole_number("{} draws were asked for", draws)
-    # A scheme gives ancestors in order; draws in order would look like a chain that does not mix.
-    return [scheme(population.log_weights, draws)[torch.randperm(draws)] for population in populations]
+    # Ancestors come in order; draws in order would look like a chain that does not mix.
+    return [systematic(population.log_weights, draws)[torch.randperm(draws)] for population in populations]
 
 
 def at_draws(values: Sequence[Tensor], chosen: Sequence[Tensor]) -> Tensor:
@@ -232,5 +192,5 @@ def _one_sign(world_from_part: Tensor) -> Tensor:
     return torch.cat([pooled[:, :3], sign * pooled[:, 3:]], dim=1).reshape(world_from_part.shape)
 
 
-def _numpy(values: dict[str, Tensor]) -> dict[str, np.ndarray]:
+def _numpy(values: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
     return {address: value.detach().cpu().numpy() for address, value in values.items()}

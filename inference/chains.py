@@ -8,8 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bcppl.arguments import whole_number
-from bcppl.errors import InputError
+from bcppl.arguments import latent_address, whole_number
 from bcppl.inference.kernels import Kernel, fitted, refuse_other, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
@@ -73,7 +72,9 @@ def markov_chains(
     refuse_other("markov_chains", kernel)
     moves = whole_number("chains are to make {} moves", moves)
     every = whole_number("chains are to be recorded every {} moves", every)
-    population = start if isinstance(start, Population) else _equal(start)
+    if isinstance(start, Trace):
+        start = Population(start, torch.zeros(start.particles, dtype=torch.float64))
+    population = start
     weights = population.log_weights
     if scheme is not None and bool((weights != weights[0]).any()):
         population = population.selected(scheme(weights))
@@ -81,11 +82,7 @@ def markov_chains(
     addresses = [addresses] if isinstance(addresses, str) else addresses
     recorded = list(trace.choices if addresses is None else addresses)
     for address in recorded:
-        if address not in trace.choices:
-            raise InputError(
-                f"chains are to record {address!r}, which is no latent address; "
-                f"latent are {', '.join(trace.choices) or 'none'}."
-            )
+        latent_address("chains are to record {}", address, trace.choices)
     order = torch.randperm(count)
     halves = [h for h in (order[: count // 2], order[count // 2 :]) if len(h)]
     moves_of = [fitted(kernel, population[other]) for other in halves[::-1]]
@@ -102,7 +99,3 @@ def markov_chains(
     # Values of a trace are never written to, so they are kept as they are until here.
     stacked = {a: torch.stack(s) if s else trace[a][None][:0] for a, s in draws.items()}
     return Chains(stacked, taken / moves, trace)
-
-
-def _equal(trace: Trace) -> Population:
-    return Population(trace, torch.zeros(trace.particles, dtype=torch.float64))

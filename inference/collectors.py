@@ -43,12 +43,6 @@ class Collected(Generic[S]):
             self._columns[name].append(value)
         return step
 
-    def to_end(self) -> Collected[S]:
-        """Run to the end."""
-        for _ in self:
-            pass
-        return self
-
     @property
     def columns(self) -> dict[str, Any]:
         """By name, (steps, ...) tensors where all values are numbers or tensors of one shape, else lists."""
@@ -100,9 +94,5 @@ def distinct(step: Any) -> int:
 
 
 def mean(address: str) -> Callable[[Any], Tensor]:
-    """The weighted mean of a latent address: of a pose (7,), of another value the shape of its event.
-
-    Returns:
-        A function of a step. It raises InputError where no latent site has that address.
-    """
+    """The weighted mean of a latent address: of a pose (7,), of another value the shape of its event."""
     return lambda step: summaries.mean(step.population, address)

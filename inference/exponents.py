@@ -14,12 +14,8 @@ from bcppl.beliefs import normalised
 SMALLEST_STEP = 1e-6
 
 
-def conditional_effective_sample_size(log_weights: Tensor, log_factor: Tensor) -> float:
-    """N (sum W w)^2 / sum W w^2 for weights W and incremental weights w = exp(log_factor), each (N,)."""
-    return _conditional(normalised(log_weights), log_factor)
-
-
-def _conditional(weights: Tensor, log_factor: Tensor) -> float:
+def conditional_effective_sample_size(weights: Tensor, log_factor: Tensor) -> float:
+    """N (sum W w)^2 / sum W w^2 for normalised weights W and w = exp(log_factor), each (N,)."""
     factor = torch.exp(log_factor - log_factor.max())
     weighted = weights * factor
     return float(len(weights) * weighted.sum() ** 2 / (weighted @ factor))
@@ -36,12 +32,12 @@ def next_exponent(log_weights: Tensor, log_likelihood: Tensor, exponent: float, 
     weights, likelihood = normalised(log_weights[finite]), log_likelihood[finite]
     target = share * len(weights)
     low, high = 0.0, 1.0 - exponent
-    if _conditional(weights, high * likelihood) >= target:
+    if conditional_effective_sample_size(weights, high * likelihood) >= target:
         return 1.0
     # The sharpest likelihoods need steps of 1e-5 and less; one part in ten thousand of a step is nothing.
     while high - low > 1e-4 * high and high > SMALLEST_STEP:
         middle = 0.5 * (low + high)
-        if _conditional(weights, middle * likelihood) >= target:
+        if conditional_effective_sample_size(weights, middle * likelihood) >= target:
             low = middle
         else:
             high = middle

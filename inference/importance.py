@@ -21,6 +21,7 @@ from bcppl.inference.population import Population
 from bcppl.traces import Series, Trace, generate, propose
 
 Program = Callable[..., Any]
+GIVE_STRATA = "give strata as a function that maps a value to its stratum."
 
 
 def importance_sampling(
@@ -77,13 +78,9 @@ def tempered_importance_sampling(
         The population, with the evidence of all observations, and a record of the steps.
 
     Raises:
-        InputError: an observed address is never visited, or `step` is no `tempered(...)`.
+        InputError: an observed address is never visited.
         InferenceError: no particle is left with any weight.
     """
-    if not isinstance(step, Tempered):
-        raise InputError(
-            f"tempered_importance_sampling is given a {type(step).__name__} as step; give tempered(kernel)."
-        )
     trace, log_likelihood = generate(program, args, observations, particles)
     prior = Population(trace, torch.zeros_like(log_likelihood))
     return step.temper(prior, [a for a in trace.addresses if a not in trace.choices], log_likelihood)
@@ -132,9 +129,17 @@ def generate_stratified(
     if callable(strata):
         wide = generate(program, args, observations, particles * candidates)
         return _selected(*wide, strata(wide[0][address]), particles)
+
+    def started(values: Tensor) -> tuple[Trace, Tensor]:
+        return generate(program, args, observations, particles, {address: values})
+
     if trace.distributions[address].has_enumerate_support:
-        return _enumerated(program, args, observations, trace, address)
-    return _by_quantile(program, args, observations, trace, address, particles if strata is None else strata)
+        return _enumerated(started, trace, address)
+    return _by_quantile(started, trace, address, particles if strata is None else strata)
+
+
+# The trace whose first latent choice has values (N, *event), and its log weights (N,).
+Started = Callable[[Tensor], tuple[Trace, Tensor]]
 
 
 def _population(trace: Trace, log_weights: Tensor) -> Population:
@@ -148,37 +153,20 @@ def _refuse_more(strata: int, particles: int) -> None:
         )
 
 
-def _enumerated(
-    program: Program | Series,
-    args: tuple[Any, ...],
-    observations: Mapping[str, Tensor],
-    trace: Trace,
-    address: str,
-) -> Population:
+def _enumerated(start: Started, trace: Trace, address: str) -> Population:
     site, particles = trace.distributions[address], trace.particles
     if len(site.batch_shape) > 1:
-        raise InputError(
-            f"the first latent choice {address!r} is in a plate; "
-            "give strata as a function that maps a value to its stratum."
-        )
+        raise InputError(f"the first latent choice {address!r} is in a plate; {GIVE_STRATA}")
     values = site.enumerate_support(expand=False)
     values = values.reshape(len(values), *site.event_shape)
     _refuse_more(len(values), particles)
     stratum = torch.arange(particles) % len(values)
-    chosen = values[stratum].to(trace[address])
-    started, log_weights = generate(program, args, observations, particles, {address: chosen})
+    started, log_weights = start(values[stratum].to(trace[address]))
     share = torch.bincount(stratum).to(torch.float64) / particles
     return _population(started, log_weights - share.log()[stratum])
 
 
-def _by_quantile(
-    program: Program | Series,
-    args: tuple[Any, ...],
-    observations: Mapping[str, Tensor],
-    trace: Trace,
-    address: str,
-    strata: int,
-) -> Population:
+def _by_quantile(start: Started, trace: Trace, address: str, strata: int) -> Population:
     site, particles = trace.distributions[address], trace.particles
     _refuse_more(strata, particles)
     # Where the strata do not divide N, random ones get one more: each draw is then the program's own.
@@ -189,11 +177,9 @@ def _by_quantile(
             raise NotImplementedError
         chosen = site.icdf(quantile).to(trace[address])
     except NotImplementedError:
-        raise InputError(
-            f"the first latent choice {address!r} has no inverse distribution function; "
-            "give strata as a function that maps a value to its stratum."
-        ) from None
-    started, log_weights = generate(program, args, observations, particles, {address: chosen})
+        what = f"the first latent choice {address!r} has no inverse distribution function"
+        raise InputError(f"{what}; {GIVE_STRATA}") from None
+    started, log_weights = start(chosen)
     # Each value is a draw of the program; only jointly are they more even than independent draws.
     return _population(started, log_weights - started.log_prob(address))
 

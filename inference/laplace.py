@@ -38,19 +38,12 @@ class Normal(NamedTuple):
 
 
 class QuadraticApproximation(NamedTuple):
-    """A log-likelihood to second order around each of its M modes, the one of largest weight first.
+    """A log-likelihood to second order around each of its M modes, the one of largest weight first."""
 
-    Attributes:
-        around: (M, 7) the modes.
-        gradient: (M, 6) of minus the log-likelihood in the tangent space at the modes.
-        information: (M, 6, 6) Gauss-Newton approximation of its Hessian.
-        log_likelihood: (M,) at the modes.
-    """
-
-    around: Tensor
-    gradient: Tensor
-    information: Tensor
-    log_likelihood: Tensor
+    around: Tensor  # (M, 7) the modes
+    gradient: Tensor  # (M, 6) of minus the log-likelihood in the tangent space at the modes
+    information: Tensor  # (M, 6, 6) Gauss-Newton approximation of its Hessian
+    log_likelihood: Tensor  # (M,) at the modes
 
     def posterior(self, center: Tensor, precision: Tensor) -> GaussianMixture:
         """The posterior, M components, under Gaussian priors: means (..., 7), precisions (..., 6, 6)."""
@@ -115,12 +108,8 @@ def gauss_newton(
 ) -> tuple[Tensor, Tensor]:
     """The poses (M, 7) of highest posterior density that are reached, and their log-densities (M,).
 
-    Args:
-        sites: the likelihood.
-        starts: (S, 7).
-        prior: of the pose.
-        blurs: metres that are added to the errors at each step, 0 in the end.
-        least: half of the starts are kept at each step, but at least so many.
+    Each step adds one of `blurs` (m) to the errors, 0 in the end, and keeps half of the starts (S, 7), but at
+    least so many.
     """
     center, precision = prior
     pose, density = starts, torch.zeros(len(starts))

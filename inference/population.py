@@ -10,6 +10,7 @@ from typing import Any, overload
 import torch
 from torch import Tensor
 
+from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised
 from bcppl.distributions.support import freedom_of, refuse_several_poses
 from bcppl.errors import InferenceError, InputError
@@ -26,8 +27,7 @@ class Population:
     their weights.
 
     Raises:
-        InputError: the trace is none, the log weights are not N numbers below +inf, or there are founders,
-            but not one for each particle.
+        InputError: the log weights are not N numbers below +inf.
 
     Attributes:
         trace: of N particles.
@@ -53,11 +53,6 @@ class Population:
         object.__setattr__(self, "log_weights", _checked(self.trace, self.log_weights))
         if math.isnan(self.log_evidence):
             object.__setattr__(self, "log_evidence", _log_mean(self.log_weights))
-        if len(self.founders) not in (0, len(self.log_weights)):
-            raise InputError(
-                f"a population of {len(self.log_weights)} particles is given {len(self.founders)} founders; "
-                "give one for each, or none."
-            )
         if len(self.founders) == 0:
             object.__setattr__(self, "founders", torch.arange(len(self.log_weights)))
         if math.isnan(self.log_pairs):
@@ -95,10 +90,9 @@ class Population:
                 "give one of as many."
             )
         later = self._with(trace=trace)
-        if "log_total" in self.__dict__:
-            later.__dict__["log_total"] = self.log_total
-        if "effective_sample_size" in self.__dict__:
-            later.__dict__["effective_sample_size"] = self.effective_sample_size
+        for computed in ("log_total", "effective_sample_size"):
+            if computed in self.__dict__:
+                later.__dict__[computed] = self.__dict__[computed]
         return later
 
     def with_approximation(self, approximation: Any) -> Population:
@@ -185,11 +179,7 @@ class Population:
         Raises:
             InputError: no latent site has that address, or no pose is there.
         """
-        if address not in self.trace.choices:
-            raise InputError(
-                f"a belief over {address!r} was asked for, which is no latent address; "
-                f"latent are {', '.join(self.trace.choices) or 'none'}."
-            )
+        latent_address("a belief over {} was asked for", address, self.trace.choices)
         poses, site = self.trace[address], self.trace.distributions[address]
         refuse_several_poses(address, poses, site)
         freedom = freedom_of(site)
@@ -198,7 +188,7 @@ class Population:
                 f"a belief over {address!r} was asked for, which is no pose: its values have shape "
                 f"{tuple(poses.shape[1:])}; use bcppl.inference.summaries."
             )
-        return Belief(poses, self.log_weights, FREE if freedom is None else freedom)
+        return Belief(poses, self.log_weights, freedom or FREE)
 
     def __repr__(self) -> str:
         try:
@@ -215,13 +205,8 @@ class Population:
 FIELDS = tuple(each.name for each in fields(Population))
 
 
-def _checked(trace: object, log_weights: object) -> Tensor:
+def _checked(trace: Trace, log_weights: Tensor) -> Tensor:
     """Log weights (N,) float64, such that only -inf is not finite."""
-    if not isinstance(trace, Trace) or not isinstance(log_weights, Tensor):
-        raise InputError(
-            f"a population is given a {type(trace).__name__} and a {type(log_weights).__name__}; "
-            "give a trace and a tensor of log weights, Population(trace, log_weights)."
-        )
     if tuple(log_weights.shape) != (trace.particles,) or log_weights.is_complex():
         raise InputError(
             f"a population of {trace.particles} particles is given log weights of shape "

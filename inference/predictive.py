@@ -1,7 +1,7 @@
 """How surprising each measurement is under the belief: posterior predictive checks.
 
 A belief that is sure and wrong often shows in what was measured: an image that no pose explains, for
-something unknown stands before the camera; a camera that would have to be farther off than it is said to be;
+something unknown stands before the camera; a camera that would have to be farther off than its stated error;
 contacts where the belief has none. Such a measurement is one whose p value is small: the probability that
 a measurement as unlikely, or more so, comes of the model at the particles' values, averaged over them.
 
@@ -20,11 +20,11 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.arguments import seed_number, whole_number
+from bcppl.arguments import whole_number
 from bcppl.distributions.checks import THRESHOLD, Check, Checked, chi_square
 from bcppl.distributions.poses import NormalPose
 from bcppl.inference.population import Population
-from bcppl.inference.resampling import systematic
+from bcppl.inference.resampling import seeded, systematic
 from bcppl.traces import Trace
 from bcppl.traces.series import SeriesTrace
 
@@ -73,14 +73,12 @@ def surprise(
     """
     particles = whole_number("a surprise is to be taken over {} particles", particles)
     replicas = whole_number("a surprise is to be taken of {} replicas", replicas, least=2)
-    seed_number(seed)
     trace = population.trace
     if isinstance(trace, SeriesTrace):
         return {}
     wanted = [a for a in trace.addresses if a in trace and (addresses is None or a in addresses)]
-    found: dict[str, Check] = {}
-    with torch.random.fork_rng(devices=[]), torch.no_grad():
-        torch.manual_seed(seed)
+    checks: dict[str, Check] = {}
+    with seeded(seed), torch.no_grad():
         chosen = systematic(population.log_weights, particles)
         few = trace.chosen(chosen)
         copies: list[Trace] = []
@@ -95,12 +93,12 @@ def surprise(
             if isinstance(site, Checked):
                 check = site.predictive_check(value, partial(replicated, address))
                 if check is not None:
-                    found[address] = check
+                    checks[address] = check
             else:
                 error = _whitened(site, value, particles)
                 if error is not None:
-                    found[address] = chi_square(error.square().sum(dim=-1), error.shape[-1])
-    return found
+                    checks[address] = chi_square(error.square().sum(dim=-1), error.shape[-1])
+    return checks
 
 
 def _whitened(site: Any, value: Tensor, particles: int) -> Tensor | None:

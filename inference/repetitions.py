@@ -20,9 +20,10 @@ from bcppl import poses
 from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief, normalised
 from bcppl.errors import InferenceError, InputError, NoWeightError
-from bcppl.inference.arviz import at_draws, check_alike, draw, import_arviz, seeded
+from bcppl.inference.arviz import at_draws, check_alike, draw, import_arviz, population_of
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
+from bcppl.inference.resampling import seeded
 from bcppl.inference.summaries import is_pose, mean
 from bcppl.traces import Trace
 
@@ -64,7 +65,8 @@ class Repeated:
     """Independent runs of one inference; print it for a table.
 
     A run in which no particle has any weight left estimates the evidence by 0, and counts as that, for the
-    mean is biased without it. Means, R-hat and the pooled posterior are those of the other runs.
+    mean is biased without it. Means, R-hat and the pooled posterior are those of the other runs; they raise
+    NoWeightError where all are dead.
 
     Attributes:
         populations: one for each run.
@@ -140,7 +142,6 @@ class Repeated:
 
         Raises:
             InputError: no latent site has that address, or no pose is there.
-            NoWeightError: all runs are dead.
         """
         first = self._alive[0].belief(address)
         each = torch.cat([p.trace.choices[address] for p in self.populations])
@@ -151,7 +152,6 @@ class Repeated:
 
         Raises:
             InputError: no latent site has that address.
-            NoWeightError: all runs are dead.
         """
         alive = self._alive
         if is_pose(alive[0], address):
@@ -198,7 +198,6 @@ class Repeated:
         Raises:
             InputError: ArviZ is not installed, or there are fewer than two runs alive, or fewer than four
                 draws.
-            NoWeightError: all runs are dead.
         """
         arviz, alive = import_arviz(), self._alive
         if len(alive) < 2:
@@ -220,7 +219,7 @@ class Repeated:
             ratios[address] = torch.tensor(each, dtype=torch.float64)
         return ratios
 
-    def table(self) -> str:
+    def __str__(self) -> str:
         """The runs, one to a line, their evidence together, and where ArviZ is installed their R-hat."""
         shares = torch.exp(self.log_evidences - self.log_evidence).div(len(self)).tolist()
         lines = [f"{'run':>4} {'seed':>11} {'log evidence':>14} {'particles':>10} {'ESS':>8} {'share':>7}"]
@@ -236,12 +235,13 @@ class Repeated:
             f"log of the mean evidence {self.log_evidence:.4f}, standard error "
             f"{self.standard_error:.4f} (jackknife {self.jackknife_error:.4f})"
         )
-        return "\n".join([*lines, *(self._deaths() if self.dead else []), *self._agreement()])
-
-    def _deaths(self) -> list[str]:
-        which = f"run{'s' * (len(self.dead) > 1)} {', '.join(map(str, self.dead))}"
-        what = "no particle has any weight left: evidence 0, left out of the posterior"
-        return [f"in {which} {what}; use more particles, or a wider prior."]
+        if self.dead:
+            which = f"run{'s' * (len(self.dead) > 1)} {', '.join(map(str, self.dead))}"
+            lines.append(
+                f"in {which} no particle has any weight left: evidence 0, left out of the posterior; "
+                "use more particles, or a wider prior."
+            )
+        return "\n".join([*lines, *self._agreement()])
 
     def _agreement(self) -> list[str]:
         try:
@@ -255,9 +255,6 @@ class Repeated:
             agreed = f"R-hat at most {max(finite):.3f}" if finite else "the same in all draws"
             lines.append(f"{address}: {agreed}, mean {numbers}")
         return lines
-
-    def __str__(self) -> str:
-        return self.table()
 
 
 def _of_run(population: Population, log_evidence: Tensor) -> Tensor:
@@ -276,13 +273,7 @@ def _population(run: Run, seed: int, number: int) -> Population:
                 result = last[0] if last else None
     except InferenceError as error:
         raise type(error)(f"run {number} (seed {seed}): {error}") from error
-    population = getattr(result, "population", result)
-    if not isinstance(population, Population):
-        raise InputError(
-            f"a run gave a {type(population).__name__}; "
-            "give a population, a step of SMC, or an iterator over those."
-        )
-    return population
+    return population_of(result, "runs that return one, a step of SMC, or an iterator over those")
 
 
 def _distributed(run: Run, seeds: Sequence[int], processes: int, progress: bool) -> list[Population]:

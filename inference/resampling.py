@@ -9,28 +9,32 @@ ordering and convergence of resampling methods, Annals of Statistics 47, 2019.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from bcppl.arguments import number_within, whole_number
+from bcppl.arguments import number_within, seed_number, whole_number
 from bcppl.beliefs import normalised
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Torch's generator seeded within, and restored afterwards."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed_number(seed))
+        yield
 
 
 class Scheme(Protocol):
     """Ancestors (count,) int64 of particles with log weights (N,); N of them unless a count is given."""
 
     def __call__(self, log_weights: Tensor, count: int | None = None, /) -> Tensor:
-        """Draw the ancestors.
-
-        Raises:
-            InferenceError: no particle has any weight, or a weight is not a number.
-            InputError: `count` is no whole number, 1 or more.
-        """
+        """Draw the ancestors; `count` is 1 or more."""
         ...
 
 
@@ -153,13 +157,7 @@ Resample = Callable[[Population], tuple[Population, Tensor | None]]
 
 
 def always(scheme: Scheme = systematic) -> Resample:
-    """Resample at every opportunity.
-
-    Raises:
-        InputError: it is given no scheme.
-    """
-    if not callable(scheme):
-        raise InputError(f"resampling is given {scheme!r} in place of a scheme; give one such as systematic.")
+    """Resample at every opportunity."""
 
     def resample(population: Population) -> tuple[Population, Tensor | None]:
         ancestors = scheme(population.log_weights)
@@ -169,11 +167,7 @@ def always(scheme: Scheme = systematic) -> Resample:
 
 
 def check_resample(where: str, resample: object) -> None:
-    """Check that an argument is a `Resample`, and not a scheme by itself.
-
-    Raises:
-        InputError: it is no function of a population.
-    """
+    """Check that an argument is a `Resample`, and not a scheme by itself."""
     if not callable(resample) or resample in (systematic, stratified, multinomial, residual, ssp):
         name = getattr(resample, "__name__", type(resample).__name__)
         raise InputError(
@@ -188,11 +182,7 @@ def never(population: Population) -> tuple[Population, Tensor | None]:
 
 
 def adaptive(scheme: Scheme = systematic, threshold: float = 0.5) -> Resample:
-    """Resample when the effective sample size falls below a share `threshold` of the particles.
-
-    Raises:
-        InputError: the threshold is no number from 0 (never) to 1.
-    """
+    """Resample when the effective sample size falls below a share `threshold`, 0 to 1, of the particles."""
     threshold = number_within("adaptive is given the threshold {}", threshold, least=0.0, most=1.0)
     resample = always(scheme)
 

@@ -1,7 +1,8 @@
 """Summaries of a population at any of its latent addresses: moments, quantiles, probabilities.
 
 At the address of a pose (its distribution has a `freedom`) these are the belief's: a mean pose (7,), and six
-tangent coordinates at it, metres and radians, 0 along held axes (`bcppl.beliefs`).
+tangent coordinates at it, metres and radians, 0 along held axes (`bcppl.beliefs`). All raise InputError where
+no latent site has the address, and NoWeightError where no particle has any weight.
 
 Of a long series (`bcppl.traces.Series`) an address may be one with the number of a step, `("x", 3)`: the
 value of each particle's ancestor at that step, with the particle's present weight.
@@ -15,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised, weighted_quantiles
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
@@ -24,20 +26,21 @@ from bcppl.traces.series import SeriesTrace
 
 Address = str | tuple[str, int]
 
+COLLAPSED = (
+    "has collapsed to a point: all particles with weight are the same, so no measurement is informative; use "
+    "more particles, or move them apart first (rejuvenation)."
+)
+WEIGHTLESS = (
+    "the belief has no weight: every particle's is zero; widen the prior, use more particles, or check the "
+    "measurements (`bcppl check`)."
+)
+
 
 def values_at(population: Population, address: Address) -> Tensor:
-    """The values (N, *event) at a latent address.
-
-    Raises:
-        InputError: no latent site has that address.
-    """
+    """The values (N, *event) at a latent address."""
     trace = population.trace
     name = address if isinstance(address, str) else address[0]
-    if name not in trace.choices:
-        raise InputError(
-            f"a summary of {name!r} was asked for, which is no latent address; "
-            f"latent are {', '.join(trace.choices) or 'none'}."
-        )
+    latent_address("a summary of {} was asked for", name, trace.choices)
     if isinstance(address, str):
         return trace.choices[address]
     if not isinstance(trace, SeriesTrace):
@@ -61,19 +64,12 @@ def _freedom(population: Population, address: Address) -> Freedom | None:
 
 
 def _belief(population: Population, address: Address) -> Belief:
-    freedom = _freedom(population, address)
-    return Belief(
-        values_at(population, address), population.log_weights, FREE if freedom is None else freedom
-    )
+    freedom = _freedom(population, address) or FREE
+    return Belief(values_at(population, address), population.log_weights, freedom)
 
 
 def mean(population: Population, address: Address) -> Tensor:
-    """The weighted mean (*event) at an address, in its own units; of a discrete one that of its numbers.
-
-    Raises:
-        InputError: no latent site has that address.
-        NoWeightError: no particle has any weight.
-    """
+    """The weighted mean (*event) at an address, in its own units; of a discrete one that of its numbers."""
     if is_pose(population, address):
         return _belief(population, address).mean
     values = values_at(population, address).to(torch.float64)
@@ -81,16 +77,16 @@ def mean(population: Population, address: Address) -> Tensor:
 
 
 def covariance(population: Population, address: Address) -> Tensor:
-    """The weighted covariance (D, D) of the D numbers of a value, in reading order; (6, 6) of a pose.
-
-    Raises:
-        InputError: no latent site has that address.
-        NoWeightError: no particle has any weight.
-    """
+    """The weighted covariance (D, D) of the D numbers of a value, in reading order; (6, 6) of a pose."""
     if is_pose(population, address):
         return _belief(population, address).covariance
     weights = normalised(population.log_weights)
     values = values_at(population, address).to(torch.float64).reshape(len(weights), -1)
+    return weighted_covariance(values, weights)
+
+
+def weighted_covariance(values: Tensor, weights: Tensor) -> Tensor:
+    """The covariance (D, D) of values (N, D) under normalised weights (N,)."""
     centred = values - weights @ values
     return (weights[:, None] * centred).T @ centred
 
@@ -102,10 +98,6 @@ def quantiles(population: Population, address: Address, probabilities: object) -
         population: weighted particles.
         address: a latent one, or with the number of a step.
         probabilities: one (then there is no first axis) or several in [0, 1]; see `weighted_quantiles`.
-
-    Raises:
-        InputError: no latent site has that address, or a probability is not in [0, 1].
-        NoWeightError: no particle has any weight.
     """
     if is_pose(population, address):
         return _belief(population, address).quantiles(probabilities)
@@ -122,16 +114,7 @@ class Probabilities(NamedTuple):
 
 
 def probabilities(population: Population, address: Address) -> Probabilities:
-    """The probability of each value at a discrete address.
-
-    Raises:
-        InputError: no latent site has that address, or it holds poses.
-        NoWeightError: no particle has any weight.
-    """
-    if is_pose(population, address):
-        raise InputError(
-            f"probabilities of the poses at {address!r} were asked for; ask its belief for modes instead."
-        )
+    """The probability of each value at a discrete address."""
     weights, values = normalised(population.log_weights), values_at(population, address)
     carrying = weights > 0
     distinct, which = torch.unique(values[carrying], dim=0, return_inverse=True)

@@ -38,11 +38,7 @@ class Target:
         return self.exponents.get(address, 1.0)
 
     def __call__(self, trace: Trace) -> Tensor:
-        """The log-density (N,).
-
-        Raises:
-            InputError: an exponent is given for an address that the program does not visit.
-        """
+        """The log-density (N,)."""
         self._refuse_unvisited(trace)
         return self.part(trace, trace.addresses)
 
@@ -65,16 +61,11 @@ class Target:
     def above(
         self, trace: Trace, needed: Tensor, addresses: Sequence[str] | None = None
     ) -> tuple[Tensor, Trace]:
-        """The particles whose log-density exceeds a threshold, for as few evaluations as possible.
+        """The particles whose log-density exceeds a threshold (N,), for as few evaluations as possible.
 
         Sites are evaluated in the order of their cost and then of the program. A particle that could not
         reach its threshold even if every remaining site had its upper bound is dropped, so that physics is
         run for the remaining particles only. The result is that of evaluating everything, to the bit.
-
-        Args:
-            trace: of N particles.
-            needed: (N,) the thresholds.
-            addresses: the sites that count; all by default.
 
         Returns:
             Their indices (K,) in increasing order, and the trace of these K particles.
@@ -104,15 +95,10 @@ class Target:
         return index, trace
 
     def accept(self, old: Trace, new: Trace, log_ratio: Tensor) -> tuple[Tensor, Trace]:
-        """The particles that accept their proposals, by Metropolis-Hastings.
+        """The indices (K,) of the particles that accept their proposals, and the trace of these.
 
-        Args:
-            old: of N particles.
-            new: their proposals.
-            log_ratio: (N,) log-density of the reverse proposal minus that of the proposal, Jacobian included.
-
-        Returns:
-            Their indices (K,), and the trace of their proposals.
+        Metropolis-Hastings: the log-ratio (N,) is the log-density of the reverse proposal minus that of the
+        proposal, Jacobian included.
         """
         # With the uniform number drawn first, the log-density that a proposal must exceed is known.
         chance = torch.log(torch.rand(old.particles, dtype=torch.float64))

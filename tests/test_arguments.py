@@ -42,7 +42,7 @@ from bcppl.inference.proposals import (
     symmetry,
 )
 from bcppl.inference.repetitions import repeated
-from bcppl.inference.resampling import adaptive, always, systematic
+from bcppl.inference.resampling import adaptive, systematic
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Series, Trace, extend, generate, simulate
 
@@ -91,7 +91,7 @@ def test_a_count_that_is_no_whole_number_is_refused(name: str) -> None:
 
 
 NUMBERS: dict[str, tuple[Callable[[Any], Any], tuple[Any, ...]]] = {
-    "threshold": (adaptive, (-0.1, 1.1)),
+    "threshold": (lambda v: adaptive(threshold=v), (-0.1, 1.1)),
     "waste-free threshold": (lambda v: waste_free_moves(WALK, 2, threshold=v), (-0.1,)),
     "share": (lambda v: tempered(WALK, share=v), (-0.1, 1.0)),
     "exponent": (lambda v: Target({"y": v}), (-1.0,)),
@@ -134,12 +134,6 @@ def test_what_counts_as_a_number() -> None:
             repeated(lambda seed: population(), 1, wrong)
 
 
-@pytest.mark.parametrize("scales", [0.5, None, (0.1,), (0.1, 0.2, 0.3), "ab"])
-def test_scales_that_are_no_two_numbers_are_refused(scales: Any) -> None:
-    with pytest.raises(InputError, match=r"drift is given the scale"):
-        drift("x", scales)
-
-
 def test_a_scheme_in_place_of_a_resampling_is_refused() -> None:
     for make in (
         lambda r: tempered(WALK, resample=r),
@@ -147,8 +141,6 @@ def test_a_scheme_in_place_of_a_resampling_is_refused() -> None:
     ):
         with pytest.raises(InputError, match="given systematic as resample, which does not define when"):
             make(systematic)
-    with pytest.raises(InputError, match="in place of a scheme"):
-        always(0.5)  # type: ignore[arg-type]
 
 
 # ---- indices
@@ -201,7 +193,6 @@ def test_ancestors_and_traces_that_do_not_fit_are_refused() -> None:
             torch.tensor([0.0, math.nan, 0.0, math.inf, 0.0]),
             r"log weight nan for 2 of 5 particles \(first: 1, 3",
         ),
-        ([0.0] * 5, "a Trace and a list"),
         (torch.zeros(5, dtype=torch.complex128), "one real number for each"),
     ],
 )

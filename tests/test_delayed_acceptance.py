@@ -269,5 +269,3 @@ def test_what_cannot_be_is_refused() -> None:
             make()
     with pytest.raises(InputError, match=r"'image_\*', which fits no address; .*depth_1"):
         delayed_acceptance(WALK, "image_*")(equal_weights(trace))(trace, POSTERIOR)
-    with pytest.raises(InputError, match="plain function"):
-        delayed_acceptance(WALK)(equal_weights(trace))(trace, lambda t: POSTERIOR(t))  # type: ignore[arg-type]

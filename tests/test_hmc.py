@@ -312,7 +312,7 @@ def test_what_has_no_gradient_is_refused_by_name() -> None:
     refused("numpy", r"'seen' takes 'x' out of torch", "x")
     refused("carried", r"the program takes 'x' out of torch", "x")
     refused("", r"'pose': it is a pose", "pose")
-    refused("", r"'which': it is discrete", "which")
+    refused("", r"'which' is discrete", "which")
     refused("", r"'nowhere', which is no latent address; latent are x, z", "nowhere")
     refused("", r"'edge' together with 'z', on which its support depends", "z", "edge")
     refused("", r"no address to move")

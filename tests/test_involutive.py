@@ -329,7 +329,6 @@ def test_maps_that_are_refused_name_the_address() -> None:
     )
     refused(r"no new value.*a, b", two_rates, factor, lambda v, a: (v, {"log_factor": -a["log_factor"]}))
     refused(r"shape \(1,\)", two_rates, factor, lambda v, a: ({"a": v["a"][:1]}, {}))
-    refused(r"two mappings", two_rates, factor, lambda v, a: {"a": v["a"]})
     refused(
         r"mixes particles",
         two_rates,

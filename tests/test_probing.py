@@ -185,7 +185,6 @@ def test_bad_input_is_one_sentence() -> None:
         (lambda: rank(population, [0, None]), "candidate 1 adds no site"),
         (lambda: rank(population, horizon=3), "a horizon of 3 steps"),
         (lambda: rank(population, outer_samples=1), "1 outer samples"),
-        (lambda: rank(population, cost={1: 2.0}), "candidate 0 has no cost"),
         (lambda: rank(population, cost=lambda c: {"time": 2.0}), "'time', which has no rate"),
         (lambda: rank(population, cost=lambda c: 2.0, rate={"time": 2.0}), "costs a single number"),
         (lambda: rank(population, cost=lambda c: 2.0, rate=-1.0), "at least 0"),

@@ -139,7 +139,7 @@ def test_runs_hang_on_the_seed_alone_and_the_last_step_counts() -> None:
     assert len(set(one.log_evidences.tolist())) == 3
     assert float(repeated(steps, 2).log_evidences.max()) < 1.0
     for run, times, processes, said in (
-        (lambda seed: 3.0, 1, 1, "a run gave a float"),
+        (lambda seed: 3.0, 1, 1, "a float was given in place of a population"),
         (importance, 0, 1, "0 runs were asked for"),
         (lambda seed: importance(seed), 2, 2, "cannot be sent to another process"),
     ):

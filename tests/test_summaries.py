@@ -66,8 +66,6 @@ def test_a_pose_is_summed_up_as_a_belief() -> None:
     assert torch.equal(covariance(found, "hole"), belief.covariance)
     held = quantiles(found, "hole", [0.1, 0.9])[:, 2:5]
     assert float(held.abs().max()) == 0.0
-    with pytest.raises(InputError, match="ask its belief for modes"):
-        probabilities(found, "hole")
 
 
 def test_an_address_that_is_not_latent_is_refused() -> None:

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from bcppl.beliefs import normalised
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.exponents import conditional_effective_sample_size, next_exponent
 from bcppl.inference.filters.step import Observed
@@ -38,16 +39,16 @@ def test_the_next_exponent_keeps_the_share_asked_for() -> None:
             exponent = next_exponent(log_weights, log_likelihood, reached, share)
             step = (exponent - reached) * log_likelihood
             assert reached < exponent < 1
-            assert conditional_effective_sample_size(log_weights, step) / 200 == pytest.approx(
+            assert conditional_effective_sample_size(normalised(log_weights), step) / 200 == pytest.approx(
                 share, abs=1e-4
             )
             reached = exponent
     # By hand: weights 1/4 3/4, factors 1 and e: CESS = 2 (1/4 + 3e/4)^2 / (1/4 + 3e^2/4).
     by_hand = 2 * (0.25 + 0.75 * math.e) ** 2 / (0.25 + 0.75 * math.e**2)
     uneven = torch.tensor([0.25, 0.75], dtype=torch.float64).log() + 7.0
-    assert conditional_effective_sample_size(uneven, torch.tensor([10.0, 11.0]).double()) == pytest.approx(
-        by_hand
-    )
+    assert conditional_effective_sample_size(
+        normalised(uneven), torch.tensor([10.0, 11.0]).double()
+    ) == pytest.approx(by_hand)
     assert next_exponent(log_weights, torch.zeros(200, dtype=torch.float64), 0.3, 0.5) == 1.0
 
 

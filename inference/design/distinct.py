@@ -12,7 +12,7 @@ from bcppl.beliefs.modes import cluster, nearest
 from bcppl.beliefs.weights import distinct_poses
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
-from bcppl.inference.summaries import is_pose, values_at
+from bcppl.inference.summaries import COLLAPSED, is_pose, values_at
 
 # The gap between modes is at least so many times the median distance of particles to their nearest neighbour.
 SPARSE = 3.0
@@ -20,29 +20,17 @@ SPARSE = 3.0
 
 @dataclass(frozen=True, eq=False)
 class DistinctParticles:
-    """The distinct values at an address, of the particles with weight.
+    """The distinct values at an address, of the particles with weight."""
 
-    Attributes:
-        values: (K, 7) poses, or (K, d) values of another site.
-        weights: (K,) normalised; those of copies are summed.
-        particles: (P,) int64 the particles with weight.
-        index: (P,) int64 the distinct value that each of them has.
-        is_pose: whether the values are poses.
-    """
-
-    values: Tensor
-    weights: Tensor
-    particles: Tensor
-    index: Tensor
-    is_pose: bool
+    values: Tensor  # (K, 7) poses, or (K, d) values of another site
+    weights: Tensor  # (K,) normalised; those of copies are summed
+    particles: Tensor  # (P,) int64 the particles with weight
+    index: Tensor  # (P,) int64 the distinct value that each of them has
+    is_pose: bool  # whether the values are poses
 
     @classmethod
     def of(cls, population: Population, address: str) -> DistinctParticles:
-        """Those of a population.
-
-        Raises:
-            InputError: no latent site has the address, or all particles with weight have the same value.
-        """
+        """Those of a population; InputError where all particles with weight have the same value."""
         weights = torch.softmax(population.log_weights, 0)
         particles = (weights > 0).nonzero().flatten()
         values, pose = values_at(population, address)[particles], is_pose(population, address)
@@ -52,11 +40,7 @@ class DistinctParticles:
             rows = values.to(torch.float64).reshape(len(values), -1)
             values, index = torch.unique(rows, dim=0, return_inverse=True)
         if len(values) < 2:
-            raise InputError(
-                f"the belief over {address!r} has collapsed to a point: all particles with weight are the "
-                "same, so no measurement is informative; move them apart first (rejuvenation, or more "
-                "particles)."
-            )
+            raise InputError(f"the belief over {address!r} {COLLAPSED}")
         total = torch.zeros(len(values), dtype=torch.float64).index_add_(0, index, weights[particles])
         return cls(values, total, particles, index, pose)
 
@@ -72,11 +56,7 @@ class DistinctParticles:
 def separate_modes(
     distinct: Tensor, translation: float, rotation: float, symmetries: Tensor | None = None
 ) -> tuple[Tensor, tuple[float, float]]:
-    """The mode (K,) int64 of each of distinct poses (K, 7), and the gap between modes (m, rad) that was used.
-
-    Raises:
-        InputError: a gap is not positive.
-    """
+    """The mode (K,) int64 of each of distinct poses (K, 7), and the gap between modes (m, rad) in use."""
     number_within("modes are to be separated by {} m", translation, above=0.0)
     number_within("modes are to be separated by {} rad", rotation, above=0.0)
     # A wide belief with few particles has no neighbours within the gap, and that makes no modes of them.

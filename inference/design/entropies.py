@@ -28,7 +28,7 @@ from bcppl.errors import InputError
 from bcppl.inference.design.distinct import DistinctParticles, separate_modes
 from bcppl.inference.design.weighted_mixtures import WeightedMixtures, cholesky_factor
 from bcppl.inference.population import Population
-from bcppl.inference.summaries import is_pose, values_at
+from bcppl.inference.summaries import COLLAPSED, is_pose, values_at, weighted_covariance
 
 # Entropies (M,) of normalised weights (M, N) of the particles that it was fitted to.
 EntropyOfWeights = Callable[[Tensor], Tensor]
@@ -44,18 +44,14 @@ def weight_entropy() -> Entropy:
     The criterion of BayesContact. It ignores the distances between particles: two that are a micrometre apart
     count as two.
 
-    Raises:
-        InputError: (of the function returned) all particles with weight are the same.
+    Fitting raises InputError where all particles with weight are the same.
     """
 
     def fit(population: Population) -> EntropyOfWeights:
         weighted = (torch.softmax(population.log_weights, 0) > 0).nonzero().flatten()
         latent = [value.index_select(0, weighted) for value in population.trace.choices.values()]
         if all(bool((value == value[:1]).all()) for value in latent):
-            raise InputError(
-                "the belief has collapsed to a point: all particles with weight are the same, so no "
-                "measurement is informative; use more particles, or move them apart first (rejuvenation)."
-            )
+            raise InputError(f"the belief {COLLAPSED}")
         return lambda weights: torch.special.entr(weights).sum(dim=1)
 
     return fit
@@ -64,9 +60,7 @@ def weight_entropy() -> Entropy:
 def discrete_entropy(address: str) -> Entropy:
     """The entropy of the distribution of a discrete value: the weights of equal values are summed.
 
-    Raises:
-        InputError: (of the function returned) no latent site has that address, or all particles agree on its
-            value.
+    Fitting raises InputError where all particles agree on the value.
     """
 
     def fit(population: Population) -> EntropyOfWeights:
@@ -99,9 +93,8 @@ def mixture_entropy(
         rotation: the gap between modes, radians.
         symmetries: (K, 7) `part_from_part` under which the part looks the same.
 
-    Raises:
-        InputError: (of the function returned) no latent site has that address, its values are whole numbers,
-            all particles have the same, or they do not span its axes.
+    Fitting raises InputError where the values are whole numbers, all particles have the same, or they do not
+    span the axes.
     """
 
     def fit(population: Population) -> EntropyOfWeights:
@@ -145,10 +138,8 @@ def neighbour_entropy(address: str, neighbours: int = 3) -> Entropy:
         address: of a latent site, of poses or of other real values.
         neighbours: k.
 
-    Raises:
-        InputError: k is no whole number, 1 or more; or (of the function returned) no latent site has that
-            address, its values are whole numbers, all particles have the same or do not span its axes, or
-            there are no more than k of them.
+    Fitting raises InputError where the values are whole numbers, all particles have the same or do not span
+    the axes, or there are no more than k of them.
     """
     neighbours = whole_number("an entropy by {} neighbours was asked for", neighbours)
 
@@ -160,9 +151,7 @@ def neighbour_entropy(address: str, neighbours: int = 3) -> Entropy:
                 f"the belief over {address!r} has {count} distinct particles, too few for an entropy by "
                 f"{neighbours} neighbours; use more particles, or weight_entropy()."
             )
-        share = particles.weights
-        centred = coordinates - share @ coordinates
-        factor = cholesky_factor(address, (share[:, None] * centred).T @ centred)
+        factor = cholesky_factor(address, weighted_covariance(coordinates, particles.weights))
         white = torch.linalg.solve_triangular(factor, coordinates.T, upper=False).T.numpy()
         radius, near = cKDTree(white).query(white, k=neighbours + 1)
         about = torch.from_numpy(np.asarray(near))

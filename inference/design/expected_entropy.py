@@ -28,12 +28,21 @@ from bcppl.inference.design.observations import (
     PredictedCandidate,
     PredictiveSampler,
     SimulatedCandidate,
-    seeded,
     simulate_candidates,
 )
-from bcppl.inference.design.outer_samples import draw_outer_samples, mean_and_error, warn_of_failures
-from bcppl.inference.design.ranking import Cost, Costs, Ranking, Utility, checked, rank
+from bcppl.inference.design.ranking import (
+    Cost,
+    Costs,
+    Ranking,
+    Utility,
+    checked,
+    draw_outer_samples,
+    mean_and_error,
+    rank,
+    warn_of_failures,
+)
 from bcppl.inference.population import Population
+from bcppl.inference.resampling import seeded
 
 
 def expected_information_gain(

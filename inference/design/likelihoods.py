@@ -27,9 +27,6 @@ def log_likelihoods(trace: Trace, observed: Sequence[str], values: Mapping[str, 
         trace: of N particles, the observed sites latent.
         observed: their addresses, in the order of the program.
         values: (S, *event) at each.
-
-    Raises:
-        InferenceError: a log-probability is +inf.
     """
     count = len(values[observed[0]])
     independent = _independent(trace, observed, values)
@@ -106,11 +103,7 @@ def _density(address: str, site: Any, value: Tensor) -> Tensor:
 
 
 def mark_failures(observed: Iterable[str], log_likelihoods: Tensor) -> Tensor:
-    """Log-likelihoods (S, N), with NaN in the rows of observations that no particle can explain.
-
-    Raises:
-        InferenceError: that is so in every row.
-    """
+    """Log-likelihoods (S, N), with NaN in the rows of observations that no particle can explain."""
     failed = torch.isnan(log_likelihoods).any(dim=1) | (log_likelihoods == -torch.inf).all(dim=1)
     if bool(failed.all()):
         raise InferenceError(

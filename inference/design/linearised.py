@@ -21,22 +21,28 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.errors import InferenceError
-from bcppl.inference.design.observations import Arguments, seeded
-from bcppl.inference.design.outer_samples import (
-    OuterSamples,
-    draw_outer_samples,
-    mean_and_error,
-    warn_of_failures,
-)
+from bcppl.inference.design.observations import Arguments
 from bcppl.inference.design.predicted import (
     Information,
     PredictedObservations,
     predict_observations,
     sum_quadratics,
 )
-from bcppl.inference.design.ranking import Cost, Costs, Ranking, Utility, checked, rank
+from bcppl.inference.design.ranking import (
+    Cost,
+    Costs,
+    OuterSamples,
+    Ranking,
+    Utility,
+    checked,
+    draw_outer_samples,
+    mean_and_error,
+    rank,
+    warn_of_failures,
+)
 from bcppl.inference.design.tangent_mixture import TangentMixture, entropy_reduction
 from bcppl.inference.population import Population
+from bcppl.inference.resampling import seeded
 from bcppl.traces import Trace
 
 _ITERATIONS = 6  # of Gauss-Newton, to the maximum of another mode's posterior density

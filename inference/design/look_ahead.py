@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bcppl.inference.design.entropies import EntropyOfWeights
-from bcppl.inference.design.outer_samples import OuterSamples
+from bcppl.inference.design.ranking import OuterSamples
 
 # Outer samples that are less probable than this after the first step are left out of the second.
 UNLIKELY = 1e-6
@@ -17,36 +17,24 @@ UNLIKELY = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedCandidate:
-    """The likelihoods of a candidate's simulated observations.
+    """The likelihoods of a candidate's simulated observations."""
 
-    Attributes:
-        first: (S, N) log-likelihoods of the outer samples' observations at all particles; rows of NaN failed.
-        second: the same for an independent draw of the noise, used in a second step; None without one.
-        entropies: (S,) after the first draw; NaN where it failed.
-        cost: nats.
-    """
-
+    # (S, N) log-likelihoods of the outer samples' observations at all particles; rows of NaN failed
     first: Tensor
+    # the same for an independent draw of the noise, used in a second step; None without one
     second: Tensor | None
-    entropies: Tensor
-    cost: float
+    entropies: Tensor  # (S,) after the first draw; NaN where it failed
+    cost: float  # nats
 
 
 @dataclass(frozen=True, eq=False)
 class SecondStep:
-    """The best second step under each outer sample.
+    """The best second step under each outer sample."""
 
-    Attributes:
-        gains: (S,) expected information gains, nats; 0 where none is worth its cost, NaN where failed.
-        numbers: (S,) int64 the candidate; -1 for none.
-        costs: (S,) nats.
-        standard_error: of the mean gain, from the inner samples that the second steps share.
-    """
-
-    gains: Tensor
-    numbers: Tensor
-    costs: Tensor
-    standard_error: float
+    gains: Tensor  # (S,) expected information gains, nats; 0 where none is worth its cost, NaN where failed
+    numbers: Tensor  # (S,) int64 the candidate; -1 for none
+    costs: Tensor  # (S,) nats
+    standard_error: float  # of the mean gain, from the inner samples that the second steps share
 
 
 def posterior_entropies(log_weights: Tensor, log_likelihoods: Tensor, entropy_of: EntropyOfWeights) -> Tensor:
@@ -70,13 +58,6 @@ def best_second_step(
 
     Each outer sample's observation reweights the particles (N,), and with them the outer samples: with these
     weights and the second draw of the noise, they are the samples of the second step.
-
-    Args:
-        number: of the candidate that is measured first.
-        candidates: all (C), with their second draws.
-        log_weights: (N,) of the population.
-        outer: (S) outer samples.
-        entropy_of: the entropy that is to be reduced.
     """
     seconds = torch.stack([each.second for each in candidates if each.second is not None])
     costs = torch.tensor([each.cost for each in candidates], dtype=torch.float64)

@@ -17,7 +17,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import Belief
@@ -135,11 +135,6 @@ def probing_loop(
     if minimum_gain is not None:
         number_within("the loop is to end below a gain of {}", minimum_gain)
     rule = by_linearised_gain(model.pose) if rule is None else rule
-    execute = getattr(world, "execute", None)
-    functions = {"candidates_from": candidates_from, "rule": rule, "infer": infer, "world.execute": execute}
-    for what, given in functions.items():
-        if not callable(given):
-            raise InputError(f"the loop's {what} is a {type(given).__name__}; give a function.")
 
     def success(belief: Belief) -> float:
         if success_probability is None:
@@ -162,15 +157,20 @@ def probing_loop(
                     _ends_at_once(f"all candidates last longer than {left:.3g} s")
                 return
         scene = model.prepare(with_candidates(recording, candidates))
-        ranking = _checked_ranking(rule(step.population, candidates, scene), minimum_gain is not None)
-        if minimum_gain is not None and ranking.best.value < minimum_gain:
+        ranking = rule(step.population, candidates, scene)
+        utility = ranking.best.value
+        if minimum_gain is not None and math.isnan(utility):
+            raise InputError(
+                "the loop is to end below a minimum_gain, and its rule expects no gains; leave minimum_gain "
+                "out, or rank by information gain."
+            )
+        if minimum_gain is not None and utility < minimum_gain:
             if number == 0:
-                _ends_at_once(f"the best candidate has an expected utility of {ranking.best.value:.3g} nats")
+                _ends_at_once(f"the best candidate has an expected utility of {utility:.3g} nats")
             return
         chosen = named_apart(ranking.best.candidate, recording)
-        measurements = _checked_measurements(world.execute(chosen), chosen)
+        recording = _extended(recording, list(world.execute(chosen)), chosen)
         left = max(0.0, left - duration_of(chosen))
-        recording = _extended(recording, measurements, chosen)
         scene, before = model.prepare(recording), step
         count = len(before.population)
         step = _last(infer(model, recording, particles=count, seed=seed, scene=scene, start=before), None)
@@ -192,23 +192,7 @@ def _ends_at_once(reason: str) -> None:
     warnings.warn(f"the loop ends before its first probe: {reason}.", stacklevel=3)
 
 
-def _checked_ranking(ranking: object, needs_gains: bool) -> Ranking:
-    if not isinstance(ranking, Ranking) or not len(ranking):
-        raise InputError(
-            f"the loop's rule gives a {type(ranking).__name__} that ranks nothing; give a function that "
-            "returns a Ranking of the candidates, such as by_linearised_gain(pose)."
-        )
-    if needs_gains and math.isnan(ranking.best.value):
-        raise InputError(
-            "the loop is to end below a minimum_gain, and its rule expects no gains; leave minimum_gain out, "
-            "or rank by information gain."
-        )
-    return ranking
-
-
-def _checked_candidates(given: object, recording: Recording) -> Candidates:
-    if not isinstance(given, Iterable) or isinstance(given, str):
-        raise InputError(f"candidates are given as a {type(given).__name__}; give a list of plans and views.")
+def _checked_candidates(given: Iterable[Candidate], recording: Recording) -> Candidates:
     candidates = given if isinstance(given, Candidates) else Candidates(tuple(given))
     for each in candidates:
         if planner_of(each).needs_peg and recording.peg is None:
@@ -219,27 +203,16 @@ def _checked_candidates(given: object, recording: Recording) -> Candidates:
     return require_candidates(candidates)
 
 
-def _checked_measurements(given: object, chosen: Candidate) -> list[Measurement]:
-    measurements: list[Any] = list(given) if isinstance(given, Iterable) else [given]
-    if given is None or not measurements:
+def _extended(recording: Recording, measurements: Sequence[Measurement], chosen: Candidate) -> Recording:
+    """The recording with the measurements of a candidate, which must not add problems."""
+    if not measurements:
         raise InputError(f"the world gave no measurement of {name_of(chosen)!r}.")
-    for each in measurements:
-        if not isinstance(each, Measurement):
-            raise InputError(
-                f"the world gave a {type(each).__name__} for {name_of(chosen)!r}; give measurements, each an "
-                "action and an observation."
-            )
-        name = name_of(each.action)
+    for name in map(name_of, (each.action for each in measurements)):
         if name != name_of(chosen):
             raise InputError(
                 f"the world was to execute {name_of(chosen)!r} and gave a measurement of {name!r}; give the "
                 "windows of a probe with the plan's name, or an image of the view's camera."
             )
-    return measurements
-
-
-def _extended(recording: Recording, measurements: Sequence[Measurement], chosen: Candidate) -> Recording:
-    """The recording with measurements, which must not add problems."""
     longer = replace(recording, measurements=[*recording.measurements, *measurements])
     known = set(problems(recording))
     for problem in problems(longer):

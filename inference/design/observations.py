@@ -11,7 +11,6 @@ steps.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Any
@@ -22,6 +21,7 @@ from torch import Tensor
 from bcppl.arguments import whole_number
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.design.likelihoods import log_likelihoods, mark_failures
+from bcppl.inference.resampling import seeded
 from bcppl.traces import Trace, extend, regenerate
 
 Arguments = Callable[[Any], tuple[Any, ...]]
@@ -62,9 +62,7 @@ class BatchedArguments:
 class SimulatedCandidate:
     """A candidate, simulated at all particles.
 
-    Attributes:
-        trace: of N particles, extended by the candidate; its new sites are latent.
-        observed: the new addresses that would be observed.
+    The trace of N particles is extended by it, its new sites latent; `observed` are those that would be.
     """
 
     trace: Trace
@@ -84,9 +82,6 @@ class SimulatedCandidate:
 
         A row is NaN where the observation has no probability anywhere: the simulation of that outer sample
         failed, or no particle can explain it.
-
-        Raises:
-            InferenceError: a log-probability is +inf, or all rows are NaN.
         """
         return mark_failures(self.observed, log_likelihoods(self.trace, self.observed, values))
 
@@ -100,15 +95,7 @@ def simulate_candidates(
 ) -> Iterator[SimulatedCandidate]:
     """Every candidate, simulated once at all particles; the noise has the same seed for each.
 
-    Args:
-        trace: of N particles.
-        candidates: those to choose from.
-        arguments: the program's arguments after a candidate, or `BatchedArguments`.
-        latent: new addresses that would not be observed, with wildcards ("bias_*").
-        seed: of new latent values.
-
-    Raises:
-        InputError: a candidate adds nothing to observe, or a batch visits other addresses than a candidate.
+    Addresses that match a pattern in `latent` would not be observed ("bias_*").
     """
     if not isinstance(arguments, BatchedArguments):
         for k, candidate in enumerate(candidates):
@@ -136,11 +123,7 @@ def simulate_candidates(
 
 
 def observed_addresses(number: int, longer: Trace, trace: Trace, latent: Collection[str] = ()) -> list[str]:
-    """The addresses that a candidate adds to a trace, without those that are latent.
-
-    Raises:
-        InputError: there are none.
-    """
+    """The addresses, one at least, that a candidate adds to a trace and that are not latent."""
     added = longer.since(trace)
     observed = [
         a for a in added if a in longer.choices and not any(fnmatchcase(a, pattern) for pattern in latent)
@@ -153,25 +136,11 @@ def observed_addresses(number: int, longer: Trace, trace: Trace, latent: Collect
     return observed
 
 
-@contextmanager
-def seeded(seed: int) -> Iterator[None]:
-    """Draws within start from a seed; the generator's state is restored afterwards."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        yield
-
-
 @dataclass(frozen=True, eq=False)
 class PredictedCandidate:
     """A candidate whose observations come from a predictive sampler; its sites need only `log_prob`.
 
-    Attributes:
-        trace: of the N particles, not extended.
-        number: of the candidate.
-        candidate: as it was given.
-        args: the program's arguments once it is measured.
-        predictive: the sampler.
-        seed: of new latent values.
+    The trace of the N particles is not extended; `args` are the program's once the candidate is measured.
     """
 
     trace: Trace
@@ -182,29 +151,12 @@ class PredictedCandidate:
     seed: int
 
     def draw(self, particles: Tensor, seed: int) -> Observations:
-        """Observations if particles (S,) were the true value.
-
-        Raises:
-            InputError: the sampler gives nothing, or not one value for each of these particles.
-        """
+        """Observations if particles (S,) were the true value."""
         with seeded(seed):
-            values = self.predictive(self.candidate, self.trace.chosen(particles))
-        wrong = [a for a, v in values.items() if not isinstance(v, Tensor) or len(v) != len(particles)]
-        if wrong or not values:
-            raise InputError(
-                f"the predictive sampler gives for candidate {self.number} "
-                f"{f'no {len(particles)} values at {wrong[0]!r}' if wrong else 'nothing'}; "
-                "give tensors by address, one value for each particle of the trace that it is given."
-            )
-        return values
+            return self.predictive(self.candidate, self.trace.chosen(particles))
 
     def log_likelihoods(self, values: Observations) -> Tensor:
-        """Log-likelihood (S, N) of every observation at every particle, as `extend` evaluates it.
-
-        Raises:
-            InputError: the program does not visit an address, or a value has the wrong shape.
-            InferenceError: no row could be evaluated.
-        """
+        """Log-likelihood (S, N) of every observation at every particle, as `extend` evaluates it."""
         rows, failure = [], None
         for k in range(len(next(iter(values.values())))):
             try:

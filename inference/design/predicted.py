@@ -11,7 +11,8 @@ from torch import Tensor
 
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
-from bcppl.inference.design.observations import Arguments, observed_addresses, seeded
+from bcppl.inference.design.observations import Arguments, observed_addresses
+from bcppl.inference.resampling import seeded
 from bcppl.traces import Trace
 from bcppl.traces.update import undrawn
 
@@ -22,18 +23,13 @@ Information = Callable[[Any, Trace], Tensor | None]
 
 @dataclass(frozen=True, eq=False)
 class PredictedObservations:
-    """A candidate's predicted observations at S outer samples.
+    """A candidate's predicted observations at S outer samples."""
 
-    Attributes:
-        args: the program's arguments once it is measured.
-        known: (S, 6, 6) its information; None to take it from the sites.
-        sites: those that would be observed, at the outer samples, by address.
-        values: (S, *event) a sample of each, one for each outer sample.
-    """
-
-    args: tuple[Any, ...]
-    known: Tensor | None = None
+    args: tuple[Any, ...]  # the program's arguments once it is measured
+    known: Tensor | None = None  # (S, 6, 6) its information; None to take it from the sites
+    # those that would be observed, at the outer samples, by address
     sites: Mapping[str, Any] = field(default_factory=dict)
+    # (S, *event) a sample of each, one for each outer sample
     values: dict[str, Tensor] = field(default_factory=dict)
 
     def information(self) -> Tensor:
@@ -64,12 +60,7 @@ def predict_observations(
     information: Information | None,
     seed: int,
 ) -> list[PredictedObservations]:
-    """Each candidate's predicted observations at the particles of a trace; alike sites are drawn in a batch.
-
-    Raises:
-        InputError: a candidate adds nothing to observe, or a site without a quadratic approximation;
-            `information` gives matrices that are not symmetric, or negative.
-    """
+    """Each candidate's predicted observations at a trace's particles; alike sites are drawn in a batch."""
     predicted: list[PredictedObservations] = []
     for k, candidate in enumerate(candidates):
         args = arguments(candidate)

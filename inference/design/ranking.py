@@ -1,8 +1,9 @@
-"""The expected utility of candidates, and their ranking by it."""
+"""The outer samples of nested Monte Carlo, the expected utility of candidates under them, and a ranking."""
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -12,13 +13,70 @@ from torch import Tensor
 
 from bcppl.arguments import LARGEST_SEED, number_within, seed_number, whole_number
 from bcppl.errors import InputError
-from bcppl.inference.design.outer_samples import OuterSamples, mean_and_error
+from bcppl.inference.population import Population
+from bcppl.inference.resampling import systematic
+from bcppl.inference.summaries import WEIGHTLESS
 
 Cost = float | Mapping[str, float]
 # The cost of a candidate in any unit: a function of it or a mapping, with a number or several by name.
 Costs = Callable[[Any], Cost] | Mapping[Any, Cost]
 
 _ALIKE = 6  # decimals of a nat; differences beyond are rounding
+
+
+@dataclass(frozen=True, eq=False)
+class OuterSamples:
+    """Particles (S,) that serve as the true value in turn, and their normalised weights (S,).
+
+    The outer samples of nested Monte Carlo. One may occur several times, each time with its own noise.
+    """
+
+    particles: Tensor
+    weights: Tensor
+
+    def __len__(self) -> int:
+        return len(self.particles)
+
+
+def draw_outer_samples(population: Population, count: int | None) -> OuterSamples:
+    """`count` particles drawn systematically by weight; None: every one with weight once, by its weight."""
+    if not math.isfinite(population.log_total):
+        raise InputError(WEIGHTLESS)
+    weights = torch.softmax(population.log_weights, 0)
+    if count is None:
+        particles = (weights > 0).nonzero().flatten()
+        return OuterSamples(particles, weights[particles])
+    count = whole_number("{} outer samples were asked for", count, least=2)
+    particles = systematic(population.log_weights, count)
+    return OuterSamples(particles, torch.full((count,), 1.0 / count, dtype=torch.float64))
+
+
+def mean_and_error(values: Tensor, weights: Tensor) -> tuple[float, float]:
+    """The weighted mean of values (S,) and its standard error, as if outer samples were independent.
+
+    Systematic draws are not independent, so the error is a little too large: by the share of the variance
+    that is between particles rather than between draws of the noise. NaN values are left out; if all are
+    NaN, the mean is NaN and the error infinite.
+    """
+    valid = ~torch.isnan(values)
+    if not bool(valid.any()):
+        return math.nan, math.inf
+    values, weights = values[valid], weights[valid] / weights[valid].sum()
+    mean = weights @ values
+    squares = weights.square()
+    remaining = float(1.0 - squares.sum())
+    variance = float(squares @ (values - mean).square())
+    return float(mean), math.sqrt(variance / remaining) if remaining > 1e-12 else math.inf
+
+
+def warn_of_failures(number: int, failed: Tensor) -> None:
+    """Warn where the information gain of a candidate leaves out some of its outer samples (S,)."""
+    if bool(failed.any()):
+        warnings.warn(
+            f"the expected information gain of candidate {number} leaves out {int(failed.sum())} of "
+            f"{len(failed)} outer samples: their simulation failed, or no particle can explain the result.",
+            stacklevel=3,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +146,7 @@ class Utility:
 class Ranking(Sequence[Utility]):
     """Candidates by their expected utility, the best first; those with the longer horizon precede the others.
 
-    Attributes:
-        utilities: in that order.
-        entropy: of the population now, nats.
+    The entropy is that of the population now, nats.
     """
 
     utilities: tuple[Utility, ...]
@@ -151,11 +207,7 @@ def rank(utilities: Sequence[Utility], entropy: float) -> Ranking:
 def checked(
     candidates: Iterable[Any], cost: Costs | None, rate: Cost, horizon: int, seed: int | None
 ) -> tuple[list[Any], list[float], int]:
-    """The candidates, the cost of each in nats, and the seed; None draws one from torch's generator.
-
-    Raises:
-        InputError: there are no candidates, or a cost, a rate, the horizon or the seed is out of range.
-    """
+    """The candidates, the cost of each in nats, and the seed; None draws one from torch's generator."""
     candidates = list(candidates)
     if not candidates:
         raise InputError("there are no candidates to choose from; give one action or more.")
@@ -165,39 +217,20 @@ def checked(
 
 
 def costs_in_nats(candidates: Sequence[Any], cost: Costs | None, rate: Cost) -> list[float]:
-    """The cost of each candidate in nats.
+    """The cost of each candidate in nats; without costs all are free.
 
-    Args:
-        candidates: those to choose from.
-        cost: of a candidate: a number, or several by name ({"time": 2.0, "force": 5.0}). None: all are free.
-        rate: nats for one unit of cost; by name where costs are.
-
-    Raises:
-        InputError: a candidate has no cost, a cost has no rate or a rate no cost, or one of them is no finite
-            number.
+    A cost is a number, or several by name ({"time": 2.0, "force": 5.0}); the rate is nats for one unit of it,
+    by name where costs are.
     """
     if cost is None and rate != 1.0:
         raise InputError(
             f"a rate of {rate} is given without a cost; give cost=..., a function of a candidate."
         )
-    if not (cost is None or callable(cost) or isinstance(cost, Mapping)):
-        raise InputError(
-            f"the cost is a {type(cost).__name__}; give a function of a candidate, or a mapping from "
-            "candidates to costs."
-        )
     return [0.0 if cost is None else _cost(k, one, cost, rate) for k, one in enumerate(candidates)]
 
 
 def _cost(number: int, candidate: Any, cost: Any, rate: Cost) -> float:
-    try:
-        price = cost[candidate] if isinstance(cost, Mapping) else cost(candidate)
-    except (KeyError, TypeError):
-        if not isinstance(cost, Mapping):
-            raise
-        raise InputError(
-            f"candidate {number} has no cost in the mapping from candidates to costs; "
-            "add it, or give a function of the candidate."
-        ) from None
+    price = cost[candidate] if isinstance(cost, Mapping) else cost(candidate)
     if not isinstance(price, Mapping):
         if isinstance(rate, Mapping):
             raise InputError(

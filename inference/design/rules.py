@@ -95,12 +95,7 @@ def at_random(seed: int = 0) -> AcquisitionRule:
 
 
 def by_surface_variance(peg: Part, pose: str) -> AcquisitionRule:
-    """The rule that ranks touches by the variance of the surface's position along its normal.
-
-    Args:
-        peg: the held peg.
-        pose: the address of the pose.
-    """
+    """The rule that ranks a peg's touches by the variance of the surface's position along its normal."""
 
     def rule(population: Population, candidates: Sequence[Candidate], scene: Any) -> Ranking:
         belief = population.belief(pose)

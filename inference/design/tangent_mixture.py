@@ -10,33 +10,23 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.beliefs import Belief, effective_sample_size
-from bcppl.errors import InputError
 from bcppl.inference.design.distinct import DistinctParticles, separate_modes
 from bcppl.inference.design.weighted_mixtures import cholesky_factor
 from bcppl.inference.population import Population
-from bcppl.inference.summaries import is_pose
+from bcppl.inference.summaries import weighted_covariance
 from bcppl.poses import Freedom
 
 
 @dataclass(frozen=True, eq=False)
 class TangentMixture:
-    """A Gaussian for each of K modes.
+    """A Gaussian for each of K modes."""
 
-    Attributes:
-        freedom: the d free axes.
-        label: (N,) the mode of each particle; -1 without weight.
-        mean: (K, 7) world_from_part.
-        mass: (K,) probabilities of the modes.
-        factor: (K, d, d) lower Cholesky factors of the covariances.
-        log_base: (K,) the mean log-density of the base measure.
-    """
-
-    freedom: Freedom
-    label: Tensor
-    mean: Tensor
-    mass: Tensor
-    factor: Tensor
-    log_base: Tensor
+    freedom: Freedom  # the d free axes
+    label: Tensor  # (N,) the mode of each particle; -1 without weight
+    mean: Tensor  # (K, 7) world_from_part
+    mass: Tensor  # (K,) probabilities of the modes
+    factor: Tensor  # (K, d, d) lower Cholesky factors of the covariances
+    log_base: Tensor  # (K,) the mean log-density of the base measure
 
     def __len__(self) -> int:
         return len(self.mean)
@@ -45,16 +35,7 @@ class TangentMixture:
     def fit(
         cls, population: Population, address: str, translation: float = 0.01, rotation: float = 0.2
     ) -> TangentMixture:
-        """The Gaussians of `mixture_entropy`: copies are merged, each mode has its particles' covariance.
-
-        Raises:
-            InputError: the address is of no pose, all particles are the same, or they do not span its axes.
-        """
-        if not is_pose(population, address):
-            raise InputError(
-                f"{address!r} holds no poses, in whose tangent space information could be summed; "
-                "use expected_information_gain."
-            )
+        """The Gaussians of `mixture_entropy`: copies are merged, each mode has its particles' covariance."""
         freedom = population.belief(address).freedom
         particles = DistinctParticles.of(population, address)
         distinct, share = particles.values, particles.weights
@@ -68,11 +49,9 @@ class TangentMixture:
             weights = share[inside] / mass
             mean = Belief(distinct[inside], weights.log()).mean
             tangent = poses.local(mean, distinct[inside])
-            coordinates = freedom.coordinates(tangent)
-            away = coordinates - weights @ coordinates
             means.append(mean)
             masses.append(mass)
-            covariances.append((weights[:, None] * away).T @ away)
+            covariances.append(weighted_covariance(freedom.coordinates(tangent), weights))
             bases.append(weights @ freedom.log_base_density(tangent[:, 3:].norm(dim=-1)))
             sizes.append(1.0 / weights.square().sum())
         mass, covariance = torch.stack(masses), torch.stack(covariances)

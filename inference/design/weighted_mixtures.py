@@ -18,19 +18,12 @@ NEGLIGIBLE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class WeightedMixtures:
-    """Distinct points, and which of them are neighbours.
+    """Distinct points, and which of them are neighbours."""
 
-    Attributes:
-        coordinates: (K, d) of each point about the mean of its mode in the belief.
-        log_base: (K,) log-density of the base measure there.
-        floor: (d, d) the covariance of a mode that consists of a single particle.
-        linked: (K, K) float32, 1 where two points are neighbours; None where all are.
-    """
-
-    coordinates: Tensor
-    log_base: Tensor
-    floor: Tensor
-    linked: Tensor | None
+    coordinates: Tensor  # (K, d) of each point about the mean of its mode in the belief
+    log_base: Tensor  # (K,) log-density of the base measure there
+    floor: Tensor  # (d, d) the covariance of a mode that consists of a single particle
+    linked: Tensor | None  # (K, K) float32, 1 where two points are neighbours; None where all are
 
     @classmethod
     def fit(
@@ -42,11 +35,7 @@ class WeightedMixtures:
         label: Tensor,
         linked: Tensor | None,
     ) -> WeightedMixtures:
-        """Of points whose belief has weights (K,) and modes that are labelled (K,) from 0.
-
-        Raises:
-            InputError: the points do not span the axes within the modes.
-        """
+        """Of points whose belief has weights (K,) and modes that are labelled (K,) from 0."""
         dimension = coordinates.shape[1]
         modes = int(label.max()) + 1
         mass = torch.zeros(modes, dtype=torch.float64).index_add_(0, label, weights)
@@ -112,11 +101,7 @@ class WeightedMixtures:
 
 
 def cholesky_factor(address: str, covariance: Tensor) -> Tensor:
-    """The lower Cholesky factor of a covariance (d, d) of particles.
-
-    Raises:
-        InputError: it is singular.
-    """
+    """The lower Cholesky factor of a covariance (d, d) of particles; InputError where it is singular."""
     scale = covariance.diagonal().clamp_min(0.0).sqrt()
     # A picometre is rounding.
     if bool((scale > 1e-12).all()):

@@ -19,7 +19,7 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.errors import NoWeightError
 from bcppl.inference.approximation import GaussianApproximation
 from bcppl.inference.filters.smc import Step, smc
-from bcppl.inference.filters.smcp3 import Pair, smcp3
+from bcppl.inference.filters.smcp3 import Pair, moved as moved_by_pair
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
 from bcppl.inference.filters.tempering import resample_move, tempered
 from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence
@@ -33,7 +33,7 @@ from bcppl.inference.proposals.approximated import (
     joint_random_walk,
 )
 from bcppl.inference.proposals.coordinates import continuous_addresses
-from bcppl.inference.resampling import adaptive, never, systematic
+from bcppl.inference.resampling import adaptive, systematic
 from bcppl.inference.sizing import replicate
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Model, Trace, extend
@@ -41,6 +41,11 @@ from bcppl.traces import Model, Trace, extend
 WALK = (0.2, 2.0)  # scales of the random walks
 CERTAIN = 0.01  # nats: a log-likelihood as small for all particles carries no information
 ASKED = 4  # particles that are evaluated first for that
+FEW = 0.2  # the effective sample size that SMCP3 is to leave, as a share of N
+# Where it does not, it is run again with more copies of each particle, as many as seem needed and at most so
+# many of each and in all: memory and time grow with them. N of all are kept.
+MOST, ROOM = 40, 40_000
+LEAST = 0.03  # of N: where even with so many copies less would be left, the measurement is tempered
 
 
 class Approximation(Protocol):
@@ -79,9 +84,7 @@ class GaussianPrograms:
 def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]]) -> Kernel:
     """A random walk of one other latent value, the approximation's proposals, and a random walk of the pose.
 
-    Args:
-        pose: its address.
-        proposals: those that go with the approximation that the population carries.
+    `proposals` are those that go with the approximation that the population carries.
     """
 
     def moved(population: Population) -> Move:
@@ -102,10 +105,6 @@ def guided(
     *,
     sweeps: int = 1,
     share: float = 0.5,
-    few: float = 0.2,
-    most: int = 40,
-    least: float = 0.03,
-    room: int = 40_000,
 ) -> StepFunction:
     """A step that assimilates a measurement by SMCP3, resamples when needed, and moves the particles.
 
@@ -115,17 +114,10 @@ def guided(
         moves: of every particle after each step.
         sweeps: how many of them.
         share: particles are resampled below this effective sample size, as a share of N.
-        few: the effective sample size that SMCP3 is to leave, as a share of N.
-        most: where it does not, it is run again with more copies of each particle, as many as seem needed and
-            at most so many; N of all are kept.
-        least: where even with `most` copies the effective sample size would be smaller, as a share of N, the
-            measurement is tempered.
-        room: at most so many copies in all: memory and time grow with them.
     """
     resample = adaptive(systematic, share)
     rejuvenation = resample_move(moves, sweeps, resample, always_move=True)
     by_tempering = tempered(moves, sweeps=2 * sweeps, resample=resample)
-    copies = Copies(few, most, least, room)
 
     def step(population: Population, observed: Observed) -> Stepped:
         scene, actions = observed.args
@@ -140,7 +132,7 @@ def guided(
         before = before.updated()
         after = before.including(scene, len(actions) - 1, action, values)
         population = population.with_approximation(after)
-        assimilated = copies.assimilate(population, observed, programs.pair(before, after, action))
+        assimilated = assimilate(population, observed, programs.pair(before, after, action))
         if assimilated is None:
             return by_tempering(population, observed)
         moved, ancestors, acceptance, _ = rejuvenation(assimilated.population, POSTERIOR)
@@ -150,52 +142,38 @@ def guided(
 
 
 class Assimilated(NamedTuple):
-    """A population given one more measurement.
+    """A population given one more measurement."""
 
-    Attributes:
-        population: of N particles.
-        effective: the effective sample size of all copies.
-        origin: (N,) the particle that each copy was made of; None where each is its own.
-    """
-
-    population: Population
-    effective: float
-    origin: Tensor | None
+    population: Population  # of N particles
+    effective: float  # the effective sample size of all copies
+    origin: Tensor | None  # (N,) the particle that each copy was made of; None where each is its own
 
 
-class Copies(NamedTuple):
-    """How many copies of each particle SMCP3 is run with: see `guided`."""
+def assimilate(population: Population, observed: Observed, pair: Pair) -> Assimilated | None:
+    """The particles moved and weighted by a pair of kernels; None where too few keep weight."""
+    count = len(population)
 
-    few: float
-    most: int
-    least: float
-    room: int
-
-    def assimilate(self, population: Population, observed: Observed, pair: Pair) -> Assimilated | None:
-        """The particles moved and weighted by a pair of kernels; None where too few keep weight."""
-        by_pair, count = smcp3(pair, resample=never), len(population)
-
-        def weighted(population: Population) -> Population | None:
-            try:
-                return by_pair(population, observed).population
-            except NoWeightError:
-                return None
-
-        times, goal = 1, self.few * count
-        allowed = max(1, min(self.most, self.room // count))
-        reached = weighted(population)
-        while times < allowed and (reached is None or reached.effective_sample_size < goal):
-            each = 0.0 if reached is None else reached.effective_sample_size / times
-            # The estimate is often too large: ask for more copies than would just do.
-            times = min(allowed, max(2 * times, math.ceil(1.5 * goal / max(each, goal / self.most))))
-            reached = weighted(replicate(population, times))
-        if reached is None or reached.effective_sample_size < self.least * count * times / self.most:
+    def weighted(population: Population) -> Population | None:
+        try:
+            return moved_by_pair(population, pair, observed)
+        except NoWeightError:
             return None
-        effective = reached.effective_sample_size
-        if times == 1:
-            return Assimilated(reached, effective, None)
-        chosen = systematic(reached.log_weights, count)
-        return Assimilated(reached.selected(chosen), effective, chosen // times)
+
+    times, goal = 1, FEW * count
+    allowed = max(1, min(MOST, ROOM // count))
+    reached = weighted(population)
+    while times < allowed and (reached is None or reached.effective_sample_size < goal):
+        each = 0.0 if reached is None else reached.effective_sample_size / times
+        # The estimate is often too large: ask for more copies than would just do.
+        times = min(allowed, max(2 * times, math.ceil(1.5 * goal / max(each, goal / MOST))))
+        reached = weighted(replicate(population, times))
+    if reached is None or reached.effective_sample_size < LEAST * count * times / MOST:
+        return None
+    effective = reached.effective_sample_size
+    if times == 1:
+        return Assimilated(reached, effective, None)
+    chosen = systematic(reached.log_weights, count)
+    return Assimilated(reached.selected(chosen), effective, chosen // times)
 
 
 def _given_all(approximation: Any, trace: Trace, actions: Sequence[Any]) -> Any:

@@ -155,10 +155,10 @@ def smc(
 def _warn_of_problems(recording: Any) -> None:
     if not isinstance(recording, Recording) or not recording.measurements:
         return
-    found = problems(recording)
-    if found:
-        more = f" ({len(found) - 1} more: bcppl.recordings.problems)" if len(found) > 1 else ""
-        warnings.warn(f"{found[0].rstrip('.')}{more}.", RuntimeWarning, stacklevel=4)
+    first, *others = problems(recording) or [""]
+    if first:
+        more = f" ({len(others)} more: bcppl.recordings.problems)" if others else ""
+        warnings.warn(f"{first.rstrip('.')}{more}.", RuntimeWarning, stacklevel=4)
 
 
 def _steps(

@@ -80,13 +80,6 @@ class Pair:
     check: bool = False
 
 
-def _refuse_no_pair(pair: object) -> None:
-    if not isinstance(pair, Pair):
-        raise InputError(
-            f"SMCP3 is given a {type(pair).__name__} in place of a pair; give Pair(forward, backward)."
-        )
-
-
 def moved(population: Population, pair: Pair, observed: Observed | None = None) -> Population:
     """The population moved by a pair, given a measurement if there is one, and weighted for it.
 
@@ -94,11 +87,10 @@ def moved(population: Population, pair: Pair, observed: Observed | None = None) 
     population.
 
     Raises:
-        InputError: no `Pair` is given, a program gives an address that the other has not, more coordinates
+        InputError: a program gives an address that the other has not, more coordinates
             than it takes, or (checked) the programs do not undo each other.
         InferenceError: no particle has any weight left.
     """
-    _refuse_no_pair(pair)
     count = len(population)
     if not isinstance(pair.forward, Fitted) and not isinstance(pair.backward, Fitted):
         parts = [torch.arange(count)]
@@ -131,13 +123,8 @@ def smcp3(pair: Pair, *, resample: Resample | None = None) -> StepFunction:
 
     Returns:
         The step. It raises what `moved` raises.
-
-    Raises:
-        InputError: no `Pair` is given.
     """
-    _refuse_no_pair(pair)
-    if resample is None:
-        resample = adaptive()
+    resample = adaptive() if resample is None else resample
     check_resample("smcp3", resample)
 
     def step(population: Population, observed: Observed) -> Stepped:
@@ -165,18 +152,16 @@ def _fitted(pair: Pair, others: Population) -> tuple[Program, Program]:
 def moved_trace(
     forward: Program, backward: Program, old: Trace, observed: Observed | None = None, check: bool = False
 ) -> tuple[Trace, Tensor]:
-    """Particles moved by two programs, with a measurement if there is one, and their log factors (N,).
-
-    Raises:
-        InputError: see `moved`.
-    """
+    """Particles moved by two programs, with a measurement if there is one, and their log factors (N,)."""
     count = old.particles
     shown = old if observed is None else Anticipated(old, *observed)
     # The next step of a series begins from the values of the last, which stay.
     latent: Values = {} if observed is not None and isinstance(old, SeriesTrace) else old.choices
     chosen = simulate(forward, (shown,), count)
     _refuse_observed("forward", chosen.choices, shown)
-    values, back = _read(chosen.result, chosen.choices, latent, lambda: _brought(shown))
+    values, back = _read(
+        chosen.result, chosen.choices, latent, lambda: shown.brought if isinstance(shown, Anticipated) else []
+    )
     new, log_ratio = _updated(old, values, observed)
     fresh = [a for a in values if a not in latent]
     reverse = assessed(backward, (new,), back, count)
@@ -223,11 +208,6 @@ def _updated(old: Trace, values: Values, observed: Observed | None) -> tuple[Tra
     else:
         updated = update(old, values, args=observed.args, observations=observed.observations)
     return updated.trace, updated.log_ratio
-
-
-def _brought(shown: Trace | Anticipated) -> list[str]:
-    """The latent addresses that come with the measurement."""
-    return shown.brought if isinstance(shown, Anticipated) else []
 
 
 def _refuse_observed(which: str, choices: Values, seen: Trace | Anticipated) -> None:

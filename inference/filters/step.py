@@ -21,36 +21,16 @@ from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 
 
-class _Observed(NamedTuple):
-    args: tuple[Any, ...]
-    observations: Mapping[str, Tensor]
-
-
-class Observed(_Observed):
+class Observed(NamedTuple):
     """New observations, and the program's arguments that go with them.
 
     Attributes:
         args: the program's arguments up to and including the new measurement, as a tuple.
         observations: values of the new addresses, of the sites' event shape.
-
-    Raises:
-        InputError: the arguments are no tuple, or the observations no mapping.
     """
 
-    __slots__ = ()
-
-    def __new__(cls, args: tuple[Any, ...], observations: Mapping[str, Tensor]) -> Observed:  # noqa: D102
-        if not isinstance(args, tuple):
-            raise InputError(
-                f"Observed is given a {type(args).__name__} as the program's arguments; "
-                "give a tuple, (5,) for one argument."
-            )
-        if not isinstance(observations, Mapping):
-            raise InputError(
-                f"Observed is given a {type(observations).__name__} as observations; "
-                "give values by address, {'y': value}."
-            )
-        return super().__new__(cls, args, observations)
+    args: tuple[Any, ...]
+    observations: Mapping[str, Tensor]
 
 
 class StepInfo(NamedTuple):
@@ -127,15 +107,12 @@ def steps(
         )
     if isinstance(observed, Observed):
         raise InputError("steps is given one Observed; give a list of them, one for each step.")
+
+    def stepping() -> Iterator[Stepped]:
+        now = population
+        for each in observed:
+            now, info = step(now, each)
+            yield Stepped(now, info)
+
     total = len(observed) if isinstance(observed, Sized) else None
-    return watched(_stepping(step, population, observed), total=total, description="steps", progress=progress)
-
-
-def _stepping(step: StepFunction, population: Population, observed: Iterable[Observed]) -> Iterator[Stepped]:
-    for each in observed:
-        if not isinstance(each, Observed):
-            raise InputError(
-                f"steps is given a {type(each).__name__}; give a list of Observed(args, observations)."
-            )
-        population, info = step(population, each)
-        yield Stepped(population, info)
+    return watched(stepping(), total=total, description="steps", progress=progress)

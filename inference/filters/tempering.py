@@ -13,7 +13,7 @@ that contains a surrogate likelihood is a surrogate's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -24,7 +24,7 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.exponents import next_exponent
 from bcppl.inference.filters.step import Observed, StepInfo, Stepped
-from bcppl.inference.kernels import Kernel, Until, moved_by, refuse_other, takes
+from bcppl.inference.kernels import Kernel, Until, moved_by, refuse_other
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Resample, adaptive, check_resample
 from bcppl.inference.targets import POSTERIOR, Target, cost_of
@@ -111,7 +111,9 @@ class Tempered:
             log_likelihood: their log-probability (N,).
         """
         start = population.log_evidence
-        groups = [[a] for a in _by_cost(population.trace, new)] if self.by_site and new else [list(new)]
+        sites = population.trace.distributions
+        ordered = sorted(new, key=lambda address: cost_of(sites[address]))
+        groups = [[a] for a in ordered] if self.by_site and new else [list(new)]
         done, acceptances, ancestors, before, resampled = [], [], None, None, 0
         displacement = float("nan")
         for number, group in enumerate(groups):
@@ -190,11 +192,6 @@ def tempered(
             resampling.
     """
     if kernel is not None:
-        if callable(kernel) and takes(kernel, 2) and not takes(kernel, 1):
-            raise InputError(
-                "tempered is given a function of two arguments in place of a kernel; "
-                "if it is a rejuvenation such as waste_free_moves(...), give it as rejuvenation=..."
-            )
         refuse_other("tempered", kernel)
     if not callable(share):
         share = kept_share(share)
@@ -203,8 +200,6 @@ def tempered(
         sweeps = whole_number("tempering is to move the particles in {} sweeps", sweeps)
     fixed = None
     if exponents is not None:
-        if not isinstance(exponents, Iterable):
-            raise InputError(f"tempering is given the exponents {exponents!r}; give a list, [0.1, 1.0].")
         fixed = tuple(number_within("tempering is given the exponent {}", e) for e in exponents)
     if fixed is not None and (fixed[-1:] != (1.0,) or any(b <= a for a, b in pairwise((0.0, *fixed)))):
         raise InputError(
@@ -221,7 +216,3 @@ def tempered(
             "a step is given a rejuvenation beside a kernel or a resampling; give one or the other."
         )
     return Tempered(rejuvenation, _Schedule(share, fixed), by_site)
-
-
-def _by_cost(trace: Trace, addresses: Sequence[str]) -> list[str]:
-    return sorted(addresses, key=lambda address: cost_of(trace.distributions[address]))

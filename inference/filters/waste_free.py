@@ -54,7 +54,8 @@ def waste_free_moves(
         side = (torch.randperm(chains) % 2)[torch.arange(count) % chains]
         sides = [s for s in (0, 1) if bool((side[ancestors] == s).any())]
         halves = [(side[ancestors] == s).nonzero().flatten() for s in sides]
-        moves = [fitted(kernel, _teachers(population, side == 1 - s)) for s in sides]
+        others = [(side == 1 - s).nonzero().flatten() for s in sides]
+        moves = [fitted(kernel, population[o] if len(o) else population) for o in others]
         current, acceptances = population.trace[ancestors], []
         whole = population.trace[ancestors.repeat(count // chains)]
         for state in range(1, count // chains):
@@ -74,12 +75,3 @@ def waste_free_moves(
         return Rejuvenated(kept, ancestors.repeat(count // chains), acceptance)
 
     return rejuvenation
-
-
-def _teachers(population: Population, others: torch.Tensor) -> Population:
-    """What is learned from: all, where the others are none; equal weights, where they have none."""
-    index = others.nonzero().flatten()
-    taught = population[index] if len(index) else population
-    if bool((taught.log_weights > -torch.inf).any()):
-        return taught
-    return replace(taught, log_weights=torch.zeros_like(taught.log_weights))

@@ -2,12 +2,12 @@
 
 Tierney, Markov chains for exploring posterior distributions, Annals of Statistics 22, 1994, section 2.4. The
 choice of the next kernel does not depend on where the particles are. The acceptance is the mean over the
-proposals.
+proposals. All raise InputError where no kernel is given, or something else, such as a proposal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -21,12 +21,22 @@ from bcppl.inference.targets import Target
 from bcppl.traces import Trace
 
 
-def _one_after_another(moves: Sequence[Move], trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-    total = torch.zeros(trace.particles, dtype=torch.float64)
-    for each in moves:
-        trace, accepted = each(trace, target)
-        total = total + accepted
-    return trace, total / len(moves)
+def _one_after_another(kernels: Sequence[Kernel], order: Callable[[int], Iterable[int]]) -> Kernel:
+    """The moves of K kernels by number, in the order that `order(K)` gives for each move."""
+
+    def together(population: Population) -> Move:
+        moves = [fitted(kernel, population) for kernel in kernels]
+
+        def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
+            total, numbers = torch.zeros(trace.particles, dtype=torch.float64), list(order(len(moves)))
+            for number in numbers:
+                trace, accepted = moves[number](trace, target)
+                total = total + accepted
+            return trace, total / len(numbers)
+
+        return move
+
+    return together
 
 
 def _listed(name: str, kernels: Sequence[Kernel | Sequence[Kernel]]) -> list[Kernel]:
@@ -41,40 +51,16 @@ def _listed(name: str, kernels: Sequence[Kernel | Sequence[Kernel]]) -> list[Ker
 
 
 def sequence(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
-    """One kernel after another, in the order given, one by one or as a list.
-
-    Raises:
-        InputError: no kernel is given, or something else, such as a proposal.
-    """
-    listed = _listed("sequence", kernels)
-
-    def together(population: Population) -> Move:
-        moves = [fitted(kernel, population) for kernel in listed]
-        return lambda trace, target: _one_after_another(moves, trace, target)
-
-    return together
+    """One kernel after another, in the order given, one by one or as a list."""
+    return _one_after_another(_listed("sequence", kernels), range)
 
 
 def cycle(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
     """Each kernel once, in an order that is drawn for each move: Tierney's random permutation scan.
 
     A fixed order of reversible kernels is not reversible; a random one is.
-
-    Raises:
-        InputError: no kernel is given, or something else, such as a proposal.
     """
-    listed = _listed("cycle", kernels)
-
-    def together(population: Population) -> Move:
-        moves = [fitted(kernel, population) for kernel in listed]
-
-        def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-            order = torch.randperm(len(moves)).tolist()
-            return _one_after_another([moves[k] for k in order], trace, target)
-
-        return move
-
-    return together
+    return _one_after_another(_listed("cycle", kernels), lambda count: torch.randperm(count).tolist())
 
 
 def mixture(kernels: Sequence[Kernel] | Kernel, *more: Any, weights: Sequence[float] | None = None) -> Kernel:
@@ -89,16 +75,12 @@ def mixture(kernels: Sequence[Kernel] | Kernel, *more: Any, weights: Sequence[fl
         weights: their probabilities, up to a factor; equal by default.
 
     Raises:
-        InputError: no kernel is given, or something else, such as a proposal; or the weights are not one for
-            each, finite, and not negative.
+        InputError: the weights are not one for each, finite, and not negative.
     """
     if isinstance(kernels, Sequence) and len(more) == 1 and weights is None and not callable(more[0]):
         weights, more = more[0], ()
     listed = _listed("mixture", (kernels, *more))
-    try:
-        chances = torch.as_tensor([1.0] * len(listed) if weights is None else weights, dtype=torch.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"mixture is given weights {weights!r}; give one number for each kernel.") from None
+    chances = torch.as_tensor([1.0] * len(listed) if weights is None else weights, dtype=torch.float64)
     sound = chances.shape == (len(listed),) and bool((torch.isfinite(chances) & (chances >= 0.0)).all())
     if not sound or not bool(chances.sum() > 0.0):
         raise InputError(
@@ -133,13 +115,8 @@ def repeat(kernel: Kernel, times: int) -> Kernel:
     `bcppl.inference.kernels.until`.
 
     Raises:
-        InputError: what is given is no kernel, or the times are no whole number, 1 or more.
+        InputError: the times are no whole number, 1 or more.
     """
     refuse_other("repeat", kernel)
     times = whole_number("a kernel is to be repeated {} times", times)
-
-    def together(population: Population) -> Move:
-        moves = [fitted(kernel, population)] * times
-        return lambda trace, target: _one_after_another(moves, trace, target)
-
-    return together
+    return _one_after_another([kernel], lambda count: [0] * times)

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.distributions import biject_to
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import normalised
-from bcppl.distributions.support import freedom_of, support_of
 from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import Kernel, Move, decided
 from bcppl.inference.population import Population
+from bcppl.inference.proposals.coordinates import Unflattened, VectorCoordinates, coordinates_of
+from bcppl.inference.proposals.spread import FLOOR
+from bcppl.inference.summaries import weighted_covariance
 from bcppl.inference.targets import Target
 from bcppl.traces import Trace, update
 from bcppl.traces.gradient import log_prob_with_grad
 from bcppl.traces.indexing import beside
 from bcppl.traces.run import inward
-
-# A standard deviation below this is rounding (in the unconstrained coordinates).
-FLOOR = 1e-6
 
 
 def hmc(
@@ -103,13 +100,8 @@ def leapfrog(
 ) -> tuple[Tensor, Tensor]:
     """Positions and momenta (N, D) after some leapfrog steps: volume preserving, reversed by flipped momenta.
 
-    Args:
-        gradient: of the log-density, (N, D), in the coordinates of the momentum: times `factor`.
-        position: (N, D).
-        momentum: (N, D), of mass 1.
-        size: (N, 1) step sizes.
-        steps: how many.
-        factor: (D, D) Cholesky factor of the inverse mass matrix of the position.
+    The gradient is in the coordinates of the momentum, whose mass is 1: times `factor` (D, D), the Cholesky
+    factor of the inverse mass matrix of the position. `size` (N, 1) is that of the steps.
     """
     momentum = momentum + 0.5 * size * gradient(position)
     for k in range(steps):
@@ -123,64 +115,44 @@ class _Unconstrained:
     """Latent values read as vectors (N, D) without bounds."""
 
     def __init__(self, addresses: tuple[str, ...], trace: Trace) -> None:
+        self.sites = {a: trace.distributions[a] for a in addresses if a in trace.choices}
+        self.transforms: dict[str, Unflattened] = {}
         for address in addresses:
-            _refuse_unsuited(address, trace)
-        self.sites = {a: trace.distributions[a] for a in addresses}
-        self.supports = {a: site.support for a, site in self.sites.items()}
-        # As the distribution takes it: the particle axis behind the plates.
-        self.shapes = {a: inward(trace[a], site).shape for a, site in self.sites.items()}
-        self.transforms: dict[str, Any] = {}
-        for address, support in self.supports.items():
-            try:
-                self.transforms[address] = biject_to(support)
-            except NotImplementedError as error:
+            coordinates = coordinates_of(trace, address)
+            if not isinstance(coordinates, VectorCoordinates):
                 raise InputError(
-                    f"hmc cannot move {address!r}: its support {support} has no unconstrained coordinates; "
-                    "move it with a proposal."
-                ) from error
-        self.dtypes = {a: trace[a].dtype for a in addresses}
+                    f"hmc cannot move {address!r}: it is a pose; move it with `drift({address!r})`."
+                )
+            self.transforms[address] = coordinates.transform
 
     def read(self, trace: Trace) -> Tensor:
         """(N, D) float64."""
-        flat = []
-        for address, transform in self.transforms.items():
-            free = transform.inv(inward(trace[address], self.sites[address]))
-            flat.append(self._outward(address, free).reshape(len(trace), -1))
-        return torch.cat(flat, dim=1).to(torch.float64)
-
-    def _outward(self, address: str, value: Tensor) -> Tensor:
-        return value.movedim(len(self.sites[address].batch_shape) - 1, 0)
+        return torch.cat([transform.inv(trace[a]) for a, transform in self.transforms.items()], dim=1)
 
     def values(self, position: Tensor) -> tuple[dict[str, Tensor], Tensor]:
         """The values at positions (N, D), and log|d value / d position| (N,)."""
-        values, total, start = {}, position.new_zeros(len(position)), 0
-        for address, transform in self.transforms.items():
-            shape = transform.inverse_shape(self.shapes[address])
-            plates = len(self.sites[address].batch_shape) - 1
-            width = math.prod(shape) // len(position)
-            free = position[:, start : start + width]
-            free = free.reshape(len(free), *shape[:plates], *shape[plates + 1 :]).movedim(0, plates)
-            start += width
-            value = transform(free)
-            log_jacobian = self._outward(address, transform.log_abs_det_jacobian(free, value))
-            total = total + log_jacobian.reshape(len(position), -1).sum(dim=1)
-            values[address] = self._outward(address, value).to(self.dtypes[address])
+        values, total = {}, position.new_zeros(len(position))
+        each = position.split([transform.dimension for transform in self.transforms.values()], dim=1)
+        for (address, transform), free in zip(self.transforms.items(), each, strict=True):
+            values[address] = transform(free)
+            total = total + transform.log_abs_det_jacobian(free, values[address])
         return values, total
 
     def inside(self, values: Mapping[str, Tensor]) -> Tensor:
         """Where values are finite and in their supports, (N,)."""
         checks = [_all(torch.isfinite(v)) for v in values.values()]
         for address, value in values.items():
-            within = self.supports[address].check(inward(value, self.sites[address]))
-            checks.append(_all(self._outward(address, within)))
+            site = self.sites[address]
+            within = site.support.check(inward(value, site))
+            checks.append(_all(within.movedim(len(site.batch_shape) - 1, 0)))
         return torch.stack(checks).all(dim=0)
 
     def refuse_moved_bounds(self, new: Trace) -> None:
         """Refuse supports that depend on what is moved: the reverse move would be in other coordinates."""
-        for address, support in self.supports.items():
-            now = new.distributions[address].support
-            if any(not torch.equal(a, b) for a, b in zip(_bounds(support), _bounds(now), strict=True)):
-                others = " or ".join(repr(a) for a in self.shapes if a != address)
+        for address, site in self.sites.items():
+            bounds = zip(_bounds(site.support), _bounds(new.distributions[address].support), strict=True)
+            if any(not torch.equal(before, now) for before, now in bounds):
+                others = " or ".join(repr(a) for a in self.sites if a != address)
                 raise InputError(
                     f"hmc cannot move {address!r} together with {others}, on which its support depends; "
                     "give each a kernel of its own."
@@ -208,19 +180,6 @@ def _all(mask: Tensor) -> Tensor:
     return mask.reshape(len(mask), -1).all(dim=1)
 
 
-def _refuse_unsuited(address: str, trace: Trace) -> None:
-    if address not in trace.choices:
-        raise InputError(
-            f"hmc was asked to move {address!r}, which is no latent address; "
-            f"latent are {', '.join(trace.choices) or 'none'}."
-        )
-    site = trace.distributions[address]
-    if freedom_of(site) is not None:
-        raise InputError(f"hmc cannot move {address!r}: it is a pose; move it with `drift({address!r})`.")
-    if support_of(site).is_discrete or not trace[address].is_floating_point():
-        raise InputError(f"hmc cannot move {address!r}: it is discrete; move it with a proposal.")
-
-
 def _factor(space: _Unconstrained, population: Population) -> Tensor:
     """Cholesky factor (D, D) of the weighted covariance, its correlations shrunk."""
     position = space.read(population.trace)
@@ -228,6 +187,5 @@ def _factor(space: _Unconstrained, population: Population) -> Tensor:
     weights = torch.where(torch.isfinite(position).all(dim=1), weights, 0.0)
     position = torch.nan_to_num(position, 0.0, 0.0, 0.0)
     weights = weights / weights.sum().clamp_min(torch.finfo(torch.float64).tiny)
-    centred = position - weights @ position
-    covariance = (weights[:, None] * centred).T @ centred
+    covariance = weighted_covariance(position, weights)
     return torch.linalg.cholesky(0.9 * covariance + 0.1 * torch.diag(covariance.diagonal() + 10 * FLOOR**2))

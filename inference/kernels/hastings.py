@@ -11,7 +11,7 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import Kernel, Move, decided, refuse_observed
 from bcppl.inference.population import Population
-from bcppl.inference.proposals.proposal import Fitted, Proposal, program_of
+from bcppl.inference.proposals.proposal import Proposal, program_of
 from bcppl.inference.targets import Target, visible
 from bcppl.traces import Trace, assess, propose, update
 from bcppl.traces.indexing import beside
@@ -32,14 +32,9 @@ def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any
     The acceptance ratio is that of Hastings, Biometrika 57, 1970, on the pair (trace, auxiliary choices).
 
     Raises:
-        InputError: what is given is no proposal. When the kernel moves: the proposal makes no choice at a
-            latent address, or one at an observed address.
+        InputError: (when the kernel moves) the proposal makes no choice at a latent address, or one at an
+            observed address.
     """
-    if not isinstance(proposal, Fitted) and not callable(proposal):
-        raise InputError(
-            f"metropolis_hastings is given a {type(proposal).__name__} in place of a proposal; "
-            "give a program, or one such as drift(...)."
-        )
 
     def kernel(population: Population) -> Move:
         program = program_of(proposal, learned, population)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from functools import partial
 
 from torch import Tensor
 
@@ -57,19 +57,13 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
         def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
             count = trace.particles
             forward = simulate(choose, (trace,), count)
-            before = {
-                **charted("latent", trace.choices, trace.distributions),
-                **charted("choice", forward.choices, forward.distributions),
-            }
-            charts = {k: v.chart for k, v in before.items()}
+            before = charted("latent", trace.choices, trace.distributions)
+            before |= charted("choice", forward.choices, forward.distributions)
+            mapped = partial(_mapped, involution)
 
-            def mapped(point: Mapping[Key, Tensor]) -> dict[Key, Tensor]:
-                return _mapped(involution, point)
-
-            def log_jacobian(point: Mapping[Key, Tensor], to: Mapping[Key, Tensor]) -> Tensor:
-                return log_abs_det_jacobian(
-                    mapped, _charted(point, charts), _charted(to, charts), check=check
-                )
+            def log_jacobian(*ends: Mapping[Key, Tensor]) -> Tensor:
+                start, end = ({k: Charted(v, before[k].chart) for k, v in each.items()} for each in ends)
+                return log_abs_det_jacobian(mapped, start, end, check=check)
 
             start = {k: v.value for k, v in before.items()}
             after = mapped(start)
@@ -80,7 +74,7 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
                     f"latent are {', '.join(trace.choices)}."
                 )
             for address, value in new.items():
-                refuse_leaving(address, charts["latent", address], trace.choices[address], value)
+                refuse_leaving(address, before["latent", address].chart, trace.choices[address], value)
             log_forward = log_jacobian(start, after)
             if check:
                 refuse_apart("the involution, applied twice,", before, mapped(after))
@@ -97,20 +91,11 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
     return kernel
 
 
-def _charted(point: Mapping[Key, Tensor], charts: Mapping[Key, Any]) -> dict[Key, Charted]:
-    return {k: Charted(v, charts[k]) for k, v in point.items()}
-
-
 def _mapped(involution: Involution, point: Mapping[Key, Tensor]) -> dict[Key, Tensor]:
     given: dict[str, dict[str, Tensor]] = {"latent": {}, "choice": {}}
     for (kind, address), value in point.items():
         given[kind][address] = value
     reached = involution(given["latent"], given["choice"])
-    if not isinstance(reached, tuple) or [isinstance(r, Mapping) for r in reached] != [True, True]:
-        raise InputError(
-            "an involution gives back something else than two mappings; "
-            "return (new values by address, new auxiliary choices by address)."
-        )
     after = dict(point)
     for kind, values in zip(given, reached, strict=True):
         for address, value in values.items():

@@ -170,13 +170,8 @@ def log_abs_det_jacobian(
         check: also check that particles are not mixed.
 
     Returns:
-        (N,) float64; -inf for a particle where the map is not one-to-one.
-
-    Raises:
-        InputError: there are more coordinates among the outputs than among the inputs or fewer, an output
-            depends on no input or (checked) on those of other particles, the map is nowhere one-to-one, or it
-            uses values on a surface (matrices of a kind, a sphere).
-        InferenceError: the Jacobian is not finite.
+        (N,) float64; -inf for a particle where the map is not one-to-one. InputError where it has none: the
+        map gives more coordinates than it takes or fewer, or uses values on a surface (a sphere, matrices).
     """
     columns, rows = _remaining(inputs, outputs)
     for key in (*columns, *rows):
@@ -247,14 +242,10 @@ def refuse_leaving(address: str, chart: Chart, old: Tensor, new: Tensor) -> None
         )
 
 
-def refuse_apart(what: str, first: Point, second: Mapping[Key, Tensor], tolerance: float = 1e-6) -> None:
-    """Refuse a move and its reverse that do not end where they began.
-
-    Raises:
-        InputError: names the address and the particle.
-    """
+def refuse_apart(what: str, first: Point, second: Mapping[Key, Tensor]) -> None:
+    """Refuse a move and its reverse that do not end where they began."""
     for (kind, address), (value, chart) in first.items():
-        apart = ~(chart.apart(value, second[kind, address]) <= tolerance)
+        apart = ~(chart.apart(value, second[kind, address]) <= 1e-6)
         if bool(apart.any()):
             particle = int(apart.nonzero()[0])
             raise InputError(

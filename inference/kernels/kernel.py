@@ -27,11 +27,7 @@ Kernel = Callable[[Population], Move]
 
 
 def fitted(kernel: Kernel, population: Population) -> Move:
-    """The move of a kernel that has learned from a population.
-
-    Raises:
-        InputError: it is no kernel but a proposal.
-    """
+    """The move of a kernel that has learned from a population."""
     refuse_other("a population", kernel)
     population = weighted(population)
     try:
@@ -55,28 +51,20 @@ def weighted(population: Population) -> Population:
     return replace(population, log_weights=torch.zeros_like(population.log_weights))
 
 
-WRAP = "if it is a proposal, wrap it in metropolis_hastings(...)"
+WRAP = "wrap a proposal in metropolis_hastings(...)"
 
 
 def refuse_other(where: str, kernel: Any) -> None:
-    """Refuse what cannot be a kernel.
-
-    Raises:
-        InputError: names what was given in place of one, and what to do.
-    """
+    """Refuse what cannot be a kernel."""
     if isinstance(kernel, Fitted):
-        raise InputError(
-            f"{where} is given a proposal in place of a kernel; wrap it in metropolis_hastings(...)."
-        )
-    if not callable(kernel):
-        raise InputError(
-            f"{where} is given a {type(kernel).__name__} in place of a kernel; "
-            "give one such as metropolis_hastings(drift(...))."
-        )
-    if not takes(kernel, 1):
-        raise InputError(
-            f"{where} is given {_name(kernel)} in place of a kernel, which would take a population; {WRAP}."
-        )
+        given = "a proposal"
+    elif not callable(kernel):
+        given = f"a {type(kernel).__name__}"
+    elif not takes(kernel, 1):
+        given = _name(kernel)
+    else:
+        return
+    raise InputError(f"{where} is given {given} in place of a kernel; {WRAP}.")
 
 
 def takes(function: Callable[..., Any], count: int) -> bool:
@@ -95,11 +83,7 @@ def _name(function: Any) -> str:
 
 
 def refuse_observed(what: str, choices: Iterable[str], trace: Trace) -> None:
-    """Refuse a program that samples at an observed address: its choice would be taken as auxiliary.
-
-    Raises:
-        InputError: names the address.
-    """
+    """Refuse a program that samples at an observed address: its choice would be taken as auxiliary."""
     for address in choices:
         if address not in trace.choices and address in trace.addresses:
             raise InputError(
@@ -111,11 +95,7 @@ def refuse_observed(what: str, choices: Iterable[str], trace: Trace) -> None:
 def decided(target: Target, trace: Trace, proposed: Trace, log_ratio: Tensor) -> tuple[Trace, Tensor]:
     """The particles after a Metropolis-Hastings decision, and whether each took its proposal (N,).
 
-    Args:
-        target: the log-density that is left invariant.
-        trace: of N particles.
-        proposed: their proposals.
-        log_ratio: (N,) log-density of the reverse proposal minus that of the proposal, Jacobian included.
+    The log-ratio (N,) is the log-density of the reverse proposal minus that of the proposal, with Jacobian.
     """
     index, taken = accept(target, trace, proposed, log_ratio)
     accepted = torch.zeros(trace.particles, dtype=torch.float64)

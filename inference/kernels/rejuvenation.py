@@ -128,11 +128,8 @@ def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int
     Raises:
         InputError: the sweeps are no whole number, 0 or more.
     """
-    most = (
-        sweeps.most
-        if isinstance(sweeps, Until)
-        else whole_number("a population is to be moved {} times", sweeps, least=0)
-    )
+    what = "a population is to be moved {} times"
+    most = sweeps.most if isinstance(sweeps, Until) else whole_number(what, sweeps, least=0)
     start, shares, made = population, [], 0
     while made < most and not (isinstance(sweeps, Until) and sweeps.reached(start, population)):
         population, accepted = _sweep(population, kernel, target)

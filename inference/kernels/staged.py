@@ -92,22 +92,15 @@ class Staged(Target):
 Surrogate = Callable[[Population], Callable[[Trace], Tensor]]
 
 
-def _unscreened(trace: Trace) -> Tensor:
-    return torch.zeros(trace.particles, dtype=torch.float64)
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Screened(Target):
     """A target that accepts in two stages, the first decided by a surrogate of its log-density.
 
     Christen and Fox, section 2: the surrogate and the proposal's ratio decide which proposals are evaluated;
-    the second stage divides the surrogate's ratio out.
-
-    Attributes:
-        surrogate: a log-density (N,) of a trace, up to a constant; it reads latent values.
+    the second stage divides the surrogate's ratio out. It is a log-density (N,) of a trace, up to a constant.
     """
 
-    surrogate: Callable[[Trace], Tensor] = _unscreened
+    surrogate: Callable[[Trace], Tensor]
 
     def accept(self, old: Trace, new: Trace, log_ratio: Tensor) -> tuple[Tensor, Trace]:
         """Which particles take their proposals: see `Target.accept`."""
@@ -182,16 +175,11 @@ def delayed_acceptance(
             fitted to other particles than those that are moved. Two stages then.
 
     Raises:
-        InputError: what is given is no kernel, fewer than two stages, a surrogate in the place of `first`, or
-            sites and a surrogate that are both to decide first. When the kernel moves: a pattern fits no
-            address, the target is a plain function, or the reverse move of a proposal reads a site of a
-            later stage.
+        InputError: what is given is no kernel, fewer than two stages, or sites and a surrogate that are both
+            to decide first. When the kernel moves: a pattern fits no address, or the reverse move of a
+            proposal reads a site of a later stage.
     """
     refuse_other("delayed_acceptance", kernel)
-    if callable(first):
-        raise InputError(
-            "delayed acceptance is to decide first by a function; give a surrogate as surrogate=..."
-        )
     stages = whole_number("delayed acceptance is asked for {} stages", stages, least=2)
     if surrogate is not None and (first is not None or stages != 2):
         raise InputError(
@@ -205,12 +193,9 @@ def delayed_acceptance(
         screen = surrogate(population) if surrogate is not None else None
 
         def in_stages(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-            if not isinstance(target, Target):
-                raise InputError(
-                    "delayed acceptance cannot divide a target that is a plain function; give a Target."
-                )
-            staged: Target = Staged(target.exponents, patterns, stages - 1)
-            return move(trace, staged if screen is None else Screened(target.exponents, screen))
+            if screen is not None:
+                return move(trace, Screened(exponents=target.exponents, surrogate=screen))
+            return move(trace, Staged(target.exponents, patterns, stages - 1))
 
         return in_stages
 

@@ -24,6 +24,7 @@ from bcppl.inference.planning.motion_constraints import (
     not_from_below,
 )
 from bcppl.inference.planning.touching import TouchParameters
+from bcppl.inference.summaries import COLLAPSED, WEIGHTLESS
 from bcppl.sensors import sensor_of
 from bcppl.sensors.candidates import Candidate, name_of, planner_of
 
@@ -73,9 +74,7 @@ def plan_candidates(
     require_uncertain(belief)
     asked = MIXED if kinds is None else kinds
     if not isinstance(asked, Mapping):
-        raise InputError(
-            f"kinds of candidates are given as {asked!r}; give a number of each: {{'touch': 8}}."
-        )
+        raise InputError(f"kinds of candidates are {asked!r}; give a number of each: {{'touch': 8}}.")
     known = candidate_kinds()
     if peg is not None:
         peg.check(closed=False)
@@ -103,11 +102,7 @@ def plan_candidates(
 
 
 def require_uncertain(belief: Belief) -> None:
-    """Raise where a belief has no weight, or no uncertainty that a measurement could reduce.
-
-    Raises:
-        InputError: no particle has weight, or all with weight are at one pose.
-    """
+    """Raise InputError where a belief has no weight, or no uncertainty that a measurement could reduce."""
     try:
         distinct = belief.distinct
     except InferenceError as error:
@@ -116,15 +111,9 @@ def require_uncertain(belief: Belief) -> None:
                 "the belief has a weight that is no number (NaN or +inf); give log weights, -inf for a "
                 "particle without weight."
             ) from error
-        raise InputError(
-            "the belief has no weight: every particle's is zero, so no candidate can be chosen by it; widen "
-            "the prior, use more particles, or check the measurements (`bcppl check`)."
-        ) from error
+        raise InputError(WEIGHTLESS) from error
     if distinct < 2:
-        raise InputError(
-            "the belief has collapsed to a point: all particles with weight are at one pose, so no candidate "
-            "is informative; use more particles, or move them apart first (rejuvenation)."
-        )
+        raise InputError(f"the belief {COLLAPSED}")
 
 
 def _of_kind(
@@ -158,5 +147,4 @@ def _usual(kind: str, problem: PlanningProblem) -> list[Constraint]:
 def _numbered(candidate: Candidate, number: int) -> Candidate:
     """The same with `#` in its name replaced."""
     name = name_of(candidate).replace("#", str(number))
-    renamed: Candidate = planner_of(candidate).renamed(candidate, name)
-    return renamed
+    return planner_of(candidate).renamed(candidate, name)

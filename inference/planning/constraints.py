@@ -18,11 +18,9 @@ from bcppl.sensors.candidates import Candidate
 
 
 class Constraint(NamedTuple):
-    """A constraint on candidates.
+    """A constraint on candidates: C booleans for C candidates.
 
-    Attributes:
-        violation: a phrase for the candidates that violate it: "are out of the arm's reach".
-        satisfied: C booleans for C candidates.
+    The violation is a phrase for the candidates that violate it: "are out of the arm's reach".
     """
 
     violation: str
@@ -31,12 +29,7 @@ class Constraint(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Candidates(Sequence[Candidate]):
-    """Feasible candidates, and how many were excluded.
-
-    Attributes:
-        feasible: the candidates.
-        excluded: how many violate each constraint, by its violation.
-    """
+    """Feasible candidates, and how many others violate each constraint, by its violation."""
 
     feasible: tuple[Candidate, ...]
     excluded: Counter[str] = field(default_factory=Counter)
@@ -83,11 +76,7 @@ def feasible(candidates: Iterable[Candidate], constraints: Sequence[Constraint])
 
 
 def require_candidates(candidates: Candidates) -> Candidates:
-    """The candidates, of which there must be one.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The candidates; InputError where there is none."""
     if len(candidates):
         return candidates
     if not candidates.violations:

@@ -10,11 +10,10 @@ import numpy.typing as npt
 import shapely
 from shapely.affinity import translate
 
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.cover import polygons_of
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
 
 _BELOW = 0.0002  # m below the top at which its outline is taken
 _HOLE = 0.002  # m
@@ -24,12 +23,7 @@ _WORTH_A_LIFT = 2.0  # a lift is worth it for a triangle so many times as large
 
 
 class Side(NamedTuple):
-    """An upright face, in the part's x-y plane.
-
-    Attributes:
-        start, stop: (2,) its ends, metres.
-        normal: (2,) its outward unit normal.
-    """
+    """An upright face in the part's x-y plane: its ends (2,), metres, and its outward unit normal (2,)."""
 
     start: Array
     stop: Array
@@ -42,11 +36,9 @@ class Side(NamedTuple):
 
 
 class TopPoints(NamedTuple):
-    """Points of contact on a top, in the part's x-y plane.
+    """Points of contact on a top (3, 2), in the part's x-y plane, metres.
 
-    Attributes:
-        positions: (3, 2) metres; a peg can slide from the first to the second.
-        lifted: whether the peg must be lifted from the second to the third; otherwise it can slide.
+    A peg can slide from the first to the second, and on to the third unless it must be `lifted`.
     """
 
     positions: Array
@@ -54,11 +46,7 @@ class TopPoints(NamedTuple):
 
 
 def section(part: Part, height: float) -> shapely.Polygon:
-    """The cross section of a part at a height z in its frame, the largest piece of it, metres.
-
-    Raises:
-        InputError: the part does not reach there.
-    """
+    """The cross section of a part at a height z in its frame, the largest piece of it, metres."""
     path = part.mesh.section(plane_origin=[0.0, 0.0, height], plane_normal=[0.0, 0.0, 1.0])
     if path is None:
         raise InputError(
@@ -76,9 +64,6 @@ def points_on_top(part: Part, peg: Part, margin: float) -> TopPoints:
     The peg's whole cross section stays on the top, `margin` metres from its outer edge where there is room
     for that, and 2 mm from holes. Of all such triples of candidates, the one with the largest triangle; where
     slides cannot lead far, as on a narrow rim, the peg is lifted to the third.
-
-    Raises:
-        InputError: the top has no room for the peg.
     """
     top = float(part.vertices[:, 2].max())
     outline = section(part, top - _BELOW)

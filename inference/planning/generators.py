@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
@@ -33,8 +33,6 @@ from bcppl.sensors import sensor_named, sensors
 from bcppl.sensors.candidates import Candidate
 from bcppl.sensors.protocol import AroundPart
 
-Array = npt.NDArray[np.float64]
-
 # Searches and attempts that take two to three seconds.
 SHORT = InsertionParameters(
     approach_height=0.01, landing_speed=0.03, search_time=1.5, maximum_radius=0.006, press_depth=0.004
@@ -49,18 +47,9 @@ _REST = 0.15  # s before any motion, for the tare
 
 @dataclass(frozen=True, eq=False)
 class PlanningProblem:
-    """The problem that candidates are planned for.
+    """The problem that candidates are planned for: the arguments of `plan_candidates`.
 
-    Attributes:
-        belief: over world_from_part.
-        part: its z axis points out of its top.
-        peg: the held peg; None for views alone.
-        gap: of part and peg; computed unless given.
-        hole: for searches and attempts; `hole_of(part)` unless given.
-        touch_parameters: of touches and slides.
-        insertion_parameters: of searches and attempts.
-        like: by kind of sensor, an action that its candidates resemble.
-        seed: of the points.
+    `like` has by kind of sensor an action that its candidates resemble.
     """
 
     belief: Belief
@@ -75,11 +64,7 @@ class PlanningProblem:
 
     @property
     def held_peg(self) -> Part:
-        """The peg.
-
-        Raises:
-            InputError: there is none.
-        """
+        """The peg; InputError where there is none."""
         if self.peg is None:
             raise InputError(
                 "there is no peg to touch the part with; add the peg to the recording, or ask for views."
@@ -88,11 +73,7 @@ class PlanningProblem:
 
     @property
     def peg_gap(self) -> PegGap:
-        """The gap of part and peg.
-
-        Raises:
-            InputError: there is no peg.
-        """
+        """The gap of part and peg."""
         return PegGap(self.part, self.held_peg) if self.gap is None else self.gap
 
     def generator(self, stream: int) -> np.random.Generator:

@@ -8,22 +8,20 @@ hole.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
 from bcppl.arguments import number_within
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.geometry.holes import Hole, fit_in, hole_of
 from bcppl.geometry.parts import Part
+from bcppl.inference.summaries import weighted_covariance
 from bcppl.robot.plan import InsertionPlan, Manner, Plan
-
-Array = npt.NDArray[np.float64]
 
 
 class InsertionParameters(NamedTuple):
@@ -139,10 +137,9 @@ def insertion_plan(
 def _checked(parameters: InsertionParameters) -> InsertionParameters:
     for name, value in parameters._asdict().items():
         if name.endswith(("stiffness", "damping")):
-            given = value if isinstance(value, Sequence) and not isinstance(value, str) else ()
-            if len(given) != 6:
+            if np.shape(value) != (6,):
                 raise InputError(f"the insertion has {name} {value!r}; give six numbers.")
-            for number in given:
+            for number in value:
                 number_within(f"the insertion has {name} with {{}} in it", number, above=0.0)
         else:
             number_within(f"the insertion has {name} {{}}", value, above=0.0)
@@ -153,8 +150,7 @@ def _covariance(belief: Belief, world_from_hole: torch.Tensor, part_from_hole: t
     """The covariance (3, 3) of the hole's origin, along the axes of its mean pose."""
     holes = poses.compose(belief.world_from_part, part_from_hole.expand(len(belief), 7))
     away = poses.transform(poses.inverse(world_from_hole), holes[:, :3])
-    away = away - belief.weights @ away
-    return (belief.weights[:, None] * away).T @ away
+    return weighted_covariance(away, belief.weights)
 
 
 def _descent(parameters: InsertionParameters, height: float) -> tuple[Array, Array, tuple[Manner, ...]]:

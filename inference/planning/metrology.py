@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.faces import Side, TopPoints, points_on_top, section, sides
@@ -26,8 +26,6 @@ from bcppl.inference.planning.waypoints import (
     upright,
 )
 from bcppl.robot.plan import Manner, Plan
-
-Array = npt.NDArray[np.float64]
 
 _ABOVE = 0.06  # m above the top where the plan begins
 _AWAY = 0.002  # m from the part on the way around it
@@ -121,14 +119,10 @@ def three_two_one(
 
 
 class _SideTouch(NamedTuple):
-    """A guarded stroke onto a side and a slide along it, in the part's frame: metres.
+    """A guarded stroke onto a side and a slide along it, the tip at a height, in the part's frame: metres.
 
-    Attributes:
-        face: the side.
-        height: z of the tip.
-        clear, stop, press: (3,) the ends of a stroke beside the face, and the depth of the press.
-        inset: of the ends of a slide from the face's.
-        parameters: of the plan.
+    `clear` and `stop` (3,) are the ends of a stroke beside the face, `press` (3,) the depth of the press, and
+    `inset` is of the ends of a slide from the face's.
     """
 
     face: Side

@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
 from bcppl.arguments import number_within
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.parts import Part
@@ -21,8 +21,6 @@ from bcppl.robot.inverse_kinematics import joint_paths
 from bcppl.robot.kinematics import Robot
 from bcppl.robot.plan import Plan
 from bcppl.sensors.candidates import Candidate, duration_of, motion_of, placement_of
-
-Array = npt.NDArray[np.float64]
 
 _CONTACT = 0.0005  # m: a peg so near to the part is in contact with it
 
@@ -82,7 +80,7 @@ def not_from_below() -> Constraint:
 def collision_free(gap: PegGap, world_from_part: Array | torch.Tensor) -> Constraint:
     """Plans' free paths do not lead through the part at a pose (7,); see `free_path`."""
     free = _distances(gap, world_from_part, free_path)
-    return Constraint("lead through the part", lambda found: [bool((d > 0.0).all()) for d in free(found)])
+    return Constraint("lead through the part", lambda plans: [bool((d > 0.0).all()) for d in free(plans)])
 
 
 def contact_at_mid_stroke(gap: PegGap, world_from_part: Array | torch.Tensor) -> Constraint:
@@ -94,7 +92,7 @@ def contact_at_mid_stroke(gap: PegGap, world_from_part: Array | torch.Tensor) ->
     met = _distances(gap, world_from_part, middles)
     return Constraint(
         "would meet the part elsewhere or not at all",
-        lambda found: [bool((np.abs(d) < _CONTACT).all()) for d in met(found)],
+        lambda plans: [bool((np.abs(d) < _CONTACT).all()) for d in met(plans)],
     )
 
 

@@ -5,24 +5,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.robot.plan import Plan
-
-Array = npt.NDArray[np.float64]
 
 _SPACING = 0.002  # m between poses of a free path
 
 
 def expected_contacts(plan: Plan) -> list[tuple[Array, Array]]:
-    """The middle of each guarded stroke, where contact is expected.
-
-    Returns:
-        For each guarded motion, the peg's pose (7,) in the middle of it, and its direction (3,) in the world.
-    """
+    """The peg's pose (7,) amid each guarded stroke, and the stroke's direction (3,) in the world."""
     contacts = []
     for k, manner in enumerate(plan.manners):
         way = plan.world_from_peg[k + 1, :3] - plan.world_from_peg[k, :3]

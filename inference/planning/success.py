@@ -11,16 +11,16 @@ import numpy.typing as npt
 import torch
 
 from bcppl import poses
-from bcppl.arguments import seed_number, whole_number
+from bcppl.arguments import whole_number
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.contact.physics import PegPhysics, Rollout
 from bcppl.geometry.holes import Hole, depth_reached, hole_of, lateral_error
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.waypoints import tip_of
-from bcppl.inference.resampling import systematic
+from bcppl.inference.resampling import seeded, systematic
 from bcppl.robot.plan import InsertionPlan, Plan, probe_of
 
-Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 _BESIDE = 0.002  # m: a tip farther from the hole's axis is not in the hole
@@ -81,10 +81,8 @@ def success_probability(
 
 def _draw(belief: Belief, particles: int, seed: int) -> torch.Tensor:
     """Poses (M, 7) of equal weight."""
-    log_weights = belief.weights.log()
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed_number(seed))
-        chosen = systematic(log_weights, min(particles, len(belief)))
+    with seeded(seed):
+        chosen = systematic(belief.weights.log(), min(particles, len(belief)))
     return belief.world_from_part[chosen]
 
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import trimesh
 
 from bcppl.arguments import number_within, seed_number, whole_number
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.waypoints import (
@@ -24,8 +24,6 @@ from bcppl.inference.planning.waypoints import (
     upright,
 )
 from bcppl.robot.plan import Plan
-
-Array = npt.NDArray[np.float64]
 
 
 class TouchParameters(NamedTuple):
@@ -61,12 +59,7 @@ class TouchParameters(NamedTuple):
 
 
 class SurfacePoint(NamedTuple):
-    """A point of a part's surface, in its frame.
-
-    Attributes:
-        position: (3,) metres.
-        normal: (3,) outward, of unit length.
-    """
+    """A point (3,) of a part's surface, in its frame, metres, and its outward unit normal (3,)."""
 
     position: Array
     normal: Array
@@ -86,11 +79,7 @@ _SHORTER = 0.6  # of the dwell, for each of two touches
 
 
 def surface_points(part: Part, count: int, seed: int = 0) -> list[SurfacePoint]:
-    """Points drawn evenly by area over a part's surface, inner walls and bottom included.
-
-    Raises:
-        InputError: the count is no whole number from 1 to a million, or the part has an empty mesh.
-    """
+    """Points drawn evenly by area over a part's surface, inner walls and bottom included."""
     count = whole_number("{} points of a surface were asked for", count, most=_MOST)
     seed = seed_number(seed)
     part.check(closed=False)
@@ -160,14 +149,8 @@ def slide(
 ) -> Plan:
     """A touch after which the peg slides along the surface, pressed on, before it retracts.
 
-    Args:
-        belief: over world_from_part.
-        part: its z axis points out of its top.
-        peg: the held peg.
-        point: where the slide begins.
-        displacement: (3,) along the surface, in the part's frame, metres.
-        parameters: of the touch.
-        name: of the plan.
+    The slide begins at the point; its displacement (3,) is along the surface, in the part's frame, metres.
+    The other arguments are those of `touch`.
 
     Raises:
         InputError: a parameter is out of range.
@@ -195,16 +178,7 @@ def pair(
     parameters: TouchParameters | None = None,
     name: str = "pair",
 ) -> Plan:
-    """Two touches in one plan; between them the peg is lifted over the part.
-
-    Args:
-        belief: over world_from_part.
-        part: its z axis points out of its top.
-        peg: the held peg.
-        first: point of contact.
-        second: point of contact.
-        parameters: of the touches.
-        name: of the plan.
+    """Two touches in one plan; between them the peg is lifted over the part: see `touch`.
 
     Raises:
         InputError: a parameter is out of range.
@@ -230,10 +204,7 @@ def pair(
 class _Stroke(NamedTuple):
     """A guarded stroke onto a point: positions (3,) of the peg's origin, in the part's frame.
 
-    Attributes:
-        above: where it begins and ends, at a safe height above the part.
-        clear, stop: the ends of the stroke.
-        pressed: the end of the command.
+    It begins and ends `above` the part, leads from `clear` to `stop`, and its command ends at `pressed`.
     """
 
     above: Array

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.geometry.parts import Part
 from bcppl.robot.plan import Manner
 
-Array = npt.NDArray[np.float64]
+if TYPE_CHECKING:
+    from bcppl.inference.planning.metrology import MetrologyParameters
+    from bcppl.inference.planning.touching import TouchParameters
+
 
 STIFFNESS = (2500.0, 2500.0, 2500.0, 150.0, 150.0, 150.0)
 DAMPING = (120.0, 120.0, 120.0, 2.5, 2.5, 2.5)
@@ -21,43 +24,19 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 class Waypoint(NamedTuple):
-    """A waypoint of the peg.
-
-    Attributes:
-        position: (3,) in the part's frame, metres.
-        manner: of the motion to it.
-        speed: of that motion, m/s.
-    """
+    """A waypoint of the peg in the part's frame (3,), m, the manner of the motion to it, its speed, m/s."""
 
     position: Array
     manner: Manner
     speed: float
 
 
-class StrokeLimits(Protocol):
-    """The parameters of a guarded stroke's length."""
-
-    @property
-    def standard_deviations(self) -> float:
-        """Half a stroke, in standard deviations of the surface's position along it."""
-
-    @property
-    def shortest_half_stroke(self) -> float:
-        """Metres."""
-
-    @property
-    def longest_half_stroke(self) -> float:
-        """Metres."""
-
-
-def half_stroke(belief: Belief, position: Array, normal: Array, limits: StrokeLimits) -> float:
+def half_stroke(
+    belief: Belief, position: Array, normal: Array, limits: TouchParameters | MetrologyParameters
+) -> float:
     """Half the length (m) of a guarded stroke, in proportion to the uncertainty of the surface's position.
 
-    Args:
-        belief: over world_from_part.
-        position: (3,) on the surface, in the part's frame.
-        normal: (3,) of the surface there, in the part's frame.
-        limits: the proportion and the limits.
+    The position (3,) on the surface and its normal (3,) are in the part's frame.
     """
     positions = poses.transform(belief.world_from_part, torch.as_tensor(position)[None])[:, 0]
     direction = poses.rotation_matrix(belief.mean) @ torch.as_tensor(normal)

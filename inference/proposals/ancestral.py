@@ -9,6 +9,7 @@ from typing import Any
 import pyro
 from torch import Tensor
 
+from bcppl.arguments import latent_address
 from bcppl.errors import InputError
 from bcppl.traces import Trace
 
@@ -31,11 +32,7 @@ def prior(*addresses: str) -> Callable[[Trace], None]:
 
     def regenerated(trace: Trace) -> None:
         for address in addresses:
-            if address not in trace.choices:
-                raise InputError(
-                    f"prior is given {address!r}, which is no latent address; "
-                    f"latent are {', '.join(trace.choices) or 'none'}."
-                )
+            latent_address("prior is given {}", address, trace.choices)
         fresh: dict[str, Tensor] = {}
         for address in trace.addresses:
             if address in addresses:

@@ -7,7 +7,6 @@ conditional, and a random walk of the part together with the nuisance parameters
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import pyro
@@ -19,10 +18,9 @@ from bcppl import poses
 from bcppl.distributions.pose_normals import GaussianMixture, transport, widened_mixture
 from bcppl.distributions.poses import MixturePose, NormalPose
 from bcppl.inference.approximation import GaussianApproximation
+from bcppl.inference.proposals.proposal import Program
 from bcppl.sensors.capabilities import FitsPose
 from bcppl.traces import Trace
-
-Program = Callable[[Trace], None]
 
 # Correlations of standardised deviations before and after a proposal: of the part, of nuisance parameters
 # when a measurement is assimilated, and of those in a random walk.

@@ -1,9 +1,9 @@
-"""Modes found by climbs from all over the prior, and jumps between them: where the best mode is narrow.
+"""Modes reached by climbs from all over the prior, and jumps between them: where the best mode is narrow.
 
 Tempering follows the mass: where a wide mode holds more of it at a low exponent than a narrow one that wins
 in the end, all particles are in the wide one before that comes to light, and more particles hardly help.
 Climbers do not compete until they have climbed. What they find is used for proposals, accepted by Metropolis
-and Hastings: the posterior weighs the modes, and no answer hangs on how they were found.
+and Hastings: the posterior weighs the modes, and no answer depends on how they were reached.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import pyro
 import torch
 from torch import Tensor
 
-from bcppl.arguments import whole_number
 from bcppl.distributions.poses import MixturePose, NormalPose
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
@@ -23,12 +22,14 @@ from bcppl.inference.exponents import next_exponent
 from bcppl.inference.proposals.coordinates import PoseCoordinates
 from bcppl.inference.proposals.depth_points import depth_aligned
 from bcppl.inference.proposals.proposal import Program
-from bcppl.inference.proposals.spread import conditioned, covariance_of
+from bcppl.inference.proposals.spread import conditioned
+from bcppl.inference.summaries import weighted_covariance
 from bcppl.poses import FREE
 from bcppl.traces import Trace
 
 ALIGNMENTS = 4  # of every climber, of two steps each
 WALKERS, STEPS = 24, 80  # the climbers that go on by small steps, and how many steps they try
+MODES = 8  # that are kept
 APART = (0.5, 1.0)  # the least distance of two walkers and of two modes, in standard deviations of the prior
 REACH = 0.5  # of an alignment, likewise
 FIRST, SMALLEST, LARGEST = 0.1, 0.002, 1.0  # sizes of a step, likewise
@@ -39,22 +40,15 @@ ANYWHERE, WIDE = 0.1, 4.0  # the share of jumps that go anywhere, and their vari
 
 
 class Modes(NamedTuple):
-    """A normal for each of K modes.
+    """A normal for each of K modes."""
 
-    Attributes:
-        centers: poses (K, 7).
-        covariance: (K, d, d) over the free axes.
-        log_mass: (K,) log of the integral of the joint density, by importance sampling.
-        scale: (d,) standard deviations of where the climbs began.
-    """
-
-    centers: Tensor
-    covariance: Tensor
-    log_mass: Tensor
-    scale: Tensor
+    centers: Tensor  # poses (K, 7)
+    covariance: Tensor  # (K, d, d) over the free axes
+    log_mass: Tensor  # (K,) log of the integral of the joint density, by importance sampling
+    scale: Tensor  # (d,) standard deviations of where the climbs began
 
 
-def modes(start: Trace, address: str, *, most: int = 8) -> Modes:
+def modes(start: Trace, address: str) -> Modes:
     """The modes that climbs from a trace's particles lead to.
 
     Every climber is aligned with the depth images, several times, and goes back to the best of these places.
@@ -66,15 +60,12 @@ def modes(start: Trace, address: str, *, most: int = 8) -> Modes:
 
     Args:
         start: of a program with all its observations, its latent values drawn from the prior. The more
-            particles, the narrower a mode may be that is found.
+            particles, the narrower a mode may be that is reached.
         address: of the pose that is moved; other latent values stay as they are.
-        most: modes that are kept.
 
     Raises:
-        InputError: no pose is at the address, no depth image is at an address `depth_*`, or `most` is no
-            whole number, 1 or more.
+        InputError: no pose is at the address, or no depth image is at an address `depth_*`.
     """
-    most = whole_number("climbs are to keep {} modes", most)
     if address not in start.choices or start[address].shape != (start.particles, 7):
         raise InputError(f"climbs are to move {address!r}, where the program samples no pose; name one.")
     known = PoseCoordinates(freedom_of(start.distributions[address]) or FREE)
@@ -90,7 +81,7 @@ def modes(start: Trace, address: str, *, most: int = 8) -> Modes:
         pose = torch.where((reached > density)[:, None], trace[address], pose)
         density = torch.maximum(reached, density)
     trace = trace.at({address: pose})
-    kept = highest(known, trace[address], density, scale, max(most, WALKERS), APART[0])
+    kept = highest(known, trace[address], density, scale, WALKERS, APART[0])
     trace, density = trace.chosen(kept), density[kept]
     size = torch.full_like(density, FIRST)
     for _ in range(STEPS):
@@ -101,7 +92,7 @@ def modes(start: Trace, address: str, *, most: int = 8) -> Modes:
         pose = torch.where(higher[:, None], tried[address], trace[address])
         trace, density = trace.at({address: pose}), torch.maximum(density, reached)
         size = torch.where(higher, LONGER * size, SHORTER * size).clamp(SMALLEST, LARGEST)
-    ends = highest(known, trace[address], density, scale, most, APART[1])
+    ends = highest(known, trace[address], density, scale, MODES, APART[1])
     return fitted(trace.chosen(ends), address, known, scale)
 
 
@@ -125,27 +116,27 @@ def fitted(trace: Trace, address: str, known: PoseCoordinates, scale: Tensor) ->
                 continue
             weights = torch.softmax(next_exponent(equal, factor[m], 0.0, KEPT) * factor[m], dim=0)
             center = known.mean(drawn[m], weights)
-            spread = conditioned(covariance_of(known.steps(center, drawn[m]), weights))
+            spread = conditioned(weighted_covariance(known.steps(center, drawn[m]), weights))
             centers = centers.index_copy(0, torch.tensor([m]), center[None])
             covariance = covariance.index_copy(0, torch.tensor([m]), spread[None])
     return Modes(centers, covariance, log_mass, scale)
 
 
-def jumps(address: str, found: Modes) -> Program:
+def jumps(address: str, ends: Modes) -> Program:
     """A pose near one of several modes, wherever the particle was: an independent proposal.
 
     Half of the jumps go to all modes alike, half by their mass. Some are wider than the prior: particles
-    where no mode was found could not leave otherwise, for nothing would lead back.
+    where no mode was reached could not leave otherwise, for nothing would lead back.
     """
-    count = len(found.centers)
+    count = len(ends.centers)
     # A mode about which no draw was possible has -inf.
-    mass = torch.softmax(found.log_mass.clamp_min(-1e300), dim=0)
+    mass = torch.softmax(ends.log_mass.clamp_min(-1e300), dim=0)
     chance = (0.5 / count + 0.5 * mass).repeat_interleave(len(WIDTHS))
-    centers = found.centers.repeat_interleave(len(WIDTHS), dim=0)
+    centers = ends.centers.repeat_interleave(len(WIDTHS), dim=0)
     width = torch.tensor(WIDTHS, dtype=torch.float64).repeat(count)
-    around = width[:, None, None] ** 2 * found.covariance.repeat_interleave(len(WIDTHS), dim=0)
-    best = found.centers[found.log_mass.argmax()][None]
-    centers, around = torch.cat([centers, best]), torch.cat([around, torch.diag(WIDE * found.scale**2)[None]])
+    around = width[:, None, None] ** 2 * ends.covariance.repeat_interleave(len(WIDTHS), dim=0)
+    best = ends.centers[ends.log_mass.argmax()][None]
+    centers, around = torch.cat([centers, best]), torch.cat([around, torch.diag(WIDE * ends.scale**2)[None]])
     chance = torch.cat([(1.0 - ANYWHERE) * chance / chance.sum(), chance.new_tensor([ANYWHERE])])
 
     def jump(trace: Trace) -> None:
@@ -159,11 +150,11 @@ def highest(
     known: PoseCoordinates, places: Tensor, density: Tensor, scale: Tensor, most: int, apart: float
 ) -> Tensor:
     """The places (K,) of highest density, none nearer to a higher one than `apart` times the scale (d,)."""
-    found: list[int] = []
+    kept: list[int] = []
     for k in density.argsort(descending=True).tolist():
-        if len(found) == most or (found and not density[k] > -torch.inf):
+        if len(kept) == most or (kept and not density[k] > -torch.inf):
             break
-        steps = known.steps(places[found], places[k]) / scale
+        steps = known.steps(places[kept], places[k]) / scale
         if not bool((steps.norm(dim=-1) < apart).any()):
-            found.append(k)
-    return torch.tensor(found)
+            kept.append(k)
+    return torch.tensor(kept)

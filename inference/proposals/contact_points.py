@@ -20,6 +20,7 @@ from bcppl.inference.proposals.least_squares import (
     Equations,
     aligned,
     alignment_proposal,
+    check_pose,
     matching,
 )
 from bcppl.inference.proposals.proposal import Fitted
@@ -66,7 +67,7 @@ def _equations(trace: Trace, address: str, measured: str) -> tuple[Equations, Te
     site: Any = trace.distributions[measured]
     pose, value = trace[address], trace[measured].to(torch.float64)
     if isinstance(site, OnsetLocation):
-        _refuse_other(torch.equal(site.pose, pose), address, measured)
+        check_pose("contact_alignment", address, measured, torch.equal(site.pose, pose))
         place = value.expand(len(pose), 3)[:, None]
         known = torch.isfinite(place).all(dim=-1)
         inside = poses.transform(poses.inverse(pose), torch.nan_to_num(place))
@@ -82,7 +83,7 @@ def _equations(trace: Trace, address: str, measured: str) -> tuple[Equations, Te
             "give contacts, peg poses or onsets as `sites`."
         )
     track: Any = site.track
-    _refuse_other(torch.equal(track.inputs[0], pose), address, measured)
+    check_pose("contact_alignment", address, measured, torch.equal(track.inputs[0], pose))
     contacts, world_from_peg = track.window(site.first, site.last)
     contacts, world_from_peg = contacts[:, site.thinned], world_from_peg[:, site.thinned]
     push = track.force_directions(site.first, site.last)[:, site.thinned]
@@ -132,11 +133,3 @@ def _robust(
         return Equations.of_planes(pose, particle, *rows)
 
     return of(precision), of(scale**-2).precision
-
-
-def _refuse_other(same: bool, address: str, measured: str) -> None:
-    if not same:
-        raise InputError(
-            f"contact_alignment moves {address!r}, but the site {measured!r} depends on another pose; "
-            "give that part's sites as `sites`."
-        )

@@ -1,13 +1,14 @@
 """Unbounded coordinates of a latent value: a pose's tangent space, or the real line for any other support.
 
 A value whose support is bounded (positive numbers, an interval, a simplex) is transformed to an unbounded one
-by torch's bijection for its support, and densities include its Jacobian.
+by torch's bijection for its support, and densities include its Jacobian. A place is a value in the form that
+`normal` and `mixture` take as a centre: a pose (..., 7), or a vector (..., d).
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import pyro.distributions as dist
 import torch
@@ -16,6 +17,7 @@ from torch.distributions import biject_to, constraints
 from torch.distributions.transforms import IndependentTransform, Transform, identity_transform
 
 from bcppl import poses
+from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief
 from bcppl.distributions.poses import MixturePose, NormalPose
 from bcppl.distributions.support import freedom_of, refuse_several_poses
@@ -23,52 +25,6 @@ from bcppl.distributions.vectors import NormalStep
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
 from bcppl.traces import Trace
-
-
-class Coordinates(Protocol):
-    """Coordinates in which proposals move the value at one latent address.
-
-    A place is a value in the form that `normal` and `mixture` take as a centre: a pose (..., 7), or a vector
-    (..., d) in unbounded coordinates.
-
-    Attributes:
-        dimension: d.
-    """
-
-    dimension: int
-
-    def of(self, trace: Trace) -> Coordinates:
-        """The same for the particles of another trace, since a support may depend on their other values."""
-
-    def places(self, values: Tensor) -> Tensor:
-        """The places, (N, 7) or (N, d), of the particles' values (N, *event)."""
-
-    def steps(self, start: Tensor, end: Tensor) -> Tensor:
-        """The coordinates (..., d) of the steps between places."""
-
-    def stepped(self, start: Tensor, step: Tensor) -> Tensor:
-        """The places after steps (..., d): the inverse of `steps`."""
-
-    def mean(self, places: Tensor, weights: Tensor) -> Tensor:
-        """The weighted mean, one place."""
-
-    def normal(self, center: Tensor, covariance: Tensor, size: Tensor) -> Any:
-        """The distribution of values, one for each particle, that is normal in these coordinates.
-
-        Args:
-            center: places of the N particles.
-            covariance: (d, d).
-            size: (N,) factor of each particle's step.
-        """
-
-    def mixture(self, log_weights: Tensor, centers: Tensor, covariance: Tensor) -> Any:
-        """A mixture of K such normals.
-
-        Args:
-            log_weights: (K,) or (N, K).
-            centers: places (K, ...) or (N, K, ...).
-            covariance: (d, d), (K, d, d) or (N, K, d, d).
-        """
 
 
 class PoseCoordinates:
@@ -79,7 +35,7 @@ class PoseCoordinates:
         self.dimension = freedom.dimension
 
     def of(self, trace: Trace) -> PoseCoordinates:
-        """Itself: all particles have the same free axes."""
+        """The same for the particles of another trace: all have the same free axes."""
         return self
 
     def places(self, values: Tensor) -> Tensor:
@@ -87,11 +43,11 @@ class PoseCoordinates:
         return values
 
     def steps(self, start: Tensor, end: Tensor) -> Tensor:
-        """Free coordinates of the tangents from pose to pose."""
+        """The free coordinates (..., d) of the tangents from pose to pose."""
         return self.freedom.coordinates(poses.local(start, end))
 
     def stepped(self, start: Tensor, step: Tensor) -> Tensor:
-        """The poses after tangents."""
+        """The poses after tangents (..., d)."""
         return poses.retract(start, self.freedom.embed(step))
 
     def mean(self, places: Tensor, weights: Tensor) -> Tensor:
@@ -100,11 +56,14 @@ class PoseCoordinates:
         return self.stepped(places[0], self.steps(places[0], mean))
 
     def normal(self, center: Tensor, covariance: Tensor, size: Tensor) -> Any:
-        """A `NormalPose`."""
+        """The `NormalPose` at N places, its covariance (d, d) times `size` (N,) squared."""
         return NormalPose(center, size[:, None, None] ** 2 * covariance, self.freedom)
 
     def mixture(self, log_weights: Tensor, centers: Tensor, covariance: Tensor) -> Any:
-        """A `MixturePose`."""
+        """The `MixturePose` with log weights (K,) or (N, K), at places (K, ...) or (N, K, ...).
+
+        The covariances are (d, d), (K, d, d) or (N, K, d, d).
+        """
         return MixturePose(log_weights, centers, covariance, self.freedom)
 
 
@@ -175,12 +134,7 @@ class OnSupport(dist.TransformedDistribution):
 
 
 class Unflattened(Transform):
-    """From unbounded coordinates (N, d) in float64 to the values (N, *plates, *event) of a site.
-
-    Args:
-        distribution: of the site, (*plates, N) its batch shape.
-        values: (N, *plates, *event), for their shape and type.
-    """
+    """From unbounded coordinates (N, d) in float64 to the values (N, *plates, *event) of a site."""
 
     bijective = True
     domain = constraints.real_vector
@@ -236,6 +190,9 @@ class Unflattened(Transform):
         return torch.Size([*shape[: len(shape) - len(self.event)], self.dimension])
 
 
+Coordinates = PoseCoordinates | VectorCoordinates
+
+
 def _is_identity(transform: Transform) -> bool:
     while isinstance(transform, IndependentTransform):
         transform = transform.base_transform
@@ -243,17 +200,8 @@ def _is_identity(transform: Transform) -> bool:
 
 
 def coordinates_of(trace: Trace, address: str) -> Coordinates:
-    """The coordinates of a latent address of a trace.
-
-    Raises:
-        InputError: the address is not latent, is discrete, has several poses for each particle, or its
-            support has no unbounded coordinates.
-    """
-    if address not in trace.choices:
-        raise InputError(
-            f"a proposal moves {address!r}, which is no latent address; "
-            f"latent are {', '.join(trace.choices) or 'none'}."
-        )
+    """The coordinates of a latent address of a trace; InputError where it has none."""
+    latent_address("a proposal moves {}", address, trace.choices)
     distribution = trace.distributions[address]
     freedom = freedom_of(distribution)
     value = trace[address]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import pyro
@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates
 from bcppl.inference.proposals.proposal import Fitted
@@ -18,10 +17,10 @@ from bcppl.inference.proposals.spread import (
     FLOOR,
     conditioned,
     covariance_about_mean,
-    covariance_of,
     weighted_places,
 )
 from bcppl.inference.resampling import systematic
+from bcppl.inference.summaries import weighted_covariance
 from bcppl.traces import Trace
 
 MOST_FITTED = 1000  # particles; their covariance is accurate to a few percent
@@ -58,16 +57,10 @@ def independent(
     if components is not None:
         components = whole_number("an independent proposal is given {} components", components)
     inflation = number_within("an independent proposal is given the inflation {}", inflation, above=0.0)
-    if not isinstance(wide, Sequence) or len(wide) != 2:
-        raise InputError(
-            f"the wide component of an independent proposal is {wide!r}; give its weight and its width."
-        )
-    share = number_within(
-        "the wide component of an independent proposal has the weight {}", wide[0], above=0.0, below=1.0
-    )
-    width = number_within(
-        "the wide component of an independent proposal has the width {}", wide[1], above=0.0
-    )
+    share, width = wide
+    what = "the wide component of an independent proposal has the"
+    share = number_within(f"{what} weight {{}}", share, above=0.0, below=1.0)
+    width = number_within(f"{what} width {{}}", width, above=0.0)
 
     def fit(population: Population) -> Callable[[Trace], None]:
         known, places, weights = weighted_places(population, address)
@@ -117,7 +110,7 @@ def _maximised(coordinates: Coordinates, places: Tensor, weights: Tensor, compon
     centers = places[_apart(coordinates, places, weights, components)]
     components = len(centers)
     steps = torch.stack([coordinates.steps(center, places) for center in centers])
-    metric = conditioned(covariance_of(steps[0], weights)).diagonal()
+    metric = conditioned(weighted_covariance(steps[0], weights)).diagonal()
     nearest = (steps.square() / metric).sum(dim=-1).argmin(dim=0)
     shares = torch.nn.functional.one_hot(nearest, components).T.to(torch.float64)
     floor = FLOOR**2 * torch.eye(dimension, dtype=torch.float64)
@@ -131,7 +124,7 @@ def _maximised(coordinates: Coordinates, places: Tensor, weights: Tensor, compon
         centers = torch.stack([coordinates.mean(places, each) for each in within])
         covariances = torch.stack(
             [
-                covariance_of(coordinates.steps(center, places), each)
+                weighted_covariance(coordinates.steps(center, places), each)
                 for center, each in zip(centers, within, strict=True)
             ]
         )

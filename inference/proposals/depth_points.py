@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within, whole_number
+from bcppl.arrays import Array
 from bcppl.distributions.depth import ClutteredDepth, LaplaceDepth, RobustDepth
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
@@ -22,6 +23,7 @@ from bcppl.inference.proposals.least_squares import (
     Equations,
     aligned,
     alignment_proposal,
+    check_pose,
     matching,
 )
 from bcppl.inference.proposals.proposal import Fitted
@@ -29,7 +31,6 @@ from bcppl.poses import FREE, Freedom
 from bcppl.rendering.part_renderer import Hits
 from bcppl.traces import Trace
 
-Array = npt.NDArray[np.float64]
 Ids = npt.NDArray[np.int64]
 
 FARTHEST = 10.0  # the largest scale of residuals, in scales of the depth's noise
@@ -71,15 +72,7 @@ def depth_aligned(
 ) -> Alignment:
     """The alignment of each particle, about which `depth_alignment` proposes.
 
-    Args:
-        trace: of the particles.
-        address: of the pose.
-        sites: a pattern of the addresses of its depth images.
-        steps: of Gauss-Newton.
-        damping: (d, d) precision over the free axes of the normal prior at the start of a step.
-
-    Raises:
-        InputError: no address matches, or a site is no depth image or of another pose than that at `address`.
+    The damping (d, d) is the precision over the free axes of the normal prior at the start of a step.
     """
     images = matching(trace, "depth_alignment", [sites])
     freedom = freedom_of(trace.distributions[address]) or FREE
@@ -102,11 +95,7 @@ def _equations(trace: Trace, address: str, image: str, pose: Tensor) -> tuple[Eq
             f"depth_alignment is given the site {image!r}, which is a {type(site).__name__} and no depth "
             "image; give those that are as `sites`."
         )
-    if not torch.equal(site.pose, trace[address]):
-        raise InputError(
-            f"depth_alignment moves {address!r}, but the site {image!r} renders another pose; "
-            "give the images of that part as `sites`."
-        )
+    check_pose("depth_alignment", address, image, torch.equal(site.pose, trace[address]))
     seen, camera = site.observed(trace[image]), site.camera
     hits = renderer.hits(camera, pose, counted=np.asarray(seen.valid.any(axis=0)), faces=True)
     hits, multiplicity = _thinned(hits, len(pose))

@@ -36,9 +36,8 @@ SHARES = (0.8, 0.15, 0.05)
 class Equations:
     """The normal equations of N particles.
 
-    Attributes:
-        precision: (N, 6, 6) of the tangent: 1 / m^2, 1 / (m rad), 1 / rad^2.
-        pull: (N, 6) precision times the solution.
+    The precision (N, 6, 6) of the tangent is in 1 / m^2, 1 / (m rad) and 1 / rad^2; the pull (N, 6) is that
+    times the solution.
     """
 
     precision: Tensor
@@ -73,12 +72,7 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """The solution of an alignment.
-
-    Attributes:
-        pose: (N, 7).
-        covariance: (N, d, d) over the free axes.
-    """
+    """The solution of an alignment: poses (N, 7), and covariances (N, d, d) over the free axes."""
 
     pose: Tensor
     covariance: Tensor
@@ -99,11 +93,8 @@ def alignment_proposal(
 ) -> Fitted:
     """A proposal about the alignment of each particle.
 
-    Args:
-        address: of the pose.
-        reach: the alignment is damped by a normal prior at the old pose, with the particles' covariance times
-            this squared.
-        align: the alignment of a trace's particles, given the damping (d, d) and the free axes.
+    `align(trace, damping (d, d), free axes)` gives it, damped by a normal prior at the old pose, with the
+    particles' covariance times `reach` squared.
     """
 
     def fit(population: Population) -> Callable[[Trace], None]:
@@ -119,11 +110,7 @@ def alignment_proposal(
 
 
 def matching(trace: Trace, name: str, patterns: Sequence[str]) -> list[str]:
-    """The addresses of a trace that match one of several patterns; `name` is of the alignment.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The addresses of a trace that match one of several patterns; `name` is of the alignment."""
     matched = [a for a in trace.addresses if any(fnmatchcase(a, pattern) for pattern in patterns)]
     if not matched:
         raise InputError(
@@ -131,6 +118,15 @@ def matching(trace: Trace, name: str, patterns: Sequence[str]) -> list[str]:
             f"the program visits {', '.join(trace.addresses)}."
         )
     return matched
+
+
+def check_pose(name: str, address: str, site: str, same: bool) -> None:
+    """Refuse a site that depends on another pose than that at `address`; `name` is of the alignment."""
+    if not same:
+        raise InputError(
+            f"{name} moves {address!r}, but the site {site!r} depends on another pose; "
+            "give that part's sites as `sites`."
+        )
 
 
 def aligned(
@@ -143,8 +139,7 @@ def aligned(
         equations: at those poses.
         damping: (d, d) precision of a normal prior there, which makes the step unique.
         freedom: the free axes.
-        information: (N, 6, 6) of the likelihood about the solution, where it differs from the equations'
-            precision, as that of a power likelihood does.
+        information: (N, 6, 6) of the likelihood about the solution, where it is not the equations' precision.
     """
     free = list(freedom.axes)
 

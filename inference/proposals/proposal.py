@@ -19,11 +19,7 @@ Program = Callable[..., Any]
 
 @dataclass(frozen=True)
 class Fitted:
-    """A proposal that learns from a population before it runs.
-
-    Attributes:
-        fit: `fit(population) -> program(trace)`.
-    """
+    """A proposal that learns from a population before it runs: `fit(population) -> program(trace)`."""
 
     fit: Callable[[Population], Program]
 

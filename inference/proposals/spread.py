@@ -11,6 +11,7 @@ from bcppl.beliefs import normalised
 from bcppl.errors import InferenceError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
+from bcppl.inference.summaries import weighted_covariance
 
 # Standard deviations below this are rounding: metres and radians for poses, the value's unit otherwise.
 FLOOR = 1e-6
@@ -30,9 +31,6 @@ def weighted_places(population: Population, address: str) -> tuple[Coordinates, 
 
     A draw beyond the range of its type (0 or infinity where values are positive) has no place in unbounded
     coordinates, and is omitted.
-
-    Raises:
-        InferenceError: no particle with weight has a place.
     """
     coordinates = coordinates_of(population.trace, address)
     values = population.trace[address]
@@ -51,13 +49,9 @@ def weighted_places(population: Population, address: str) -> tuple[Coordinates, 
 
 def covariance_about_mean(coordinates: Coordinates, places: Tensor, weights: Tensor) -> Tensor:
     """The conditioned weighted covariance (d, d) of places (K, ...) about their mean."""
-    return conditioned(covariance_of(coordinates.steps(coordinates.mean(places, weights), places), weights))
-
-
-def covariance_of(steps: Tensor, weights: Tensor) -> Tensor:
-    """The weighted covariance (d, d) of steps (N, d)."""
-    centred = steps - weights @ steps
-    return (weights[:, None] * centred).T @ centred
+    return conditioned(
+        weighted_covariance(coordinates.steps(coordinates.mean(places, weights), places), weights)
+    )
 
 
 def conditioned(covariance: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,11 +43,8 @@ class Continuous:
     def __post_init__(self) -> None:
         number_within("a continuous symmetry turns up to {} rad", self.turn, least=0.0, most=math.pi)
         number_within("a continuous symmetry slides up to {} m", self.slide, least=0.0)
-        for name, given in (("axis", self.axis), ("point", self.point)):
-            if len(given) != 3 or not all(math.isfinite(x) for x in given):
-                raise InputError(f"a continuous symmetry has the {name} {given}; give three finite numbers.")
-        if not any(self.axis):
-            raise InputError("a continuous symmetry has an axis of no length; give a direction.")
+        if not (math.isfinite(sum(self.axis)) and any(self.axis)):
+            raise InputError(f"a continuous symmetry has the axis {self.axis}; give a direction.")
 
     def at(self, share: Tensor) -> Tensor:
         """The motions (..., 7) `part_from_part` by a share (...,) of the largest amount, in [-1, 1]."""
@@ -93,10 +90,9 @@ def symmetry(
         InputError: the motions are no poses, or the spread is not positive; when it is run: the address is
             no latent pose, or a motion leaves the pose's free axes.
     """
-    if not isinstance(spread, Sequence) or len(spread) != 2:
-        raise InputError(f"symmetry is given a spread of {spread!r}; give two, metres and radians.")
-    metres = number_within("symmetry is given a spread of {} m", spread[0], above=0.0)
-    radians = number_within("symmetry is given a spread of {} rad", spread[1], above=0.0)
+    metres, radians = spread
+    metres = number_within("symmetry is given a spread of {} m", metres, above=0.0)
+    radians = number_within("symmetry is given a spread of {} rad", radians, above=0.0)
     family = transforms if isinstance(transforms, Continuous) else None
     listed = poses.identity(1) if family is not None else _with_inverses(transforms)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import pyro
@@ -16,7 +16,8 @@ from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import FLOOR, covariance_of, spread_of, weighted_places
+from bcppl.inference.proposals.spread import FLOOR, spread_of, weighted_places
+from bcppl.inference.summaries import weighted_covariance
 from bcppl.traces import Trace
 
 # Shrinkage of correlations: a ridge a tenth as wide as it is long is still followed.
@@ -99,13 +100,9 @@ def joint_drift(*addresses: str, scales: tuple[float, float] = (0.05, 1.0)) -> F
 
 
 class _Link(NamedTuple):
-    """The normal of one address's step, given the steps before it.
+    """The normal of one address's step, given the steps before it (D,).
 
-    Attributes:
-        address: of the latent value.
-        coordinates: of the latent value.
-        gain: (d, D) regression of its mean on the steps before it (D,).
-        covariance: (d, d) given them.
+    Its mean is `gain` (d, D) times these, its covariance (d, d).
     """
 
     address: str
@@ -126,7 +123,7 @@ def _links(population: Population, addresses: tuple[str, ...]) -> list[_Link]:
         known.append(coordinates)
         steps.append(coordinates.steps(coordinates.mean(places, weights), places))
     together = torch.cat(steps, dim=1)
-    covariance = covariance_of(together, weights)
+    covariance = weighted_covariance(together, weights)
     diagonal = torch.diag(covariance.diagonal() + FLOOR**2)
     covariance = ((1.0 - SHRUNK) * covariance + SHRUNK * diagonal) * (2.38**2 / together.shape[1])
     links, end = [], 0
@@ -139,10 +136,8 @@ def _links(population: Population, addresses: tuple[str, ...]) -> list[_Link]:
     return links
 
 
-def _log_scales(scales: object) -> Tensor:
+def _log_scales(scales: tuple[float, float]) -> Tensor:
     """The logarithms (2,) of the smallest and the largest scale."""
-    if not isinstance(scales, Sequence | Tensor) or isinstance(scales, str) or len(scales) != 2:
-        raise InputError(f"drift is given the scales {scales!r}; give two, (0.05, 1.0).")
     smallest, largest = (number_within("drift is given the scale {}", s, above=0.0) for s in scales)
     if smallest > largest:
         raise InputError(
