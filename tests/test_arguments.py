@@ -1,4 +1,4 @@
-"""Numbers, indices, weights and addresses that cannot be are refused in one sentence that says what to do."""
+"""Numbers, indices, weights and addresses that cannot be are refused in a sentence that states what to do."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def series_trace() -> Trace:
 @pytest.mark.parametrize("make", [lambda: population().trace, series_trace, population])
 def test_an_index_that_means_no_particle_is_refused(make: Callable[[], Any]) -> None:
     one = make()
-    for wrong, said in (
+    for wrong, message in (
         ([], "no particle of 5"),
         (slice(7, 9), "no particle of 5"),
         (torch.zeros(5, dtype=torch.bool), "no particle of 5"),
@@ -175,7 +175,7 @@ def test_an_index_that_means_no_particle_is_refused(make: Callable[[], Any]) -> 
         (torch.tensor([0.5]), "give whole numbers"),
         (None, "asked for by a NoneType"),
     ):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             one[wrong]
     for right in (
         [0, 4],
@@ -189,11 +189,11 @@ def test_an_index_that_means_no_particle_is_refused(make: Callable[[], Any]) -> 
 
 
 def test_ancestors_and_traces_that_do_not_fit_are_refused() -> None:
-    for wrong, said in (
+    for wrong, message in (
         ([5], "particle 5 was asked for"),
         ([0.5], "give whole numbers"),
     ):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             population().selected(torch.tensor(wrong))
     with pytest.raises(InputError, match="with no particle"):
         population().selected(torch.tensor([], dtype=torch.int64))
@@ -205,7 +205,7 @@ def test_ancestors_and_traces_that_do_not_fit_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("weights", "said"),
+    ("weights", "message"),
     [
         (torch.zeros(4), r"5 particles is given log weights of shape \(4,\)"),
         (torch.zeros(5, 1), r"shape \(5, 1\)"),
@@ -217,10 +217,10 @@ def test_ancestors_and_traces_that_do_not_fit_are_refused() -> None:
         (torch.zeros(5, dtype=torch.complex128), "one real number for each"),
     ],
 )
-def test_weights_that_cannot_be_are_refused(weights: Any, said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_weights_that_cannot_be_are_refused(weights: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         Population(population().trace, weights)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         Population(population().trace, weights, log_evidence=0.0)
 
 
