@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import trimesh
+from matplotlib import rc_context
 from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from scipy.spatial.transform import Rotation
 
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
-from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
 
 # Of Okabe and Ito's palette, whose colours differ for every kind of colour vision.
 STRONG = "#D55E00"
@@ -26,19 +26,10 @@ MANY_FACES = 4000  # more than this are drawn from vertices merged on a grid
 FEATURE_ANGLE = np.radians(25.0)
 
 
-def checked(title: str, poses: Array, log_weights: Array) -> tuple[Array, Array, Array]:
+def weighted(poses: Array, log_weights: Array) -> tuple[Array, Array, Array]:
     """Poses (N, 7), normalised weights (N,) and the mean pose (7,) of one panel."""
-    poses, log_weights = (np.asarray(values, dtype=np.float64) for values in (poses, log_weights))
-    if poses.ndim != 2 or poses.shape[1] != 7 or log_weights.shape != poses.shape[:1] or len(poses) == 0:
-        raise InputError(
-            f"belief {title!r} has poses {poses.shape} and log weights {log_weights.shape}; "
-            "give (N, 7) and (N,)."
-        )
-    largest = log_weights.max()
-    if not np.isfinite(largest):
-        raise InputError(f"belief {title!r} has log weights whose largest is {largest}; give a finite one.")
-    belief = Belief(torch.from_numpy(poses), torch.from_numpy(log_weights))
-    return poses, belief.weights.numpy(), belief.mean.numpy()
+    belief = Belief(torch.as_tensor(poses), torch.as_tensor(log_weights))
+    return belief.world_from_part.numpy(), belief.weights.numpy(), belief.mean.numpy()
 
 
 def rotation(pose: Array) -> Rotation:
@@ -61,6 +52,19 @@ def outline(part: Part) -> tuple[Array, Array]:
     alone = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
     edges = np.concatenate([sharp, mesh.edges_sorted[alone]])
     return np.asarray(mesh.triangles), np.asarray(mesh.vertices[edges])
+
+
+def panel(figure: Figure, place: tuple[int, int, int], shape: tuple[Array, Array], mean: Array) -> Axes3D:
+    """Axes at a place of a figure (rows, columns, number), with the part's `outline` at a pose (7,)."""
+    with rc_context({"grid.color": "0.88", "grid.linewidth": 0.6}):
+        axes: Axes3D = figure.add_subplot(*place, projection="3d", computed_zorder=False)
+    faces, edges = (placed(mean, each) for each in shape)
+    axes.add_collection3d(
+        Poly3DCollection(faces, facecolors=BODY, linewidths=0.0, alpha=0.28, shade=True, zorder=1)
+    )
+    if len(edges):
+        axes.add_collection3d(Line3DCollection(edges, colors="0.3", linewidths=0.6, zorder=2))
+    return axes
 
 
 def placed(pose: Array, points: Array) -> Array:

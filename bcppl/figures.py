@@ -9,35 +9,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
-from matplotlib import rc_context
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from mpl_toolkits.mplot3d import Axes3D
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
+from bcppl.arrays import Array
 from bcppl.drawn_in_3d import (
     BODY,
     PARTICLE,
     STRONG,
     arrows,
-    checked,
     frame,
     in_words,
     limits_of,
     outline,
-    placed,
+    panel,
+    weighted,
 )
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 from bcppl.sensors.candidates import Candidate
 from bcppl.sensors.protocol import FAINT, Drawable, sensor_of
-
-Array = npt.NDArray[np.float64]
 
 # Of Okabe and Ito's palette, whose colours differ for every kind of colour vision.
 TRUTH = "#00A6D6"
@@ -47,11 +42,7 @@ SMALLEST_ADD = 0.01  # mm: below it a logarithmic axis shows nothing of interest
 
 
 def add_over_time(
-    times: Array,
-    adds: Array,
-    weights: Array,
-    labels: Sequence[str],
-    contact_start: int | None = None,
+    times: Array, adds: Array, weights: Array, labels: Sequence[str], contact_start: int | None = None
 ) -> Figure:
     """ADD of every particle, and their weighted mean, after each measurement.
 
@@ -65,18 +56,9 @@ def add_over_time(
         contact_start: index of the first measurement by touch; None where there is none.
 
     Raises:
-        InputError: shapes do not fit, or a measurement's weights are negative, not finite, or all zero.
+        InputError: a measurement's weights are negative, not finite, or all zero.
     """
     times, adds, weights = (np.asarray(values, dtype=np.float64) for values in (times, adds, weights))
-    if adds.ndim != 2 or weights.shape != adds.shape or times.shape != adds.shape[:1]:
-        raise InputError(
-            f"ADD over time got times {times.shape}, ADD {adds.shape} and weights {weights.shape}; "
-            "give (K,), (K, N) and (K, N)."
-        )
-    if len(labels) != len(times):
-        raise InputError(
-            f"ADD over time got {len(labels)} labels for {len(times)} measurements; give one each."
-        )
     total = weights.sum(axis=1)
     if not np.isfinite(total).all() or (weights < 0).any() or (total <= 0).any():
         raise InputError(
@@ -138,9 +120,7 @@ def add_over_time(
 
 
 def belief_in_3d(
-    part: Part,
-    beliefs: Sequence[tuple[str, Array, Array]],
-    truth: Array | None = None,
+    part: Part, beliefs: Sequence[tuple[str, Array, Array]], truth: Array | None = None
 ) -> Figure:
     """Beliefs side by side: the part at each mean, and every particle as an arrow along the part's z axis.
 
@@ -153,32 +133,22 @@ def belief_in_3d(
         truth: (7,) true `world_from_part`, where known.
 
     Raises:
-        InputError: there is no belief, shapes do not fit, or a belief has no finite weight.
+        InputError: there is no belief, or as `bcppl.Belief`.
+        InferenceError: a belief has no weight, or one that is not finite.
     """
     if not beliefs:
         raise InputError("a picture of beliefs got none; give at least one (title, poses, log weights).")
-    panels = [(title, *checked(title, poses, log_weights)) for title, poses, log_weights in beliefs]
+    panels = [(title, *weighted(poses, log_weights)) for title, poses, log_weights in beliefs]
     true = None if truth is None else np.asarray(truth, dtype=np.float64)
     length = 0.45 * 1000.0 * part.diameter
-    body, edges = outline(part)
-
-    figure = Figure(figsize=(max(4.6 * len(panels), 6.0), 4.8))
+    shape, figure = outline(part), Figure(figsize=(max(4.6 * len(panels), 6.0), 4.8))
     reached = [limits_of(part, length, poses, mean) for _, poses, _, mean in panels]
     if true is not None:
         reached.append(limits_of(part, 1.15 * length, true[None], true))
     shown = np.concatenate(reached)
     low, high = shown.min(axis=0), shown.max(axis=0)
     for k, (title, poses, weights, mean) in enumerate(panels):
-        with rc_context({"grid.color": "0.88", "grid.linewidth": 0.6}):
-            axes: Axes3D = figure.add_subplot(1, len(panels), k + 1, projection="3d", computed_zorder=False)
-        faces = placed(mean, body)
-        axes.add_collection3d(
-            Poly3DCollection(faces, facecolors=BODY, linewidths=0.0, alpha=0.28, shade=True, zorder=1)
-        )
-        if len(edges):
-            axes.add_collection3d(
-                Line3DCollection(placed(mean, edges), colors="0.3", linewidths=0.6, zorder=2)
-            )
+        axes = panel(figure, (1, len(panels), k + 1), shape, mean)
         order = np.argsort(-weights, kind="stable")
         heavy, light = poses[order[:HEAVIEST]], poses[order[HEAVIEST:]]
         arrows(axes, light, length, PARTICLE, width=0.8, alpha=0.45, zorder=3)
@@ -223,22 +193,14 @@ def action_in_3d(
         others: candidates that were not chosen, drawn faintly.
 
     Raises:
-        InputError: as `belief_in_3d`; or a candidate is of a kind that cannot be drawn.
+        InputError: as `belief_in_3d`, or a candidate is of a kind that cannot be drawn.
     """
-    title, poses, weights, mean = belief[0], *checked(*belief)
+    title, poses, weights, mean = belief[0], *weighted(*belief[1:])
     length = 0.2 * 1000.0 * part.diameter
-    body, edges = outline(part)
     figure = Figure(figsize=(7.0, 5.6))
-    with rc_context({"grid.color": "0.88", "grid.linewidth": 0.6}):
-        axes: Axes3D = figure.add_subplot(projection="3d", computed_zorder=False)
-    axes.add_collection3d(
-        Poly3DCollection(placed(mean, body), facecolors=BODY, linewidths=0.0, alpha=0.28, shade=True)
-    )
-    if len(edges):
-        axes.add_collection3d(Line3DCollection(placed(mean, edges), colors="0.3", linewidths=0.6, zorder=2))
-    arrows(
-        axes, poses[np.argsort(-weights, kind="stable")], length, PARTICLE, width=0.8, alpha=0.35, zorder=3
-    )
+    axes = panel(figure, (1, 1, 1), outline(part), mean)
+    order = np.argsort(-weights, kind="stable")
+    arrows(axes, poses[order], length, PARTICLE, width=0.8, alpha=0.35, zorder=3)
     for other in others:
         _drawer(other).draw(axes, other, mean, peg, faint=True)
     drawer = _drawer(action)

@@ -24,6 +24,7 @@ from bcppl import quaternions
 from bcppl.errors import InputError
 
 LOG_8_PI_SQUARED = math.log(8.0 * math.pi**2)
+NUMBERS = "x y z (m) qw qx qy qz in the last dimension"
 
 
 def identity(*batch: int) -> Tensor:
@@ -41,26 +42,14 @@ def as_pose(values: object, name: str = "pose") -> Tensor:
     """
     pose = torch.as_tensor(values, dtype=torch.float64)
     if pose.ndim == 0 or pose.shape[-1] != 7:
-        raise InputError(
-            f"{name} has shape {tuple(pose.shape)}; a pose is seven numbers x y z (m) qw qx qy qz "
-            "in the last dimension."
-        )
+        raise InputError(f"{name} has shape {tuple(pose.shape)}; a pose is seven numbers {NUMBERS}.")
     if not bool(torch.isfinite(pose).all()):
-        raise InputError(
-            f"{name} holds a number that is not finite; give x y z in metres and a unit quaternion."
-        )
+        raise InputError(f"{name} holds a number that is not finite; give finite ones, {NUMBERS}.")
     norm = pose[..., 3:].norm(dim=-1)
     if bool(((norm - 1.0).abs() > 1e-3).any()):
-        raise InputError(
-            f"{name} has a quaternion of length {float(norm.flatten()[0]):.4g}; "
-            "give qw qx qy qz of unit length."
-        )
+        length = float(norm.flatten()[0])
+        raise InputError(f"{name} has a quaternion of length {length:.4g}; give qw qx qy qz of unit length.")
     return torch.cat([pose[..., :3], pose[..., 3:] / norm[..., None]], dim=-1)
-
-
-def translation(pose: Tensor) -> Tensor:
-    """The translation of poses (..., 7), in metres, shape (..., 3)."""
-    return pose[..., :3]
 
 
 def quaternion_xyzw(pose: Tensor) -> Tensor:
@@ -153,10 +142,7 @@ class Freedom:
 
     def __post_init__(self) -> None:
         if "".join(a for a in "xyz" if a in self.translation) != self.translation:
-            raise InputError(
-                f"free translations {self.translation!r} are not a part of 'xyz' in that order; "
-                "write for example 'xy'."
-            )
+            raise InputError(f"free translations {self.translation!r} are no part of 'xyz' in that order.")
         if self.rotation not in ("all", "none", "x", "y", "z"):
             raise InputError(
                 f"free rotation {self.rotation!r} is refused: "
@@ -164,7 +150,7 @@ class Freedom:
             )
         if not self.translation and self.rotation == "none":
             raise InputError(
-                "a pose with no free axis needs no belief: leave at least one translation or rotation free."
+                "a pose with no free axis needs no belief; leave a translation or rotation free."
             )
 
     @property

@@ -19,6 +19,7 @@ from scipy.stats import chi2
 from bcppl import poses
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models import camera_error, part_in_view
+from bcppl.models.worlds.two_cameras import simulate_recording
 
 MODELS = {"latent errors": camera_error.model, "none": part_in_view.model}
 MASS = 0.9
@@ -46,7 +47,7 @@ class Run(NamedTuple):
 
 def run(name: str, seed: int, particles: int) -> Run:
     """One bench and one belief."""
-    recording = camera_error.simulate_recording(seed)
+    recording = simulate_recording(seed)
     begun, own = time.perf_counter(), time.process_time()
     *_, last = infer(MODELS[name], recording, particles=particles, seed=seed, climbs=0)
     seconds, own = time.perf_counter() - begun, time.process_time() - own

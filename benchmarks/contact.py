@@ -32,7 +32,7 @@ from bcppl.models.peg_in_hole import model
 from bcppl.models.worlds.peg_in_hole import simulate_recording
 from bcppl.recordings import Recording
 from bcppl.robot.motion import Probe, ProbeWindow
-from bcppl.sensors.simulated_probe import CONTACT
+from bcppl.sensors.likelihoods.simulated_probe import CONTACT
 
 PARTICLES = 75
 TOUCHING = 0.1  # N more or less than in free motion: what a wrist sensor's noise is

@@ -29,7 +29,7 @@ from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.point_probe import estimate_settings, model
 from bcppl.recordings.importers.point_probe import command
 from bcppl.sensors import Push, Recording
-from bcppl.sensors.point_finger import FingerSettings, contact_of, registration_pose
+from bcppl.sensors.likelihoods.point_finger import FingerSettings, contact_of, registration_pose
 
 LOGS = DATA / "point_probe_pushes"
 OTHER = {"10_90": "10_130", "10_130": "10_90"}  # where the finger is learnt for the pushes of a log

@@ -40,7 +40,7 @@ from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.point_probe import model
 from bcppl.recordings.importers.point_probe import command
 from bcppl.sensors import Push, Recording
-from bcppl.sensors.point_finger import contact_of
+from bcppl.sensors.likelihoods.point_finger import contact_of
 from bcppl.traces import Trace, extend
 
 LOG = "10_90"

@@ -21,8 +21,8 @@ from bcppl.models import peg_in_hole
 from bcppl.models.worlds.peg_in_hole import simulate_recording
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors import Recording
+from bcppl.sensors.likelihoods.simulated_probe import CONTACT, ProbeSettings, SimulatedProbe
 from bcppl.sensors.scene import Numbered, Scene
-from bcppl.sensors.simulated_probe import CONTACT, ProbeSettings, SimulatedProbe
 
 PARTICLES = 75
 WORLD = ContactParameters(time_step=0.0015, friction=0.2, time_constant=0.003)  # the world's own friction

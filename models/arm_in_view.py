@@ -22,6 +22,7 @@ from scipy.ndimage import binary_erosion
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import fitted_normal
 from bcppl.distributions.pose_normals import normal_like, truncated
@@ -34,8 +35,6 @@ from bcppl.geometry.parts import Part
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.robot.kinematics import Robot
 from bcppl.traces import Trace
-
-Array = npt.NDArray[np.float64]
 
 WIDER = 1.3  # than the fit: of the proposal
 # Smallest standard deviations of the fit: metres, radians, metres of bias, pixels of rim.
@@ -172,9 +171,7 @@ def prepare(
         InputError: as `Robot.drawn`, or there is not one image, or one mask of its size, for each view.
     """
     if len(images) != len(angles):
-        raise InputError(
-            f"{len(angles)} views of the arm are given {len(images)} depth images; give one for each."
-        )
+        raise InputError(f"{len(angles)} views are given {len(images)} depth images; give one for each.")
     chosen = Settings(**settings)
     still = replace(camera, world_from_camera=poses.identity().numpy())
     small = still.binned(chosen.bins)
@@ -185,29 +182,14 @@ def prepare(
         # Without masks the outline is informed by depth, which widens it.
         renderers = [RayCaster(widened(part, chosen.widening)) for part in drawn]
         return Scene(small, prior, renderers, backgrounds, None, chosen)
-    shown = checked_masks(still, masks, len(angles))
+    shown = [np.asarray(mask) != 0 for mask in masks]
+    if [mask.shape for mask in shown] != [(camera.height, camera.width)] * len(angles):
+        raise InputError(
+            f"{len(angles)} views are given masks of shapes {[mask.shape for mask in shown]}; give one for "
+            f"each, of the image's own pixels {(camera.height, camera.width)}, or none."
+        )
     insides = [_inside(mask, chosen) for mask in shown]
     return Scene(small, prior, [RayCaster(part) for part in drawn], backgrounds, insides, chosen)
-
-
-def checked_masks(camera: Camera, masks: Sequence[npt.ArrayLike], views: int) -> list[npt.NDArray[np.bool_]]:
-    """The masks (H, W) of some views, true where they show the arm.
-
-    Raises:
-        InputError: there is not one for each view, or one is not of the camera's size.
-    """
-    shown = [np.asarray(mask) != 0 for mask in masks]
-    if len(shown) != views:
-        raise InputError(
-            f"{views} views of the arm are given {len(shown)} masks; give one for each, or none."
-        )
-    for k, mask in enumerate(shown):
-        if mask.shape != (camera.height, camera.width):
-            raise InputError(
-                f"mask {k} has shape {mask.shape} and the images of camera {camera.name!r} have "
-                f"{(camera.height, camera.width)}; give the mask of the depth image's own pixels."
-            )
-    return shown
 
 
 def _inside(mask: npt.NDArray[np.bool_], settings: Settings) -> npt.NDArray[np.bool_]:

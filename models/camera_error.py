@@ -1,6 +1,7 @@
-"""A part is seen by depth cameras whose stated poses and ranges are in error (`bcppl.sensors.erring_camera`).
+"""A part is seen by depth cameras whose stated poses and ranges are in error.
 
-Errors that are common to all pixels of an image are latent, so that the belief is not overconfident.
+Errors that are common to all pixels of an image are latent, so that the belief is not overconfident
+(`bcppl.sensors.likelihoods.erring_camera`).
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.pose_normals import product_of_factors
 from bcppl.distributions.poses import NormalPose, prior_from_guess
-from bcppl.sensors.erring_camera import CameraSettings, ErringCamera
+from bcppl.models.shipped import simulated_in
+from bcppl.sensors.likelihoods.erring_camera import CameraSettings, ErringCamera
 from bcppl.sensors.measurements import Recording
-from bcppl.sensors.scene import Scene, likelihoods_for
-from bcppl.sensors.settings import chosen
+from bcppl.sensors.scene import Scene, chosen, likelihoods_for
 from bcppl.traces import Model, Trace
 
 # Logarithms of the scales of a random walk, in the particles' standard deviations.
@@ -85,18 +86,11 @@ def prepare(recording: Recording, **settings: Any) -> Scene:
     return Scene(prior, likelihoods_for(recording, likelihoods, only=True), "camera_error")
 
 
-def simulate_recording(seed: int, **options: Any) -> Recording:
-    """A block before two cameras whose poses are in error: see `bcppl.models.worlds.two_cameras`."""
-    from bcppl.models.worlds.two_cameras import simulate_recording as simulated
-
-    return simulated(seed, **options)
-
-
 model = Model(
     program=camera_error,
     prepare=prepare,
     observe=Scene.observed,
     pose="part",
-    simulate_recording=simulate_recording,
+    simulate_recording=simulated_in("two_cameras"),
     proposals=(conditional_proposal, joint_proposal),
 )

@@ -22,8 +22,8 @@ import torch
 from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.distributions.poses import NormalPose
-from bcppl.errors import InputError
 from bcppl.models import peg_in_hole
+from bcppl.models.shipped import simulated_in
 from bcppl.sensors.capabilities import Grasping
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Scene
@@ -63,30 +63,15 @@ def prepare(
         InputError: a spread is not positive, grip_shift is longer than the peg or grip_turn beyond pi; or as
             `peg_in_hole.prepare`.
     """
-    for name, value in (("grip_shift", grip_shift), ("grip_turn", grip_turn)):
-        number_within(
-            "a site's spread must be positive (for a peg that is held as planned choose peg_in_hole) and "
-            f"{name} is {{}}",
-            value,
-            above=0.0,
+    longest = math.inf if recording.peg is None else float(recording.peg.extent.max())
+    for name, value, most in (("grip_shift", grip_shift, longest), ("grip_turn", grip_turn, math.pi)):
+        what = (
+            f"a spread is in metres or radians, and positive unless the model is peg_in_hole; {name} is {{}}"
         )
-    if grip_turn > math.pi:
-        raise InputError(f"grip_turn is {grip_turn:g} rad, probably degrees; give radians below pi.")
-    if recording.peg is not None and grip_shift > (longest := float(recording.peg.extent.max())):
-        raise InputError(
-            f"grip_shift is {grip_shift:g} m and peg {recording.peg.name!r} only {longest:.3g} m long: "
-            "probably millimetres; scale it by 0.001."
-        )
+        number_within(what, value, above=0.0, most=most)
     spread = torch.tensor([grip_shift] * 3 + [grip_turn] * 3, dtype=torch.float64)
     known = peg_in_hole.prepare(recording, **settings)
     return GraspScene(known.prior, known.likelihoods, "grasped_peg", NormalPose(poses.identity(), spread))
-
-
-def simulate_recording(seed: int, **options: Any) -> Recording:
-    """A block with a hole, touched twice with the hand turned between: `bcppl.models.worlds.grasped_peg`."""
-    from bcppl.models.worlds.grasped_peg import simulate_recording as simulated
-
-    return simulated(seed, **options)
 
 
 model = Model(
@@ -94,5 +79,5 @@ model = Model(
     prepare=prepare,
     observe=Scene.observed,
     pose="hole",
-    simulate_recording=simulate_recording,
+    simulate_recording=simulated_in("grasped_peg"),
 )

@@ -1,9 +1,8 @@
 """A part is seen by depth cameras whose stated poses are in error, then touched with a held peg.
 
-The default model. A camera's extrinsic error and range bias are latent (`bcppl.sensors.erring_camera`). A
-touch is explained by the measured pose of the peg, which robots know to hundredths of a millimetre: while the
-wrench shows contact the peg's distance to the part is zero, otherwise positive
-(`bcppl.sensors.contact_probe`).
+The default model. A camera's extrinsic error and range bias are latent (`ErringCamera`). A touch is explained
+by the measured pose of the peg, which robots know to hundredths of a millimetre: while the wrench shows
+contact the peg's distance to the part is zero, otherwise positive (`ContactProbe`).
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ from typing import Any
 import pyro
 
 from bcppl.distributions.poses import prior_from_guess
-from bcppl.sensors.contact_probe import ContactProbe, TouchSettings
-from bcppl.sensors.erring_camera import CameraSettings, ErringCamera
+from bcppl.models.shipped import simulated_in
+from bcppl.sensors.likelihoods.contact_probe import ContactProbe, TouchSettings
+from bcppl.sensors.likelihoods.erring_camera import CameraSettings, ErringCamera
 from bcppl.sensors.measurements import Recording
-from bcppl.sensors.scene import Prepare, Scene, likelihoods_for
-from bcppl.sensors.settings import chosen
+from bcppl.sensors.scene import Prepare, Scene, chosen, likelihoods_for
 from bcppl.traces import Model
 
 CAMERAS = CameraSettings(bins=1, effective_pixels=None, temperature=6.0)
@@ -48,18 +47,11 @@ def prepare(recording: Recording, **settings: Any) -> Scene:
     return Scene(prior, likelihoods_for(recording, likelihoods), "look_and_touch")
 
 
-def simulate_recording(seed: int, **options: Any) -> Recording:
-    """A part on a bench, seen by two cameras and not yet touched: see `bcppl.models.worlds.bench`."""
-    from bcppl.models.worlds.bench import bench_scene
-
-    return bench_scene(seed, **options).look()
-
-
 model = Model(
     program=look_and_touch,
     prepare=prepare,
     observe=Scene.observed,
     pose="part",
-    simulate_recording=simulate_recording,
+    simulate_recording=simulated_in("bench"),
     inference=("guided_smc", {}),
 )

@@ -13,15 +13,14 @@ from typing import Any
 
 import pyro
 
-from bcppl.arguments import number_within, whole_number
+from bcppl.arguments import whole_number
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.geometry.parts import Part
 from bcppl.rendering.part_renderer import PartRenderer
 from bcppl.rendering.ray_casting import RayCaster
-from bcppl.sensors.cameras import ClutteredCamera
+from bcppl.sensors.likelihoods.cameras import ClutteredCamera
 from bcppl.sensors.measurements import Recording
-from bcppl.sensors.scene import Scene, likelihoods_for
-from bcppl.sensors.settings import chosen
+from bcppl.sensors.scene import Scene, chosen, likelihoods_for, require_positive
 from bcppl.traces import Model
 
 
@@ -53,7 +52,7 @@ class Settings:
     temperature: float = 1.0
 
     def __post_init__(self) -> None:
-        number_within("a site's spread must be positive and scale is {}", self.scale, above=0.0)
+        require_positive(self, "scale")
         whole_number("part_in_view is given stride {}", self.stride)
 
 

@@ -1,7 +1,7 @@
 """BayesContact's program: a hole is seen by depth cameras, then touched with a peg on a compliant arm.
 
-The part's pose is drawn from the prior. Images are explained by rendering (`bcppl.sensors.cameras`), the
-windows of a probe by contact physics (`bcppl.sensors.simulated_probe`).
+The part's pose is drawn from the prior. Images are explained by rendering (`CalibratedCamera`), the windows
+of a probe by contact physics (`SimulatedProbe`).
 """
 
 from __future__ import annotations
@@ -13,16 +13,15 @@ from typing import Any
 
 import pyro
 
-from bcppl.arguments import number_within
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.geometry.parts import Part
+from bcppl.models.shipped import simulated_in
 from bcppl.rendering.part_renderer import PartRenderer
 from bcppl.rendering.ray_casting import RayCaster
-from bcppl.sensors.cameras import CalibratedCamera
+from bcppl.sensors.likelihoods.cameras import CalibratedCamera
+from bcppl.sensors.likelihoods.simulated_probe import ProbeSettings, SimulatedProbe
 from bcppl.sensors.measurements import Recording
-from bcppl.sensors.scene import Likelihood, Scene, likelihoods_for
-from bcppl.sensors.settings import chosen
-from bcppl.sensors.simulated_probe import ProbeSettings, SimulatedProbe
+from bcppl.sensors.scene import Scene, chosen, likelihoods_for, require_positive
 from bcppl.traces import Model
 
 
@@ -42,7 +41,7 @@ class DepthSettings:
     effective_pixels: float = 50.0
 
     def __post_init__(self) -> None:
-        number_within("a site's spread must be positive and depth_scale is {}", self.depth_scale, above=0.0)
+        require_positive(self, "depth_scale")
 
 
 def peg_in_hole(scene: Scene, actions: Sequence[Any]) -> None:
@@ -66,14 +65,7 @@ def prepare(
         InputError: a setting is unknown or out of range, there are probe windows and no peg, or the part
             cannot be touched.
     """
-    return Scene(prior_from_guess(recording.guess), likelihoods(recording, renderer, settings), "peg_in_hole")
-
-
-def likelihoods(
-    recording: Recording, renderer: Callable[[Part], PartRenderer], settings: Any, model: str = "peg_in_hole"
-) -> dict[str, Likelihood]:
-    """The sensors' likelihoods, with settings that are fields of `DepthSettings` and `ProbeSettings`."""
-    depth, probe = chosen(model, settings, DepthSettings(), ProbeSettings())
+    depth, probe = chosen("peg_in_hole", settings, DepthSettings(), ProbeSettings())
     camera = CalibratedCamera(
         recording,
         renderer(recording.part),
@@ -81,16 +73,10 @@ def likelihoods(
         outlier=depth.outlier,
         effective_pixels=depth.effective_pixels,
     )
-    return likelihoods_for(
+    likelihoods = likelihoods_for(
         recording, {"view": lambda _: camera, "window": partial(SimulatedProbe.prepare, settings=probe)}
     )
-
-
-def simulate_recording(seed: int, **options: Any) -> Recording:
-    """A block with a hole, seen and probed in a finer simulation: see `bcppl.models.worlds.peg_in_hole`."""
-    from bcppl.models.worlds.peg_in_hole import simulate_recording as simulated
-
-    return simulated(seed, **options)
+    return Scene(prior_from_guess(recording.guess), likelihoods, "peg_in_hole")
 
 
 model = Model(
@@ -98,5 +84,5 @@ model = Model(
     prepare=prepare,
     observe=Scene.observed,
     pose="hole",
-    simulate_recording=simulate_recording,
+    simulate_recording=simulated_in("peg_in_hole"),
 )

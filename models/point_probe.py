@@ -1,8 +1,8 @@
 """A part is touched by a point finger that moves towards it until a contact force.
 
 Each push measures the onset of contact on the finger's path, the direction of the force, and (as an option)
-that the path before was free (`bcppl.sensors.point_finger`). `estimate_settings` estimates the settings from
-pushes at a known pose.
+that the path before was free (`PointFinger`). `estimate_settings` estimates the settings from pushes at a
+known pose.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from bcppl.distributions.poses import prior_from_guess
 from bcppl.distributions.touch import Path
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
+from bcppl.models.shipped import simulated_in
 from bcppl.poses import compose, inverse, rotation_matrix, transform
-from bcppl.sensors.measurements import Recording
-from bcppl.sensors.point_finger import (
+from bcppl.sensors.likelihoods.point_finger import (
     FingerSettings,
     PointFinger,
     contact_of,
     finger_points,
     registration_pose,
 )
-from bcppl.sensors.scene import Scene, likelihoods_for
-from bcppl.sensors.settings import chosen
+from bcppl.sensors.measurements import Recording
+from bcppl.sensors.scene import Scene, chosen, likelihoods_for
 from bcppl.traces import Model
 
 
@@ -54,19 +54,12 @@ def prepare(recording: Recording, **settings: Any) -> Scene:
     return Scene(prior_from_guess(recording.guess), likelihoods_for(recording, likelihoods), "point_probe")
 
 
-def simulate_recording(seed: int, **options: Any) -> Recording:
-    """Pushes simulated by the program itself; see `bcppl.models.worlds.point_probe`."""
-    from bcppl.models.worlds.point_probe import simulate_recording as simulated
-
-    return simulated(seed, **options)
-
-
 model = Model(
     program=point_probe,
     prepare=prepare,
     observe=Scene.observed,
     pose="part",
-    simulate_recording=simulate_recording,
+    simulate_recording=simulated_in("point_probe"),
 )
 
 
@@ -98,7 +91,7 @@ def estimate_settings(recording: Recording, **settings: Any) -> FingerSettings:
     kept = [k for k, one in enumerate(contacts) if not bool(one.direction.isnan())]
     if len(kept) < 10:
         raise InputError(
-            f"settings are estimated from 10 pushes with contact or more, not from {len(kept)}; record more."
+            f"settings are estimated from 10 pushes with contact, not from {len(kept)}; record more."
         )
     tips = torch.stack([contacts[k].onset for k in kept])
     angles = torch.stack([contacts[k].direction for k in kept])

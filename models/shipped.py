@@ -1,9 +1,12 @@
-"""The recordings that come with bcppl."""
+"""The recordings that come with bcppl, and those that a model's own world simulates."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from importlib import import_module
 from importlib.resources import as_file, files
 from pathlib import Path
+from typing import Any
 
 from bcppl.errors import InputError
 from bcppl.recordings import Recording, load
@@ -24,8 +27,17 @@ def load_recording(name: str | Path) -> Recording:
     shipped = files("bcppl.models") / "recordings"
     names = sorted(p.name.removesuffix(".h5") for p in shipped.iterdir() if p.name.endswith(".h5"))
     if name not in names:
-        raise InputError(
-            f"there is no recording {str(name)!r}: give a file, or one that ships: {', '.join(names)}."
-        )
+        raise InputError(f"there is no recording {str(name)!r}: give a file, or one of {', '.join(names)}.")
     with as_file(shipped / f"{name}.h5") as file:
         return load(file)
+
+
+def simulated_in(world: str) -> Callable[..., Recording]:
+    """The `simulate_recording` of a module of `bcppl.models.worlds`, which is imported when it is called."""
+
+    def simulate_recording(seed: int, **options: Any) -> Recording:
+        module: Any = import_module(f"bcppl.models.worlds.{world}")
+        recording: Recording = module.simulate_recording(seed, **options)
+        return recording
+
+    return simulate_recording

@@ -25,6 +25,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.models import peg_in_hole
+from bcppl.models.shipped import simulated_in
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Scene
 from bcppl.traces import Model
@@ -61,17 +62,17 @@ def prepare(
         settings: as for `peg_in_hole.prepare`.
 
     Raises:
-        InputError: there are fewer than two holes, the first is not at the origin, two are at one place or
-            one beside the part; or as `peg_in_hole.prepare`.
+        InputError: there are fewer than two holes, the first is not at the origin, two are at one place, or
+            one is beside the part; or as `peg_in_hole.prepare`.
     """
     try:
-        places = np.asarray(holes, dtype=np.float64)
+        places = np.asarray(holes, dtype=np.float64).reshape(-1, 2)
     except (TypeError, ValueError):
-        places = np.zeros(0)
-    if places.ndim != 2 or places.shape[1] != 2 or len(places) < 2 or places[0].any():
+        places = np.zeros((0, 2))
+    if len(places) < 2 or places[0].any() or len(np.unique(places, axis=0)) < len(places):
         raise InputError(
             f"which_hole is given holes at {holes}; give x and y of two or more in the part's "
-            "frame, the first (0, 0)."
+            "frame, the first (0, 0), and none twice."
         )
     low, high = recording.part.vertices[:, :2].min(axis=0), recording.part.vertices[:, :2].max(axis=0)
     within = ((low <= places) & (places <= high)).all(axis=1)
@@ -81,19 +82,10 @@ def prepare(
             f"hole {k} is at {places[k].tolist()}, beside part {recording.part.name!r}, which reaches from "
             f"{low.tolist()} to {high.tolist()} m; give metres in the part's frame."
         )
-    if len(np.unique(places, axis=0)) < len(places):
-        raise InputError(f"which_hole is given one hole twice, {places.tolist()}; give each once.")
     hole_from_part = poses.identity(len(places))
     hole_from_part[:, :2] = -torch.from_numpy(places)
     scene = peg_in_hole.prepare(recording, **settings)
     return PlateScene(scene.prior, scene.likelihoods, "which_hole", hole_from_part)
-
-
-def simulate_recording(seed: int, **options: Any) -> Recording:
-    """A plate with four holes, one in view, touched at two points: see `bcppl.models.worlds.which_hole`."""
-    from bcppl.models.worlds.which_hole import simulate_recording as simulated
-
-    return simulated(seed, **options)
 
 
 model = Model(
@@ -101,5 +93,5 @@ model = Model(
     prepare=prepare,
     observe=Scene.observed,
     pose="hole",
-    simulate_recording=simulate_recording,
+    simulate_recording=simulated_in("which_hole"),
 )

@@ -1,4 +1,4 @@
-"""What tests of the command line share: what a command said, and a recording of a few pushes."""
+"""What tests of the command line share: what a command printed, and a recording of a few pushes."""
 
 from __future__ import annotations
 

@@ -26,8 +26,8 @@ def bcppl(
         capsys.readouterr()
         with pytest.raises(SystemExit) as caught:
             main()
-        said = capsys.readouterr()
+        captured = capsys.readouterr()
         code = caught.value.code
-        return Ran(code if isinstance(code, int) else 0 if code is None else 1, said.out, said.err)
+        return Ran(code if isinstance(code, int) else 0 if code is None else 1, captured.out, captured.err)
 
     return run

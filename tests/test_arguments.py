@@ -1,4 +1,4 @@
-"""Numbers, indices, weights and addresses that cannot be are refused in one sentence that says what to do."""
+"""Numbers, indices, weights and addresses that cannot be are refused in a sentence that states what to do."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def test_ancestors_and_traces_that_do_not_fit_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("weights", "said"),
+    ("weights", "message"),
     [
         (torch.zeros(4), r"5 particles is given log weights of shape \(4,\)"),
         (torch.zeros(5, 1), r"shape \(5, 1\)"),
@@ -196,10 +196,10 @@ def test_ancestors_and_traces_that_do_not_fit_are_refused() -> None:
         (torch.zeros(5, dtype=torch.complex128), "one real number for each"),
     ],
 )
-def test_weights_that_cannot_be_are_refused(weights: Any, said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_weights_that_cannot_be_are_refused(weights: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         Population(population().trace, weights)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         Population(population().trace, weights, log_evidence=0.0)
 
 

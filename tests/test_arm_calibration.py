@@ -23,6 +23,7 @@ from bcppl.models.arm_calibration import (
 from bcppl.models.robots import load_robot
 from bcppl.robot.kinematics import Robot
 from bcppl.traces import generate
+from tests.scene_contents import contents
 
 DATA = Path(__file__).parents[2] / "shared/data/ball_in_socket"
 needed = pytest.mark.skipif(not DATA.is_dir(), reason=f"the ball-in-socket recordings are not at {DATA}")
@@ -178,3 +179,13 @@ def test_another_number_of_joints_is_refused() -> None:
     arm = Arm(load_robot("panda", tip="panda_hand"))
     with pytest.raises(InputError, match="has 6 angles for each stamp; give 7, in the order panda_joint1,"):
         laplace_proposal(arm, [torch.zeros(5, 6).double()])
+
+
+def test_nothing_is_written_into_the_arm() -> None:
+    arm = Arm(load_robot("panda", tip="panda_hand"), link="panda_hand")
+    torch.manual_seed(0)
+    middle = torch.tensor([0.0, 0.2, 0.0, -1.5, 0.0, 1.8, 0.5], dtype=torch.float64)
+    seatings = [middle + 0.3 * torch.randn(6, 7, dtype=torch.float64) for _ in range(2)]
+    before, observed = contents(arm), observations(seatings)
+    importance_sampling(arm_calibration, (arm, seatings), observed, 5, laplace_proposal(arm, seatings))
+    assert len(before) > 40 and contents(arm) == before

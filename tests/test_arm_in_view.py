@@ -35,6 +35,7 @@ from bcppl.models.robots import load_robot
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.robot.kinematics import Robot
 from bcppl.traces import generate
+from tests.scene_contents import contents
 
 XARM = Path(__file__).parents[2] / "shared/data/xarm7_realsense"
 needed = pytest.mark.skipif(not XARM.is_dir(), reason=f"the xArm's frames are not at {XARM}")
@@ -121,9 +122,13 @@ def test_masks_that_do_not_fit_are_refused() -> None:
     scene, _ = drawn(0.0)
     robot, angles = load_robot("panda", tip="panda_hand"), [np.array(q) for q in POSTURES]
     images = [np.ones((72, 96))] * 2
-    with pytest.raises(InputError, match="2 views of the arm are given 1 masks; give one for each, or none"):
+    with pytest.raises(
+        InputError, match=r"2 views are given masks of shapes \[\(72, 96\)\]; give one for each"
+    ):
         prepare(robot, CAMERA, scene.prior, angles, images, images[:1])
-    with pytest.raises(InputError, match=r"mask 1 has shape \(96, 72\) and the images of camera 'c' have"):
+    with pytest.raises(
+        InputError, match=r"\(72, 96\), \(96, 72\)\]; give one for each, .* \(72, 96\), or none"
+    ):
         prepare(robot, CAMERA, scene.prior, angles, images, [images[0], images[0].T])
 
 
@@ -168,3 +173,12 @@ def test_the_static_background_is_estimated_from_the_other_views() -> None:
     behind = background_of(views, 0)
     assert behind[0, 0] == 2.0 and behind[0, 1] == 1.0 and np.isnan(behind[0, 2]) and behind[0, 3] == 2.0
     assert np.isnan(background_of(views[:1], 0)).all()
+
+
+def test_nothing_is_written_into_the_scene() -> None:
+    scene, seen = drawn(0.0, masked=True)
+    before = contents(scene)
+    views = len(scene.renderers)
+    torch.manual_seed(0)
+    importance_sampling(arm_in_view, (scene, views), seen, 5, fitted_proposal(scene, seen, draws=20))
+    assert len(before) > 40 and contents(scene) == before

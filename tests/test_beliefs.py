@@ -115,7 +115,7 @@ def test_weights_of_any_size_are_normalised_and_none_is_an_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("poses_given", "weights_given", "says"),
+    ("poses_given", "weights_given", "message"),
     [
         ((4, 7), (3,), r"log weights of shape \(3,\); give \(N, 7\)"),
         ((4, 7), (4, 1), r"log weights of shape \(4, 1\)"),
@@ -123,8 +123,8 @@ def test_weights_of_any_size_are_normalised_and_none_is_an_error() -> None:
         ((7,), (1,), r"poses of shape \(7,\)"),
     ],
 )
-def test_poses_and_weights_that_do_not_fit(poses_given: Any, weights_given: Any, says: str) -> None:
-    with pytest.raises(InputError, match=says):
+def test_poses_and_weights_that_do_not_fit(poses_given: Any, weights_given: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         Belief(torch.zeros(poses_given), torch.zeros(weights_given))
 
 

@@ -22,11 +22,11 @@ DATA = Path(__file__).parents[2] / "shared/data"
 replace = dataclasses.replace
 
 
-def assert_refused(ran: Ran, says: str) -> None:
+def assert_refused(ran: Ran, message: str) -> None:
     lines = ran.err.strip().splitlines()
     assert ran.code == 2, (ran.code, ran.err)
     assert len(lines) == 1 and lines[0].startswith("bcppl: ") and lines[0].endswith("."), ran.err
-    assert says in lines[0], lines[0]
+    assert message in lines[0], lines[0]
     assert "Traceback" not in ran.err + ran.out
 
 
@@ -91,19 +91,19 @@ BAD: dict[str, tuple[Callable[[], Recording], str]] = {
 def test_a_bad_recording_is_refused_before_anything_is_written(
     case: str, bcppl: Callable[..., Ran], tmp_path: Path
 ) -> None:
-    make, says = BAD[case]
+    make, message = BAD[case]
     save(make(), tmp_path / "bad.h5")
-    assert_refused(bcppl("run", "bad.h5", "--particles", 5), says)
+    assert_refused(bcppl("run", "bad.h5", "--particles", 5), message)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.h5"]
 
 
 @pytest.mark.parametrize("case", [c for c in BAD if problems(BAD[c][0]())])
-def test_check_says_what_is_wrong(case: str, bcppl: Callable[..., Ran], tmp_path: Path) -> None:
-    make, says = BAD[case]
+def test_check_lists_what_is_wrong(case: str, bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    make, message = BAD[case]
     save(make(), tmp_path / "bad.h5")
     ran = bcppl("check", "bad.h5")
     assert ran.code == 2 and "Traceback" not in ran.err + ran.out, ran
-    assert says in " ".join(ran.out.split()), ran.out
+    assert message in " ".join(ran.out.split()), ran.out
     assert "no problem" not in ran.out
 
 
@@ -113,8 +113,8 @@ def test_check_lists_all_problems(bcppl: Callable[..., Ran], tmp_path: Path) -> 
     save(bad, tmp_path / "bad.h5")
     ran = bcppl("check", "bad.h5")
     assert ran.code == 2 and ran.out.count("wrong:") == 3
-    for says in ("open mesh", "the truth", "measurement 0's wrench"):
-        assert says in ran.out
+    for message in ("open mesh", "the truth", "measurement 0's wrench"):
+        assert message in ran.out
     assert bcppl("check", SHIPPED).code == 0
 
 
@@ -143,10 +143,10 @@ FILES: dict[str, tuple[Callable[[Path], object], str]] = {
 def test_a_file_that_is_no_recording_is_refused(
     case: str, command: str, bcppl: Callable[..., Ran], tmp_path: Path
 ) -> None:
-    make, says = FILES[case]
+    make, message = FILES[case]
     make(tmp_path / "file.h5")
     before = sorted(tmp_path.iterdir())
-    assert_refused(bcppl(command, "file.h5"), says)
+    assert_refused(bcppl(command, "file.h5"), message)
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -167,10 +167,10 @@ USER_FILES = {
 def test_a_users_file_that_cannot_be_run(
     case: str, option: str, bcppl: Callable[..., Ran], tmp_path: Path
 ) -> None:
-    text, *says = USER_FILES[case]
+    text, *message = USER_FILES[case]
     (tmp_path / "mine.py").write_text(text)
     ran = bcppl("run", SHIPPED, option, "mine.py")
-    for each in ("mine.py", *says):
+    for each in ("mine.py", *message):
         assert_refused(ran, each)
     assert not (tmp_path / "runs").exists()
 
@@ -199,9 +199,9 @@ OPTIONS = {
 
 @pytest.mark.parametrize("case", OPTIONS)
 def test_a_bad_option_is_refused(case: str, bcppl: Callable[..., Ran], tmp_path: Path) -> None:
-    words, says = OPTIONS[case]
+    words, message = OPTIONS[case]
     (tmp_path / "file").write_text("mine")
-    assert_refused(bcppl("run", SHIPPED, *words), says)
+    assert_refused(bcppl("run", SHIPPED, *words), message)
     assert [p.name for p in tmp_path.iterdir()] == ["file"] and (tmp_path / "file").read_text() == "mine"
 
 
@@ -218,9 +218,9 @@ IMPORTS = {
 
 @pytest.mark.parametrize("case", IMPORTS)
 def test_a_bad_import_writes_nothing(case: str, bcppl: Callable[..., Ran], tmp_path: Path) -> None:
-    words, says = IMPORTS[case]
+    words, message = IMPORTS[case]
     (tmp_path / "words.txt").write_text("no numbers here")
-    assert_refused(bcppl("import", *words, "--out", "made.h5"), says)
+    assert_refused(bcppl("import", *words, "--out", "made.h5"), message)
     assert [p.name for p in tmp_path.iterdir()] == ["words.txt"]
 
 
@@ -234,8 +234,8 @@ def test_an_unknown_object_is_refused(bcppl: Callable[..., Ran], tmp_path: Path)
     )
     assert list(tmp_path.iterdir()) == []
     assert_refused(bcppl("import", "bop", scene, "--object", 5, "--translation", "nan"), "half width")
-    for out, says in (("no/where.h5", "no folder no"), (".", "is a directory")):
-        assert_refused(bcppl("import", "bop", scene, "--object", 5, "--out", out), says)
+    for out, message in (("no/where.h5", "no folder no"), (".", "is a directory")):
+        assert_refused(bcppl("import", "bop", scene, "--object", 5, "--out", out), message)
         assert list(tmp_path.iterdir()) == []
 
 

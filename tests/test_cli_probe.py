@@ -98,25 +98,25 @@ def test_views_and_touches_are_ranked_together_and_other_models_by_reweighting(
     table = dict(ranked(bcppl("probe", "runs/belief_002.h5", *words)))
     views = [gain for name, gain in table.items() if name.startswith("view")]
     (touched,) = (gain for name, gain in table.items() if name.startswith("touch"))
-    # A third view of a camera that is off by millimetres tells less than a touch.
+    # A third view of a camera that is off by millimetres informs less than a touch.
     assert len(views) == 2 and 0.5 < max(views) < touched
     save(short(1), here / "push.h5")
-    for kind, says in (
+    for kind, message in (
         ("view", "point_probe does not explain a measurement of kind 'view'"),
         ("touch", "holds no peg to carry out 'touch' with"),
     ):
-        refused(bcppl("probe", "push.h5", "--candidates", f"{kind}:1", "--particles", 6), says)
+        refused(bcppl("probe", "push.h5", "--candidates", f"{kind}:1", "--particles", 6), message)
     refused(
         bcppl("probe", "runs/belief_002.h5", "--by", "luck"),
         "'luck' is not one of 'linearised', 'reweighted'",
     )
 
 
-def refused(ran: Ran, says: str) -> None:
+def refused(ran: Ran, message: str) -> None:
     lines = ran.err.strip().splitlines()
     assert ran.code == 2, (ran.code, ran.out, ran.err)
     assert len(lines) == 1 and lines[0].startswith("bcppl: ") and lines[0].endswith("."), ran.err
-    assert says in lines[0], lines[0]
+    assert message in lines[0], lines[0]
 
 
 HAND = ["--robot", "panda", "--link", "panda_hand"]
@@ -135,7 +135,7 @@ WRONG = {
     "table": (["--table", "0.5"], "lead into the table"),
     "robot": (["--robot", "panda"], "without --link"),
     "robot's name": (["--robot", "hal", "--link", "x"], "no URDF file and no shipped robot"),
-    "held": ([*HAND, "--link-from-peg", "1 2"], "has 2 numbers"),
+    "held": ([*HAND, "--link-from-peg", "1 2"], "a pose is seven numbers"),
     "held somehow": (HAND, "without --link-from-peg"),
     "reach": (
         [*HAND, "--link-from-peg", "0 0 0.1 0 1 0 0", "--world-from-base", "9 0 0 1 0 0 0"],
@@ -158,10 +158,10 @@ WRONG = {
 def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
     what: str, bcppl: Callable[..., Ran], here: Path
 ) -> None:
-    words, says = WRONG[what]
+    words, message = WRONG[what]
     before = sorted(here.rglob("*"))
     given = words if "--candidates" in words else [*words, "--candidates", "touch:1"]
-    refused(bcppl("probe", "runs/belief_002.h5", *given), says)
+    refused(bcppl("probe", "runs/belief_002.h5", *given), message)
     assert sorted(here.rglob("*")) == before
 
 

@@ -77,10 +77,10 @@ def test_what_was_computed_before_a_stop_is_kept(
         "        yield step\n"
     )
     ran = bcppl("run", SHIPPED, "--particles", 8, "--inference", "stops.py", "--out", "kept")
-    code, says = STOPS[error]
+    code, message = STOPS[error]
     assert ran.code == code and "Traceback" not in ran.err + ran.out
-    if says is not None:
-        assert says in ran.err and len(ran.err.strip().splitlines()) == 1
+    if message is not None:
+        assert message in ran.err and len(ran.err.strip().splitlines()) == 1
     found = sorted(p.name for p in (tmp_path / "kept").iterdir())
     assert found == [
         "add_over_time.png",
@@ -133,28 +133,28 @@ def test_every_latent_site_comes_out(bcppl: Callable[..., Ran], tmp_path: Path) 
     belief, values = load_belief(path), load_latent(path)
     assert set(values) == {"part", "slot", "wear/mm", "grip"}
     assert torch.equal(values["part"], belief.world_from_part)
-    said = json.loads((tmp_path / "out/run.json").read_text())["latent"]
+    record = json.loads((tmp_path / "out/run.json").read_text())["latent"]
 
     weights, slot = belief.weights.numpy(), values["slot"].numpy()
     shares = {k: float(weights[slot == k].sum()) for k in range(3) if (slot == k).any()}
     ordered = sorted(shares.items(), key=lambda pair: -pair[1])
-    assert said["slot"]["values"] == [k for k, _ in ordered]
-    assert said["slot"]["probabilities"] == pytest.approx([share for _, share in ordered])
+    assert record["slot"]["values"] == [k for k, _ in ordered]
+    assert record["slot"]["probabilities"] == pytest.approx([share for _, share in ordered])
     assert ", ".join(f"{k}: {100 * share:.1f} %" for k, share in ordered) in ran.out
 
     wear = values["wear/mm"].numpy()
-    assert said["wear/mm"]["mean"] == pytest.approx(weights @ wear)
+    assert record["wear/mm"]["mean"] == pytest.approx(weights @ wear)
     for k in range(2):
-        low, high = said["wear/mm"]["from"][k], said["wear/mm"]["to"][k]
-        assert low <= said["wear/mm"]["mean"][k] <= high
+        low, high = record["wear/mm"]["from"][k], record["wear/mm"]["to"][k]
+        assert low <= record["wear/mm"]["mean"][k] <= high
         assert weights[wear[:, k] < low].sum() <= 0.05 and weights[wear[:, k] > high].sum() <= 0.05
         assert f"wear/mm[{k}]" in ran.out and f"{low:.4g} to {high:.4g}" in ran.out
 
     grip = Belief(values["grip"], belief.log_weights)
-    assert said["grip"]["mean"] == pytest.approx(grip.mean.tolist())
-    assert said["grip"]["spread"] == pytest.approx(grip.spread.tolist())
+    assert record["grip"]["mean"] == pytest.approx(grip.mean.tolist())
+    assert record["grip"]["spread"] == pytest.approx(grip.spread.tolist())
     assert " ".join(f"{1e3 * x:.3f}" for x in grip.mean[:3].tolist()) + " mm" in ran.out
-    assert "truth gap: empty" in ran.out and "slot, wear/mm, grip besides" in ran.out
+    assert "empty" not in ran.out  # a column without numbers needs no words
 
 
 def test_a_model_of_the_pose_alone_prints_no_other_sites(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_a_model_of_the_pose_alone_prints_no_other_sites(bcppl: Callable[..., Ra
         save(dataclasses.replace(short(1), truth=truth), tmp_path / f"{name}.h5")
         ran = bcppl("run", f"{name}.h5", "--particles", 4, "--inference", FEW_MOVES)
         assert ran.code == 0 and "other latent values" not in ran.out
-        assert ("the recording has no truth" in ran.out) == (name == "unknown")
+        assert "empty" not in ran.out
     path = tmp_path / "runs/known/belief_001.h5"
     with h5py.File(path, "r+") as file:
         del file["latent"]  # as earlier versions wrote it

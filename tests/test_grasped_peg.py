@@ -88,9 +88,9 @@ def test_a_peg_held_as_planned_is_that_of_peg_in_hole() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"grip_shift": 1.5}, "grip_shift is 1.5 m .* probably millimetres"),
-        ({"grip_turn": 5.0}, "grip_turn is 5 rad, probably degrees"),
-        ({"grip_shift": 0.0}, "a site's spread must be positive .*choose peg_in_hole.* grip_shift is 0.0"),
+        ({"grip_shift": 1.5}, "in metres .* grip_shift is 1.5; .* at most 0.08"),
+        ({"grip_turn": 5.0}, "grip_turn is 5.0; .* at most 3.14"),
+        ({"grip_shift": 0.0}, "positive unless the model is peg_in_hole; grip_shift is 0.0"),
         ({"grip_turn": float("nan")}, "grip_turn is nan"),
         ({"grip_shift": "1"}, "grip_shift is '1'"),
         ({"depth_scale": 0.0}, "a site's spread must be positive and depth_scale is 0.0"),

@@ -127,7 +127,7 @@ def test_bad_logs_are_refused_in_a_sentence(tmp_path: Path) -> None:
         ("1 " + push[:-30], "middle of a push"),
         ("1 " + push + push, "more numbers"),
         ("1 " + push.replace(" 12 ", " 2 ", 1), "too few rows|more numbers|middle"),
-        ("1 " + push, "holds no push that touches"),
+        ("1 " + push, "holds 0 with a contact"),
         ("1 " + push.replace("12 0 0 0", "12 0 0 nan"), "not finite"),
         ("1 " + push.replace("1 0 0 0", "2 0 0 0", 1), "unit length"),
         ("", "middle of a push"),

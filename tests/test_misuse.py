@@ -1,4 +1,4 @@
-"""What a newcomer hands to the wrong place is refused in one sentence that says what to do."""
+"""What a newcomer hands to the wrong place is refused in one sentence that states what to do."""
 
 from __future__ import annotations
 
@@ -113,8 +113,8 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
 
 @pytest.mark.parametrize("misuse", MISUSES)
 def test_it_is_refused_in_one_sentence(misuse: str) -> None:
-    call, said = MISUSES[misuse]
-    with pytest.raises(InputError, match=said) as caught:
+    call, message = MISUSES[misuse]
+    with pytest.raises(InputError, match=message) as caught:
         call()
     assert "\n" not in str(caught.value)
 
@@ -137,7 +137,7 @@ def test_an_error_of_the_kernel_itself_is_left_alone() -> None:
     ],
     ids=["mixture", "sequence", "cycle", "hmc"],
 )
-def test_a_list_says_the_same_as_one_by_one(one: Any, other: Any) -> None:
+def test_a_list_gives_the_same_as_one_by_one(one: Any, other: Any) -> None:
     found = []
     for kernel in (one, other):
         torch.manual_seed(1)
@@ -148,8 +148,8 @@ def test_a_list_says_the_same_as_one_by_one(one: Any, other: Any) -> None:
 def test_a_population_is_told_in_a_line_and_read_by_address() -> None:
     (population, _) = next(steps(tempered(walk), start(), [SEEN]))
     assert torch.equal(population["mu"], population.trace["mu"]) and float(population["y_0"]) == 0.4
-    told = repr(population)
-    assert told.startswith("Population(20 particles, effective sample size ") and "tensor" not in told
-    assert told.endswith("latent: mu, observed: y_0)") and f"{population.log_evidence:.4f}" in told
+    shown = repr(population)
+    assert shown.startswith("Population(20 particles, effective sample size ") and "tensor" not in shown
+    assert shown.endswith("latent: mu, observed: y_0)") and f"{population.log_evidence:.4f}" in shown
     dead = Population(population.trace, torch.full((20,), -torch.inf, dtype=torch.float64))
     assert "effective sample size none" in repr(dead)

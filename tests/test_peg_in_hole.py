@@ -14,8 +14,8 @@ from bcppl.inference.filters import bayes_contact
 from bcppl.models import peg_in_hole
 from bcppl.models.worlds import peg_in_hole as world
 from bcppl.recordings import ProbeWindow, Recording
+from bcppl.sensors.likelihoods.simulated_probe import CONTACT
 from bcppl.sensors.scene import Scene
-from bcppl.sensors.simulated_probe import CONTACT
 from bcppl.traces import Trace, extend, generate, simulate, update
 from tests import few_moves
 

@@ -17,7 +17,7 @@ from bcppl.models.point_probe import estimate_settings, model, prepare
 from bcppl.models.worlds.point_probe import noise_seed
 from bcppl.recordings.importers.point_probe import command
 from bcppl.sensors import Measurement, Push, Recording
-from bcppl.sensors.point_finger import FingerSettings, contact_of
+from bcppl.sensors.likelihoods.point_finger import FingerSettings, contact_of
 from bcppl.traces import assess, generate
 
 LOGS = File(__file__).parents[2] / "shared/data/point_probe_pushes"

@@ -1,4 +1,4 @@
-"""Recordings that are wrong: each problem is one sentence that says where."""
+"""Recordings that are wrong: each problem is one sentence that names the place."""
 
 import dataclasses
 import re
@@ -204,7 +204,7 @@ WRONG: dict[str, tuple[Recording, str]] = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_each_problem_is_one_sentence_that_says_where(case: str) -> None:
+def test_each_problem_is_one_sentence_that_names_the_place(case: str) -> None:
     recording, pattern = WRONG[case]
     found = problems(recording)
     matching = [problem for problem in found if re.search(pattern, problem)]
@@ -225,9 +225,11 @@ def test_an_open_mesh_may_be_looked_at() -> None:
     assert notes(recording) == []
 
 
-def test_describe_says_what_is_there() -> None:
+def test_describe_lists_what_is_there() -> None:
     rows = dict(describe(full()))
     assert "100.0 × 80.0 × 30.0 mm" in rows["part"] and "closed" in rows["part"]
     assert rows["measurements"] == "3 views, 3 probe windows, 1 push"
     assert rows["camera left"] == "8×6 pixels, 0.06 to 4 m, background known"
     assert "20 Hz" in rows["probe slide"] and rows["truth"] == "known"
+    old = replace(full(), source="made up by bcppl, seed 3")  # as earlier versions wrote it
+    assert dict(describe(old))["source"] == "simulated by bcppl, seed 3"

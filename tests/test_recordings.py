@@ -1,4 +1,4 @@
-"""Recordings on disk: what comes back is what went in, and what is wrong is said in one sentence."""
+"""Recordings on disk: what comes back is what went in, and a refusal is one sentence."""
 
 import dataclasses
 from collections.abc import Callable
@@ -175,7 +175,7 @@ def edited(tmp_path: Path, edit: Callable[[h5py.File], None]) -> str:
     return str(failure.value)
 
 
-def test_a_newer_schema_says_which_and_what_to_do(tmp_path: Path) -> None:
+def test_a_newer_schema_is_named_with_what_to_do(tmp_path: Path) -> None:
     message = edited(tmp_path, lambda file: file.attrs.__setitem__("schema_version", 7))
     assert "schema version 7" in message and "reads versions 1 to 2" in message and "upgrade" in message
 

@@ -1,12 +1,13 @@
-"""Runs that are resumed, branched or repeated on one scene give the same bits."""
+"""Runs that are resumed, branched or repeated on one scene give the same bits, and write nothing into it."""
 
 from __future__ import annotations
 
+import copy
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.resources import as_file, files
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -16,13 +17,23 @@ from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.geometry.parts import Guess
 from bcppl.inference.filters import bayes_contact, guided_smc, tempered_smc
+from bcppl.inference.filters.default import default_inference
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.metrology import three_two_one
-from bcppl.models import look_and_touch, peg_in_hole, point_probe
+from bcppl.models import (
+    camera_error,
+    grasped_peg,
+    look_and_touch,
+    part_in_view,
+    peg_in_hole,
+    point_probe,
+    which_hole,
+)
 from bcppl.models.worlds.bench import BenchParameters, bench_scene
 from bcppl.recordings import Recording, load
 from bcppl.sensors.scene import Scene
 from bcppl.traces import Model, generate, update
+from tests.scene_contents import contents
 
 PARTICLES = 6
 # Windows are left out of the recordings for the sake of time.
@@ -84,6 +95,15 @@ def state_of(step: Step) -> dict[str, torch.Tensor]:
 # ---------------------------------------------------------------- resumed from a step
 
 FEW_MOVES = functools.partial(tempered_smc.infer, sweeps=(2, 2))
+HOLES = ((0.0, 0.0), (0.01, 0.005))  # on the block of the shipped recording
+TWO_HOLES = replace(which_hole.model, prepare=functools.partial(which_hole.prepare, holes=HOLES))
+
+
+def own(model: Model) -> Callable[..., Any]:
+    """A model's own inference program, with few moves."""
+    return functools.partial(default_inference(model)[1], sweeps=(1, 1))
+
+
 # The inference program, the model, the recording, and the steps to resume from.
 RUNS: dict[str, tuple[Callable[..., Any], Model, Callable[[], Recording], tuple[int, ...]]] = {
     "guided, views and a touch": (
@@ -123,16 +143,83 @@ RUNS: dict[str, tuple[Callable[..., Any], Model, Callable[[], Recording], tuple[
         lambda: shipped("point_probe_10_pushes", 0, 1, 2),
         (1, 2),
     ),
+    "camera errors": (own(camera_error.model), camera_error.model, lambda: bench(FIRST), ()),
+    "clutter": (own(part_in_view.model), part_in_view.model, lambda: bench(FIRST), ()),
+    "grasp": (own(grasped_peg.model), grasped_peg.model, lambda: shipped("peg_probe", 0, 2), ()),
+    "two holes": (own(TWO_HOLES), TWO_HOLES, lambda: shipped("peg_probe", 0, 2), ()),
 }
+RESUMED = [name for name, (*_, starts) in RUNS.items() if starts]
+
+
+class Listed(NamedTuple):
+    """A run on a scene, and what the scene held before and after it."""
+
+    run: list[Step]
+    before: dict[str, Any]
+    after: dict[str, Any]
 
 
 @functools.cache
-def whole_run(name: str) -> list[Step]:
+def listed_run(name: str) -> Listed:
     infer, model, recording, _ = RUNS[name]
-    return list(infer(model, recording(), particles=PARTICLES, seed=3))
+    scene = model.prepare(recording())
+    before = contents(scene)
+    run = list(infer(model, recording(), particles=PARTICLES, seed=3, scene=scene))
+    return Listed(run, before, contents(scene))
+
+
+def whole_run(name: str) -> list[Step]:
+    return listed_run(name).run
+
+
+def written(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
+    """The paths at which a scene holds something else than before."""
+    return [path for path in before | after if before.get(path) != after.get(path)]
 
 
 @pytest.mark.parametrize("name", RUNS)
+def test_nothing_is_written_into_a_scene(name: str) -> None:
+    _, before, after = listed_run(name)
+    assert len(before) > 40 and written(before, after) == []
+
+
+def by_entry(scene: Any) -> None:
+    scene.likelihoods["view"].looks["another"] = None
+
+
+def by_replaced_entry(scene: Any) -> None:
+    looks = scene.likelihoods["view"].looks
+    looks["camera_0"] = looks["camera_0"]._replace(region=(0, 0, 1, 1))
+
+
+def by_attribute(scene: Any) -> None:
+    scene.likelihoods["view"].fits = {0: torch.zeros(6)}
+
+
+def by_tensor(scene: Any) -> None:
+    scene.prior.center[0] += 1e-12
+
+
+def by_array(scene: Any) -> None:
+    scene.likelihoods["window"].gap.part.vertices[0, 0] *= 1.0 + 1e-15
+
+
+@pytest.mark.parametrize("write", [by_entry, by_replaced_entry, by_attribute, by_tensor, by_array])
+def test_a_model_that_writes_into_its_scene_is_seen(write: Callable[[Any], None]) -> None:
+    def program(scene: Any, actions: Sequence[Any]) -> None:
+        look_and_touch.look_and_touch(scene, actions)
+        write(scene)
+
+    recording = copy.deepcopy(bench(FIRST, TOP))
+    scene = look_and_touch.prepare(recording)
+    before, actions = contents(scene), [m.action for m in recording.measurements]
+    generate(look_and_touch.look_and_touch, (scene, actions), {}, 2)
+    assert written(before, contents(scene)) == []
+    generate(program, (scene, actions), {}, 2)
+    assert written(before, contents(scene)) != []
+
+
+@pytest.mark.parametrize("name", RESUMED)
 def test_a_resumed_run_is_the_uninterrupted_one(name: str) -> None:
     """It is resumed from nothing but a step."""
     infer, model, recording, starts = RUNS[name]

@@ -20,7 +20,7 @@ from bcppl.rendering.information import pixel_information
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors import View
 from bcppl.sensors.candidates import with_candidates
-from bcppl.sensors.erring_camera import ErringCamera
+from bcppl.sensors.likelihoods.erring_camera import ErringCamera
 from bcppl.traces import generate
 
 

@@ -64,7 +64,7 @@ def test_it_is_offered_by_name_and_refuses_what_cannot_be_chosen_from() -> None:
         ([(0, 0), (34, 0)], r"hole 1 is at \[34.0, 0.0\], beside part .* give metres"),
         ([(0, 0), (float("nan"), 0)], "hole 1 is at .nan"),
         ([(0, 0), (0.034,)], "two or more"),
-        ([(0, 0), (0.034, 0), (0.034, 0)], "twice"),
+        ([(0, 0), (0.034, 0), (0.034, 0)], "none twice"),
     ]:
         with pytest.raises(InputError, match=message):
             which_hole.prepare(recording, holes=holes)

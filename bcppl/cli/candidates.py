@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.beliefs import Belief
@@ -41,11 +39,7 @@ Asked = Sequence[Candidate] | Mapping[str, int]
 
 
 def asked_for(words: str | None) -> Asked:
-    """The candidates in a file, or numbers by kind, of words such as touch:20,slide.
-
-    Raises:
-        InputError: the file cannot be read, or a word is neither a kind nor a number of one.
-    """
+    """The candidates in a file, or numbers by kind, of words such as touch:20,slide."""
     if words is None:
         return dict(MIXED)
     if Path(words).suffix in SUFFIXES or "/" in words:
@@ -68,19 +62,12 @@ def asked_for(words: str | None) -> Asked:
             raise InputError(f"--candidates asks for {count[:20]} of {kind}; give {MOST} at most.")
         counts[kind] = counts.get(kind, 0) + int(count or COUNT)
     if not any(counts.values()):
-        raise InputError(
-            f"there are no candidates: --candidates is {words!r}; give kinds such as touch:20,slide:12, or a "
-            "file of plans."
-        )
+        raise InputError(f"there are no candidates: --candidates is {words!r}; give touch:20 or a file.")
     return counts
 
 
 def refuse_without_peg(asked: Asked, recording: Recording) -> None:
-    """Refuse a recording without a peg where a candidate needs one.
-
-    Raises:
-        InputError: there is none; names the candidate or its kind.
-    """
+    """Refuse a recording without a peg where a candidate needs one."""
     if isinstance(asked, Mapping):
         needing = [kind for kind, count in asked.items() if count and kind in MOTIONS]
     else:
@@ -106,16 +93,10 @@ def constraints(force: float | None, seconds: float | None, above: float | None)
 def reach(
     robot: str | None, link: str | None, link_from_peg: str | None, world_from_base: str | None, seed: int
 ) -> list[Constraint]:
-    """The constraint on candidates by the reach of an arm, where one is given.
-
-    Raises:
-        InputError: an option is missing, superfluous or no pose, or there is no such arm.
-    """
+    """The constraint on candidates by the reach of an arm, where one is given."""
     if robot is None:
         if (link, link_from_peg, world_from_base) != (None, None, None):
-            raise InputError(
-                "--link, --link-from-peg and --world-from-base are of an arm; give it with --robot."
-            )
+            raise InputError("--link, --link-from-peg, --world-from-base need an arm; give it with --robot.")
         return []
     if link is None:
         raise InputError("--robot is given without --link; name the link of the arm that holds the peg.")
@@ -125,20 +106,16 @@ def reach(
             "--robot is given without --link-from-peg; state how the link holds the peg (panda_hand, whose "
             'z leads along the fingers, at about "0 0 0.1 0 1 0 0").'
         )
-    held, base = (
-        _pose("--link-from-peg", link_from_peg),
-        _pose("--world-from-base", world_from_base or ORIGIN),
-    )
+    held = _pose("--link-from-peg", link_from_peg)
+    base = _pose("--world-from-base", world_from_base or ORIGIN)
     return [within_reach(ArmWithPeg(arm, link, held, base), seed=seed)]
 
 
 def _pose(option: str, words: str) -> Any:
     try:
-        numbers = np.array([float(word) for word in words.replace(",", " ").split()])
+        numbers = [float(word) for word in words.replace(",", " ").split()]
     except ValueError:
         raise InputError(f"{option} is {words!r}; give seven numbers, {NUMBERS}, in metres.") from None
-    if numbers.shape != (7,):
-        raise InputError(f"{option} has {numbers.size} numbers; give seven, {NUMBERS}, in metres.")
     return poses.as_pose(numbers, option).numpy()
 
 
@@ -150,11 +127,7 @@ def planned(
     table: float | None,
     seed: int,
 ) -> Candidates:
-    """The candidates that satisfy the constraints, a table's height (m) among them.
-
-    Raises:
-        InputError: none is feasible.
-    """
+    """The candidates that satisfy the constraints, a table's height (m) among them."""
     if table is not None:
         number_within("--table is {}", table)
         if recording.peg is not None:

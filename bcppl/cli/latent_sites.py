@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,19 +16,10 @@ from bcppl import poses
 from bcppl.distributions.support import freedom_of, support_of
 from bcppl.inference.population import Population
 from bcppl.inference.summaries import mean, probabilities, quantiles
-from bcppl.traces import Series
 
 LIKELIEST = 5  # of a discrete site's values
 ROWS = 12  # of one site's numbers; run.json holds them all
 INTERVAL = (0.05, 0.95)
-
-
-class Row(NamedTuple):
-    """One row of the table: the site, its mean or likeliest values, and their spread."""
-
-    name: str
-    middle: str
-    spread: str
 
 
 def values_of(step: Any) -> Mapping[str, Tensor]:
@@ -82,69 +73,48 @@ def _is_discrete(values: Tensor, distribution: Any) -> bool:
         return False
 
 
-def rows(summaries: Mapping[str, Mapping[str, Any]], pose: str) -> list[Row]:
-    """The rows of the table, of all sites but the sought pose."""
-    return [
-        row for address, summary in summaries.items() if address != pose for row in _rows(address, summary)
-    ]
+def table(summaries: Mapping[str, Mapping[str, Any]], pose: str) -> Table:
+    """The summaries for a terminal, of all sites but the sought pose; without rows where there are none."""
+    shown = Table(title="other latent values", title_justify="left", box=None, pad_edge=False)
+    for name in ("site", "mean (SI units) or probability", "90 % interval, or standard deviation"):
+        shown.add_column(name, justify="left")
+    for address, summary in summaries.items():
+        for row in _rows(address, summary) if address != pose else ():
+            shown.add_row(*map(escape, row))
+    return shown
 
 
-def _rows(address: str, summary: Mapping[str, Any]) -> Iterator[Row]:
+def _rows(address: str, summary: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     if summary["kind"] == "pose":
         center, spread = torch.tensor(summary["mean"], dtype=torch.float64), summary["spread"]
         turn = poses.local(poses.identity(), center)[3:].tolist()
-        millimetres = (_numbers([1e3 * x for x in part], 3) for part in (center[:3].tolist(), spread[:3]))
-        degrees = (_numbers([math.degrees(x) for x in part], 3) for part in (turn, spread[3:]))
-        yield Row(f"{address} x y z", f"{next(millimetres)} mm", f"± {next(millimetres)} mm")
-        yield Row(f"{address} turn", f"{next(degrees)}°", f"± {next(degrees)}°")
+        place, off = (_listed([1e3 * x for x in part]) for part in (center[:3].tolist(), spread[:3]))
+        yield (f"{address} x y z", f"{place} mm", f"± {off} mm")
+        turned, off = (_listed([math.degrees(x) for x in part]) for part in (turn, spread[3:]))
+        yield (f"{address} turn", f"{turned}°", f"± {off}°")
     elif summary["kind"] == "discrete":
         pairs = zip(summary["values"], summary["probabilities"], strict=True)
         likely = [f"{_value(value)}: {100 * share:.1f} %" for value, share in pairs]
         if summary["others"] > 0.0:
             likely.append(f"others: {100 * summary['others']:.1f} %")
-        yield Row(address, ", ".join(likely), "")
+        yield (address, ", ".join(likely), "")
     elif summary["kind"] == "real":
         middle, low, high = (torch.tensor(summary[k], dtype=torch.float64) for k in ("mean", "from", "to"))
         places = list(np.ndindex(*middle.shape))
         for at in places[:ROWS]:
             name = f"{address}[{', '.join(map(str, at))}]" if at else address
-            yield Row(name, f"{float(middle[at]):.4g}", f"{float(low[at]):.4g} to {float(high[at]):.4g}")
+            yield (name, f"{float(middle[at]):.4g}", f"{float(low[at]):.4g} to {float(high[at]):.4g}")
         if len(places) > ROWS:
-            yield Row(f"{address}: {len(places) - ROWS} more", "in run.json", "")
+            yield (f"{address}: {len(places) - ROWS} more", "in run.json", "")
     else:
-        yield Row(address, summary["kind"], "in the belief files")
+        yield (address, summary["kind"], "in the belief files")
 
 
-def _numbers(values: list[float], digits: int) -> str:
-    return " ".join(f"{value:.{digits}f}" for value in values)
+def _listed(values: list[float]) -> str:
+    return " ".join(f"{value:.3f}" for value in values)
 
 
 def _value(value: Any) -> str:
     if isinstance(value, list):
         return f"({' '.join(map(_value, value))})"
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def table(rows: list[Row]) -> Table:
-    """The rows for a terminal."""
-    shown = Table(title="other latent values", title_justify="left", box=None, pad_edge=False)
-    for name in ("site", "mean (SI units) or probability", "90 % interval, or standard deviation"):
-        shown.add_column(name, justify="left")
-    for row in rows:
-        shown.add_row(*map(escape, row))
-    return shown
-
-
-def why_no_truth_gap(model: Any, truth_is_known: bool, sites: Mapping[str, Any]) -> str | None:
-    """The reason why the column is empty, as a line; None where it need not be."""
-    if not truth_is_known:
-        return "ADD, truth gap: empty, for the recording has no truth."
-    if isinstance(model.program, Series):
-        return "truth gap: empty, for a recording has one true pose, and in this model the pose moves."
-    others = [address for address in sites if address != model.pose]
-    if others:
-        return (
-            "truth gap: empty, for a recording has the true pose alone, and this model has "
-            f"{', '.join(others)} besides."
-        )
-    return None

@@ -32,27 +32,14 @@ HOMES: dict[str, tuple[ModuleType, str, str]] = {
 
 
 def recording(name: str) -> Recording:
-    """The recording in a file, or a shipped one by name, checked.
-
-    Raises:
-        InputError: there is none, it cannot be read, or it has a problem.
-    """
+    """The recording in a file, or a shipped one by name, checked."""
     loaded = load_recording(name)
     validate(loaded)
     return loaded
 
 
 def model(given: str | None, named: str = "", by: str = "the recording") -> Model:
-    """The model that the command line gives, else the installed one that data names.
-
-    Args:
-        given: an installed model's name, or a file that defines `model`; None for none.
-        named: in data.
-        by: what data.
-
-    Raises:
-        InputError: there is no such model, the file cannot be run, or data names a file.
-    """
+    """The model that the command line gives (a name, or a file), else the installed one that data names."""
     if given is None and _is_file(named):
         raise InputError(
             f"{by} names the file {named!r} as its model, and data never runs code; "
@@ -62,18 +49,10 @@ def model(given: str | None, named: str = "", by: str = "the recording") -> Mode
 
 
 def inference(given: str | None, chosen: Model) -> tuple[str, Infer]:
-    """The name and the `infer` of an inference program, with the model's settings where it is its own.
-
-    Args:
-        given: an installed program's name, or a file that defines `infer`; None for the model's own.
-        chosen: the model.
-
-    Raises:
-        InputError: there is no such program, the file cannot be run, or its `infer` cannot be called.
-    """
-    name, infer = default_inference(chosen)
+    """The name and the `infer` of an inference program; of the model's own with the model's settings."""
+    name, own = default_inference(chosen)
     if given is None or given == name:
-        return name, infer
+        return name, own
     infer = _defined(given, INFERENCE)
     try:
         inspect.signature(infer).bind(chosen, None, particles=2, seed=0, scene=None)
@@ -91,7 +70,6 @@ def simulating() -> list[str]:
 
 
 def _offered(word: str) -> list[str]:
-    """The names of the installed models or inference programs that the command line can run."""
     package, attribute, _ = HOMES[word]
     return [n for n in _files(package) if hasattr(import_module(f"{package.__name__}.{n}"), attribute)]
 
@@ -111,9 +89,8 @@ def _defined(name: str, word: str) -> Any:
     elif name in _files(package):
         module = import_module(f"{package.__name__}.{name}")
     else:
-        raise InputError(
-            f"there is no {word} {name!r}: give one of {', '.join(_offered(word))}, or a file ending in .py."
-        )
+        offered = ", ".join(_offered(word))
+        raise InputError(f"there is no {word} {name!r}: give one of {offered}, or a file ending in .py.")
     defined = getattr(module, attribute, None)
     if isinstance(defined, Model) if word == MODEL else callable(defined):
         return defined
@@ -127,9 +104,7 @@ def _defined(name: str, word: str) -> Any:
 
 def _from_file(path: Path, package: ModuleType, word: str) -> ModuleType:
     if not path.is_file():
-        raise InputError(
-            f"there is no {word} file {path}; give an existing file ending in .py, or the name of one."
-        )
+        raise InputError(f"there is no {word} file {path}; give a file ending in .py, or a name.")
     # An installed file given by its path is the installed module: otherwise its classes would exist twice.
     for home in package.__path__:
         if path.resolve().parent == Path(home).resolve():
@@ -148,12 +123,9 @@ def _from_file(path: Path, package: ModuleType, word: str) -> ModuleType:
     except InputError:
         raise
     except SyntaxError as error:
-        raise InputError(
-            f"the {word} file {path} is no valid Python: {error.msg}, line {error.lineno}."
-        ) from error
+        what = f"the {word} file {path} is no valid Python"
+        raise InputError(f"{what}: {error.msg}, line {error.lineno}.") from error
     except (Exception, SystemExit) as error:
-        raise InputError(
-            f"the {word} file {path} stopped with {type(error).__name__}: {error}; "
-            f"run `python {path}` to see where."
-        ) from error
+        what = f"the {word} file {path} stopped with {type(error).__name__}: {error}"
+        raise InputError(f"{what}; run `python {path}` to see where.") from error
     return module

@@ -22,14 +22,7 @@ from bcppl.traces import Model, Series, generate
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """A population after some measurements, and what it is of.
-
-    Attributes:
-        recording: with the assimilated measurements, and no others.
-        model: what explains it.
-        population: after them.
-        scene: of the model.
-    """
+    """A population after all measurements of a recording, which holds no others; and the model's scene."""
 
     recording: Recording
     model: Model
@@ -47,21 +40,7 @@ def posterior(
     console: Console,
     check: Callable[[Recording], None] = lambda recording: None,
 ) -> Posterior:
-    """Run a recording, or read a belief.
-
-    Args:
-        name: a recording's file or name, or a belief's file.
-        of: the recording that a belief is of; None: the one that the run.json beside it names.
-        model: None: the one that the recording or the run.json names.
-        inference: None: the model's own.
-        particles: of a run.
-        seed: of a run.
-        console: shows the progress of a run.
-        check: refuses a recording before anything is run.
-
-    Raises:
-        InputError: a file or a name does not exist or does not fit the others.
-    """
+    """The posterior of a recording, which is run, or in a belief's file; `check` refuses a recording."""
     if Path(name).is_file() and is_belief(name):
         if inference is not None:
             raise InputError(f"--inference is given with {name}, a belief, which needs no run; leave it out.")
@@ -80,9 +59,7 @@ def posterior(
             population = getattr(step, "population", None)
             progress.update(task, advance=1, description=step.info.label)
     if not isinstance(population, Population):
-        raise InputError(
-            "the steps of this inference program have no population, which predictions need; use another."
-        )
+        raise InputError("steps of this inference program have no population to predict with; use another.")
     return Posterior(recording, chosen, population, scene)
 
 
@@ -101,9 +78,7 @@ def _read(path: Path, of: str | None, model: str | None, check: Callable[[Record
     record = _run_record(path)
     of = of or record.get("recording")
     if of is None:
-        raise InputError(
-            f"{path} does not name its recording, and there is no run.json beside it; give --of RECORDING."
-        )
+        raise InputError(f"{path} names no recording, nor does a run.json beside it; give --of RECORDING.")
     whole = loading.recording(of)
     by = "the recording" if record.get("model") is None else str(path.parent / "run.json")
     named = record.get("model") or whole.model
@@ -136,7 +111,7 @@ def _read(path: Path, of: str | None, model: str | None, check: Callable[[Record
 
 
 def _assimilated(path: Path, label: str) -> int:
-    """How many measurements a belief has assimilated, by the label of its step."""
+    """The number of measurements that a belief has assimilated, by the label of its step."""
     count = "0" if label == "prior" else label.rpartition(" ")[2]
     if not (count.isascii() and count.isdecimal() and len(count) < 10):
         raise InputError(

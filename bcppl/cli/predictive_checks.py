@@ -10,7 +10,6 @@ from bcppl.inference.population import Population
 from bcppl.inference.predictive import THRESHOLD, Check, surprise
 
 MARK = "!"
-NO_CHECK = "p value: empty, for nothing in this model is a depth image, a contact manifold or normal."
 NAMED = 6  # measurements that a warning names
 MEANING = {
     "image": "an unmodelled object may occlude the view, or the camera is not where it is stated to be",
@@ -21,15 +20,9 @@ MEANING = {
 
 @dataclass
 class PredictiveChecks:
-    """The checks of a run so far.
-
-    Attributes:
-        labels: of the measurement that each address came with.
-        made: whether any measurement could be checked.
-    """
+    """The checks of a run so far, and the labels of the measurements that each address came with."""
 
     labels: dict[str, str] = field(default_factory=dict)
-    made: bool = False
 
     def cell(self, step: Any) -> str:
         """The p value of a step's measurement, marked where it is small; empty where there is none."""
@@ -42,14 +35,13 @@ class PredictiveChecks:
         checks = {} if is_prior else surprise(population, new)
         if not checks:
             return ""
-        self.made = True
         probability = together(checks.values())
         return f"<{THRESHOLD:g}{MARK}" if probability < THRESHOLD else f"{probability:.3f}"
 
     def warning(self, step: Any) -> str | None:
         """One sentence on the measurements that do not fit the belief of the last step; None where all do."""
         population = getattr(step, "population", None)
-        if not isinstance(population, Population) or not self.made:
+        if not isinstance(population, Population):
             return None
         by_label: dict[str, dict[str, Check]] = {}
         for address, check in surprise(population, list(self.labels)).items():

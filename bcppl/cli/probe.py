@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -39,8 +40,7 @@ def probe(
     output: Annotated[
         Path | None,
         typer.Option(
-            dir_okay=False,
-            help="File for the best action (.h5 or .json); a picture goes beside it (.png).",
+            dir_okay=False, help="File for the best action (.h5 or .json); a picture goes beside it (.png)."
         ),
     ] = None,
     of: Annotated[str | None, typer.Option(help="The recording that a belief is of.")] = None,
@@ -110,16 +110,8 @@ def probe(
     constraints = options.constraints(force, seconds, above)
     constraints += options.reach(robot, link, link_from_peg, world_from_base, seed)
     console = Console(highlight=False)
-    now = posterior(
-        recording,
-        of,
-        model,
-        inference,
-        particles,
-        seed,
-        console,
-        lambda whole: options.refuse_without_peg(asked, whole),
-    )
+    refuse = partial(options.refuse_without_peg, asked)
+    now = posterior(recording, of, model, inference, particles, seed, console, refuse)
     belief = now.population.belief(now.model.pose)
     require_uncertain(belief)
     listed = options.planned(asked, belief, now.recording, constraints, table, seed)
@@ -129,14 +121,8 @@ def probe(
     if by == "linearised" and not linearised:
         raise InputError("--by linearised needs a model whose sensors can be linearised; leave it out.")
     kind = by_linearised_gain if linearised and by != "reweighted" else by_reweighted_gain
-    rule = kind(
-        now.model.pose,
-        outer_samples=outer_samples,
-        cost=duration_of,
-        rate=rate,
-        horizon=horizon,
-        seed=seed,
-    )
+    settings = {"outer_samples": outer_samples, "rate": rate, "horizon": horizon, "seed": seed}
+    rule = kind(now.model.pose, cost=duration_of, **settings)
     with console.status("ranking"):
         ranking = rule(now.population, listed, scene)
     console.width = max(console.width, 100)  # no number is cut, also where the output is no terminal
@@ -163,9 +149,7 @@ def _picture(output: Path, given: Sequence[str]) -> Path:
     for file in (output, picture):
         for name in given:
             if file.exists() and Path(name).exists() and file.samefile(name):
-                raise InputError(
-                    f"--output would overwrite {name}, which is read; give another name for the best action."
-                )
+                raise InputError(f"--output would overwrite {name}, which is read; give another name.")
     return picture
 
 

@@ -12,7 +12,7 @@ from rich.table import Table
 from bcppl import poses
 from bcppl.beliefs import Belief, average_distance, average_nearest_distance, average_point_distance
 from bcppl.cli import latent_sites
-from bcppl.cli.predictive_checks import NO_CHECK, PredictiveChecks
+from bcppl.cli.predictive_checks import PredictiveChecks
 from bcppl.recordings import Recording
 from bcppl.traces import Model
 
@@ -36,11 +36,7 @@ UNITS = {"rendering": "images", "physics": "rollouts"}
 
 
 class Report:
-    """Prints a run.
-
-    Attributes:
-        steps: so far.
-    """
+    """Prints a run."""
 
     def __init__(self, console: Console, recording: Recording, model: Model) -> None:
         self.console = console
@@ -90,15 +86,10 @@ class Report:
                 f"stopped after {last.info.label}: {len(self.steps) - 1} of {total} measurements were "
                 "assimilated."
             )
-        why = latent_sites.why_no_truth_gap(self.model, self.recording.truth is not None, sites)
-        if why is not None and all(math.isnan(step.info.truth_gap) for step in self.steps):
-            self._note(why)
-        if not self._checks.made:
-            self._note(NO_CHECK)
         self.console.print(self._pose(last.belief))
-        rows = latent_sites.rows(sites, self.model.pose)
-        if rows:
-            self.console.print(latent_sites.table(rows))
+        others = latent_sites.table(sites, self.model.pose)
+        if others.row_count:
+            self.console.print(others)
         gap = last.info.truth_gap
         if gap > LARGEST_GAP:
             self._warn(

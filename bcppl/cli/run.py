@@ -69,9 +69,8 @@ def run(
     try:
         with sole_bar(console) as progress:
             task = progress.add_task("prior", total=len(measured.measurements))
-            for count, step in enumerate(
-                infer(chosen, measured, particles=particles, seed=seed, scene=scene)
-            ):
+            steps = infer(chosen, measured, particles=particles, seed=seed, scene=scene)
+            for count, step in enumerate(steps):
                 folder.add(step, report.row(step))
                 progress.update(task, completed=count, description=next_label(measured, count + 1))
     finally:

@@ -13,8 +13,9 @@ import numpy as np
 from bcppl.cli import latent_sites
 from bcppl.recordings import Recording
 from bcppl.recordings.beliefs import save_belief
+from bcppl.recordings.file import replacing
 from bcppl.recordings.fingerprint import fingerprint
-from bcppl.sensors import sensor_named
+from bcppl.sensors import sensor_of
 
 
 class RunFolder:
@@ -49,10 +50,9 @@ class RunFolder:
             of=fingerprint(self.recording, number),
         )
         self.rows.append(row)
-        unfinished = self.path / "run.json.part"
         whole = {**self.record, "rows": self.rows, "latent": latent_sites.summarised(step)}
-        unfinished.write_text(json.dumps(whole, indent=1), encoding="utf-8")
-        unfinished.replace(self.path / "run.json")
+        with replacing(self.path / "run.json") as beside:
+            beside.write_text(json.dumps(whole, indent=1), encoding="utf-8")
 
     def draw(self, steps: Sequence[Any]) -> None:
         """Draw ADD over the measurements, from the final mean where the truth is unknown, and beliefs."""
@@ -63,20 +63,20 @@ class RunFolder:
         true = recording.truth if known else steps[-1].belief.mean
         adds = np.stack([step.belief.add(points, true).numpy() for step in steps])
         weights = np.stack([step.belief.weights.numpy() for step in steps])
-        kinds = ["prior", *(m.kind for m in recording.measurements)][: len(steps)]
-        touched = [k for k, kind in enumerate(kinds) if k and sensor_named(kind).contact]
+        touching = [sensor_of(m.action).contact for m in recording.measurements][: len(steps) - 1]
         labels = [step.info.label for step in steps]
-        contact = touched[0] if touched and "view" in kinds else None
+        contact = touching.index(True) + 1 if len(set(touching)) > 1 else None
         figure = add_over_time(np.arange(len(steps), dtype=np.float64), adds, weights, labels, contact)
         if not known:
             figure.axes[0].set_ylabel("distance from the final mean (mm)")
         figure.savefig(self.path / "add_over_time.png", dpi=150)
-        views = [k for k, kind in enumerate(kinds) if kind == "view"]
-        middle, last = views[-1] if views else len(steps) // 2, len(steps) - 1
-        titles = {0: "start", middle: "after vision" if views else f"after {labels[middle]}"}
-        titles[last] = ("after contact" if touched else "after vision") if last else "start"
+        looked = [k for k, touches in enumerate(touching, 1) if not touches]
         shown = [
-            (titles[k], steps[k].belief.world_from_part.numpy(), steps[k].belief.log_weights.numpy())
-            for k in dict.fromkeys([0, middle, last])
+            (
+                f"after {labels[k]}" if k else "start",
+                steps[k].belief.world_from_part.numpy(),
+                steps[k].belief.log_weights.numpy(),
+            )
+            for k in dict.fromkeys([0, looked[-1] if looked else len(steps) // 2, len(steps) - 1])
         ]
         belief_in_3d(recording.part, shown, recording.truth).savefig(self.path / "belief_in_3d.png", dpi=150)

@@ -50,6 +50,8 @@ class PegPhysics:
         InputError: the part or the peg has no convex pieces and is not convex.
     """
 
+    __caches__ = ("_simulations",)  # of the other attributes
+
     def __init__(
         self,
         part: Part,

@@ -91,6 +91,8 @@ class PegGap:
         InputError: a mesh is empty, open or not finite.
     """
 
+    __caches__ = ("_grid",)  # of the part
+
     def __init__(self, part: Part, peg: Part) -> None:
         self.part, self.peg = part, peg
         self.effort = Effort()

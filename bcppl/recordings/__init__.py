@@ -1,19 +1,9 @@
 """Measurements on disk: the native file, its checks, and the importers."""
 
 from bcppl.geometry.parts import Guess
-from bcppl.recordings.check import notes, problems, validate
-from bcppl.recordings.describe import describe
+from bcppl.recordings.check import describe, notes, problems, validate
 from bcppl.recordings.file import load, save
-from bcppl.sensors import (
-    DepthImage,
-    Measurement,
-    Probe,
-    ProbeWindow,
-    Push,
-    Recording,
-    Touch,
-    View,
-)
+from bcppl.sensors import DepthImage, Measurement, Probe, ProbeWindow, Push, Recording, Touch, View
 
 __all__ = [
     "DepthImage",

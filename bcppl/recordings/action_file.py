@@ -15,9 +15,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +23,7 @@ import h5py
 
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
+from bcppl.recordings.file import replacing
 from bcppl.sensors.candidates import Candidate, planner_of
 from bcppl.sensors.layout import Layout
 from bcppl.sensors.protocol import Plannable, sensors
@@ -43,29 +42,17 @@ def save_actions(actions: Sequence[Candidate], path: str | os.PathLike[str]) -> 
     """
     path = Path(path)
     _refuse_suffix(path)
-    if not path.parent.is_dir():
-        raise InputError(f"{path} cannot be written: there is no folder {path.parent}; make it first.")
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with replacing(path) as beside:
         if path.suffix == ".json":
-            unfinished.write_text(json.dumps(_tree(actions), indent=1) + "\n", encoding="utf-8")
-        else:
-            with h5py.File(unfinished, "w") as file:
-                file.attrs.update(format=FORMAT, schema_version=SCHEMA_VERSION)
-                file.create_group("actions")
-                for k, action in enumerate(actions):
-                    group, planner = file.create_group(f"actions/{k:06d}"), planner_of(action)
-                    group.attrs["kind"] = planner.candidate_kind
-                    planner.candidate.write(group, action)
-        os.replace(unfinished, path)
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be written: {error}.") from error
-    finally:
-        # A name that is too long can be neither made nor removed.
-        with suppress(OSError, ValueError):
-            unfinished.unlink(missing_ok=True)
+            beside.write_text(json.dumps(_tree(actions), indent=1) + "\n", encoding="utf-8")
+            return
+        with h5py.File(beside, "w") as file:
+            file.attrs.update(format=FORMAT, schema_version=SCHEMA_VERSION)
+            file.create_group("actions")
+            for k, action in enumerate(actions):
+                group, planner = file.create_group(f"actions/{k:06d}"), planner_of(action)
+                group.attrs["kind"] = planner.candidate_kind
+                planner.candidate.write(group, action)
 
 
 def load_actions(path: str | os.PathLike[str]) -> list[Candidate]:
@@ -83,9 +70,7 @@ def load_actions(path: str | os.PathLike[str]) -> list[Candidate]:
 
 def _refuse_suffix(path: Path) -> None:
     if path.suffix not in SUFFIXES:
-        raise InputError(
-            f"actions are kept in files that end in {' or '.join(SUFFIXES)}, not {path.name}; rename it."
-        )
+        raise InputError(f"files of actions end in {' or '.join(SUFFIXES)}, not {path.name}; rename it.")
 
 
 def _refuse_header(path: Path, header: Mapping[str, Any]) -> None:
@@ -100,14 +85,15 @@ def _planners() -> dict[str, Plannable]:
     return {each.candidate_kind: each for each in sensors() if isinstance(each, Plannable)}
 
 
-def _read(kind: object, what: str, read: Callable[[Layout[Any]], Candidate]) -> Candidate:
+def _read(kind: object, what: str, source: h5py.Group | Mapping[str, Any]) -> Candidate:
     """One action; all that is wrong with it is one sentence that begins with `what`."""
     known = _planners()
     if kind not in known:
         words = ", ".join(f'"{each}"' for each in known)
         raise InputError(f"{what} is of kind {kind!r}; give one of {words}.")
+    layout = known[str(kind)].candidate
     try:
-        return read(known[str(kind)].candidate)
+        return layout.read(source) if isinstance(source, h5py.Group) else _of_fields(source, layout)
     except InputError as error:
         raise InputError(f"{what}: {error}") from None
     except KeyError as error:
@@ -121,17 +107,13 @@ def _read(kind: object, what: str, read: Callable[[Layout[Any]], Candidate]) -> 
 
 def _tree(actions: Sequence[Candidate]) -> dict[str, Any]:
     layouts = [planner.candidate for planner in _planners().values()]
+    planned = [(planner_of(action), action) for action in actions]
     return {
         "format": FORMAT,
         "schema_version": SCHEMA_VERSION,
         "about": " ".join(layout.about for layout in layouts if layout.about),
-        "units": {
-            lay.key(name): kept.units for lay in layouts for name, kept in lay.fields.items() if kept.units
-        },
-        "actions": [
-            {"kind": planner.candidate_kind, **planner.candidate.tree(action)}
-            for planner, action in ((planner_of(action), action) for action in actions)
-        ],
+        "units": {key: units for layout in layouts for key, units in layout.units.items()},
+        "actions": [{"kind": p.candidate_kind, **p.candidate.tree(each)} for p, each in planned],
     }
 
 
@@ -144,20 +126,15 @@ def _from_json(path: Path) -> list[Candidate]:
         raise InputError(f'{path} holds no list of "actions"; see `bcppl.recordings.action_file` for one.')
     _refuse_header(path, tree)
 
-    found = []
-    for k, entry in enumerate(tree["actions"]):
-        fields = dict(entry) if isinstance(entry, dict) else {}
-        kind = fields.pop("kind", None)
-        found.append(_read(kind, f"action {k} of {path}", partial(_of_fields, fields)))
-    return found
+    entries = [dict(entry) if isinstance(entry, dict) else {} for entry in tree["actions"]]
+    return [_read(e.pop("kind", None), f"action {k} of {path}", e) for k, e in enumerate(entries)]
 
 
 def _of_fields(fields: Mapping[str, Any], layout: Layout[Any]) -> Candidate:
     known = [layout.key(name) for name in layout.fields]
-    if unknown := sorted(set(fields) - set(known)):
+    if unknown := ", ".join(map(repr, sorted(set(fields) - set(known)))):
         raise InputError(
-            f"a {layout.type.__name__} has no field {', '.join(map(repr, unknown))}; its fields are "
-            f"{', '.join(known)}."
+            f"a {layout.type.__name__} has no field {unknown}; its fields are {', '.join(known)}."
         )
     return layout.parsed(fields)
 
@@ -174,7 +151,7 @@ def _from_hdf5(path: Path) -> list[Candidate]:
             _refuse_header(path, header)
             entries = [entry for _, entry in sorted(file["actions"].items())]
             return [
-                _read(entry.attrs.get("kind"), f"action {k} of {path}", partial(_of_group, entry))
+                _read(entry.attrs.get("kind"), f"action {k} of {path}", entry)
                 for k, entry in enumerate(entries)
             ]
     except InputError:
@@ -183,7 +160,3 @@ def _from_hdf5(path: Path) -> list[Candidate]:
         raise InputError(f"{path} lacks its group of actions; make it again.") from error
     except (OSError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path} is damaged or no HDF5 file ({error}); make it again.") from error
-
-
-def _of_group(group: h5py.Group, layout: Layout[Any]) -> Candidate:
-    return layout.read(group)

@@ -6,6 +6,8 @@ the model, (N, *event) each in the particles' order, so that one set of weights 
     belief, values = load_belief(path), load_latent(path)
     share = belief.weights[values["which"] == 2].sum()  # probability of the third hole
     grip = Belief(values["grip_from_peg"], belief.log_weights)  # a pose: its mean, spread, modes
+
+Every `load_*` raises InputError where there is no such file, or it holds no belief that this version reads.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from torch import Tensor
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
+from bcppl.recordings.file import replacing
 
 FORMAT = "bcppl belief"
 SCHEMA_VERSION = 1
@@ -50,44 +53,30 @@ def save_belief(
         random_state: of torch's generator, so that a run can be resumed.
         latent: values (N, *event) at the latent addresses.
         of: the `bcppl.recordings.fingerprint.fingerprint` of the recording's assimilated measurements.
+
+    Raises:
+        InputError: the file cannot be written.
     """
-    path = Path(path)
-    unfinished = path.with_name(path.name + ".part")
-    try:
-        with h5py.File(unfinished, "w") as file:
-            file.attrs.update(
-                format=FORMAT, schema_version=SCHEMA_VERSION, label=label, log_evidence=log_evidence
-            )
-            file.attrs["of"] = of
-            file.attrs.update(
-                free_translation=belief.freedom.translation, free_rotation=belief.freedom.rotation
-            )
-            poses = file.create_dataset("world_from_part", data=belief.world_from_part.numpy())
-            poses.attrs["units"] = "m, unit quaternion: x y z qw qx qy qz"
-            file.create_dataset("log_weights", data=belief.log_weights.numpy())
-            file.create_dataset("random_state", data=random_state.numpy())
-            group = file.create_group(LATENT)
-            for address, values in (latent or {}).items():
-                # A slash would make groups of groups, and "a" could not stand beside "a/b".
-                site = group.create_dataset(quote(address, safe=SAFE), data=values.detach().numpy())
-                site.attrs["address"] = address
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    attributes = {"label": label, "log_evidence": log_evidence, "of": of}
+    with replacing(path) as beside, h5py.File(beside, "w") as file:
+        file.attrs.update(format=FORMAT, schema_version=SCHEMA_VERSION, **attributes)
+        file.attrs.update(free_translation=belief.freedom.translation, free_rotation=belief.freedom.rotation)
+        poses = file.create_dataset("world_from_part", data=belief.world_from_part.numpy())
+        poses.attrs["units"] = "m, unit quaternion: x y z qw qx qy qz"
+        file.create_dataset("log_weights", data=belief.log_weights.numpy())
+        file.create_dataset("random_state", data=random_state.numpy())
+        group = file.create_group(LATENT)
+        for address, values in (latent or {}).items():
+            # A slash would make groups of groups, and "a" could not stand beside "a/b".
+            site = group.create_dataset(quote(address, safe=SAFE), data=values.detach().numpy())
+            site.attrs["address"] = address
 
 
 def load_belief(path: str | os.PathLike[str]) -> Belief:
-    """The belief in a file that `save_belief` wrote.
-
-    Raises:
-        InputError: the file does not exist, or holds no belief that this version reads.
-    """
+    """The belief in a file that `save_belief` wrote."""
     with _opened(path) as file:
         freedom = Freedom(str(file.attrs["free_translation"]), str(file.attrs["free_rotation"]))
-        poses, log_weights = (
-            torch.from_numpy(file["world_from_part"][:]),
-            torch.from_numpy(file["log_weights"][:]),
-        )
+        poses, log_weights = (torch.from_numpy(file[name][:]) for name in ("world_from_part", "log_weights"))
     return Belief(poses, log_weights, freedom)
 
 
@@ -98,8 +87,7 @@ def load_latent(path: str | os.PathLike[str]) -> dict[str, Tensor]:
         Values (N, *event) by address, in the particles' order, weighted by `load_belief(path).weights`.
 
     Raises:
-        InputError: the file does not exist, holds no belief that this version reads, or is of a version of
-            bcppl that kept the pose alone.
+        InputError: as the others here, or the file is of a version of bcppl that kept the pose alone.
     """
     with _opened(path) as file:
         if LATENT not in file:
@@ -108,21 +96,13 @@ def load_latent(path: str | os.PathLike[str]) -> dict[str, Tensor]:
 
 
 def load_label(path: str | os.PathLike[str]) -> str:
-    """The label of a belief that `save_belief` wrote: "prior", "view 1", "window 7".
-
-    Raises:
-        InputError: the file does not exist, or holds no belief that this version reads.
-    """
+    """The label of a belief that `save_belief` wrote: "prior", "view 1", "window 7"."""
     with _opened(path) as file:
         return str(file.attrs["label"])
 
 
 def load_fingerprint(path: str | os.PathLike[str]) -> str:
-    """The fingerprint of the recording that a belief is of; empty where `save_belief` was given none.
-
-    Raises:
-        InputError: the file does not exist, or holds no belief that this version reads.
-    """
+    """The fingerprint of the recording that a belief is of; empty where `save_belief` was given none."""
     with _opened(path) as file:
         return str(file.attrs.get("of", ""))
 

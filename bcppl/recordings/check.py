@@ -1,4 +1,4 @@
-"""Checks a recording before anything is inferred from it: each problem is one sentence."""
+"""Describes a recording, and checks it before anything is inferred from it: each problem is one sentence."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bcppl.errors import InputError
-from bcppl.geometry.parts import LARGEST_EXTENT, Guess
+from bcppl.geometry.parts import LARGEST_EXTENT, Guess, Part
 from bcppl.sensors import checks
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.protocol import by_sensor, sensor_for, sensors
@@ -56,10 +56,10 @@ def _problems(recording: Recording) -> Iterator[str]:
     if not recording.measurements:
         kinds = ", ".join(sensor.names[0] for sensor in sensors())
         yield f"the recording holds no measurement; record at least one ({kinds})."
-    found = list(_strays(recording))
+    wrong = list(_strays(recording))
     for sensor, measurements in by_sensor(recording.measurements):
-        found += sensor.problems(measurements, recording)
-    for _, problem in sorted(found, key=lambda each: each[0]):
+        wrong += sensor.problems(measurements, recording)
+    for _, problem in sorted(wrong, key=lambda each: each[0]):
         yield problem
 
 
@@ -89,3 +89,38 @@ def _guess(guess: Guess) -> Iterator[str]:
             yield f"the guess's {name} is {limit:.4g}; give a limit of at least 0, in radians."
         elif limit > math.pi + 1e-9:
             yield f"the guess's {name} is {limit:.4g} rad, probably degrees; give radians below pi."
+
+
+def describe(recording: Recording) -> list[tuple[str, str]]:
+    """Rows (what, value) about a recording, in the order in which people ask; it may have problems."""
+    rows = [("part", _described_part(recording.part))]
+    if recording.peg is not None:
+        rows.append(("peg", _described_part(recording.peg)))
+    groups = by_sensor(recording.measurements)
+    counts = [f"{len(each)} {sensor.names[len(each) > 1]}" for sensor, each in groups]
+    rows += [("prior", _described_guess(recording.guess)), ("measurements", ", ".join(counts) or "none")]
+    for sensor, measurements in groups:
+        rows += sensor.describe([measurement for _, measurement in measurements], recording)
+    rows.append(("truth", "known" if recording.truth is not None else "unknown"))
+    rows.append(("model", recording.model))
+    source = recording.source.replace(
+        "made up by bcppl", "simulated by bcppl"
+    )  # as earlier versions wrote it
+    rows.append(("source", source or "not stated"))
+    return rows
+
+
+def _described_part(part: Part) -> str:
+    if part.vertices.ndim != 2 or len(part.vertices) == 0 or len(part.faces) == 0:
+        return f"{part.name}, empty mesh"
+    size = " × ".join(f"{1e3 * side:.1f}" for side in part.extent)
+    closed = "closed" if part.is_closed else "open"
+    pieces = f", convex pieces: {len(part.pieces)}" if part.pieces else ""
+    return f"{part.name}, {size} mm, {len(part.faces)} triangles, {closed}{pieces}"
+
+
+def _described_guess(guess: Guess) -> str:
+    widths = " × ".join(f"{1e3 * width:g}" for width in np.ravel(guess.translation))
+    if guess.angle is not None:
+        return f"±{widths} mm, any rotation within {math.degrees(guess.angle):.3g}°"
+    return f"±{widths} mm, tilt up to {math.degrees(guess.tilt):.3g}°, yaw ±{math.degrees(guess.yaw):.3g}°"

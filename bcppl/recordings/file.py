@@ -24,6 +24,8 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -40,15 +42,7 @@ FORMAT = "bcppl recording"
 SCHEMA_VERSION = 2
 ALWAYS = ("background", "cameras", "probes", "measurements")  # groups that a reader of version 1 asks for
 
-PART = Layout(
-    Part,
-    {
-        "name": TEXT,
-        "source": TEXT,
-        "vertices": numbers("m"),
-        "faces": numbers("1", np.int64),
-    },
-)
+PART = Layout(Part, {"name": TEXT, "source": TEXT, "vertices": numbers("m"), "faces": numbers("1", np.int64)})
 PIECE = Layout(Piece, {"kind": TEXT, "size": numbers("m"), "center": numbers("m")})
 GUESS = Layout(
     Guess,
@@ -66,27 +60,37 @@ DEPTH = numbers("m", np.float32)
 def save(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Write a recording to an HDF5 file, all or nothing.
 
-    The file is written beside `path` and moved there when it is complete, so a failure leaves an earlier
-    file as it was. A recording may have problems: see `bcppl.recordings.check`.
+    A failure leaves an earlier file as it was. A recording may have problems: see `bcppl.recordings.check`.
 
     Raises:
         InputError: the folder is missing or not writable, two cameras or probes share a name but differ, an
             action is of no known kind, or the recording holds something that is no number.
+    """
+    with replacing(path) as beside, h5py.File(beside, "w") as file:
+        _write(file, recording)
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A new file beside `path`, which is moved there once it is written, and removed if that fails.
+
+    Raises:
+        InputError: the folder is missing, or what is written raises an error of the system, type or value.
     """
     path = Path(path)
     if not path.parent.is_dir():
         raise InputError(f"{path} cannot be written: there is no folder {path.parent}; make it first.")
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with h5py.File(beside, "w") as file:
-            _write(file, recording)
+        yield beside
         os.replace(beside, path)
     except InputError:
         raise
     except (OSError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path} cannot be written: {_one_line(error)}.") from error
     finally:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError, ValueError):  # a name that is too long can be neither made nor removed
+            beside.unlink(missing_ok=True)
 
 
 def load(path: str | os.PathLike[str]) -> Recording:
@@ -112,9 +116,8 @@ def load(path: str | os.PathLike[str]) -> Recording:
             raise InputError(f"{path} lacks {missing.group(1)!r}; make the recording again.") from error
         if not h5py.is_hdf5(path):
             raise InputError(f"{path} is not an HDF5 file; give a recording written by bcppl.") from error
-        raise InputError(
-            f"{path} is damaged or cut off ({_one_line(error)}); copy or make it again."
-        ) from error
+        what = f"{path} is damaged or cut off ({_one_line(error)})"
+        raise InputError(f"{what}; copy or make it again.") from error
 
 
 def _one_line(error: BaseException) -> str:
@@ -126,10 +129,8 @@ def _refuse_header(file: h5py.File) -> None:
         raise InputError("the file is an HDF5 file but not a bcppl recording; give one written by bcppl.")
     version = int(file.attrs["schema_version"])
     if not 1 <= version <= SCHEMA_VERSION:
-        raise InputError(
-            f"the file has schema version {version}, this bcppl reads versions 1 to {SCHEMA_VERSION}; "
-            "upgrade bcppl."
-        )
+        known = f"this bcppl reads versions 1 to {SCHEMA_VERSION}"
+        raise InputError(f"the file has schema version {version}, {known}; upgrade bcppl.")
 
 
 def _write(file: h5py.File, recording: Recording) -> None:

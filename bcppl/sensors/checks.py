@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 from bcppl.poses import as_pose
 from bcppl.robot.plan import FARTHEST
 from bcppl.sensors.layout import same
-
-Array = npt.NDArray[np.float64]
 
 LEAVE_OUT, FILL = "leave that row out", "fill it by interpolation, or cut the recording there"
 POSE_COLUMNS = "x y z qw qx qy qz"

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import torch
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.distortion import coefficients
@@ -19,9 +20,7 @@ from bcppl.geometry.parts import Part
 from bcppl.sensors import checks
 from bcppl.sensors.layout import POSE_UNITS, TEXT, Layout, number, numbers, shared
 from bcppl.sensors.measurements import Measurement, Recording
-from bcppl.sensors.protocol import FAINT, Indexed, Placement, register
-
-Array = npt.NDArray[np.float64]
+from bcppl.sensors.protocol import FAINT, Indexed, Placement, PlannedAsIs, register
 
 MOST_DEPTH = 100.0  # m: beyond it a median depth is in millimetres
 COLOUR = "#D55E00"
@@ -70,7 +69,7 @@ def _stated_view(**fields: Any) -> View:
     return View(camera)
 
 
-class DepthSensor:
+class DepthSensor(PlannedAsIs):
     """Depth images, each observed from one camera; a view that may be taken next is the view itself."""
 
     kind = "view"
@@ -82,14 +81,9 @@ class DepthSensor:
     )
 
     candidate_kind = "view"
-    needs_peg = False
     caption = ""
     candidate = Layout(
-        View,
-        {"name": TEXT, **CAMERA.fields},
-        optional=CAMERA.optional,
-        make=_stated_view,
-        within="camera",
+        View, {"name": TEXT, **CAMERA.fields}, CAMERA.optional, make=_stated_view, within="camera"
     )
 
     def problems(self, measurements: Indexed, recording: Recording) -> Iterator[tuple[int, str]]:
@@ -97,35 +91,28 @@ class DepthSensor:
         cameras: dict[str, Camera] = {}
         for index, measurement in measurements:
             where, camera, image = f"measurement {index}", measurement.action.camera, measurement.observation
-            found: list[str] = []
+            wrong: list[str] = []
             if camera.name not in cameras:
-                found += _camera(f"{where}: camera {camera.name!r}", camera, recording)
-                found += _background(camera, recording)
-            found += checks.named_alike(where, "camera", camera, cameras)
-            found += _depth(where, image.depth, camera)
+                wrong += _camera(f"{where}: camera {camera.name!r}", camera, recording)
+                wrong += _background(camera, recording)
+            wrong += checks.named_alike(where, "camera", camera, cameras)
+            wrong += _depth(where, image.depth, camera)
             if image.rgb is not None and image.rgb.shape != (camera.height, camera.width, 3):
-                found.append(
-                    f"{where}: the colour image is {image.rgb.shape}, its camera {_frame(camera)} pixels."
-                )
-            yield from ((index, problem) for problem in found)
+                what = f"{where}: the colour image is {image.rgb.shape}"
+                wrong.append(f"{what}, its camera {_frame(camera)} pixels.")
+            yield from ((index, problem) for problem in wrong)
 
     def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:
         """Each camera's size and range."""
         cameras = {m.action.camera.name: m.action.camera for m in measurements}
-        return [
-            (
-                f"camera {name}",
-                f"{_frame(camera)} pixels, {camera.near:g} to {camera.far:g} m, "
-                f"background {'known' if name in recording.background else 'unknown'}",
-            )
-            for name, camera in cameras.items()
-        ]
+        rows = []
+        for name, camera in cameras.items():
+            size = f"{_frame(camera)} pixels, {camera.near:g} to {camera.far:g} m"
+            known = "known" if name in recording.background else "unknown"
+            rows.append((f"camera {name}", f"{size}, background {known}"))
+        return rows
 
     # ---- candidates: views
-
-    def action_of(self, candidate: View) -> View:
-        """The view itself."""
-        return candidate
 
     def name_of(self, candidate_or_action: View) -> str:
         """The camera's name."""
@@ -135,10 +122,6 @@ class DepthSensor:
         """The view under another name; it stays one of the same instrument, whose error it shares."""
         camera = candidate.camera
         return View(replace(camera, name=name, device=camera.device or camera.name))
-
-    def duration(self, candidate: View) -> float:
-        """No time."""
-        return 0.0
 
     def placement(self, candidate: View) -> Placement:
         """The camera's pose."""

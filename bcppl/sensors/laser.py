@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Normal
 
+from bcppl.arrays import Array
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.manifold import Quadratic
 from bcppl.geometry.camera import looking_at
@@ -20,7 +21,7 @@ from bcppl.geometry.parts import Part
 from bcppl.poses import as_pose, compose, inverse, rotation_matrix
 from bcppl.sensors import Measurement, Recording, checks, register
 from bcppl.sensors.layout import POSE_UNITS, TEXT, Layout, number, numbers
-from bcppl.sensors.protocol import FAINT, Array, Indexed, Placement, PlannedAsIs
+from bcppl.sensors.protocol import FAINT, Indexed, Placement, PlannedAsIs
 from bcppl.sensors.scene import OneSite
 
 NOISE, OUTLIER = 0.0003, 0.01  # standard deviation (m) of a distance, and the probability of any in the range
@@ -129,12 +130,8 @@ class WristLaser(PlannedAsIs):
         turn, up = rotation_matrix(torch.as_tensor(mean)).numpy(), part.mesh.face_normals[faces]
         for point, normal in zip(points @ turn.T + mean[:3], up @ turn.T, strict=True):
             if normal[2] > 0.1:
-                yield Beam(
-                    "laser #",
-                    0.05,
-                    0.5,
-                    looking_at(point + 0.2 * normal, point, np.eye(3)[np.abs(normal).argmin()]),
-                )
+                pose = looking_at(point + 0.2 * normal, point, np.eye(3)[np.abs(normal).argmin()])
+                yield Beam("laser #", 0.05, 0.5, pose)
 
     def draw(
         self, axes: Any, candidate: Beam, mean: Array, peg: Part | None, *, faint: bool = False

@@ -21,8 +21,6 @@ from bcppl.errors import InputError
 
 POSE_UNITS = "m m m 1 1 1 1"  # [x y z qw qx qy qz]
 WRENCH_UNITS = "N N N N m N m N m"
-STIFFNESS_UNITS = "N/m N/m N/m N m/rad N m/rad N m/rad"
-DAMPING_UNITS = "N s/m N s/m N s/m N m s/rad N m s/rad N m s/rad"
 SMALLEST_COMPRESSED = 256  # entries: below it gzip's chunk index outweighs what it saves
 
 T = TypeVar("T")
@@ -118,9 +116,7 @@ class SharedObjects:
             InputError: another object has the same name, or the name is empty.
         """
         if not same(self._known.setdefault((kept.group, thing.name), thing), thing):
-            raise InputError(
-                f"two different {kept.group} are both called {thing.name!r}; give each its own name."
-            )
+            raise InputError(f"two different {kept.group} are called {thing.name!r}; give each its own name.")
         place = self._file.require_group(kept.group)
         if link(thing.name) not in place and kept.layout is not None:
             kept.layout.write(place.create_group(link(thing.name)), thing)

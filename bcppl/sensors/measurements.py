@@ -10,13 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
+from bcppl.arrays import Array
 from bcppl.geometry.parts import Guess, Part
 from bcppl.sensors.protocol import sensor_of
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,35 +7,24 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.contact.touch import Touch
 from bcppl.geometry.parts import Part
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.robot.plan import Plan, probe_of
 from bcppl.sensors import checks, touches
-from bcppl.sensors.layout import (
-    COUNT,
-    DAMPING_UNITS,
-    POSE_UNITS,
-    STIFFNESS_UNITS,
-    TEXT,
-    WORDS,
-    Layout,
-    number,
-    numbers,
-    shared,
-)
+from bcppl.sensors.layout import COUNT, POSE_UNITS, TEXT, WORDS, Layout, number, numbers, shared
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.protocol import FAINT, Indexed, register
 
 __all__ = ["Plan", "Probe", "ProbeSensor", "ProbeWindow", "Touch"]
 
-Array = npt.NDArray[np.float64]
-
 SAME_TIME = 1e-6  # s: two clocks that were copied agree to this
+STIFFNESS = numbers("N/m N/m N/m N m/rad N m/rad N m/rad")
+DAMPING = numbers("N s/m N s/m N s/m N m s/rad N m s/rad N m s/rad")
 COLOURS = {"free": "#56B4E9", "guarded": "#D55E00", "held": "#CC79A7", "searching": "#009E73"}
 
 PROBE = Layout(
@@ -43,8 +32,8 @@ PROBE = Layout(
     {
         "command_times": numbers("s"),
         "command": numbers(POSE_UNITS),
-        "stiffness": numbers(STIFFNESS_UNITS),
-        "damping": numbers(DAMPING_UNITS),
+        "stiffness": STIFFNESS,
+        "damping": DAMPING,
         "stamps": numbers("s"),
     },
     keys={"command": "command_world_from_peg"},
@@ -57,10 +46,7 @@ class ProbeSensor:
     kind = "window"
     names = ("probe window", "probe windows")
     contact = True
-    action = Layout(
-        ProbeWindow,
-        {"probe": shared("probes", PROBE), "first": COUNT, "last": COUNT},
-    )
+    action = Layout(ProbeWindow, {"probe": shared("probes", PROBE), "first": COUNT, "last": COUNT})
     observation = touches.TOUCH
 
     candidate_kind = "plan"
@@ -74,8 +60,8 @@ class ProbeSensor:
             "times": numbers("s"),
             "world_from_peg": numbers(POSE_UNITS),
             "force": number("N"),
-            "stiffness": numbers(STIFFNESS_UNITS),
-            "damping": numbers(DAMPING_UNITS),
+            "stiffness": STIFFNESS,
+            "damping": DAMPING,
             "rate": number("1/s"),
             "sink": number("m"),
         },
@@ -97,14 +83,14 @@ class ProbeSensor:
         for index, measurement in measurements:
             where, window = f"measurement {index}", measurement.action
             name = window.probe.name
-            found = [] if name in probes else list(_probe(f"{where}: probe {name!r}", window.probe))
-            found += checks.named_alike(where, "probe", window.probe, probes)
-            found += _touch(where, measurement.observation)
-            found += _window(where, window, measurement.observation, ends.get(name, 0))
+            wrong = [] if name in probes else list(_probe(f"{where}: probe {name!r}", window.probe))
+            wrong += checks.named_alike(where, "probe", window.probe, probes)
+            wrong += _touch(where, measurement.observation)
+            wrong += _window(where, window, measurement.observation, ends.get(name, 0))
             ends[name] = max(window.last, ends.get(name, 0))
             if recording.peg is None:
                 yield index, f"{where} is a probe window but the recording has no peg; add the held peg."
-            yield from ((index, problem) for problem in found)
+            yield from ((index, problem) for problem in wrong)
 
     def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:
         """Each probe's length and rate, and those of all windows together."""

@@ -9,15 +9,13 @@ in `bcppl.sensors` or named by an entry point of the group "bcppl.sensors".
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
-import numpy as np
-import numpy.typing as npt
-
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.sensors.layout import Layout
 
@@ -28,7 +26,6 @@ if TYPE_CHECKING:
 
 GROUP = "bcppl.sensors"  # of entry points
 
-Array = npt.NDArray[np.float64]
 # The style of candidates that were not chosen, for matplotlib.
 FAINT: dict[str, Any] = {"color": "#c7a6d8", "linewidth": 0.7, "alpha": 0.8, "zorder": 4}
 
@@ -218,14 +215,12 @@ def sensor_named(kind: str) -> Sensor:
     Raises:
         InputError: there is none.
     """
-    if kind not in _registered:
-        _search()
-    if kind not in _registered:
+    if (sensor := _looked_up(_registered, kind)) is None:
         raise InputError(
             f"a measurement is of unknown kind {kind!r}; known are {', '.join(_registered)}: install the "
             "package that registers it."
         )
-    return _registered[kind]
+    return sensor
 
 
 def sensor_of(thing: Any) -> Sensor:
@@ -234,14 +229,12 @@ def sensor_of(thing: Any) -> Sensor:
     Raises:
         InputError: there is none.
     """
-    if type(thing) not in _by_type:
-        _search()
-    if type(thing) not in _by_type:
+    if (sensor := _looked_up(_by_type, type(thing))) is None:
         raise InputError(
             f"{type(thing).__name__} is no known kind of action; known are "
             f"{', '.join(known.__name__ for known in _by_type)}: register its sensor."
         )
-    return _by_type[type(thing)]
+    return sensor
 
 
 def sensor_for(measurement: Measurement) -> Sensor:
@@ -263,11 +256,17 @@ def sensor_for(measurement: Measurement) -> Sensor:
 
 def by_sensor(measurements: Sequence[Measurement]) -> list[tuple[Sensor, list[tuple[int, Measurement]]]]:
     """Measurements with their places, by sensor in the order of registration; those of none are left out."""
-    found: dict[str, list[tuple[int, Measurement]]] = {}
+    indexed: dict[str, list[tuple[int, Measurement]]] = {}
     for index, measurement in enumerate(measurements):
         with suppress(InputError):
-            found.setdefault(sensor_for(measurement).kind, []).append((index, measurement))
-    return [(sensor, found[kind]) for kind, sensor in _registered.items() if kind in found]
+            indexed.setdefault(sensor_for(measurement).kind, []).append((index, measurement))
+    return [(sensor, indexed[kind]) for kind, sensor in _registered.items() if kind in indexed]
+
+
+def _looked_up(known: Mapping[Any, Sensor], key: Any) -> Sensor | None:
+    if key not in known:
+        _search()
+    return known.get(key)
 
 
 def _search() -> None:

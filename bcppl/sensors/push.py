@@ -5,16 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
+from bcppl.arrays import Array
 from bcppl.contact.touch import Touch
 from bcppl.sensors import checks, touches
 from bcppl.sensors.layout import POSE_UNITS, Layout, numbers
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.protocol import Indexed, register
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +38,8 @@ class PushSensor:
     def problems(self, measurements: Indexed, recording: Recording) -> Iterator[tuple[int, str]]:
         """Problems of finger paths and wrenches, and of paths and wrenches on different clocks."""
         for index, measurement in measurements:
-            found = _problems(f"measurement {index}", measurement.action, measurement.observation)
-            yield from ((index, problem) for problem in found)
+            wrong = _problems(f"measurement {index}", measurement.action, measurement.observation)
+            yield from ((index, problem) for problem in wrong)
 
     def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:
         """How long was pushed, and at which rates."""

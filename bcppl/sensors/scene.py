@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import pyro
 from torch import Tensor
 
+from bcppl.arguments import number_within
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.sensors.capabilities import Approximated
@@ -21,6 +22,14 @@ class Numbered(NamedTuple):
 
     number: int
     measurement: Measurement
+
+
+def by_probe(measurements: Sequence[Numbered]) -> list[list[Numbered]]:
+    """Windows, those of each probe together in their order."""
+    probes: dict[str, list[Numbered]] = {}
+    for each in measurements:
+        probes.setdefault(each.measurement.action.probe.name, []).append(each)
+    return list(probes.values())
 
 
 class Likelihood(Protocol):
@@ -160,3 +169,36 @@ def likelihoods_for(
             if kind not in prepared and isinstance(sensor, HasLikelihood):
                 prepared[kind] = sensor.prepare(recording)
     return {kind: each for kind, each in prepared.items() if each is not None}
+
+
+def chosen(model: str, given: Mapping[str, Any], *defaults: Any) -> list[Any]:
+    """The default settings, each with those of the given values that are its fields.
+
+    Args:
+        model: its name, for messages.
+        given: values by name.
+        defaults: dataclasses.
+
+    Raises:
+        InputError: no default has a field of a given name, or a value is out of range.
+    """
+    names = [{field.name for field in fields(each)} for each in defaults]
+    unknown = sorted(set(given).difference(*names))
+    if unknown:
+        known = ", ".join(sorted(set().union(*names)))
+        raise InputError(f"{model} has no setting {unknown[0]!r}; its settings are {known}.")
+    return [
+        replace(each, **{name: value for name, value in given.items() if name in own})
+        for each, own in zip(defaults, names, strict=True)
+    ]
+
+
+def require_positive(settings: Any, *spreads: str) -> None:
+    """Refuse settings of which a site's spread is not a positive number.
+
+    Raises:
+        InputError: names the spread.
+    """
+    for name in spreads:
+        what = f"a site's spread must be positive and {name} is {{}}"
+        number_within(what, getattr(settings, name), above=0.0)

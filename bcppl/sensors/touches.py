@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from bcppl.arrays import Array
 from bcppl.contact.touch import Touch
 from bcppl.sensors import checks
 from bcppl.sensors.layout import POSE_UNITS, WRENCH_UNITS, Layout, numbers
 
-Array = npt.NDArray[np.float64]
-
 MOST_FORCE = 1e4  # N or N m: beyond it a sensor would have been torn off, so the units are wrong
 
 TOUCH = Layout(
-    Touch,
-    {"times": numbers("s"), "wrench": numbers(WRENCH_UNITS), "world_from_peg": numbers(POSE_UNITS)},
+    Touch, {"times": numbers("s"), "wrench": numbers(WRENCH_UNITS), "world_from_peg": numbers(POSE_UNITS)}
 )
 
 

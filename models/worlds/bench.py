@@ -10,33 +10,38 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
 from bcppl.arguments import number_within, seed_number
+from bcppl.arrays import Array
 from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.extrusion import block
 from bcppl.geometry.parts import Guess, Part
 from bcppl.models.worlds.bench_parts import PARTS, BenchPart, bench_part
-from bcppl.models.worlds.bench_sensors import SensorErrors
 from bcppl.models.worlds.guarded_motion import Execution, execute, stamps_of
 from bcppl.models.worlds.inserting import InsertionResult, insert, samples_of
 from bcppl.models.worlds.occlusion import occluder
-from bcppl.models.worlds.simulated_sensors import ProbeErrors, depth_image, draw_pose, per_axis, windows
+from bcppl.models.worlds.simulated_sensors import (
+    ProbeErrors,
+    SensorErrors,
+    depth_image,
+    draw_pose,
+    per_axis,
+    windows,
+)
 from bcppl.rendering.depth_noise import DepthNoise
 from bcppl.rendering.scene import SceneRenderer
 from bcppl.robot.plan import InsertionPlan, Plan
 from bcppl.sensors import DepthImage, Measurement, Recording, View
 
-Array = npt.NDArray[np.float64]
-
 # Streams of random numbers: a given part or plan changes no other draw of a scene.
-_CHOICE, _POSE, _CAMERAS, _CONTACT, _IMAGES = range(5)  # those after are in bench_sensors
+_CHOICE, _POSE, _CAMERAS, _CONTACT, _IMAGES = range(5)  # those after are in simulated_sensors
 
 
 @dataclass(frozen=True)
@@ -260,6 +265,11 @@ def bench_scene(
         range_bias=bias,
         hidden_view=hidden,
     )
+
+
+def simulate_recording(seed: int, **options: Any) -> Recording:
+    """The two views of `bench_scene(seed, **options)`: a part that is not yet touched."""
+    return bench_scene(seed, **options).look()
 
 
 def _truth(seed: int, guess: Guess) -> Array:

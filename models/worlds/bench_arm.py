@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.geometry.camera import Camera
 from bcppl.models.worlds.bench import BenchScene
 from bcppl.models.worlds.inserting import InsertionResult
@@ -16,8 +16,6 @@ from bcppl.models.worlds.simulated_sensors import depth_image, per_axis
 from bcppl.robot.plan import InsertionPlan
 from bcppl.sensors import DepthImage, Measurement
 from bcppl.sensors.candidates import Candidate, motion_of
-
-Array = npt.NDArray[np.float64]
 
 _BETWEEN = 0.5  # s from the end of one probe to the beginning of the next
 _VIEWS = 9  # stream of random numbers for further cameras

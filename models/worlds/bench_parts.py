@@ -7,16 +7,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block_with_hole, peg_for
 from bcppl.geometry.outlines import named_outline, rectangular_outline, round_outline
 from bcppl.geometry.parts import Part
 from bcppl.models.parts import insert_tray
-
-Array = npt.NDArray[np.float64]
 
 PEG_LENGTH = 0.08  # m, from the wrench sensor to the tip
 BLOCK = (0.06, 0.06, 0.025)  # m

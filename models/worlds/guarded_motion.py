@@ -10,17 +10,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from bcppl.arrays import Array
 from bcppl.contact.mujoco_model import ContactParameters, build_model, interpolated_command
 from bcppl.contact.stepping import POSE, WRENCH, SimulationState, Stepper
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 from bcppl.robot.motion import Probe
 from bcppl.robot.plan import Manner, Plan
-
-Array = npt.NDArray[np.float64]
 
 STEP = 0.005  # s between the command's poses
 ROUNDED = 8  # steps over which corners are rounded: 40 ms

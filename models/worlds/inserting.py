@@ -5,17 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.geometry.parts import Part
 from bcppl.models.worlds.guarded_motion import TARE, execute, stamps_of
 from bcppl.robot.plan import InsertionPlan
-
-Array = npt.NDArray[np.float64]
-
 
 _BESIDE = 0.002  # m: a tip farther from the hole's axis is not in the hole but beside the part
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.extrusion import block
 from bcppl.geometry.parts import Part
 from bcppl.rendering.ray_casting import RayCaster
-
-Array = npt.NDArray[np.float64]
 
 WIDTH, LENGTH, THICKNESS = 0.05, 0.08, 0.01  # m
 

@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -32,8 +31,6 @@ from bcppl.models.worlds.simulated_sensors import (
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.robot.motion import Probe
 from bcppl.sensors import Measurement, Recording, View
-
-Array = npt.NDArray[np.float64]
 
 # The world's contact: finer in time, more slippery and stiffer than inference assumes.
 CONTACT = ContactParameters(time_step=0.0005, friction=0.2, time_constant=0.003)
@@ -104,9 +101,7 @@ def probe(world_from_estimate: torch.Tensor) -> Probe:
 
 
 def probe_through(
-    name: str,
-    knots: tuple[tuple[float, tuple[float, float, float]], ...],
-    world_from_estimate: torch.Tensor,
+    name: str, knots: tuple[tuple[float, tuple[float, float, float]], ...], world_from_estimate: torch.Tensor
 ) -> Probe:
     """A probe whose tip moves through knots in the frame of an estimate (7,), with its orientation.
 

@@ -6,22 +6,20 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from bcppl.arrays import Array
 from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Guess, Part
 from bcppl.models.point_probe import point_probe, prepare
 from bcppl.poses import identity, rotation_matrix, transform
 from bcppl.recordings.importers.point_probe import prism
+from bcppl.sensors.likelihoods.point_finger import PointFinger
 from bcppl.sensors.measurements import Measurement, Recording
-from bcppl.sensors.point_finger import PointFinger
 from bcppl.sensors.push import Push
 from bcppl.traces import generate
-
-Array = npt.NDArray[np.float64]
 
 SPEED = 0.0033  # m/s, as in the MLab_EXP logs
 TIP_PERIOD, FORCE_PERIOD = 0.03, 0.01  # s
@@ -51,7 +49,7 @@ def simulate_recording(
         part: the part; the aluminium triangle of MLab_EXP by default.
         translation: half width of the prior in x and y, metres.
         yaw: half width of the prior in yaw, radians.
-        settings: fields of `bcppl.sensors.point_finger.FingerSettings`.
+        settings: fields of `bcppl.sensors.likelihoods.point_finger.FingerSettings`.
 
     Raises:
         InputError: the part has no upright face, or none that a finger can approach.
@@ -111,7 +109,7 @@ def _push(rng: np.random.Generator, finger: PointFinger, truth: Array) -> Push:
             break
     else:
         raise InputError(
-            f"part {finger.part.name!r} leaves a finger no room to approach it; give one that does."
+            f"part {finger.part.name!r} leaves a finger no room to approach; give one that does."
         )
 
     times = np.arange(0.0, STROKE / SPEED, TIP_PERIOD)

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.ndimage import uniform_filter1d
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.contact.physics import Rollout
 from bcppl.contact.touch import Touch
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors import DepthImage, Measurement
 
-Array = npt.NDArray[np.float64]
+if TYPE_CHECKING:
+    from bcppl.models.worlds.bench import BenchParameters
 
+_WRENCH, _DRIFT, _POSE = range(5, 8)  # streams of random numbers, after those of `bcppl.models.worlds.bench`
 STEP = 0.005  # s between the command's poses
 _ROUNDED = 12  # steps over which corners are rounded: 60 ms
 
@@ -92,3 +95,29 @@ def measured_windows(
     world_from_peg = torch.from_numpy(rollout.world_from_peg[0].copy())
     measured = poses.retract(world_from_peg, torch.from_numpy(pose_error)).numpy()
     return windows(probe, rollout.wrench[0] + noise + bias, measured, length)
+
+
+class SensorErrors:
+    """The errors of a scene's wrench sensor and joint encoders; the sensor's bias drifts from use to use.
+
+    Attributes:
+        bench: with the errors' standard deviations.
+    """
+
+    def __init__(self, bench: BenchParameters, seed: int) -> None:
+        self.bench = bench
+        self._bias = np.random.default_rng([seed, _WRENCH]).normal(size=6) * per_axis(
+            bench.force_bias, bench.torque_bias
+        )
+        self._drift, self._noise = (np.random.default_rng([seed, _DRIFT, which]) for which in range(2))
+        self._pose = np.random.default_rng([seed, _POSE])
+
+    def sample(self, count: int, rate: float) -> tuple[Array, Array]:
+        """The errors of the next `count` samples of the wrench (T, 6) and of the peg's pose (T, 6)."""
+        bench, size = self.bench, (count, 6)
+        pace = per_axis(bench.force_drift, bench.torque_drift) / math.sqrt(bench.drift_time * rate)
+        drift = np.cumsum(self._drift.normal(size=size) * pace, axis=0)
+        noise = self._noise.normal(size=size) * per_axis(bench.force_noise, bench.torque_noise)
+        error = self._bias + drift + noise
+        self._bias = self._bias + drift[-1]
+        return error, self._pose.normal(size=size) * per_axis(bench.peg_noise, bench.peg_turn)

@@ -81,7 +81,7 @@ def planar(scale: float = 0.015, believed: float | None = None) -> Case:
 
 
 def upright(scale: float = 0.015, believed: float | None = None) -> Case:
-    """In a plane that holds the optical axis, where the noise says how well two axes are known."""
+    """In a plane that holds the optical axis, where the noise determines how well two axes are known."""
     spread, freedom, outlier = (0.03, 0.03, 0.4), Freedom("xz", "y"), 0.1
     program = Seen(spread, freedom, scale, outlier)
     inferred = Seen(spread, freedom, believed or scale, outlier)

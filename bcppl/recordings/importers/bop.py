@@ -19,7 +19,8 @@ import typer
 from PIL import Image
 from scipy.optimize import brentq
 
-from bcppl.arguments import LARGEST_SEED
+from bcppl.arguments import LARGEST_SEED, number_within
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Guess, Part
@@ -32,8 +33,6 @@ HELP = (
 )
 
 NEAR, FAR = 0.2, 2.5  # m: a structured-light sensor's range
-
-Array = npt.NDArray[np.float64]
 
 
 def command(
@@ -50,36 +49,30 @@ def command(
         InputError: a file of the scene is missing or unreadable, or the frame or object is not in it.
     """
     scene = Path(scene)
-    if not 0 <= translation < math.inf or not 0 < angle <= 180:
-        raise InputError(
-            "the prior's half width cannot be negative; give an angle above 0, at most 180 degrees."
-        )
+    number_within("the prior's half width is {} m", translation, least=0.0)
+    number_within("the prior's angle is {} degrees", angle, above=0.0, most=180.0)
     try:
-        return _read(
-            scene, object_id, frame, draw(seed, translation, math.radians(angle)), translation, angle
-        )
+        return _read(scene, object_id, frame, seed, translation, math.radians(angle))
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         details = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise InputError(
-            f"{scene} is not laid out as a BOP scene ({details}); compare its files with the format."
-        ) from error
+        what = f"{scene} is not laid out as a BOP scene ({details})"
+        raise InputError(f"{what}; compare its files with the format.") from error
 
 
 def _read(
-    scene: Path, object_id: int, frame: int | None, tangent: Array, translation: float, angle: float
+    scene: Path, object_id: int, frame: int | None, seed: int, translation: float, angle: float
 ) -> Recording:
-    """The recording whose truth is its guess moved by `tangent` (6,)."""
     truths = _json(scene / "scene_gt.json")
     number = min(map(int, truths), default=-1) if frame is None else frame
     if str(number) not in truths:
         raise InputError(f"{scene} has no frame {number}; give --frame one of {', '.join(truths) or 'none'}.")
-    present = truths[str(number)]
-    instance = next((entry for entry in present if entry["obj_id"] == object_id), None)
-    if instance is None:
-        ids = ", ".join(str(k) for k in sorted({entry["obj_id"] for entry in present}))
+    present = {entry["obj_id"]: entry for entry in reversed(truths[str(number)])}
+    if object_id not in present:
+        ids = ", ".join(map(str, sorted(present)))
         raise InputError(f"{scene} holds no object {object_id}; give --object one of {ids}.")
+    instance = present[object_id]
     rotation = np.reshape(instance["cam_R_m2c"], (3, 3)).astype(np.float64)
     moved = 1e-3 * np.asarray(instance["cam_t_m2c"], dtype=np.float64)
     # Ground truth is printed with eight digits; its rotation is orthogonal to that.
@@ -89,9 +82,9 @@ def _read(
     return Recording(
         part=_part(scene / "models_eval" / f"obj_{object_id:06d}.ply", object_id),
         guess=Guess(
-            world_from_part=retract(truth, -torch.from_numpy(tangent)).numpy(),
+            world_from_part=retract(truth, -torch.from_numpy(draw(seed, translation, angle))).numpy(),
             translation=np.full(3, translation),
-            angle=math.radians(angle),
+            angle=angle,
         ),
         measurements=[Measurement(View(camera), image)],
         truth=truth.numpy(),

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import typer
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bcppl.arguments import LARGEST_SEED
+from bcppl.arguments import LARGEST_SEED, number_within
+from bcppl.arrays import Array
 from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Guess, Part, Piece
@@ -38,8 +38,6 @@ ONSET = 0.6  # N: contact begins where the tared force exceeds it
 
 # The sensor's axes lie at 45 degrees to the tool's and one is flipped.
 TOOL_FROM_SENSOR = math.sqrt(0.5) * np.array([[1.0, 1.0], [1.0, -1.0]])
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +89,7 @@ def read_log(path: Path) -> list[LoggedPush]:
     try:
         numbers = np.array(path.read_text().split(), dtype=np.float64)
     except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path} is not a push log of whitespace-separated numbers; give a MLab_EXP log."
-        ) from error
+        raise InputError(f"{path} is no push log of whitespace-separated numbers; give one.") from error
     if not np.isfinite(numbers).all():
         raise InputError(f"{path} holds a number that is not finite; copy the log again.")
     place = 0
@@ -102,9 +98,7 @@ def read_log(path: Path) -> list[LoggedPush]:
         nonlocal place
         end = place + int(rows) * columns
         if rows < 0 or rows != int(rows) or end > len(numbers):
-            raise InputError(
-                f"{path} ends in the middle of a push, or is no MLab_EXP log; copy the log again."
-            )
+            raise InputError(f"{path} ends in the middle of a push, or is no MLab_EXP log; copy it again.")
         place, block = end, numbers[place:end]
         return block.reshape(int(rows), columns)
 
@@ -187,20 +181,14 @@ def command(
         InputError: a log cannot be read, or holds fewer pushes with a contact than asked for.
     """
     touching = [push for log in logs for push in read_log(Path(log)) if push.onset is not None]
-    if not touching:
-        raise InputError(
-            f"{', '.join(str(log) for log in logs)} holds no push that touches; give another log."
-        )
     if not 1 <= pushes <= len(touching):
-        names = ", ".join(str(log) for log in logs)
         raise InputError(
-            f"{pushes} pushes were asked for but {names} holds {len(touching)} with a contact; "
-            f"give --pushes between 1 and {len(touching)}."
+            f"{pushes} pushes were asked for but {', '.join(map(str, logs))} holds {len(touching)} with a "
+            f"contact; give other logs, or --pushes between 1 and {len(touching)}."
         )
-    if not 0 <= translation < math.inf or not 0 <= yaw <= 180 or not after >= 0:
-        raise InputError(
-            "the prior's half widths and --after cannot be negative, nor yaw more than 180 degrees."
-        )
+    number_within("--translation is {} m", translation, least=0.0)
+    number_within("--yaw is {} degrees", yaw, least=0.0, most=180.0)
+    number_within("--after is {} s", after, least=0.0)
     rng = np.random.default_rng(seed)
     picked = rng.choice(len(touching), pushes, replace=False)
     x, y = rng.uniform(-translation, translation, 2)

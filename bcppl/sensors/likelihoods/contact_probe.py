@@ -25,7 +25,7 @@ from bcppl.geometry.parts import Part
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.capabilities import Approximated
 from bcppl.sensors.measurements import Recording
-from bcppl.sensors.scene import Numbered
+from bcppl.sensors.scene import Numbered, by_probe
 
 _NEAR = 0.02  # m: a window in which the peg stays farther away carries no information
 _MOVED = 0.001  # m: a shorter displacement has no direction
@@ -126,10 +126,7 @@ class ContactProbe:
 
     def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
         """The peg's poses, and whether contact is felt, by address; each probe's wrench is tared whole."""
-        by_probe: dict[str, list[Numbered]] = {}
-        for each in measurements:
-            by_probe.setdefault(each.measurement.action.probe.name, []).append(each)
-        return {a: v for windows in by_probe.values() for a, v in self._of_probe(windows)}
+        return {a: v for windows in by_probe(measurements) for a, v in self._of_probe(windows)}
 
     def _of_probe(self, windows: Sequence[Numbered]) -> Iterator[tuple[str, Tensor]]:
         assert self.sensing is not None

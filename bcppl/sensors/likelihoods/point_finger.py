@@ -157,8 +157,8 @@ class PointFinger:
             InputError: a wrench cannot be read (see `contact_of`).
         """
         values: dict[str, Tensor] = {}
-        for number, (push, touch) in ((n, (m.action, m.observation)) for n, m in measurements):
-            contact = contact_of(push, touch, self.settings, f"push {number}")
+        for number, each in measurements:
+            contact = contact_of(each.action, each.observation, self.settings, f"push {number}")
             values[f"onset_{number}"] = contact.onset
             if self.settings.use_direction:
                 values[f"direction_{number}"] = contact.direction
@@ -196,10 +196,8 @@ def contact_of(push: Push, touch: Touch, settings: FingerSettings, name: str = "
         InputError: the wrench has too few rows to tare, is not finite, or starts after or outlasts the path.
     """
     if len(touch.times) <= settings.tare:
-        raise InputError(
-            f"{name} has {len(touch.times)} rows of force, too few to tare by the first {settings.tare}; "
-            "record longer."
-        )
+        rows = f"{len(touch.times)} rows of force, too few to tare by the first {settings.tare}"
+        raise InputError(f"{name} has {rows}; record longer.")
     if not np.isfinite(touch.wrench[:, :3]).all():
         raise InputError(f"{name} has a force that is not finite; leave that row out.")
     force = touch.wrench[:, :2] - touch.wrench[: settings.tare, :2].mean(axis=0)

@@ -83,22 +83,11 @@ class ClutteredCamera(CalibratedCamera):
     def image(self, camera: Camera, part: Tensor) -> Any:
         """The likelihood of an image of a part at poses (N, 7)."""
         if self.clutter and self.background.get(camera.name) is None:
-            return ClutteredDepth(
-                self.renderer,
-                camera,
-                part,
-                self.noise["scale"],
-                lines=self.stride,
-                temperature=self.temperature,
-            )
-        return RobustDepth(
-            self.renderer,
-            camera,
-            part,
-            background=self.background.get(camera.name),
-            region=grid(camera.height, camera.width, self.stride),
-            **self.noise,
-        )
+            scale, stride, temperature = self.noise["scale"], self.stride, self.temperature
+            return ClutteredDepth(self.renderer, camera, part, scale, lines=stride, temperature=temperature)
+        background, region = self.background.get(camera.name), grid(camera.height, camera.width, self.stride)
+        noise = {"background": background, "region": region, **self.noise}
+        return RobustDepth(self.renderer, camera, part, **noise)
 
 
 @lru_cache(maxsize=16)

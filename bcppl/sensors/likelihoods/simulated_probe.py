@@ -22,7 +22,7 @@ from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.measurements import Recording
-from bcppl.sensors.scene import Numbered
+from bcppl.sensors.scene import Numbered, by_probe, require_positive
 from bcppl.traces.carried import carried
 
 # The contact that inference assumes. Worlds that simulate recordings have parameters of their own.
@@ -50,10 +50,7 @@ class ProbeSettings:
     contact: ContactParameters = CONTACT
 
     def __post_init__(self) -> None:
-        for name in ("contact_scale", "translation_scale", "rotation_scale"):
-            number_within(
-                f"a site's spread must be positive and {name} is {{}}", getattr(self, name), above=0.0
-            )
+        require_positive(self, "contact_scale", "translation_scale", "rotation_scale")
         number_within("a simulated probe is given one_empty {}", self.one_empty, least=0.0)
         whole_number("a simulated probe is given pose_every {}", self.pose_every)
 
@@ -123,11 +120,8 @@ class SimulatedProbe:
 
     def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
         """Contact locations and peg poses, by address; each probe's wrench is filtered whole."""
-        by_probe: dict[str, list[Numbered]] = {}
-        for each in measurements:
-            by_probe.setdefault(each.measurement.action.probe.name, []).append(each)
         values: dict[str, Tensor] = {}
-        for windows in by_probe.values():
+        for windows in by_probe(measurements):
             read = self.sensing.measure([measurement.observation for _, measurement in windows])
             for (number, _), (contacts, peg) in zip(windows, read, strict=True):
                 values[f"contacts_{number}"], values[f"peg_{number}"] = contacts, peg

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.arguments import number_within, whole_number
+from bcppl.arguments import whole_number
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import FittedNormal, fitted_normal
 from bcppl.distributions.pose_normals import PoseFactor, allowed, normal_like, product, widened
@@ -29,7 +29,7 @@ from bcppl.rendering.ray_casting import RayCaster
 from bcppl.rendering.region_of_interest import region_of_interest
 from bcppl.sensors.depth import View
 from bcppl.sensors.measurements import Recording
-from bcppl.sensors.scene import Numbered
+from bcppl.sensors.scene import Numbered, require_positive
 from bcppl.traces.carried import once
 
 # The Gaussian fit of an image is no sharper than this: metres, radians, metres of bias.
@@ -63,10 +63,7 @@ class CameraSettings:
     temperature: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("camera_shift", "camera_turn", "bias", "scale"):
-            number_within(
-                f"a site's spread must be positive and {name} is {{}}", getattr(self, name), above=0.0
-            )
+        require_positive(self, "camera_shift", "camera_turn", "bias", "scale")
         whole_number("a camera's images are read with bins {}", self.bins)
 
 
@@ -118,12 +115,10 @@ class ErringCamera:
         self.renderer = RayCaster(recording.part)
         self.looks: dict[str, Look] = {}
         within = float(np.linalg.norm(recording.guess.translation))
-        for view in (m.action for m in recording.measurements if isinstance(m.action, View)):
-            if view.camera.name not in self.looks:
-                camera, bins = view.camera, settings.bins
-                region = region_of_interest(
-                    camera, recording.part, recording.guess.world_from_part, within, bins
-                )
+        guess, bins = recording.guess.world_from_part, settings.bins
+        for camera in (m.action.camera for m in recording.measurements if isinstance(m.action, View)):
+            if camera.name not in self.looks:
+                region = region_of_interest(camera, recording.part, guess, within, bins)
                 self.looks[camera.name] = Look(region, camera.cropped(*region).binned(bins))
 
     @property
@@ -137,13 +132,12 @@ class ErringCamera:
         Raises:
             InputError: the scene was prepared without views of this camera.
         """
-        try:
-            return self.looks[action.camera.name].camera
-        except KeyError:
+        if action.camera.name not in self.looks:
+            name = action.camera.name
             raise InputError(
-                f"the scene was prepared without camera {action.camera.name!r}; prepare it with a recording "
-                "that holds a view of it."
-            ) from None
+                f"the scene was prepared without a view of camera {name!r}; prepare it with one."
+            )
+        return self.looks[action.camera.name].camera
 
     # ---- the program's sites
 
@@ -187,11 +181,10 @@ class ErringCamera:
     def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
         """The cropped and binned images, by address."""
         values = {}
-        for number, (view, image) in ((n, (m.action, m.observation)) for n, m in measurements):
-            camera = view.camera
-            self.camera(view)
+        for number, measurement in measurements:
+            camera = self.camera(measurement.action)
             left, top, width, height = self.looks[camera.name].region
-            region = image.depth[top : top + height, left : left + width]
+            region = measurement.observation.depth[top : top + height, left : left + width]
             binned = bin_depth(region, self.settings.bins, near=camera.near, far=camera.far)
             values[f"depth_{number}"] = torch.from_numpy(binned)
         return values
@@ -242,20 +235,14 @@ class ErringCamera:
         return covariance
 
     def information(self, done: Sequence[Any], action: View, part: Tensor) -> Tensor:
-        """The information (N, 6, 6) that an image adds to the part's pose (N, 7).
+        """The information (N, 6, 6) that an image adds to the part's pose (N, 7) after `done`.
 
         Pixels are weighted as by `RobustDepth`; range bias and extrinsic error are integrated out. Images of
         one instrument share both, so the tenth adds less than the first. It is information about one mode:
         it does not discriminate between modes.
-
-        Args:
-            done: the actions before, of whatever kind.
-            action: the view.
-            part: where the part is.
         """
-        before = [
-            a.camera for a in done if isinstance(a, View) and a.camera.instrument == action.camera.instrument
-        ]
+        views = [a.camera for a in done if isinstance(a, View)]
+        before = [camera for camera in views if camera.instrument == action.camera.instrument]
         return self._information([*before, action.camera], part) - self._information(before, part)
 
     def _information(self, cameras: Sequence[Camera], part: Tensor) -> Tensor:
@@ -283,12 +270,9 @@ class ErringCamera:
         return f"seen_by_{action.camera.instrument}" not in trace
 
     def propose(self, action: View, fit: FittedNormal, part: NormalPose | None) -> Mapping[str, Tensor]:
-        """Sample the nuisance parameters from their approximate conditional.
+        """Sample the nuisance parameters from their approximate conditional, given their first image's fit.
 
-        Args:
-            action: the first view of its instrument.
-            fit: of its image.
-            part: the part's pose given all measurements before, (N, 7); None where there are none.
+        `part` is the part's pose (N, 7) given all measurements before; None where there are none.
         """
         name, camera = action.camera.instrument, self.camera(action)
         bias = pyro.sample(f"bias_{name}", dist.Normal(fit.mean[6], _WIDER * fit.covariance[6, 6].sqrt()))
@@ -308,14 +292,7 @@ class ErringCamera:
         """Sample the apparent pose for a part that moves, at the same quantile of its conditional.
 
         Contacts move the part by more than a camera's error; what the image leaves open has to follow.
-
-        Args:
-            action: the first view of its instrument.
-            fit: of its image.
-            trace: of the particles as they are.
-            old: (N, 7) the part's pose in it.
-            new: (N, 7) the part's proposed pose.
-            correlation: of the standardised deviation from the conditional mean with that before.
+        `correlation` is that of the standardised deviations from the conditional mean, before and after.
         """
         name, camera = action.camera.instrument, self.camera(action)
         bias = trace[f"bias_{name}"]

@@ -1,0 +1,1 @@
+"""Likelihoods of the kinds of measurement: models choose among them, each prepared from one recording."""
