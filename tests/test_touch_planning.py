@@ -17,7 +17,7 @@ from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, round_peg
 from bcppl.geometry.gap import PegGap
-from bcppl.inference.planning.faces import points_on_top, section, sides
+from bcppl.inference.planning.faces import boundary_points, points_on_top, section, sides
 from bcppl.inference.planning.metrology import MetrologyParameters, three_two_one
 from bcppl.models.parts import insert_peg, insert_tray
 from bcppl.models.worlds.bench import BenchScene, bench_scene
@@ -135,6 +135,18 @@ def test_a_plan_of_lists_is_one_of_arrays() -> None:
 
 
 # ---------------------------------------------------------------- what is felt
+
+
+def test_room_on_top_that_a_micrometre_separates_is_one() -> None:
+    """The peg's axis may be in two squares that a neck of 1.5 micrometres joins."""
+    squares = shapely.union_all(
+        [shapely.box(-0.03, -0.01, -0.01, 0.01), shapely.box(0.01, -0.01, 0.03, 0.01)]
+    )
+    room = squares.union(shapely.box(-0.02, -0.75e-6, 0.02, 0.75e-6))
+    assert isinstance(room, shapely.Polygon) and isinstance(room.buffer(-1e-6), shapely.MultiPolygon)
+    points = boundary_points(room)
+    assert {tuple(np.sign(point)) for point in points} >= {(-1, -1), (-1, 1), (1, -1), (1, 1)}
+    assert np.abs(points).max(axis=0) == pytest.approx([0.03, 0.01], abs=1e-5)
 
 
 def forces(*sizes: float) -> torch.Tensor:

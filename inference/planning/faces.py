@@ -82,7 +82,7 @@ def points_on_top(part: Part, peg: Part, margin: float) -> TopPoints:
             f"the top of part {part.name!r} has no room for a peg {2e3 * across:.3g} mm across; "
             "plan touches by hand."
         )
-    candidates = _boundary_points(room)
+    candidates = boundary_points(room)
     reachable = _straight_ways(room, candidates)
     from_middle = candidates[None] - candidates[:, None]
     sizes = np.abs(  # (M, M, M): twice the area, by the second point, the first and the third
@@ -117,17 +117,22 @@ def _spread(room: shapely.Geometry) -> float:
     return float((high - low).min())
 
 
-def _boundary_points(room: shapely.Geometry) -> Array:
+def boundary_points(room: shapely.Geometry) -> Array:
     """Points (M, 2) along the outer boundaries, where the vertices of the largest triangle lie."""
     pieces = [shapely.Polygon(piece.exterior) for piece in polygons_of(room)]
     whole = sum(piece.length for piece in pieces)
     points = []
     for ring in pieces:
-        inner = ring.buffer(-1e-6) if not ring.buffer(-1e-6).is_empty else ring
-        line = inner.exterior
-        shares = np.linspace(0, 1, max(3, round(_CANDIDATES * ring.length / whole)))
-        points.append(np.asarray(shapely.simplify(line, 1e-4).coords))
-        points.append(np.asarray([line.interpolate(share, normalized=True).coords[0] for share in shares]))
+        # Points are inside, if only just. A ring that is narrow somewhere falls into several.
+        shrunk = [p for p in shapely.get_parts(ring.buffer(-1e-6)) if p.area > 0.0] or [ring]
+        length = sum(piece.length for piece in shrunk)
+        for line in (piece.exterior for piece in shrunk):
+            count = round(_CANDIDATES * ring.length * (line.length / length) / whole)
+            shares = np.linspace(0, 1, max(3, count))
+            points.append(np.asarray(shapely.simplify(line, 1e-4).coords))
+            points.append(
+                np.asarray([line.interpolate(share, normalized=True).coords[0] for share in shares])
+            )
     return np.unique(np.round(np.concatenate(points), 7), axis=0)
 
 
