@@ -169,7 +169,7 @@ def test_depth_alignment_refuses_what_is_no_image_of_the_part() -> None:
 
     trace = simulate(beside, (), 3)
     for sites, message in (
-        ("depth_*", "renders another pose"),
+        ("depth_*", "depends on another pose"),
         ("felt", "no depth image"),
         ("touch_*", "match no address"),
     ):
