@@ -105,9 +105,9 @@ def test_a_simulated_wrench_with_the_tools_weight_and_a_bias_reads_as_without() 
 
 def test_weights_in_no_orientation_are_refused() -> None:
     for bad in (np.zeros(7), np.array([0, 0, 0, 2.0, 0, 0, 0]), np.full(7, np.nan)):
-        with pytest.raises(InputError, match="unit|finite"):
+        with pytest.raises(InputError, match=r"unit|finite"):
             LOAD.weight(bad)
-        with pytest.raises(InputError, match="unit|finite"):
+        with pytest.raises(InputError, match=r"unit|finite"):
             transform_wrench(np.ones(6), bad)
 
 
