@@ -1,12 +1,18 @@
-"""Checks of numeric arguments: one out of range is refused in one sentence."""
+"""Checks of arguments: a number out of range, or a pose that is none, is refused in one sentence."""
 
 from __future__ import annotations
 
 import math
 import operator
 from collections.abc import Collection
+from typing import TYPE_CHECKING
 
 from bcppl.errors import InputError
+
+if TYPE_CHECKING:
+    from bcppl.arrays import Array
+
+POSE_NUMBERS = "x y z (m) qw qx qy qz in the last dimension"
 
 # What torch's generators and numpy's seed sequences all take.
 LARGEST_SEED = 2**63 - 1
@@ -56,6 +62,20 @@ def number_within(
     bounds = [(above, "above"), (least, "at least"), (below, "below"), (most, "at most")]
     asked = " and ".join(f"{name} {bound:g}" for bound, name in bounds if math.isfinite(bound))
     raise InputError(f"{_named(what, value)}; give a finite number{' ' * bool(asked)}{asked}.")
+
+
+def pose_problem(name: str, pose: Array) -> str | None:
+    """Why numbers (..., 7) are no poses x y z (m) qw qx qy qz; None where they are."""
+    import numpy as np
+
+    if np.ndim(pose) == 0 or np.shape(pose)[-1] != 7:
+        return f"{name} has shape {np.shape(pose)}; a pose is seven numbers {POSE_NUMBERS}."
+    if not np.isfinite(pose).all():
+        return f"{name} holds a number that is not finite; give finite ones, {POSE_NUMBERS}."
+    norm = np.linalg.norm(pose[..., 3:], axis=-1)
+    if (np.abs(norm - 1.0) > 1e-3).any():
+        return f"{name} has a quaternion of length {norm.flat[0]:.4g}; give qw qx qy qz of unit length."
+    return None
 
 
 def latent_address(what: str, address: str, latent: Collection[str]) -> None:

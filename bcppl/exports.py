@@ -13,7 +13,21 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from importlib.resources import files
+from importlib.util import LazyLoader, find_spec, module_from_spec
+from types import ModuleType
 from typing import Any
+
+
+def _when_used(name: str) -> ModuleType:
+    """A module that is executed when something in it is first asked for."""
+    spec = find_spec(name)
+    if name in sys.modules or spec is None or spec.loader is None:
+        return import_module(name)
+    spec.loader = LazyLoader(spec.loader)
+    module = module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
 
 
 def exported(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
@@ -30,9 +44,11 @@ def exported(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]
         home = homes.get(name)
         if home is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module = import_module(home)
-        is_module = home == package or not hasattr(module, name)
-        value = import_module(f"{home}.{name}") if is_module else getattr(module, name)
+        if home == package:
+            value: Any = _when_used(f"{home}.{name}")
+        else:
+            module = import_module(home)
+            value = getattr(module, name) if hasattr(module, name) else import_module(f"{home}.{name}")
         setattr(sys.modules[package], name, value)
         return value
 

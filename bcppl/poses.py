@@ -21,10 +21,10 @@ import torch
 from torch import Tensor
 
 from bcppl import quaternions
+from bcppl.arguments import pose_problem
 from bcppl.errors import InputError
 
 LOG_8_PI_SQUARED = math.log(8.0 * math.pi**2)
-NUMBERS = "x y z (m) qw qx qy qz in the last dimension"
 
 
 def identity(*batch: int) -> Tensor:
@@ -41,15 +41,9 @@ def as_pose(values: object, name: str = "pose") -> Tensor:
         InputError: the last dimension is not 7, a number is not finite, or a quaternion is not a unit one.
     """
     pose = torch.as_tensor(values, dtype=torch.float64)
-    if pose.ndim == 0 or pose.shape[-1] != 7:
-        raise InputError(f"{name} has shape {tuple(pose.shape)}; a pose is seven numbers {NUMBERS}.")
-    if not bool(torch.isfinite(pose).all()):
-        raise InputError(f"{name} holds a number that is not finite; give finite ones, {NUMBERS}.")
-    norm = pose[..., 3:].norm(dim=-1)
-    if bool(((norm - 1.0).abs() > 1e-3).any()):
-        length = float(norm.flatten()[0])
-        raise InputError(f"{name} has a quaternion of length {length:.4g}; give qw qx qy qz of unit length.")
-    return torch.cat([pose[..., :3], pose[..., 3:] / norm[..., None]], dim=-1)
+    if problem := pose_problem(name, pose.detach().cpu().numpy()):
+        raise InputError(problem)
+    return torch.cat([pose[..., :3], pose[..., 3:] / pose[..., 3:].norm(dim=-1)[..., None]], dim=-1)
 
 
 def quaternion_xyzw(pose: Tensor) -> Tensor:

@@ -33,10 +33,10 @@ def test_asking_for_help_imports_nothing_that_computes(code: str) -> None:
     assert imported(code).isdisjoint(HEAVY)
 
 
-def test_checking_a_recording_imports_no_simulator_and_no_mesh_library() -> None:
+def test_checking_a_recording_imports_no_simulator_and_no_tensor_library() -> None:
     modules = imported("from bcppl.cli import app\napp(['check', 'peg_probe'], standalone_mode=False)")
-    assert "torch" in modules
-    assert modules.isdisjoint({"pyro", "scipy", "trimesh", "matplotlib", "mujoco", "numba"})
+    assert "h5py" in modules
+    assert modules.isdisjoint({"torch", "pyro", "scipy", "trimesh", "matplotlib", "mujoco", "numba"})
 
 
 def test_no_export_imports_the_compiler_of_torch() -> None:

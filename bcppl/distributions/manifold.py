@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import torch
-from scipy.stats import binom
+from scipy.special import bdtrc
 from torch import Tensor
 from torch.special import log_ndtr
 
@@ -160,7 +160,7 @@ class ContactManifold(LazyDistribution):
         squared = (contact.square().sum(dim=1) - share * contact.sum(dim=1).square()) / variance
         whole = chi_square(squared, count, "contacts") if count else Check(1.0, "contacts", 0.0)
         deep = (free < -_FAR * math.hypot(self.noise, self.shared)).sum(dim=1)
-        outliers = float(binom.sf(deep.numpy() - 1, free.shape[1], self.outlier).mean())
+        outliers = float(bdtrc(deep.numpy() - 1, free.shape[1], self.outlier).mean())
         return Check(min(1.0, 2.0 * min(whole.probability, outliers)), "contacts", whole.excess)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within, whole_number
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.distortion import LARGEST, Optics, distorted, undistorted_rays, unfolded
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-import torch
 
 from bcppl import poses
 from bcppl.arguments import number_within
@@ -170,6 +169,8 @@ class InsertionPlan:
             sunk: its depth (m) below the top, where contact located it; None for the depth relative to the
                 push's first pose.
         """
+        import torch
+
         start = torch.from_numpy(self.push.world_from_peg[0])
         pose = torch.as_tensor(world_from_peg)
         path = poses.compose(poses.inverse(start), torch.from_numpy(self.push.world_from_peg))

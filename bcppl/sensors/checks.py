@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bcppl.arguments import pose_problem
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
-from bcppl.poses import as_pose
 from bcppl.robot.plan import FARTHEST
 from bcppl.sensors.layout import same
 
@@ -26,10 +26,8 @@ def first(where: npt.ArrayLike) -> int:
 
 def pose(what: str, values: object) -> Iterator[str]:
     """Problems of one pose (7,)."""
-    try:
-        as_pose(values, what)
-    except InputError as error:
-        yield str(error)
+    if problem := pose_problem(what, np.asarray(values, dtype=float)):
+        yield problem
 
 
 def times(what: str, values: Array, remedy: str = LEAVE_OUT) -> Iterator[str]:

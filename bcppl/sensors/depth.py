@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from bcppl import poses
 from bcppl.arrays import Array
@@ -24,7 +23,7 @@ from bcppl.sensors.protocol import FAINT, Indexed, Placement, PlannedAsIs, regis
 
 MOST_DEPTH = 100.0  # m: beyond it a median depth is in millimetres
 COLOUR = "#D55E00"
-USUAL = Camera("camera", 160, 120, 160.0, 160.0, 79.5, 59.5, poses.identity().numpy(), near=0.1, far=2.0)
+USUAL = Camera("camera", 160, 120, 160.0, 160.0, 79.5, 59.5, np.eye(7)[3], near=0.1, far=2.0)
 DISTANCE = 0.45  # m from the part, of a camera like no other
 HEIGHTS = (50.0, 70.0, 35.0)  # degrees above the horizon, in turn
 GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
@@ -133,6 +132,8 @@ class DepthSensor(PlannedAsIs):
 
     def around(self, mean: Array, part: Part, like: View | None, count: int, seed: int) -> Iterator[View]:
         """Views of the part from all around, in turn from three heights, as far off as `like` is."""
+        import torch
+
         whole = poses.transform(torch.as_tensor(mean), torch.from_numpy(part.vertices)).numpy()
         middle = 0.5 * (whole.min(axis=0) + whole.max(axis=0))
         camera, distance = USUAL, DISTANCE
@@ -222,9 +223,12 @@ def _camera(what: str, camera: Camera, recording: Recording) -> Iterator[str]:
 
 def _stands_off(what: str, camera: Camera, recording: Recording) -> Iterator[str]:
     """Problems of the camera's place relative to the part at its guess: inside it, or out of its range."""
-    part_from_world = poses.inverse(poses.as_pose(recording.guess.world_from_part))
-    place = poses.as_pose(camera.world_from_camera)[None, :3]
-    eye = poses.transform(part_from_world, place)[0].numpy()
+    guess = np.asarray(recording.guess.world_from_part, dtype=float)
+    place = np.asarray(camera.world_from_camera, dtype=float)[:3] - guess[:3]
+    # Rotated by the guess's inverse quaternion; without torch, so that a recording is checked at once.
+    w, axis = guess[3], -guess[4:]
+    turned = 2.0 * np.cross(axis, place)
+    eye = place + w * turned + np.cross(axis, turned)
     low, high = recording.part.vertices.min(axis=0), recording.part.vertices.max(axis=0)
     radius, middle = np.linalg.norm(high - low) / 2, (low + high) / 2
     away = np.linalg.norm(eye - middle)

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from bcppl import poses
 from bcppl.arrays import Array
@@ -133,6 +132,8 @@ class ProbeSensor:
         tip = np.zeros(3)
         if peg is not None:
             tip = peg.vertices[peg.vertices[:, 2] < peg.vertices[:, 2].min() + 1e-6].mean(axis=0)
+        import torch
+
         knots = torch.from_numpy(candidate.world_from_peg)
         path: Array = 1000.0 * poses.transform(knots, torch.from_numpy(tip)[None])[:, 0].numpy()
         if faint:

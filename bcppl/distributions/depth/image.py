@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy.stats import norm
+from scipy.special import ndtr
 from torch import Tensor
 
 from bcppl import poses
@@ -201,7 +201,7 @@ class DepthDistribution(CameraImage):
         if not spread > 0.0:  # no pixel of the image counts
             return Check(1.0, "image", 0.0)
         excess = (observed - replicated.mean(dim=1)) / spread
-        return Check(float(norm.sf(excess.numpy()).mean()), "image", float(excess.mean()))
+        return Check(float(ndtr(-excess.numpy()).mean()), "image", float(excess.mean()))
 
     def _replicated(self, value: Tensor, many: Any) -> Tensor:
         missing = torch.from_numpy(~self.observed(value).valid.any(axis=0)).reshape(value.shape)
