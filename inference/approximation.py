@@ -27,6 +27,7 @@ from bcppl.distributions.pose_normals import (
     widened_mixture,
 )
 from bcppl.distributions.poses import MixturePose
+from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.laplace import Normal, QuadraticApproximation, quadratic_approximation
 from bcppl.sensors.capabilities import Approximated, Contacts, FitsPose, Linearised
@@ -60,6 +61,12 @@ class GaussianApproximation:
             raise InputError(
                 "a Gaussian approximation needs a scene with a prior and sensors (bcppl.sensors.Scene); "
                 "compose the model of sensors, or use tempered SMC."
+            )
+        freedom = freedom_of(self.scene.prior)
+        if freedom is not None and freedom.dimension < 6:
+            raise InputError(
+                f"the prior holds {6 - freedom.dimension} of the part's 6 axes fixed, and a Gaussian "
+                "approximation needs all free; use tempered SMC (--inference tempered_smc)."
             )
 
     def including(

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from bcppl.errors import InputError
 from bcppl.inference.filters.smcp3 import Pair, moved
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.importance import importance_sampling
@@ -54,6 +55,9 @@ def observations_of(
         scene: `model.prepare(recording)`.
         measurements: of the recording, in the order in which they are assimilated.
         start: number of measurements that the population has assimilated.
+
+    Raises:
+        InputError: a measurement gives no observation at a new address.
     """
     known = set(model.observe(scene, measurements[:start])) if start else set()
     for count in range(start + 1, len(measurements) + 1):
@@ -64,6 +68,11 @@ def observations_of(
             continue
         observations = model.observe(scene, measurements[:count])
         new = {address: value for address, value in observations.items() if address not in known}
+        if not new:
+            raise InputError(
+                f"measurement {count - 1} gives no observation, so it would leave the belief as it is; "
+                "let the model's `observe` name its addresses, or leave the measurement out."
+            )
         known |= new.keys()
         yield Observed((scene, [each.action for each in measurements[:count]]), new)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -12,8 +13,9 @@ from bcppl.cli import loading
 from bcppl.errors import InputError
 from bcppl.inference.filters import bayes_contact, guided_smc, tempered_smc
 from bcppl.inference.filters.default import default_inference
-from bcppl.models import look_and_touch, part_in_view, point_probe
+from bcppl.models import load_recording, look_and_touch, part_in_view, point_probe
 from tests.command_line import short
+from tests.made_recordings import assert_one_sentence
 
 
 def test_the_model_names_the_program_and_its_settings() -> None:
@@ -39,3 +41,21 @@ def test_the_command_line_keeps_the_settings_of_the_models_own_program_only() ->
         name, infer = loading.inference(given, part_in_view.model)
         assert name == "tempered_smc" and infer.keywords == {"climbs": 240}  # type: ignore[attr-defined]
     assert loading.inference("bayes_contact", part_in_view.model) == ("bayes_contact", bayes_contact.infer)
+
+
+def test_what_cannot_be_run_is_refused_in_one_sentence() -> None:
+    recording, model = short(1), point_probe.model
+    seen = load_recording("peg_probe")
+    held = replace(seen, guess=replace(seen.guess, tilt=0.0), measurements=seen.measurements[:1])
+    for message, call in {
+        "a module in place of a model": lambda: bcppl.infer(point_probe, recording),  # type: ignore[arg-type]
+        "a str in place of a recording": lambda: bcppl.infer(model, "point_probe_10_pushes"),
+        "names 'guided'": lambda: bcppl.infer(replace(model, inference=("guided", {})), recording),
+        "measurement 0 gives no observation": lambda: bcppl.infer(
+            replace(model, observe=lambda scene, measurements: {}), recording, particles=5
+        ),
+        "holds 2 of the part's 6 axes fixed": lambda: bcppl.infer(look_and_touch.model, held, particles=5),
+    }.items():
+        with pytest.raises(InputError, match=message) as refused:
+            list(call())
+        assert_one_sentence(str(refused.value))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from typing import Annotated
 
 import typer
@@ -65,9 +66,10 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         _stop("stopped.", INTERRUPTED)
     except Exception as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
         _stop(
-            f"something went wrong ({type(error).__name__}: {error}); "
-            "set BCPPL_TRACEBACK=1 to see where, and report it if it is not in a file of yours.",
+            f"something went wrong ({type(error).__name__}: {error}, line {last.lineno} of {last.filename}); "
+            "set BCPPL_TRACEBACK=1 to see the whole way, and report it if it is not in a file of yours.",
             FAILED,
         )
 

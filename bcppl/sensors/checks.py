@@ -12,7 +12,7 @@ from bcppl.arguments import pose_problem
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
-from bcppl.robot.plan import FARTHEST
+from bcppl.robot.plan import FARTHEST, WIDEST
 from bcppl.sensors.layout import same
 
 LEAVE_OUT, FILL = "leave that row out", "fill it by interpolation, or cut the recording there"
@@ -68,6 +68,8 @@ def poses(what: str, values: Array, at: Array, remedy: str = LEAVE_OUT) -> Itera
             f"{what} is {away.max():.4g} m from the world's origin at row {int(away.argmax())}, probably "
             "millimetres; scale x, y and z by 0.001 to metres."
         )
+    elif len(values) and (extent := float(np.ptp(values[:, :3], axis=0).max())) > WIDEST:
+        yield f"{what} spans {extent:.4g} m, probably millimetres; scale x, y and z by 0.001 to metres."
 
 
 def part(body: Part, closed: bool) -> Iterator[str]:

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
+from bcppl.errors import InputError
 from bcppl.inference.filters.smc import Step
+from bcppl.recordings import Recording
 from bcppl.traces import Model
 
 Infer = Callable[..., Iterator[Step]]
@@ -15,7 +18,16 @@ Infer = Callable[..., Iterator[Step]]
 
 def default_inference(model: Model) -> tuple[str, Infer]:
     """The name of a model's own inference program, and its `infer` with the model's settings."""
+    if not isinstance(model, Model):
+        raise InputError(
+            f"inference is given a {type(model).__name__} in place of a model; give bcppl.models.NAME.model."
+        )
     name, settings = model.inference
+    if find_spec(f"bcppl.inference.filters.{name}") is None:
+        raise InputError(
+            f"the model names {name!r} as its inference program; "
+            "give tempered_smc, guided_smc or bayes_contact."
+        )
     return name, partial(import_module(f"bcppl.inference.filters.{name}").infer, **settings)
 
 
@@ -29,7 +41,14 @@ def infer(model: Model, recording: Any, **settings: Any) -> Iterator[Step]:
             in place of the model's own: `particles`, `seed`, `scene`, `start` and others.
 
     Raises:
-        InputError: a setting is out of range, or the recording does not fit the model.
+        InputError: what is given is no model or no recording, a setting is out of range, or the recording
+            does not fit the model.
         InferenceError: no particle is left with any weight.
     """
-    return default_inference(model)[1](model, recording, **settings)
+    program = default_inference(model)[1]
+    if not isinstance(recording, Recording):
+        raise InputError(
+            f"inference is given a {type(recording).__name__} in place of a recording; "
+            "read one with bcppl.load."
+        )
+    return program(model, recording, **settings)
