@@ -9,7 +9,7 @@ PEERS := particles blackjax open3d chsel
 JOBS ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: run test lint long peers check-links clean help
+.PHONY: run test tests lint long peers check-links clean help
 .DEFAULT_GOAL := help
 
 help:
@@ -23,8 +23,13 @@ help:
 run: $(STAMP)
 	@for name in $(RECORDINGS); do $(BIN)/bcppl run models/recordings/$$name.h5 || exit 1; done
 
-test: lint
-	$(PYTEST) -n $(JOBS) --dist loadfile
+# The linter and the type checker run beside the tests.
+test: $(STAMP)
+	@$(MAKE) --no-print-directory -j2 lint tests
+
+# Files in the order of their names: by size, those with few and long tests would be left to one process.
+tests: $(STAMP)
+	$(PYTEST) -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -264,10 +264,10 @@ def particle_by_particle(population: Population, kernel: Kernel) -> Population:
 
 
 def test_stopping_together_leaves_no_bias_that_shows_and_each_alone_does() -> None:
-    """75 exact draws, moved until they have come half a variance: over 60 runs the mean stays."""
+    """75 exact draws, moved until they have come half a variance: over 40 runs the mean stays."""
     torch.manual_seed(6)
     together, alone = [], []
-    for _ in range(60):
+    for _ in range(40):
         population = equal_weights(simulate(lopsided, (), 75))
         done = moved_by(population, SHORT, POSTERIOR, until(displacement=0.5)).population
         together.append(done.trace["x"].mean() - 2.0)
