@@ -5,9 +5,9 @@ STAMP := $(VENV)/.installed
 RECORDINGS := peg_probe point_probe_10_pushes
 # Packages that the benchmarks measure beside bcppl; each gets an environment of its own.
 PEERS := particles blackjax open3d chsel
-# Test processes; each keeps to one thread.
+# Test processes; each keeps to one thread. Bytecode is kept, for they begin many others.
 JOBS ?= 2
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 .PHONY: run test tests lint long peers check-links clean help
 .DEFAULT_GOAL := help
