@@ -59,22 +59,20 @@ def observations_of(
     Raises:
         InputError: a measurement gives no observation at a new address.
     """
-    known = set(model.observe(scene, measurements[:start])) if start else set()
+    # A step of a series is given the newest measurement alone, under its own addresses, and may have none.
+    alone = isinstance(model.program, Series)
+    known = set(model.observe(scene, measurements[:start])) if start and not alone else set()
     for count in range(start + 1, len(measurements) + 1):
-        if isinstance(model.program, Series):
-            # A step of a series is given the newest measurement alone, under its own addresses.
-            latest = measurements[count - 1 : count]
-            yield Observed((scene, [latest[0].action]), model.observe(scene, latest))
-            continue
-        observations = model.observe(scene, measurements[:count])
-        new = {address: value for address, value in observations.items() if address not in known}
-        if not new:
+        given = measurements[count - 1 if alone else 0 : count]
+        new = {a: value for a, value in model.observe(scene, given).items() if a not in known}
+        if not (new or alone):
             raise InputError(
                 f"measurement {count - 1} gives no observation, so it would leave the belief as it is; "
                 "let the model's `observe` name its addresses, or leave the measurement out."
             )
-        known |= new.keys()
-        yield Observed((scene, [each.action for each in measurements[:count]]), new)
+        if not alone:
+            known |= new.keys()
+        yield Observed((scene, [each.action for each in given]), new)
 
 
 def update(population: Population, observed: Observed, pair: Pair | None = None) -> Population:

@@ -77,4 +77,8 @@ def _array(values: Any) -> Any:
 def _attributes(value: Any) -> Mapping[str, Any]:
     kind = type(value)
     lazy = {name for base in kind.__mro__ for name, each in vars(base).items() if type(each) is lazy_property}
-    return {f".{name}": each for name, each in _layout(kind).attributes(value).items() if name not in lazy}
+    return {
+        f".{name}": each
+        for name, each in _layout(kind).attributes(value).items()
+        if name not in lazy | _layout(kind).cached
+    }

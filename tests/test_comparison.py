@@ -179,6 +179,9 @@ def test_what_a_distribution_computed_on_demand_does_not_count(make: Callable[[]
 def test_what_is_cached_does_not_count() -> None:
     assert comparison()(Caching(1.0), Caching(1.0, last=object(), ask=True))
     assert not comparison()(Caching(1.0), Caching(2.0))
+    given, computed = Caching(1.0), Caching(1.0, ask=True)
+    given.double = 3.0
+    assert not comparison()(given, computed), "what was assigned to it counts where both have it"
 
 
 ONE = torch.complex(t(1.0), t(1.0))

@@ -161,6 +161,8 @@ def test_uninformative_wrenches_have_no_candidates_and_bad_ones_are_refused() ->
     clean = pressed(PEG, 5, seed=9)[2] * [1, 1, 1, 1000, 1000, 1000]
     with pytest.raises(InputError, match="N mm"):
         sensing.candidates(clean, COVARIANCE)
+    with pytest.raises(InputError, match="not symmetric"):
+        sensing.candidates(seen, COVARIANCE + np.triu(np.full((6, 6), 1e-4), 1))
     with pytest.raises(np.linalg.LinAlgError, match="positive definite"):
         sensing.candidates(seen, np.zeros((6, 6)))
     for most, least in ((0, 0.1), (2.5, 0.1), (8, math.nan), (8, 1.0)):

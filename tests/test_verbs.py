@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -26,7 +27,8 @@ from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import adaptive, always, never
 from bcppl.models import load_recording
 from bcppl.models.point_probe import model
-from bcppl.recordings import Recording
+from bcppl.recordings import Measurement, Recording
+from bcppl.traces import Series
 
 
 def pushes(count: int = 4) -> Recording:
@@ -86,3 +88,16 @@ def test_resizing_keeps_the_evidence_and_what_merging_keeps() -> None:
     for other in (resize(population, 200), replicate(population, 3), merge(replicate(population, 3))):
         assert math.isclose(other.log_evidence, population.log_evidence, abs_tol=1e-12)
     assert len(resize(population, 200)) == 200 and len(merge(replicate(population, 3))) == 50
+
+
+def test_a_series_is_given_the_newest_measurement_alone_and_continues_so() -> None:
+    recording, given = pushes(3), []
+
+    def observe(scene: object, measurements: Sequence[Measurement]) -> dict[str, torch.Tensor]:
+        given.append(len(measurements))
+        return {"y": torch.zeros(())} if len(given) > 1 else {}
+
+    walking = replace(model, program=Series(lambda *_: None, lambda *_: None), observe=observe)
+    whole = list(observations_of(walking, None, recording.measurements, start=1))
+    assert given == [1, 1] and [sorted(each.observations) for each in whole] == [[], ["y"]]
+    assert [each.args[1] for each in whole] == [[m.action] for m in recording.measurements[1:]]

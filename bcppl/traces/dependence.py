@@ -7,9 +7,10 @@ that an error costs an evaluation and never gives a wrong density.
 
 Two values are the same if they are one object; tensors or arrays that are equal to the bit; containers,
 objects, partial applications, or functions with equal code, whose parts are the same. Parts that cache what
-the others determine do not count: the values of `functools.cached_property`, and the attributes that a class
-names in `__caches__`. What is stored neither in a value nor in its parts is not seen: a global variable, or
-a write into an object that both runs share.
+the others determine do not count: the attributes that a class names in `__caches__`, and the values of
+`functools.cached_property` where not both have one or it is no number and no array.
+What is stored neither in a value nor in its parts is not seen: a global variable, or a write into an object
+that both runs share.
 """
 
 from __future__ import annotations
@@ -233,12 +234,13 @@ class _Layout(NamedTuple):
     root: type | None  # list, tuple, dict, or object for none of them; None: more than Python can see
     slots: Mapping[str, Any]  # descriptors of `__slots__`
     computed: frozenset[str]  # attributes that torch computes from the others, or the others from them
+    cached: frozenset[str]  # cached properties
     caches: frozenset[str]  # attributes that do not count
 
     def attributes(self, value: Any) -> Mapping[str, Any]:
         """The attributes of an instance that count, by name."""
         held: dict[str, Any] = getattr(value, "__dict__", {})
-        if not self.slots and not self.caches:
+        if not self.slots and not self.caches and not self.cached:
             return held
         held = {name: each for name, each in held.items() if name not in self.caches}
         for name in self.slots.keys() - self.caches:
@@ -251,11 +253,11 @@ class _Layout(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def _layout(kind: type) -> _Layout:
-    slots, computed, caches = {}, set(), set(_caches(kind))
+    slots, computed, cached = {}, set(), set()
     for base in kind.__mro__:
         for name, each in vars(base).items():
             if isinstance(each, cached_property):
-                caches.add(name)
+                cached.add(name)
             elif isinstance(each, lazy_property):
                 computed.add(name)
             # What a class of C calls a member is not all that it keeps.
@@ -267,7 +269,7 @@ def _layout(kind: type) -> _Layout:
     pointers = dictionary + (kind.__weakrefoffset__ > 0) + len(slots)
     whole = kind.__basicsize__ == root.__basicsize__ + pointers * calcsize("P")
     whole = whole and kind.__itemsize__ == root.__itemsize__ and kind is not object
-    return _Layout(root if whole else None, slots, frozenset(computed), frozenset(caches))
+    return _Layout(root if whole else None, slots, frozenset(computed), frozenset(cached), _caches(kind))
 
 
 def _caches(kind: type) -> frozenset[str]:
@@ -280,6 +282,11 @@ def _caches(kind: type) -> frozenset[str]:
 def _attributes(layout: _Layout, a: Any, b: Any, shared: bool) -> list[tuple[Any, Any]]:
     """Pairs of attributes that are still to be compared."""
     mine, others = layout.attributes(a), layout.attributes(b)
+    for name in layout.cached:
+        # The others determine it, unless something was assigned: it counts where both have numbers.
+        x, y = mine.get(name), others.get(name)
+        if x is None or y is None or type(x) not in _PLAIN | _ARRAYS:
+            mine, others = ({n: v for n, v in each.items() if n != name} for each in (mine, others))
     if mine.keys() != others.keys():
         mine, others = _common(layout, mine, others)
     pairs = []

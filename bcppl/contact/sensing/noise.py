@@ -9,6 +9,7 @@ from scipy.signal import sosfilt
 
 from bcppl.arguments import number_within
 from bcppl.arrays import Array
+from bcppl.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,17 @@ class WrenchNoise:
 
 
 def covariance_of(given: Array | WrenchNoise) -> Array:
-    """Covariances (6, 6) or (M, 6, 6) of wrenches, symmetric to the bit."""
+    """Covariances (6, 6) or (M, 6, 6) of wrenches, symmetric to the bit.
+
+    Raises:
+        InputError: one is not symmetric.
+    """
     covariance = given.covariance() if isinstance(given, WrenchNoise) else np.asarray(given, np.float64)
-    return 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
+    turned = np.swapaxes(covariance, -1, -2)
+    scale = np.sqrt(np.abs(np.diagonal(covariance, axis1=-2, axis2=-1)))
+    if (np.abs(covariance - turned) > 1e-6 * scale[..., None] * scale[..., None, :]).any():
+        raise InputError("the wrenches' covariance is not symmetric; give one that equals its transpose.")
+    return 0.5 * (covariance + turned)
 
 
 def noise_at_rest(wrench: Array) -> WrenchNoise:
