@@ -233,3 +233,33 @@ def test_describe_lists_what_is_there() -> None:
     assert "20 Hz" in rows["probe slide"] and rows["truth"] == "known"
     old = replace(full(), source="made up by bcppl, seed 3")  # as earlier versions wrote it
     assert dict(describe(old))["source"] == "simulated by bcppl, seed 3"
+
+
+@pytest.mark.parametrize("turn", [0.25 * np.pi, -0.25 * np.pi])
+def test_a_camera_is_inside_a_long_part_as_the_guess_turns_it(turn: float) -> None:
+    beam = block("beam")
+    beam = replace(beam, vertices=beam.vertices * [20.0, 1.0, 1.0])  # 2 m along x
+    guess = np.array([0.3, 0.1, 0.0, np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)])
+    recording = replace(full(), part=beam, guess=replace(full().guess, world_from_part=guess), truth=None)
+
+    def named(direction: float) -> bool:
+        place = guess[:3] + 0.7 * np.array([np.cos(direction), np.sin(direction), 0.0])
+        measurement = recording.measurements[2]
+        view = replace(measurement.action.camera, world_from_camera=np.r_[place, 0.0, 1.0, 0.0, 0.0])
+        there = Measurement(replace(measurement.action, camera=view), measurement.observation)
+        measurements = [*recording.measurements[:2], there, *recording.measurements[3:]]
+        return any("inside it" in each for each in problems(replace(recording, measurements=measurements)))
+
+    assert named(turn) and not named(-turn)
+
+
+def test_a_short_path_in_millimetres_is_named() -> None:
+    recording = full()
+    push: Any = recording.measurements[3].action
+    path = np.array(push.world_from_tip)
+    path[:, :3] = 0.0
+    path[-1, 0] = 36.0  # mm, within 100 m of the origin
+    measurements = list(recording.measurements)
+    measurements[3] = Measurement(replace(push, world_from_tip=path), measurements[3].observation)
+    (named,) = [p for p in problems(replace(recording, measurements=measurements)) if "millimetres" in p]
+    assert "spans 36 m" in named
