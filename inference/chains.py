@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import latent_address, whole_number
-from bcppl.inference.kernels import Kernel, fitted, refuse_other, scattered
+from bcppl.inference.kernels import Kernel, fitted, halved, halves, refuse_other, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.resampling import Scheme, systematic
@@ -52,7 +52,8 @@ def markov_chains(
 ) -> Chains:
     """Run a chain from each particle.
 
-    The kernel is fitted once, for each half of the chains to the starts of the other half, and then stays:
+    The kernel is fitted once, for each half of the chains to the starts of the other half, split by ancestry
+    (`bcppl.inference.kernels.halving`), and then stays:
     the target is left invariant however long the chains are.
 
     Args:
@@ -83,13 +84,13 @@ def markov_chains(
     recorded = list(trace.choices if addresses is None else addresses)
     for address in recorded:
         latent_address("chains are to record {}", address, trace.choices)
-    order = torch.randperm(count)
-    halves = [h for h in (order[: count // 2], order[count // 2 :]) if len(h)]
-    moves_of = [fitted(kernel, population[other]) for other in halves[::-1]]
+    population = halved(population)
+    parts = halves(population)
+    moves_of = [fitted(kernel, population[other]) for other in parts[::-1]]
     taken = torch.zeros(count, dtype=torch.float64)
     draws: dict[str, list[Tensor]] = {address: [] for address in recorded}
     for number in watched(range(1, moves + 1), description="chains", progress=progress):
-        for mine, move in zip(halves, moves_of, strict=True):
+        for mine, move in zip(parts, moves_of, strict=True):
             moved, accepted = move(trace[mine], target)
             trace = scattered(trace, mine, moved)
             taken[mine] += accepted.to(torch.float64)

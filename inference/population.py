@@ -38,6 +38,9 @@ class Population:
             its own. What `bcppl.inference.summaries` reads.
         log_pairs: sum over the first population and every resampling since of log M / (M - 1), M the
             particles that were then drawn independently of one another.
+        families: (N,) int64, the family of each particle: those that descend from one since the population
+            was last split into halves (`bcppl.inference.kernels.halving`); empty before.
+        sides: (N,) bool, the half to which each particle's family belongs; empty before.
         approximation: the filter's approximation of the posterior, an immutable value that guides proposals
             and that the target never depends on (`bcppl.inference.approximation`); None where there is none.
     """
@@ -47,6 +50,8 @@ class Population:
     log_evidence: float = math.nan
     founders: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64), repr=False)
     log_pairs: float = math.nan
+    families: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64), repr=False)
+    sides: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.bool), repr=False)
     approximation: Any = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -142,6 +147,7 @@ class Population:
             log_weights=torch.zeros(count, dtype=torch.float64),
             founders=founders,
             log_pairs=self.log_pairs + log_pair(count),
+            **self._halves(ancestors),
         )
         drawn.__dict__["log_total"] = math.log(count)
         return drawn
@@ -165,7 +171,14 @@ class Population:
             trace=self.trace.chosen(particles),
             log_weights=self.log_weights[particles],
             founders=self.founders[particles],
+            **self._halves(particles),
         )
+
+    def _halves(self, particles: Tensor) -> dict[str, Tensor]:
+        """The halves to which some particles belong, once the population was split."""
+        if len(self.sides) == 0:
+            return {}
+        return {"families": self.families[particles], "sides": self.sides[particles]}
 
     def _with(self, **changed: Any) -> Population:
         """The same population with other fields, which are known to be right: a step makes several."""

@@ -30,6 +30,7 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
+from bcppl.inference.kernels.halving import halved, halves
 from bcppl.inference.kernels.jacobian import (
     Key,
     charted,
@@ -95,11 +96,12 @@ def moved(population: Population, pair: Pair, observed: Observed | None = None) 
     if not isinstance(pair.forward, Fitted) and not isinstance(pair.backward, Fitted):
         parts = [torch.arange(count)]
     else:
-        parts = [half for half in torch.randperm(count).tensor_split(2) if len(half)]
+        population = halved(population)
+        parts = halves(population)
     log_factor = torch.zeros(count, dtype=torch.float64)
     whole: Trace | None = None
     for k, mine in enumerate(parts):
-        forward, backward = _fitted(pair, population[parts[1 - k]] if len(parts) > 1 else population)
+        forward, backward = _fitted(pair, population[parts[-1 - k]])
         trace, gained = moved_trace(forward, backward, population.trace[mine], observed, pair.check)
         log_factor[mine] = gained
         if whole is None:

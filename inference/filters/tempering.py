@@ -26,7 +26,7 @@ from bcppl.inference.exponents import next_exponent
 from bcppl.inference.filters.step import Observed, StepInfo, Stepped
 from bcppl.inference.kernels import Kernel, Until, moved_by, refuse_other
 from bcppl.inference.population import Population
-from bcppl.inference.resampling import Resample, adaptive, check_resample
+from bcppl.inference.resampling import Resample, adaptive, check_resample, systematic
 from bcppl.inference.targets import POSTERIOR, Target, cost_of
 from bcppl.traces import Trace, extend
 
@@ -171,7 +171,8 @@ def tempered(
         kernel: moves the particles after each resampling; None leaves them where they are.
         sweeps: how many moves of every particle after each resampling, `until(...)`, or a function of the
             trace that gives either.
-        resample: when and how; by default systematic below half the effective sample size.
+        resample: when and how; by default systematic wherever the exponent leaves no more than `share` of the
+            effective sample size (half, where `share` is no number or the exponents are fixed).
         share: tempering keeps the conditional effective sample size above this share of the particles;
             with 0 there is one exponent, 1. A number, or a function of the trace, as `sweeps`.
         exponents: fixed ones, increasing, the last 1; then `share` does not matter.
@@ -208,9 +209,11 @@ def tempered(
     if resample is not None:
         check_resample("tempered", resample)
     if rejuvenation is None:
-        rejuvenation = resample_move(
-            kernel, sweeps, adaptive() if resample is None else resample, always_move
-        )
+        # An adaptive exponent leaves just `share`: particles that are not resampled there are not moved
+        # either, and the variance of the evidence was nine times as large for half the moves.
+        below = 0.5 if callable(share) or fixed is not None or share <= 0.0 else min(1.0, 1.01 * share)
+        default = adaptive(systematic, below)
+        rejuvenation = resample_move(kernel, sweeps, default if resample is None else resample, always_move)
     elif kernel is not None or resample is not None:
         raise InputError(
             "a step is given a rejuvenation beside a kernel or a resampling; give one or the other."

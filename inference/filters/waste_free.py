@@ -12,7 +12,7 @@ import torch
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.filters.tempering import Rejuvenated, Rejuvenation
-from bcppl.inference.kernels import Kernel, fitted, refuse_other, scattered
+from bcppl.inference.kernels import Kernel, fitted, halved, halves, refuse_other, scattered
 from bcppl.inference.population import Population, log_pair
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import Target
@@ -23,8 +23,8 @@ def waste_free_moves(
 ) -> Rejuvenation:
     """A rejuvenation for `tempered`: M of N particles are resampled, and N / M - 1 moves made of each.
 
-    A move is fitted to the weighted particles of the other half of the chains, before resampling, and stays
-    the same along a chain.
+    A move is fitted to the weighted particles of the other half (`bcppl.inference.kernels.halving`), before
+    resampling, and stays the same along a chain.
 
     Args:
         kernel: moves the particles; one that mixes well matters more than here the number of chains.
@@ -50,25 +50,24 @@ def waste_free_moves(
         if threshold < 1.0 and population.effective_sample_size >= threshold * count:
             return Rejuvenated(population, None, None)
         ancestors = scheme(population.log_weights, chains)
-        # States of one chain stand `chains` apart, and are of one half: a particle teaches no copy of itself.
-        side = (torch.randperm(chains) % 2)[torch.arange(count) % chains]
-        sides = [s for s in (0, 1) if bool((side[ancestors] == s).any())]
-        halves = [(side[ancestors] == s).nonzero().flatten() for s in sides]
-        others = [(side == 1 - s).nonzero().flatten() for s in sides]
-        moves = [fitted(kernel, population[o] if len(o) else population) for o in others]
-        current, acceptances = population.trace[ancestors], []
-        whole = population.trace[ancestors.repeat(count // chains)]
+        population = halved(population)
+        started = population[ancestors]
+        parts = halves(started)
+        others = [population.sides != started.sides[part[0]] for part in parts]
+        moves = [fitted(kernel, population[o] if bool(o.any()) else population) for o in others]
+        current, acceptances = started.trace, []
+        kept = population[ancestors.repeat(count // chains)]
+        whole = kept.trace
         for state in range(1, count // chains):
-            for mine, move in zip(halves, moves, strict=True):
+            for mine, move in zip(parts, moves, strict=True):
                 moved, accepted = move(current[mine], target)
                 current = scattered(current, mine, moved)
                 acceptances.append(accepted.to(torch.float64))
             whole = scattered(whole, torch.arange(chains) + state * chains, current)
         kept = replace(
-            population,
+            kept,
             trace=whole,
             log_weights=torch.zeros(count, dtype=torch.float64),
-            founders=population.founders[ancestors].repeat(count // chains),
             log_pairs=population.log_pairs + log_pair(chains),
         )
         acceptance = float(torch.cat(acceptances).mean()) if acceptances else None

@@ -1,6 +1,7 @@
 """Kernels: moves that leave a target invariant, and their combinations."""
 
 from bcppl.inference.kernels.combinators import cycle, mixture, repeat, sequence
+from bcppl.inference.kernels.halving import halved, halves
 from bcppl.inference.kernels.hamiltonian import hmc
 from bcppl.inference.kernels.hastings import metropolis_hastings
 from bcppl.inference.kernels.involutions import involutive
@@ -21,6 +22,8 @@ __all__ = [
     "displacement",
     "distinct",
     "fitted",
+    "halved",
+    "halves",
     "hmc",
     "involutive",
     "metropolis_hastings",

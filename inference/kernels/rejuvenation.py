@@ -13,6 +13,7 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import normalised
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
+from bcppl.inference.kernels.halving import halved, halves
 from bcppl.inference.kernels.kernel import Kernel, fitted, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.targets import Target
@@ -117,7 +118,7 @@ def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int
     """Move every particle, `sweeps` times.
 
     The kernel that moves one half of the population is fitted to the other, so that no particle shapes its
-    own proposal. The particles are split at random: copies of one ancestor lie side by side after resampling.
+    own proposal, nor do its copies (`bcppl.inference.kernels.halving`).
 
     Args:
         population: of N particles.
@@ -142,13 +143,10 @@ def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int
 
 
 def _sweep(population: Population, kernel: Kernel, target: Target) -> tuple[Population, Tensor]:
-    order = torch.randperm(len(population))
-    halves = [order[: len(order) // 2], order[len(order) // 2 :]]
-    shares = []
-    for mine, others in (halves, halves[::-1]):
-        if len(mine) == 0:
-            continue
-        move = fitted(kernel, population[others] if len(others) else population)
+    population = halved(population)
+    parts, shares = halves(population), []
+    for mine, others in zip(parts, parts[::-1], strict=True):
+        move = fitted(kernel, population[others])
         moved, share = move(population.trace[mine], target)
         shares.append(share.to(torch.float64))
         population = population.with_trace(scattered(population.trace, mine, moved))
