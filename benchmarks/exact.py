@@ -1,0 +1,244 @@
+"""Evidence and posterior moments of problems with exact answers, for every kernel in tempered SMC.
+
+For each problem, kernel and number of particles the bias of log Z over several seeds, beside its standard
+error; the log of the mean of the estimated evidence over the exact one, which is what theory makes unbiased
+(the mean of a logarithm is lower by about half the variance); and the posterior moments: the largest |z| of a
+mean over the axes, and the mean ratio of estimated to exact variance.
+
+A bias is explained where it is within two standard errors of minus half the variance of log Z. With --file
+cells are written as they are done, and a later call adds those that are missing.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from exact_problems import PROBLEMS, Problem
+from jobs import each
+from kernel_table import even, near, reflected, walk
+from report import Row, finish, options, show
+
+from bcppl.beliefs import normalised
+from bcppl.inference import tempered, tempered_importance_sampling, waste_free_moves
+from bcppl.inference.filters.tempering import Tempered
+from bcppl.inference.kernels import (
+    Kernel,
+    cycle,
+    delayed_acceptance,
+    hmc,
+    metropolis_hastings,
+    mixture,
+    student_t,
+    until,
+)
+from bcppl.inference.proposals import differential_evolution, independent
+
+COUNTS = (75, 1000, 10_000)
+
+
+def swept(kernel: Kernel, sweeps: int, dimension: int) -> Tempered:
+    """Tempering with so many sweeps for each six axes: a random walk takes of the order of D."""
+    return tempered(kernel, sweeps=sweeps * math.ceil(dimension / 6))
+
+
+def waste_free(dimension: int, count: int) -> Tempered:
+    """A fifth of the particles each start a chain of five states."""
+    return tempered(rejuvenation=waste_free_moves(even("x"), count // 5))
+
+
+# By name, a step for a problem of so many axes and so many particles.
+KERNELS: dict[str, Callable[[int, int], Tempered]] = {
+    "drift": lambda d, n: swept(even("x"), 5, d),
+    "drift, many scales": lambda d, n: swept(walk("x"), 8, d),
+    "drift until displaced": lambda d, n: tempered(walk("x"), sweeps=until(displacement=0.5)),
+    "independent": lambda d, n: tempered(metropolis_hastings(independent("x"))),
+    "independent, 1 normal": lambda d, n: tempered(near("x", 1)),
+    "mixture drift, independent": lambda d, n: swept(mixture([even("x"), near("x", 1)]), 3, d),
+    "mixture until displaced": lambda d, n: tempered(
+        mixture([walk("x"), metropolis_hastings(independent("x"))]), sweeps=until(displacement=0.5)
+    ),
+    "cycle drift, independent": lambda d, n: swept(cycle(even("x"), near("x", 1)), 2, d),
+    "differential evolution": lambda d, n: swept(metropolis_hastings(differential_evolution("x")), 5, d),
+    "involutive": lambda d, n: swept(reflected("x"), 5, d),
+    "delayed acceptance": lambda d, n: swept(delayed_acceptance(even("x"), surrogate=student_t("x")), 5, d),
+    "hmc": lambda d, n: tempered(hmc("x")),
+    "hmc, always moved": lambda d, n: tempered(hmc("x"), always_move=True),
+    "waste-free": waste_free,
+}
+
+
+class Cell(NamedTuple):
+    """What is run: a problem and a kernel by name, N, and the seeds."""
+
+    problem: str
+    kernel: str
+    particles: int
+    seeds: tuple[int, ...]
+
+
+class Outcome(NamedTuple):
+    """What came out of a cell's runs: errors of log Z, posterior moments over the exact ones, seconds."""
+
+    errors: list[float]
+    means: list[list[float]]  # of each run, in exact standard deviations
+    variances: list[float]  # of each run, its mean ratio over the axes
+    seconds: float
+
+
+@cache
+def problem_named(name: str) -> Problem:
+    return PROBLEMS[name]()
+
+
+def measured(cell: Cell) -> Outcome:
+    """The runs of one cell, on one thread."""
+    problem, errors, means, variances = problem_named(cell.problem), [], [], []
+    begun = time.perf_counter()
+    for seed in cell.seeds:
+        torch.manual_seed(seed)
+        step = KERNELS[cell.kernel](problem.dimension, cell.particles)
+        done = tempered_importance_sampling(
+            problem.program, (), {"y": problem.observed}, cell.particles, step
+        ).population
+        weights, x = normalised(done.log_weights), done["x"]
+        errors.append(done.log_evidence - problem.log_evidence)
+        mean = weights @ x
+        means.append(((mean - problem.mean) / problem.variance.sqrt()).tolist())
+        # About the exact mean: about its own it would be too small by one part in the effective sample size.
+        variances.append(float((weights @ (x - problem.mean).square() / problem.variance).mean()))
+    return Outcome(errors, means, variances, time.perf_counter() - begun)
+
+
+class Summary(NamedTuple):
+    """The figures of a cell."""
+
+    bias: float
+    error: float  # standard error of the bias
+    deviation: float  # standard deviation of log Z
+    log_mean: float  # log of the mean of Zhat / Z
+    largest: float  # |z| of the posterior mean, over the axes
+    variance: float
+    variance_error: float
+    seconds: float  # of one run
+
+    @property
+    def explained(self) -> bool:
+        """Whether the bias is that of a logarithm of an unbiased estimate, within two standard errors."""
+        return (
+            abs(self.bias) <= 2.0 * self.error or abs(self.bias + 0.5 * self.deviation**2) <= 2.0 * self.error
+        )
+
+
+def summary(outcome: Outcome) -> Summary:
+    errors, means, variances = (np.array(v) for v in outcome[:3])
+    runs = len(errors)
+    root = math.sqrt(runs)
+    deviation = float(errors.std(ddof=1))
+    spread = means.std(axis=0, ddof=1) / root
+    return Summary(
+        float(errors.mean()),
+        deviation / root,
+        deviation,
+        float(np.logaddexp.reduce(errors) - math.log(runs)),
+        float((np.abs(means.mean(axis=0)) / np.maximum(spread, 1e-12)).max()),
+        float(variances.mean()),
+        float(variances.std(ddof=1)) / root,
+        outcome.seconds / runs,
+    )
+
+
+def recorded(file: Path | None, cell: Cell) -> Outcome:
+    """A cell's outcome, read from the file if it is there, else measured and added to it."""
+    key = [cell.problem, cell.kernel, cell.particles, list(cell.seeds)]
+    if file is not None and file.exists():
+        for line in file.read_text(encoding="utf-8").splitlines():
+            known, outcome = json.loads(line)
+            if known == key:
+                return Outcome(*outcome)
+    outcome = measured(cell)
+    if file is not None:
+        with file.open("a", encoding="utf-8") as lines:
+            lines.write(json.dumps([key, list(outcome)]) + "\n")
+    return outcome
+
+
+def main() -> None:
+    parser = options(__doc__ or "")
+    parser.add_argument("--problems", nargs="+", choices=PROBLEMS, default=list(PROBLEMS), metavar="NAME")
+    parser.add_argument("--kernels", nargs="+", choices=KERNELS, default=list(KERNELS), metavar="NAME")
+    parser.add_argument("--counts", nargs="+", type=int, default=list(COUNTS), metavar="N")
+    parser.add_argument("--runs", type=int, default=30)
+    parser.add_argument("--jobs", type=int, default=1, help="cells at a time")
+    parser.add_argument("--file", type=Path, help="where the outcome of each cell is kept")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    problems, kernels, counts, runs = (
+        (list(PROBLEMS)[:4], ["drift", "hmc"], [75], 5)
+        if arguments.quick
+        else (arguments.problems, arguments.kernels, arguments.counts, arguments.runs)
+    )
+    seeds = tuple(range(arguments.seed, arguments.seed + runs))
+    cells = [Cell(p, k, n, seeds) for n in counts for p in problems for k in kernels]
+    outcomes = each(partial(recorded, arguments.file), cells, arguments.jobs)
+    rows: list[Row] = []
+    for problem in problems:
+        lines = []
+        for cell, outcome in zip(cells, outcomes, strict=True):
+            if cell.problem != problem:
+                continue
+            figures = summary(outcome)
+            name = f"{problem}, {cell.kernel}, N = {cell.particles}"
+            # Goals where theory promises them: many particles, and not more axes than they can learn.
+            goal = cell.particles >= 1000 and "D = 100" not in problem
+            rows += [
+                Row(f"{name}: |bias of log Z|", abs(figures.bias), "nats", 0.1 if goal else None),
+                Row(
+                    f"{name}: bias in standard errors",
+                    abs(figures.bias) / figures.error,
+                    "1",
+                    2.0 if goal else None,
+                ),
+                Row(f"{name}: log of the mean of Zhat / Z", figures.log_mean, "nats"),
+                Row(f"{name}: sd of log Z", figures.deviation, "nats"),
+                Row(f"{name}: largest |z| of a mean", figures.largest, "1"),
+                Row(f"{name}: variance over the exact one", figures.variance, "1"),
+            ]
+            met = abs(figures.bias) <= min(0.1, 2.0 * figures.error)
+            lines.append(
+                [
+                    cell.kernel,
+                    cell.particles,
+                    f"{figures.bias:+.3f} ± {figures.error:.3f}",
+                    f"{figures.deviation:.3f}",
+                    f"{figures.log_mean:+.3f}",
+                    f"{figures.largest:.1f}",
+                    f"{figures.variance:.3f} ± {figures.variance_error:.3f}",
+                    figures.seconds,
+                    "" if met else "variance" if figures.explained else "biased",
+                ]
+            )
+        columns = [
+            "kernel",
+            "N",
+            "bias of log Z",
+            "sd",
+            "log mean Zhat/Z",
+            "|z| of means",
+            "variance",
+            "s",
+            "",
+        ]
+        show(f"{problem}: {runs} runs of each kernel", columns, lines)
+    finish(rows, arguments.json)
+
+
+if __name__ == "__main__":
+    main()
