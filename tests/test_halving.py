@@ -1,0 +1,159 @@
+"""Halves of a population, split by ancestry: what moves a particle was learned from none of its copies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from torch import Tensor
+
+from bcppl.inference import Population, markov_chains, replicate, resample, resize
+from bcppl.inference.filters.smcp3 import Pair, moved
+from bcppl.inference.filters.waste_free import waste_free_moves
+from bcppl.inference.kernels import Kernel, halved, halves, metropolis_hastings, moved_by
+from bcppl.inference.proposals import Fitted, drift, independent
+from bcppl.inference.targets import POSTERIOR
+from bcppl.traces import Trace, simulate
+from tests.invariance import equal_weights
+
+AXES = 20
+
+
+def gaussian() -> None:
+    pyro.sample("x", dist.Normal(torch.zeros(AXES, dtype=torch.float64), 1.0).to_event(1))
+
+
+def with_copies(draws: int, copies: int) -> Population:
+    """Exact draws, each of them several times."""
+    return equal_weights(simulate(gaussian, (), draws)[torch.arange(draws * copies) % draws])
+
+
+def families_apart(population: Population) -> bool:
+    """Whether no value is on both sides."""
+    first, second = ({tuple(row) for row in population["x"][part].tolist()} for part in halves(population))
+    return not first & second
+
+
+def test_copies_are_of_one_half() -> None:
+    for seed in range(20):
+        torch.manual_seed(seed)
+        population = halved(with_copies(9, 5))
+        assert families_apart(population)
+        assert 0.25 * 45 <= int(population.sides.sum()) <= 0.75 * 45
+
+
+def test_descendants_are_on_their_ancestors_side() -> None:
+    torch.manual_seed(0)
+    start = halved(with_copies(40, 1).reweighed(torch.randn(40, dtype=torch.float64)))
+    side = dict(zip(start["x"][:, 0].tolist(), start.sides.tolist(), strict=True))
+    for later in (resample(start), resize(start, 90), replicate(start, 3), start[torch.tensor([3, 3, 7])]):
+        assert later.sides.tolist() == [side[x] for x in later["x"][:, 0].tolist()]
+    move = metropolis_hastings(drift("x"))
+    again = moved_by(resample(start), move, POSTERIOR, 5).population
+    assert torch.equal(again.sides, start.sides[again.founders])
+    whole = waste_free_moves(move, 10)(start, POSTERIOR).population
+    assert torch.equal(whole.sides, start.sides[whole.founders])
+
+
+def test_a_population_that_leans_to_one_side_is_split_by_families() -> None:
+    torch.manual_seed(1)
+    start = halved(with_copies(60, 1))
+    (many, few) = halves(start)
+    leaning = start[torch.cat([many.repeat(3), few[:2]])]
+    # Copies were moved apart: their values no longer show that they are of one family.
+    shifted = leaning.trace.at({"x": leaning["x"] + 0.1 * torch.randn_like(leaning["x"])})
+    again = halved(leaning.with_trace(shifted))
+    assert torch.equal(again.families, leaning.families)
+    assert not set(again.families[again.sides].tolist()) & set(again.families[~again.sides].tolist())
+    assert 0.25 <= float(again.sides.double().mean()) <= 0.75
+
+
+def test_a_single_family_is_split_by_values_and_equal_particles_are_not() -> None:
+    torch.manual_seed(2)
+    one = halved(with_copies(30, 1))[torch.full((30,), 4)]
+    assert len(halves(halved(one))) == 1
+    assert len(moved_by(one, metropolis_hastings(drift("x")), POSTERIOR, 2).population) == 30
+    spread = one.with_trace(one.trace.at({"x": torch.randn(30, AXES, dtype=torch.float64)}))
+    assert 0.25 * 30 <= int(halved(spread).sides.sum()) <= 0.75 * 30
+
+
+def at_random(population: Population) -> Population:
+    """The mutant: halves that ignore ancestry."""
+    sides = torch.randperm(len(population)) < len(population) // 2
+    return replace(population, sides=sides, families=torch.arange(len(population)))
+
+
+def by_sweeps(population: Population, kernel: Kernel) -> Tensor:
+    return moved_by(population, kernel, POSTERIOR, 3).population["x"]
+
+
+def by_chains(population: Population, kernel: Kernel) -> Tensor:
+    return markov_chains(kernel, population, 3, progress=False).trace["x"]
+
+
+@pytest.mark.parametrize("mutated", [False, True])
+@pytest.mark.parametrize("by", [by_sweeps, by_chains])
+def test_moves_leave_exact_draws_with_copies_as_they_are(
+    monkeypatch: pytest.MonkeyPatch, by: Callable[[Population, Kernel], Tensor], mutated: bool
+) -> None:
+    """A normal in 20 axes, learned from four copies of each of 60 draws: from their own, it draws them in."""
+    if mutated:
+        for home in ("bcppl.inference.kernels.rejuvenation", "bcppl.inference.chains"):
+            monkeypatch.setattr(import_module(home), "halved", at_random)
+    torch.manual_seed(3)
+    changes = []
+    for _ in range(30):
+        population = with_copies(60, 4)
+        after = by(population, metropolis_hastings(independent("x", 1)))
+        changes.append((after.square() - population["x"].square()).mean())
+    change = torch.stack(changes)
+    z = float(change.mean() / (change.std() / math.sqrt(len(change))))
+    assert z < -5.0 if mutated else abs(z) < 3.5
+
+
+class Spied:
+    """A random walk that records the values that it is fitted to, and those that it moves."""
+
+    def __init__(self) -> None:
+        self.learned: list[set[float]] = []
+        self.moved: list[set[float]] = []
+        self.proposal = Fitted(self.fit)
+
+    def fit(self, population: Population) -> Callable[[Trace], None]:
+        learned = set(population["x"][:, 0].tolist())
+
+        def walk(trace: Trace) -> None:
+            self.learned.append(learned)
+            self.moved.append(set(trace["x"][:, 0].tolist()))
+            pyro.sample("x", dist.Normal(trace["x"], 1e-9).to_event(1))
+
+        return walk
+
+
+def by_pair(population: Population, proposal: Fitted) -> None:
+    moved(population, Pair(proposal, proposal))
+
+
+def by_waste_free(population: Population, proposal: Fitted) -> None:
+    waste_free_moves(metropolis_hastings(proposal), 10)(population, POSTERIOR)
+
+
+def by_kernel(population: Population, proposal: Fitted) -> None:
+    moved_by(population, metropolis_hastings(proposal), POSTERIOR, 1)
+
+
+@pytest.mark.parametrize("by", [by_pair, by_waste_free, by_kernel])
+def test_nothing_is_learned_from_copies(by: Callable[[Population, Fitted], None]) -> None:
+    for seed in range(10):
+        torch.manual_seed(seed)
+        spied = Spied()
+        by(with_copies(12, 5), spied.proposal)
+        assert spied.moved
+        for learned, values in zip(spied.learned, spied.moved, strict=True):
+            assert not learned & values
