@@ -196,7 +196,8 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "entry of a vector": (lambda: simulate(first_entry, (), N), r"'x' has 3 .* 5 particles; .*`\[:, k\]`"),
     "no such value": (lambda: simulate(latent_and_seen, (), N)["q"], "no value at address 'q'; it has x, y"),
-    "update by a number": (lambda: updated({"x": 1.0}), "'x' is a float; give a tensor"),  # type: ignore[dict-item]
+    "update by a number": (lambda: updated({"x": 1.0}), "'x' has shape .., the old one"),
+    "update by a word": (lambda: updated({"x": "one"}), "'x' is a str; give a tensor"),  # type: ignore[dict-item]
     "update of whole numbers by reals": (
         lambda: update(simulate(sampled_whole, (), N), {"x": ones}),
         "'x' is of torch.float64, the old one of torch.int64",

@@ -231,7 +231,7 @@ REFUSED: dict[str, tuple[Callable[[Trace], Any], str]] = {
     "shape": (lambda t: update(t, {"x": t["x"][:2]}, args=(3,)), r"'x' has shape \(2,\)"),
     "shape of a new value": (lambda t: update(t, {"z_2": t["x"][:2]}, args=(3,)), r"'z_2' has shape \(2,\)"),
     "one for each": (lambda t: update(t, observations={"a_0": t["x"]}), "the same for all particles"),
-    "no tensor": (lambda t: update(t, observations={"a_0": 1.0}), "'a_0' is a float"),
+    "no number": (lambda t: update(t, observations={"a_0": "x"}), "'a_0' is a str"),  # type: ignore[dict-item]
     "arguments": (lambda t: update(t, args=3), "arguments are of type int; give a tuple"),
     "vanished": (lambda t: extend(t, (1,), {}), "no longer visits address 'z_1'"),
 }
@@ -271,7 +271,7 @@ def test_a_masked_latent_site_is_refused() -> None:
     trace, weight = generate(masked, (False, "y"), {"y": torch.nan_to_num(values)}, N)
     torch.testing.assert_close(weight, normal_log(values[0], trace["x"], 1.0))
     trace.log_prob()
-    sentence = "site '{}' is latent and its distribution is masked, .*; mask observed sites only"
+    sentence = "site '{}' is latent and its distribution is masked, .* ignore its value with `torch.where`"
     with pytest.raises(InputError, match=sentence.format("x")):
         generate(masked, (False,), {"y": torch.nan_to_num(values)}, N)
     with pytest.raises(InputError, match=sentence.format("y")):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import torch
 from pyro.distributions.torch_distribution import ExpandedDistribution, MaskedDistribution
 from torch import Tensor
-from torch.distributions import Independent, constraints
+from torch.distributions import Distribution, Independent, constraints
 
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
@@ -22,10 +23,24 @@ def base(distribution: Any) -> Any:
 
 
 def masks(distribution: Any) -> bool:
-    """Whether a distribution leaves some values out of its log-probability (`.mask()`)."""
+    """Whether a distribution, or one that it is made of, leaves values out of its log-probability.
+
+    That is what `.mask()` does. It may be made of others as their transformation, mixture or choice.
+    """
     if isinstance(distribution, MaskedDistribution) and not torch.as_tensor(distribution._mask).all():
         return True
-    return isinstance(distribution, WRAPPERS) and masks(distribution.base_dist)
+    return any(map(masks, _components(vars(distribution).values())))
+
+
+def _components(attributes: Iterable[Any]) -> Iterator[Any]:
+    """The distributions among the attributes of one, also within lists, tuples and dictionaries."""
+    for each in attributes:
+        if isinstance(each, Distribution):
+            yield each
+        elif type(each) in (list, tuple):
+            yield from _components(each)
+        elif type(each) is dict:
+            yield from _components(each.values())
 
 
 def freedom_of(distribution: Any) -> Freedom | None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -36,6 +38,24 @@ def unfit_particles(site: str, particles: int, given: int) -> InputError:
     return InputError(
         f"site {site!r} has {given} entries where there are {particles} particles; index the entries of a "
         "sampled vector with `[:, k]`, and make a vector one event with `.to_event(1)`."
+    )
+
+
+def other_addresses(addresses: Collection[str]) -> InputError:
+    """The error of values at which a program visits other addresses than before."""
+    return InputError(
+        "new values changed which addresses the program visits "
+        f"({', '.join(map(repr, sorted(addresses)))}); "
+        "sample such a site always, from its prior, and where it plays no part ignore its value with "
+        "`torch.where`, or make a trace for each structure."
+    )
+
+
+def unsampled(address: str, distribution: Any) -> InputError:
+    """The error of a site that is to be sampled from a distribution that cannot be."""
+    return InputError(
+        f"site {address!r} is to be sampled, but its distribution {type(distribution).__name__} defines no "
+        "`sample`; give the site an observation, or the distribution a sampler."
     )
 
 

@@ -26,7 +26,8 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.shortcuts import drawn
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry, carrying
-from bcppl.traces.explained import explained, unfit, unfit_particles
+from bcppl.traces.explained import explained, unfit, unfit_particles, unsampled
+from bcppl.traces.values import Value, tensors
 
 Program = Callable[..., Any]
 PARTICLES = "particles"
@@ -66,7 +67,7 @@ def run(
     program: Program,
     args: tuple[Any, ...],
     particles: int,
-    given: Mapping[str, Tensor],
+    given: Mapping[str, Value],
     carried: Mapping[str, Entry],
     *,
     draws_lazy: bool = True,
@@ -86,7 +87,7 @@ def run(
             f"a program's arguments are of type {type(args).__name__}; give a tuple of them, `(x,)` for one."
         )
     particles = whole_number("a program was to be run for {} particles", particles)
-    refuse_other_than_tensors(given)
+    given = tensors(given)
     recorder = _Recorder(particles, given, draws_lazy)
     with carrying(carried, particles) as used, torch.no_grad(), pyro.validation_enabled(False):
         try:
@@ -100,15 +101,6 @@ def run(
     values, fixed = recorder.values, frozenset(recorder.fixed)
     coincident, whole = frozenset(recorder.coincident), frozenset(plate.whole)
     return Run(recorder.distributions, values, fixed, used, result, coincident, whole)
-
-
-def refuse_other_than_tensors(given: Mapping[str, Any]) -> None:
-    """Refuse a value that is no tensor; the error names its address."""
-    for address, value in given.items():
-        if not isinstance(value, Tensor):
-            raise InputError(
-                f"the value given for address {address!r} is a {type(value).__name__}; give a tensor."
-            )
 
 
 @contextmanager
@@ -194,7 +186,8 @@ class _Recorder(Messenger):
         if message["mask"] is not None or _scaled(message["scale"]):
             raise InputError(
                 f"site {address!r} is scaled or masked by a handler or lies in a subsampled plate, which "
-                "traces do not read; use the distribution's own `.mask()`, or weigh inside a distribution."
+                "traces do not read; mask an observed site by its distribution's own `.mask()`, or weigh "
+                "inside a distribution."
             )
         if not isinstance(distribution, TorchDistributionMixin):
             kind = f"{type(distribution).__module__}.{type(distribution).__name__}"
@@ -212,7 +205,7 @@ class _Recorder(Messenger):
             self.values[address] = value
         elif message["value"] is None:
             lazy = not self.draws_lazy and isinstance(distribution, LazyDistribution)
-            message["value"] = distribution.undrawn() if lazy else drawn(distribution)
+            message["value"] = distribution.undrawn() if lazy else _draw(address, distribution)
 
     def _pyro_post_sample(self, message: Any) -> None:
         address = message["name"]
@@ -264,6 +257,14 @@ class _Recorder(Messenger):
                 f"the value of site {address!r} has shape {tuple(value.shape)}; one value for all particles "
                 f"has shape {one}, one for each of {self.particles} particles {(self.particles, *one)}."
             )
+
+
+def _draw(address: str, distribution: Any) -> Any:
+    try:
+        value = drawn(distribution)
+        return distribution() if value is None else value
+    except NotImplementedError as error:
+        raise unsampled(address, distribution) from error
 
 
 def _is_no_choice(message: Any) -> bool:

@@ -19,9 +19,10 @@ from bcppl.distributions.support import log_prob_inside, masks, support_of
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.dependence import comparison, equal
-from bcppl.traces.explained import hidden_site, not_a_number
+from bcppl.traces.explained import hidden_site, not_a_number, other_addresses
 from bcppl.traces.indexing import Index, beside, particles_at
-from bcppl.traces.run import Program, Run, inward, refuse_other_than_tensors, run
+from bcppl.traces.run import Program, Run, inward, run
+from bcppl.traces.values import Value, tensors
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -210,11 +211,11 @@ class Trace:
         secret._keep_run(self._run)
         return secret
 
-    def at(self, values: Mapping[str, Tensor]) -> Trace:
+    def at(self, values: Mapping[str, Value]) -> Trace:
         """The trace at other values of some latent addresses; log-probabilities that stay are kept.
 
         Raises:
-            InputError: an address is not latent; a value is no tensor, has the wrong shape, or is real where
+            InputError: an address is not latent; a value is no array, has the wrong shape, or is real where
                 the old one is a whole number; or the values change which addresses the program visits.
         """
         self.refuse_other_than_latent(values)
@@ -232,7 +233,7 @@ class Trace:
     def _at_same_addresses(self, values: Mapping[str, Tensor], without: Collection[str] = ()) -> Trace:
         revised = self.revised(values, without=without)
         if set(revised.addresses) != set(self.addresses):
-            raise InputError("new values changed which addresses the program visits; mask sites instead.")
+            raise other_addresses(set(self.addresses) ^ set(revised.addresses))
         return revised
 
     def revised(
@@ -260,14 +261,15 @@ class Trace:
         ran = run(self.program, args, self.particles, given, self.carried, draws_lazy=draws_lazy)
         observed = {a: v for a, v in observed.items() if a in ran.distributions}
         revised = type(self).of_run(self.program, args, self.particles, ran, observed, self.hidden)
+        refuse_masked_latents(revised)
         known = [a for a in self.known if a in ran.distributions]
         lost = set(changed(self, revised, known))
         revised.known.update({a: self.known[a] for a in known if a not in lost})
         return revised
 
-    def as_replacing(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def as_replacing(self, values: Mapping[str, Value]) -> dict[str, Tensor]:
         """New values of latent addresses, of the type of the old ones; others than `at` takes are refused."""
-        refuse_other_than_tensors(values)
+        values = tensors(values)
         for address, value in values.items():
             old = self.choices[address]
             if not torch.can_cast(value.dtype, old.dtype):
@@ -304,12 +306,19 @@ class _Hiding(UserDict[str, Any]):
         return self.data[address]
 
 
+def refuse_masked_latents(trace: Trace) -> None:
+    """Refuse a trace with a latent site that masks some of its values."""
+    for address in trace.choices:
+        refuse_masked(address, trace._run.distributions[address])
+
+
 def refuse_masked(address: str, distribution: Any) -> None:
     """Refuse the distribution of a latent site that masks some of its values."""
     if masks(distribution):
         raise InputError(
             f"site {address!r} is latent and its distribution is masked, so that the target would be "
-            "improper; mask observed sites only."
+            "improper; sample it from its prior for every particle, and where it plays no part ignore its "
+            "value with `torch.where`."
         )
 
 

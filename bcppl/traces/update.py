@@ -11,8 +11,10 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
+from bcppl.traces.explained import other_addresses
 from bcppl.traces.series import SeriesTrace
 from bcppl.traces.trace import Trace, changed
+from bcppl.traces.values import Value, tensors
 from bcppl.traces.verbs import constrained, copied, log_weight, refuse_unfit
 
 
@@ -51,10 +53,10 @@ class Update:
 
 def update(
     trace: Trace,
-    values: Mapping[str, Tensor] | None = None,
+    values: Mapping[str, Value] | None = None,
     *,
     args: tuple[Any, ...] | None = None,
-    observations: Mapping[str, Tensor] | None = None,
+    observations: Mapping[str, Value] | None = None,
 ) -> Update:
     """Change values, arguments and observations of a trace, all at once; what is not given stays.
 
@@ -73,7 +75,7 @@ def update(
             that is never visited; one has the wrong shape or type; new values change which addresses are
             visited, while the arguments stay; or a new latent pose lies in a plate.
     """
-    values, observations = values or {}, copied(observations or {})
+    values, observations = tensors(values or {}), copied(observations or {})
     old = {**trace.choices, **trace.observations}
     replaced = {a: v for a, v in values.items() if a in old or args is None}
     trace.refuse_other_than_latent(replaced)
@@ -84,7 +86,7 @@ def update(
     new = trace.revised(given, args=args, observations=observations)
     new._run.refuse_unvisited((*values, *observations))
     if args is None and set(new.addresses) != set(trace.addresses):
-        raise InputError("new values changed which addresses the program visits; mask sites instead.")
+        raise other_addresses(set(new.addresses) ^ set(trace.addresses))
     if args is not None or observations:
         refuse_unfit(new, observations, old)
     vanished = [a for a in old if a not in new._run.distributions]
@@ -96,8 +98,8 @@ def update(
 def extend(
     trace: Trace,
     args: tuple[Any, ...],
-    observations: Mapping[str, Tensor],
-    choices: Mapping[str, Tensor] | None = None,
+    observations: Mapping[str, Value],
+    choices: Mapping[str, Value] | None = None,
 ) -> tuple[Trace, Tensor]:
     """An update by new arguments that adds sites and changes no value, with its log weight.
 

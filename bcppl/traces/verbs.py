@@ -17,9 +17,10 @@ from bcppl.distributions.support import refuse_several_poses
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.indexing import indexed
-from bcppl.traces.run import Program, Run, refuse_other_than_tensors, run
+from bcppl.traces.run import Program, Run, run
 from bcppl.traces.series import Series, SeriesTrace, Stage, runnable
-from bcppl.traces.trace import Trace, refuse_masked, shapes
+from bcppl.traces.trace import Trace, refuse_masked_latents, shapes
+from bcppl.traces.values import Value, tensors
 
 # A vector that was meant as one event is unlikely to have more entries.
 FEW = 20
@@ -40,17 +41,17 @@ def simulate(program: Program | Series, args: tuple[Any, ...] = (), particles: i
 def generate(
     program: Program | Series,
     args: tuple[Any, ...],
-    observations: Mapping[str, Tensor],
+    observations: Mapping[str, Value],
     particles: int,
-    choices: Mapping[str, Tensor] | None = None,
+    choices: Mapping[str, Value] | None = None,
 ) -> tuple[Trace, Tensor]:
     """Run a program with some sites constrained, the others drawn from the program itself.
 
     Args:
         program: a Pyro program.
         args: its arguments.
-        observations: values by address, of the shape of the site's plates and event: the same for all
-            particles. They are copied.
+        observations: tensors, arrays or numbers by address, of the shape of the site's plates and event: the
+            same for all particles. They are copied; floats become float64.
         particles: N.
         choices: values (N, ...) of latent addresses, such as a proposal gave; the others are drawn. One value
             without the particle axis is that of all particles.
@@ -65,8 +66,6 @@ def generate(
             latent site is masked; see also `bcppl.traces.run.run`.
     """
     trace, weighed = constrained(runnable(program), args, particles, observations, choices or {})
-    for address in trace.choices:
-        refuse_masked(address, trace._run.distributions[address])
     return trace, log_weight(trace, weighed)
 
 
@@ -94,7 +93,7 @@ def propose(program: Program | Series, args: tuple[Any, ...], particles: int) ->
 
 
 def assess(
-    program: Program | Series, args: tuple[Any, ...], choices: Mapping[str, Tensor], particles: int
+    program: Program | Series, args: tuple[Any, ...], choices: Mapping[str, Value], particles: int
 ) -> Tensor:
     """Log-density (N,) of a program at given values for all of its choices.
 
@@ -105,7 +104,7 @@ def assess(
 
 
 def assessed(
-    program: Program | Series, args: tuple[Any, ...], choices: Mapping[str, Tensor], particles: int
+    program: Program | Series, args: tuple[Any, ...], choices: Mapping[str, Value], particles: int
 ) -> Trace:
     """The trace of a program at given values for all of its choices; it raises what `assess` does."""
     program = runnable(program)
@@ -125,8 +124,8 @@ def constrained(
     program: Program,
     args: tuple[Any, ...],
     particles: int,
-    observations: Mapping[str, Tensor],
-    choices: Mapping[str, Tensor],
+    observations: Mapping[str, Value],
+    choices: Mapping[str, Value],
     carried: Mapping[str, Entry] | None = None,
 ) -> tuple[Trace, list[str]]:
     """A program run as by `generate`, or one step of a series, and the addresses that weigh it."""
@@ -138,6 +137,7 @@ def constrained(
     ran = run(program, args, particles, given, carried or {})
     ran.refuse_unvisited(given)
     trace = _traced(program, args, particles, ran, observations)
+    refuse_masked_latents(trace)
     # The steps of a series after the first visit what that has visited.
     later = isinstance(program, Stage) and program.number > 1
     refuse_unfit(trace, observations, trace.addresses if later else ())
@@ -163,10 +163,9 @@ def _traced(
     return kind.of_run(program, args, particles, ran, observations or {})
 
 
-def copied(observations: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def copied(observations: Mapping[str, Value]) -> dict[str, Tensor]:
     """Observations as a trace keeps them: an array that is written to again does not change it."""
-    refuse_other_than_tensors(observations)
-    return {address: value.detach().clone() for address, value in observations.items()}
+    return {address: value.detach().clone() for address, value in tensors(observations).items()}
 
 
 def _refuse_fixed(ran: Run) -> None:
