@@ -1,0 +1,39 @@
+"""Values as the verbs take them: tensors, numpy arrays or numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from bcppl.errors import InputError
+
+Value = Tensor | npt.NDArray[Any] | float
+
+
+def tensors(given: Mapping[str, Value]) -> dict[str, Tensor]:
+    """Values by address as tensors: a float becomes float64, a whole number int64, an array keeps its type.
+
+    Raises:
+        InputError: a value is none of these, or an array of no numbers; names its address.
+    """
+    return {address: _tensor(address, value) for address, value in given.items()}
+
+
+def _tensor(address: str, value: Any) -> Tensor:
+    if isinstance(value, Tensor):
+        return value
+    if isinstance(value, float):
+        return torch.tensor(value, dtype=torch.float64)
+    if isinstance(value, bool | int) or (
+        isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biuf"
+    ):
+        return torch.as_tensor(np.asarray(value).copy())
+    kind = f"{value.dtype} array" if isinstance(value, np.ndarray) else type(value).__name__
+    raise InputError(
+        f"the value given for address {address!r} is a {kind}; give a tensor, a numpy array or a number."
+    )
