@@ -110,7 +110,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
         "'a_0' was observed or sampled before",
     ),
     "vanished": (lambda: extend(simulate(vanishing, (0,), N), (1,), {}), "no longer visits address 'x'"),
-    "no tensor": (lambda: generate(latent_and_seen, (), {"y": 1.0}, N), "'y' is a float"),  # type: ignore[dict-item]
+    "no number": (lambda: generate(latent_and_seen, (), {"y": "x"}, N), "'y' is a str"),  # type: ignore[dict-item]
     "wrong shape": (
         lambda: generate(latent_and_seen, (), {"y": torch.zeros(3)}, N),
         "'y' has shape \\(3,\\)",

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InferenceError, InputError, NotANumberError
+from bcppl.traces.faults import Fault, ProgramError
 
 _MISMATCHED = re.compile(r"Shape mismatch inside plate\('(.+)'\) at site (.+) dim (-?\d+), (\d+) vs (\d+)")
 _COLLIDING = re.compile(r'at plates "(.+)" and "(.+)", collide at dim=(-?\d+)')
@@ -43,11 +44,13 @@ def unfit_particles(site: str, particles: int, given: int) -> InputError:
 
 def other_addresses(addresses: Collection[str]) -> InputError:
     """The error of values at which a program visits other addresses than before."""
-    return InputError(
+    return ProgramError(
+        Fault.ADDRESSES,
+        min(addresses),
         "new values changed which addresses the program visits "
         f"({', '.join(map(repr, sorted(addresses)))}); "
         "sample such a site always, from its prior, and where it plays no part ignore its value with "
-        "`torch.where`, or make a trace for each structure."
+        "`torch.where`, or make a trace for each structure.",
     )
 
 

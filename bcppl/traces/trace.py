@@ -20,6 +20,7 @@ from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.dependence import comparison, equal
 from bcppl.traces.explained import hidden_site, not_a_number, other_addresses
+from bcppl.traces.faults import Fault, ProgramError
 from bcppl.traces.indexing import Index, beside, particles_at
 from bcppl.traces.run import Program, Run, inward, run
 from bcppl.traces.values import Value, tensors
@@ -315,10 +316,12 @@ def refuse_masked_latents(trace: Trace) -> None:
 def refuse_masked(address: str, distribution: Any) -> None:
     """Refuse the distribution of a latent site that masks some of its values."""
     if masks(distribution):
-        raise InputError(
+        raise ProgramError(
+            Fault.MASKED,
+            address,
             f"site {address!r} is latent and its distribution is masked, so that the target would be "
             "improper; sample it from its prior for every particle, and where it plays no part ignore its "
-            "value with `torch.where`."
+            "value with `torch.where`.",
         )
 
 

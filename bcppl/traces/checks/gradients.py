@@ -1,0 +1,79 @@
+"""Whether gradients that a trace gives are those of its log-probabilities."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.support import freedom_of, support_of
+from bcppl.errors import InputError
+from bcppl.traces.checks.comparing import log_probs
+from bcppl.traces.faults import Fault, ProgramError
+from bcppl.traces.gradient import log_prob_with_grad
+from bcppl.traces.trace import Trace
+
+# Of a difference, in units of a value.
+STEP = 1e-5
+# A gradient is wrong if it is off by more, at most particles.
+RELATIVE = 0.1
+
+
+def check_gradients(trace: Trace) -> None:
+    """Check gradients with respect to each real latent value, in double precision, by central differences.
+
+    A site that passes no gradient on at all is refused where one is asked for, and is not looked at.
+
+    Raises:
+        ProgramError: the gradient of a site is another (GRADIENT): one of the ways in which it depends on a
+            value is cut.
+    """
+    for latent, value in trace.choices.items():
+        distribution = trace.distributions[latent]
+        if value.dtype != torch.float64 or freedom_of(distribution) is not None:
+            continue
+        if isinstance(distribution, LazyDistribution) or support_of(distribution).event_dim > 0:
+            continue
+        _check(trace, latent, value)
+
+
+def _check(trace: Trace, latent: str, value: Tensor) -> None:
+    direction = torch.randn_like(value)
+    step = STEP * (1.0 + value.abs())
+    ahead = log_probs(trace.at({latent: value + step * direction}))
+    behind = log_probs(trace.at({latent: value - step * direction}))
+    for site in trace.addresses:
+        if not bool((ahead[site] != behind[site]).any()):
+            continue
+        gradient = _gradient(trace, latent, value, site)
+        if gradient is None:
+            continue
+        along = (gradient * direction * step).reshape(len(value), -1).sum(1)
+        difference = (ahead[site] - behind[site]) / 2.0
+        rounding = 1e-9 * (1.0 + ahead[site].abs())
+        wrong = (along - difference).abs() > RELATIVE * torch.maximum(
+            along.abs(), difference.abs()
+        ) + rounding
+        wrong = wrong & torch.isfinite(difference)
+        if float(wrong.double().mean()) > 0.5:
+            raise ProgramError(
+                Fault.GRADIENT,
+                site,
+                f"the gradient of site {site!r} with respect to {latent!r} is not that of its "
+                "log-probability, since a part of what it depends on is cut off; compute it with torch "
+                "alone, without `detach`, `item`, `numpy` or `torch.tensor` of a tensor.",
+            )
+
+
+def _gradient(trace: Trace, latent: str, value: Tensor, site: str) -> Tensor | None:
+    """The gradient of one site's log-probability; None where it passes none on."""
+    leaf = value.detach().clone().requires_grad_()
+    others = {address: 0.0 for address in trace.addresses if address != site}
+    try:
+        total = log_prob_with_grad(trace, {latent: leaf}, others)
+    except InputError:
+        return None
+    if not total.requires_grad:
+        return None
+    (gradient,) = torch.autograd.grad(total.sum(), leaf, allow_unused=True)
+    return gradient
