@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bcppl.traces import Fault, ProgramError, check_program
+from bcppl.traces import ProgramError, check_program
 from tests.wrong_programs import WRONG
 
 

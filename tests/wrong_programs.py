@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pyro
@@ -310,7 +310,7 @@ def root_of_a_normal() -> None:
 class Custom(dist.TorchDistribution):
     """A distribution of one number, as users write them: subclasses sample and give densities."""
 
-    arg_constraints: dict[str, Any] = {}
+    arg_constraints: ClassVar[dict[str, Any]] = {}
     support = constraints.real
 
     def __init__(self, shape: Any = ()) -> None:
