@@ -435,7 +435,7 @@ def through_a_closure() -> None:
 @pytest.mark.parametrize(
     ("program", "match"),
     [
-        (through_a_global, "site 'y' has log-probability .* after 'shift' was updated and .* hold all"),
+        (through_a_global, "site 'y' reads 'LAST' from outside .* hold all"),
         (at_random, "site 'y' has log-probability .* draws random numbers"),
     ],
 )

@@ -9,8 +9,8 @@ Two values are the same if they are one object; tensors or arrays that are equal
 objects, partial applications, or functions with equal code, whose parts are the same. Parts that cache what
 the others determine do not count: the attributes that a class names in `__caches__`, and the values of
 `functools.cached_property` where not both have one or it is no number and no array.
-What is stored neither in a value nor in its parts is not seen: a global variable, or a write into an object
-that both runs share.
+What is stored neither in a value nor in its parts is not seen: a write into an object that both runs share.
+Global variables that a lazy site reads are compared besides (`bcppl.traces.surroundings`).
 """
 
 from __future__ import annotations

@@ -27,6 +27,7 @@ from bcppl.distributions.shortcuts import drawn
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry, carrying
 from bcppl.traces.explained import explained, unfit, unfit_particles, unsampled
+from bcppl.traces.surroundings import surroundings
 from bcppl.traces.values import Value, tensors
 
 Program = Callable[..., Any]
@@ -45,6 +46,7 @@ class Run:
         result: what it returned.
         coincident: addresses with a plate or an event axis of N entries (`bcppl.traces.verbs`).
         whole: the first address, if its distribution had N entries before it was expanded to the particles.
+        surroundings: what lazy sites read from outside, where they do (`bcppl.traces.surroundings`).
     """
 
     distributions: dict[str, Any]
@@ -54,6 +56,7 @@ class Run:
     result: Any
     coincident: frozenset[str]
     whole: frozenset[str]
+    surroundings: Mapping[str, dict[Any, Any]]
 
     def refuse_unvisited(self, addresses: Iterable[str]) -> None:
         """Refuse addresses that the program did not visit."""
@@ -100,7 +103,8 @@ def run(
             raise reason from error
     values, fixed = recorder.values, frozenset(recorder.fixed)
     coincident, whole = frozenset(recorder.coincident), frozenset(plate.whole)
-    return Run(recorder.distributions, values, fixed, used, result, coincident, whole)
+    outside = surroundings(recorder.distributions)
+    return Run(recorder.distributions, values, fixed, used, result, coincident, whole, outside)
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from bcppl.traces.explained import hidden_site, not_a_number, other_addresses
 from bcppl.traces.faults import Fault, ProgramError
 from bcppl.traces.indexing import Index, beside, particles_at
 from bcppl.traces.run import Program, Run, inward, run
+from bcppl.traces.surroundings import changed as surroundings_changed, evaluated, surroundings_of
 from bcppl.traces.values import Value, tensors
 
 
@@ -130,7 +131,7 @@ class Trace:
             refuse_masked(address, distribution)
         # A value that another one has moved out of the support is impossible, not a mistake.
         with torch.no_grad(), pyro.validation_enabled(False):
-            value = log_prob_inside(narrowed(distribution), inward(self._run.values[address], distribution))
+            value = self._log_prob_of(address, distribution)
         batch = distribution.batch_shape
         if value.shape not in ((), batch):
             raise InputError(
@@ -144,6 +145,21 @@ class Trace:
         if not bool(value.max() < torch.inf):
             raise not_a_number(address, value, self.choices.get(address), self.observations.get(address))
         return value
+
+    def _log_prob_of(self, address: str, distribution: Any) -> Tensor:
+        value = inward(self._run.values[address], distribution)
+        if address not in self._run.surroundings:
+            return log_prob_inside(narrowed(distribution), value)
+        then, now = self._run.surroundings[address], surroundings_of(distribution)
+        if (name := surroundings_changed(then, now)) is not None:
+            raise ProgramError(
+                Fault.DEPENDENCE,
+                address,
+                f"site {address!r} reads {name!r} from outside its distribution, and that has changed since "
+                "the program was run; hold all that the distribution depends on in it, as an attribute that "
+                "is made in each run.",
+            )
+        return evaluated(distribution, lambda: log_prob_inside(distribution, value))
 
     def __getitem__(self, key: str | Index) -> Any:
         if isinstance(key, str):
@@ -340,8 +356,10 @@ def changed(first: Trace, second: Trace, addresses: Iterable[str]) -> Iterator[s
     """Those of some addresses of two traces whose values or distributions differ."""
     same, then, now = comparison(), first._run, second._run
     for address in addresses:
-        if not equal(then.values[address], now.values[address]) or not same(
-            then.distributions[address], now.distributions[address]
+        if (
+            not equal(then.values[address], now.values[address])
+            or not same(then.distributions[address], now.distributions[address])
+            or surroundings_changed(then.surroundings.get(address, {}), now.surroundings.get(address, {}))
         ):
             yield address
 

@@ -38,7 +38,7 @@ def undisturbed() -> Iterator[None]:
 
 def seed(number: int) -> None:
     """Seed the generators of torch, numpy and Python."""
-    torch.manual_seed(number)
+    torch.default_generator.manual_seed(number)
     np.random.seed(number)
     random.seed(number)
 

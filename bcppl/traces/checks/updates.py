@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from bcppl.traces.checks.comparing import differing, log_probs, rerun
+from bcppl.traces.checks.comparing import differing, first_differing, log_probs, rerun
 from bcppl.traces.faults import Fault, ProgramError
 from bcppl.traces.trace import Trace
 from bcppl.traces.update import update
@@ -25,13 +25,28 @@ def check_updates(trace: Trace, other: Trace) -> None:
     Raises:
         ProgramError: a log-probability is another.
     """
-    log_probs(trace)
+    _check_late(trace, other)
     particles = trace.particles
     half, reverse = torch.arange(particles) % 2 == 0, torch.arange(particles).flip(0)
     for address, value in other.choices.items():
         moved = update(trace, {address: value}).trace
         _compare(moved, address)
         _compare(moved.where(half, trace)[reverse], address)
+
+
+def _check_late(trace: Trace, other: Trace) -> None:
+    """Check that a trace may be evaluated after the program was run at other values."""
+    expected, late = log_probs(trace), rerun(trace)
+    late.addresses  # noqa: B018
+    rerun(other).addresses  # noqa: B018
+    if (found := first_differing(expected, log_probs(late))) is not None:
+        raise ProgramError(
+            Fault.DEPENDENCE,
+            found[0],
+            f"site {found[0]!r} has another log-probability where the program was run at other values before "
+            "it is evaluated; hold all that its distribution depends on in the distribution, as an attribute "
+            "that is made in each run.",
+        )
 
 
 def _compare(trace: Trace, latent: str) -> None:
