@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
-import pytest
+import random
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
 
-from bcppl.traces import ProgramError, check_program
-from tests.wrong_programs import WRONG
+import numpy as np
+import pytest
+import torch
+
+from bcppl.errors import InputError
+from bcppl.models import camera_error, grasped_peg, look_and_touch, peg_in_hole, point_probe, which_hole
+from bcppl.traces import Fault, Model, ProgramError, check_program
+from tests.right_programs import RIGHT
+from tests.wrong_programs import WRONG, normal
 
 
 @pytest.mark.parametrize("name", WRONG)
@@ -15,3 +27,72 @@ def test_the_mistake_and_the_site_are_named(name: str) -> None:
         check_program(wrong.program, wrong.args, wrong.observations, steps=wrong.steps)
     assert (caught.value.fault, caught.value.site) == (wrong.fault, wrong.site), str(caught.value)
     assert str(caught.value).endswith(".") and (wrong.site is None or repr(wrong.site) in str(caught.value))
+
+
+def test_every_kind_of_mistake_is_shown() -> None:
+    assert {wrong.fault for wrong in WRONG.values()} == set(Fault)
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_a_right_program_passes(name: str) -> None:
+    right = RIGHT[name]
+    check_program(right.program, right.args, right.observations, steps=right.steps)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", RIGHT)
+def test_a_right_program_passes_whatever_is_drawn(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs, right = sys.modules["bcppl.traces.checks.runs"], RIGHT[name]
+    seed = runs.seed
+    for other in range(10):
+        monkeypatch.setattr(runs, "seed", lambda number, other=other: seed(number + 10_000 * (other + 1)))
+        check_program(right.program, right.args, right.observations, steps=right.steps)
+
+
+# Of each shipped model, a recording of its own world.
+SHIPPED = {
+    "point_probe": point_probe,
+    "look_and_touch": look_and_touch,
+    "which_hole": which_hole,
+    "camera_error": camera_error,
+    "peg_in_hole": peg_in_hole,
+    "grasped_peg": grasped_peg,
+}
+
+
+def few(model: Model, measurements: int) -> Any:
+    assert model.simulate_recording is not None
+    recording = model.simulate_recording(0)
+    return replace(recording, measurements=list(recording.measurements)[:measurements])
+
+
+@pytest.mark.parametrize("name", ["point_probe"])
+def test_a_shipped_model_passes(name: str) -> None:
+    check_program(SHIPPED[name].model, few(SHIPPED[name].model, 2), particles=4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_model_passes(name: str) -> None:
+    check_program(SHIPPED[name].model, few(SHIPPED[name].model, 4), particles=5)
+
+
+def states() -> list[Any]:
+    return [torch.get_rng_state().tolist(), np.random.get_state()[1].tolist(), random.getstate()]  # type: ignore[index, union-attr]
+
+
+def good() -> None:
+    normal("y", normal("x"))
+
+
+@pytest.mark.parametrize("program", [good, WRONG["torch_noise"].program])
+def test_the_generators_are_as_before(program: Callable[[], None]) -> None:
+    before = states()
+    with suppress(ProgramError):
+        check_program(program, (), {"y": 0.3})
+    assert states() == before
+
+
+def test_too_few_particles_are_refused() -> None:
+    with pytest.raises(InputError, match="checked with 2 particles; give 3 or more"):
+        check_program(good, (), {"y": 0.3}, 2)

@@ -20,7 +20,8 @@ from torch.distributions import constraints
 from torch.distributions.transforms import Transform
 
 from bcppl.distributions.lazy import LazyDistribution
-from bcppl.traces import Fault, Series
+from bcppl.traces import Fault, Series, simulate
+from tests import small_programs
 from tests.invariance import number
 from tests.small_programs import normal_log
 
@@ -101,7 +102,54 @@ WRONG["noise in a state"] = Wrong(
     Fault.RANDOMNESS, None, Series(lambda: normal("x"), noisy_step), (), {}, (((), {"y": 0.3}),)
 )
 
+
+NETWORK = torch.nn.Sequential(torch.nn.Linear(1, 8), torch.nn.Dropout(0.5), torch.nn.Linear(8, 1)).double()
+
+
+@wrong(Fault.RANDOMNESS)
+def network_in_training() -> None:
+    normal("y", NETWORK(normal("x")[:, None])[:, 0])
+
+
+@wrong(Fault.RANDOMNESS)
+def simulation_within() -> None:
+    x = normal("x")
+    normal("y", x + simulate(lambda: normal("noise"), (), len(x))["noise"])
+
+
 # ---- state
+
+BUFFER = torch.zeros(10_000, dtype=torch.float64)
+
+
+class Buffered(Reads):
+    def log_prob(self, value: Tensor) -> Tensor:
+        BUFFER[: len(self.x)] = super().log_prob(value)
+        return BUFFER[: len(self.x)]
+
+
+@wrong(Fault.STATE)
+def one_buffer_for_all_densities() -> None:
+    pyro.sample("y", Buffered(normal("x"), lambda: 0.0))
+
+
+class Shifting(Reads):
+    def log_prob(self, value: Tensor) -> Tensor:
+        self.x += 0.5
+        return super().log_prob(value)
+
+
+@wrong(Fault.STATE)
+def density_that_writes_into_itself() -> None:
+    pyro.sample("y", Shifting(normal("x") + 1.0, lambda: 0.0))
+
+
+@wrong(Fault.STATE, "y_0", iter([1.0, 2.0]), observations={})
+def exhausted_iterator(actions: Any) -> None:
+    x = normal("x")
+    for k, each in enumerate(actions):
+        normal(f"y_{k}", x + each)
+
 
 COUNTED = [0.0]
 GENERATOR = np.random.default_rng(0)
@@ -161,6 +209,12 @@ def in_place() -> None:
     normal("y", x)
 
 
+@wrong(Fault.OVERWRITTEN)
+def observation_in_place() -> None:
+    y = normal("y", normal("x"))
+    y *= 2.0
+
+
 # ---- addresses
 
 
@@ -171,7 +225,7 @@ def one_particle_decides_the_sites() -> None:
         normal("bad")
 
 
-@wrong(Fault.ADDRESSES, "bad", observations={})
+@wrong(Fault.RANDOMNESS, "bad", observations={})
 def chance_decides_the_sites() -> None:
     normal("x")
     if random.random() > 0.5:
@@ -251,6 +305,51 @@ def shared_out() -> None:
     normal("y", x / len(x))
 
 
+@wrong(Fault.COUNT, None)
+def as_many_as_now() -> None:
+    x = pyro.sample("x", dist.Normal(torch.zeros(10), 1.0))
+    normal("y", x)
+
+
+@wrong(Fault.MIXING)
+def mean_as_a_number() -> None:
+    x = normal("x")
+    normal("y", x - x.mean().item())
+
+
+@wrong(Fault.MIXING, "f", observations={})
+def summed_factor() -> None:
+    x = normal("x")
+    pyro.factor("f", -x.square().sum())
+
+
+@wrong(Fault.MIXING)
+def batch_norm() -> None:
+    normal("y", torch.nn.functional.batch_norm(normal("x")[:, None], None, None, training=True)[:, 0])
+
+
+@wrong(Fault.PLACE)
+def fixed_noise() -> None:
+    x = normal("x")
+    normal("y", x + torch.as_tensor(np.random.default_rng(0).normal(size=len(x))))
+
+
+def centred_step(x: Tensor) -> Tensor:
+    normal("y", x - x.mean())
+    return x
+
+
+def mixed_state(x: Tensor) -> Tensor:
+    normal("y", x)
+    return x - x.mean()
+
+
+ONE_STEP = (((), {"y": 0.3}),)
+IN_A_STEP, A_STATE = Series(lambda: normal("x"), centred_step), Series(lambda: normal("x"), mixed_state)
+WRONG["mixing in a step"] = Wrong(Fault.MIXING, "y", IN_A_STEP, (), {}, ONE_STEP)
+WRONG["a mixed state"] = Wrong(Fault.MIXING, None, A_STATE, (), {}, ONE_STEP)
+
+
 # ---- dependence
 
 
@@ -294,7 +393,58 @@ def cached_holder() -> None:
     pyro.sample("y", Reads(x, lambda: holder()["shift"]))
 
 
+class ClassWide(LazyDistribution):
+    shift: Any = 0.0
+
+    def __init__(self, x: Tensor) -> None:
+        self.x = x
+        super().__init__(len(x), ())
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return normal_log(value, self.x + self.shift, 1.0)
+
+
+@wrong(Fault.DEPENDENCE)
+def class_attribute() -> None:
+    x = normal("x")
+    ClassWide.shift = normal("shift")
+    pyro.sample("y", ClassWide(x))
+
+
+@wrong(Fault.DEPENDENCE)
+def module_attribute() -> None:
+    x = normal("x")
+    small_programs.shift = normal("shift")  # type: ignore[attr-defined]
+    pyro.sample("y", Reads(x, lambda: small_programs.shift))  # type: ignore[attr-defined]
+
+
+@wrong(Fault.DEPENDENCE)
+def function_attribute() -> None:
+    x = normal("x")
+    normal_log.shift = normal("shift")  # type: ignore[attr-defined]
+    pyro.sample("y", Reads(x, lambda: normal_log.shift))  # type: ignore[attr-defined]
+
+
+MEANS = torch.zeros(100_000, dtype=torch.float64)
+
+
+@wrong(Fault.DEPENDENCE)
+def one_buffer_for_all_means() -> None:
+    x = normal("x")
+    MEANS[: len(x)] = x
+    normal("y", MEANS[: len(x)])
+
+
 # ---- numbers and supports
+
+
+class Bounded(Reads):
+    log_prob_bound = -2.0
+
+
+@wrong(Fault.BOUND)
+def too_low_a_bound() -> None:
+    pyro.sample("y", Bounded(normal("x"), lambda: 0.0))
 
 
 @wrong(Fault.NOT_A_NUMBER)
@@ -404,6 +554,13 @@ def custom(fault: Fault, make: Callable[[], Any]) -> None:
     WRONG[make.__name__] = Wrong(fault, "x", program)
 
 
+class SeedsItself(VarianceForScale):
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        generator = torch.Generator().manual_seed(0)
+        return torch.randn(torch.Size(sample_shape) + self.batch_shape, generator=generator).double()
+
+
+custom(Fault.RANDOMNESS, SeedsItself)
 for make in (DeclaredReal, NoNumberBelowZero, DrawsOutside):
     custom(Fault.SUPPORT, make)
 for make in (WithoutConstant, VarianceForScale, OneDrawForAll, Dice, without_jacobian):

@@ -23,6 +23,7 @@ class Fault(Enum):
     NOT_A_NUMBER = "a log-probability that is no number"
     SUPPORT = "a support that is not that of the density"
     DENSITY = "draws and a density that disagree"
+    BOUND = "a bound that the density exceeds"
     GRADIENT = "a gradient that is cut"
 
 

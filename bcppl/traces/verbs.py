@@ -16,6 +16,7 @@ from torch import Tensor
 from bcppl.distributions.support import refuse_several_poses
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
+from bcppl.traces.faults import Fault, ProgramError
 from bcppl.traces.indexing import indexed
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.series import Series, SeriesTrace, Stage, runnable
@@ -222,9 +223,11 @@ def _refuse_coincidence(
         if isinstance(larger, Stage):
             indexed(again.result, None, particles + 1)
     except InputError as error:
-        raise InputError(
+        raise ProgramError(
+            Fault.COUNT,
+            None,
             f"with {particles} particles the shapes fit by coincidence alone; with one more, "
-            f"{str(error).removesuffix('.')}."
+            f"{str(error).removesuffix('.')}.",
         ) from error
     finally:
         torch.set_rng_state(state)

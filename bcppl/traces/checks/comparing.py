@@ -35,7 +35,8 @@ def log_probs(trace: Trace) -> dict[str, Tensor]:
     values = {}
     for address in trace.addresses:
         try:
-            values[address] = trace.log_prob(address)
+            # A copy: what a log-probability returns may be written to again.
+            values[address] = trace.log_prob(address).clone()
         except NotANumberError as error:
             raise ProgramError(Fault.NOT_A_NUMBER, address, str(error)) from error
     return values

@@ -56,7 +56,9 @@ def check_numbers(start: Start, particles: int) -> None:
     if not any(isinstance(each, LazyDistribution) for each in trace.distributions.values()):
         try:
             many = start(MANY)
-        except InputError as error:
+        except ProgramError:
+            raise
+        except (InputError, RuntimeError, ValueError, IndexError, TypeError) as error:
             sentence = f"the program runs with {particles} particles and not with {MANY}: {error}"
             raise ProgramError(Fault.COUNT, None, sentence) from error
         _refuse_impossible(many)
@@ -64,6 +66,15 @@ def check_numbers(start: Start, particles: int) -> None:
 
 def _refuse_impossible(trace: Trace) -> None:
     values = log_probs(trace)
+    for address, value in values.items():
+        bound = getattr(trace.distributions[address], "log_prob_bound", torch.inf)
+        if float(value.max()) > bound + 1e-9 * (1.0 + abs(bound)):
+            raise ProgramError(
+                Fault.BOUND,
+                address,
+                f"site {address!r} has log-probability {float(value.max()):.6g}, above its distribution's "
+                f"`log_prob_bound` of {bound:.6g}; give an upper bound at all values, or leave it out.",
+            )
     for address, value in trace.choices.items():
         distribution = trace.distributions[address]
         outside = values[address] == -torch.inf

@@ -52,7 +52,7 @@ def check_particles(trace: Trace, other: Trace) -> None:
             continue
         try:
             fewer = signature(rerun(trace[some]))
-        except InputError as error:
+        except (InputError, RuntimeError, ValueError, IndexError, TypeError) as error:
             raise ProgramError(
                 Fault.COUNT,
                 None,

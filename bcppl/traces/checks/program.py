@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+import torch
+
 from bcppl.errors import InputError
 from bcppl.traces.checks.comparing import Start, log_probs
 from bcppl.traces.checks.densities import check_densities, check_numbers
@@ -59,7 +61,10 @@ def check_program(
         for start, given in _starts(program, (args, observations or {}), steps):
             check_addresses(start, particles, given, program)
             check_numbers(start, particles)
-            trace, other = _evaluated(start, particles), _evaluated(start, particles)
+            trace = start(particles)
+            # Evaluated before any other run could change what a site of it reads.
+            log_probs(trace)
+            log_probs(other := _another(trace))
             check_reruns(trace, other, given, program)
             check_particles(trace, other)
             check_updates(trace, other)
@@ -92,11 +97,10 @@ def _first(program: Program, case: Case) -> Start:
     return lambda particles: constrained(program, case[0], particles, case[1], {})[0]
 
 
-def _evaluated(start: Start, particles: int) -> Trace:
-    """A trace, evaluated before any other run could change what a site of it reads."""
-    trace = start(particles)
-    log_probs(trace)
-    return trace
+def _another(trace: Trace) -> Trace:
+    """A trace at other values; of a series, of the same step from the states of the other particles."""
+    other, _ = constrained(trace.program, trace.args, trace.particles, trace.observations, {})
+    return other[torch.arange(trace.particles).roll(1)] if isinstance(other, SeriesTrace) else other
 
 
 def _next(start: Callable[[int], Trace], case: Case) -> Start:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from types import FunctionType
 from typing import Any
 
 import numpy as np
 import torch
+from pyro.distributions import Delta
 from torch import Tensor
 
 from bcppl.traces.checks.comparing import Start, first_differing, log_probs, rerun
@@ -19,6 +21,7 @@ from bcppl.traces.indexing import indexed
 from bcppl.traces.series import SeriesTrace
 from bcppl.traces.trace import Trace
 
+KEEPS_NOTHING = "use nothing that an earlier run leaves behind, no clock, and no random generator of its own"
 # Runs in which a program may visit other addresses: a fair choice stays unseen in one of 2^15.
 RUNS = 16
 
@@ -51,23 +54,14 @@ def check_addresses(start: Start, particles: int, args: Any, program: Any) -> No
             torch's generator is seeded (RANDOMNESS).
     """
     before, dtype = _Kept.of(args, program), torch.get_default_dtype()
-    first: Trace | None = None
-    generators = set()
+    first, others = start(particles), []
+    generators = {torch.get_rng_state().numpy().tobytes()}
     for number in range(RUNS):
         seed(1000 + number)
-        trace = start(particles)
+        others.append(trace := start(particles))
         generators.add(torch.get_rng_state().numpy().tobytes())
-        first = first or trace
-        other = set(trace.addresses) ^ set(first.addresses)
-        if other:
-            before.refuse_changed(min(other), "visits other addresses")
-            raise ProgramError(
-                Fault.ADDRESSES,
-                min(other),
-                f"site {min(other)!r} is visited in some runs and not in others; sample it always, from its "
-                "prior, and where it plays no part ignore its value with `torch.where`, or write a program "
-                "for each structure.",
-            )
+        if other := set(trace.addresses) ^ set(first.addresses):
+            raise _other_addresses(first, min(other), before)
         if torch.get_default_dtype() != dtype:
             torch.set_default_dtype(dtype)
             raise ProgramError(
@@ -81,6 +75,35 @@ def check_addresses(start: Start, particles: int, args: Any, program: Any) -> No
             None,
             "the program seeds torch's generator, so that all runs draw the same; seed it before it is run.",
         )
+    for address, value in first.choices.items():
+        again = all(equal(value, trace.choices[address]) for trace in others)
+        if again and value.is_floating_point() and not isinstance(first.distributions[address], Delta):
+            spread = bool((value != value[0]).any())
+            if spread:
+                raise ProgramError(
+                    Fault.RANDOMNESS,
+                    address,
+                    f"site {address!r} is sampled at the same values in every run; let its distribution draw "
+                    "from torch's generator, which it does not seed.",
+                )
+
+
+def _other_addresses(first: Trace, site: str, before: _Kept) -> ProgramError:
+    """The error of a site that some runs visit and others do not, at the same values or at others alone."""
+    visited, generators = set(first.addresses), _generators()
+    what = f"site {site!r} is visited in some runs and not in others"
+    if any(set(rerun(first).addresses) != visited for _ in range(RUNS)):
+        before.refuse_changed(site, what)
+        if _generators() != generators:
+            sentence = f"{what} at the same values; sample whatever is random by `pyro.sample`."
+            return ProgramError(Fault.RANDOMNESS, site, sentence)
+        return ProgramError(Fault.STATE, site, f"{what} at the same values; {KEEPS_NOTHING}.")
+    return ProgramError(
+        Fault.ADDRESSES,
+        site,
+        f"{what}; sample it always, from its prior, and where it plays no part ignore its value with "
+        "`torch.where`, or write a program for each structure.",
+    )
 
 
 def check_reruns(trace: Trace, other: Trace, args: Any, program: Any) -> None:
@@ -96,15 +119,22 @@ def check_reruns(trace: Trace, other: Trace, args: Any, program: Any) -> None:
         ProgramError: a density or the state of a series is another (RANDOMNESS, STATE), or the program
             writes into a site's value (OVERWRITTEN).
     """
-    before, values = _Kept.of(args, program), {a: v.clone() for a, v in trace.choices.items()}
+    before, values = _Kept.of(args, program), {a: trace[a].clone() for a in trace.addresses if a in trace}
     expected = log_probs(trace)
     log_probs(rerun(other))
+    if (found := first_differing(expected, log_probs(trace))) is not None:
+        raise ProgramError(
+            Fault.STATE,
+            found[0],
+            f"the log-probability of site {found[0]!r} is written over when another is evaluated; return a "
+            "new tensor each time.",
+        )
     generators = _generators()
     again = rerun(trace)
     got = log_probs(again)
     drew = _generators() != generators
     for address, value in values.items():
-        if not equal(value, trace.choices[address]):
+        if not equal(value, trace[address]):
             raise ProgramError(
                 Fault.OVERWRITTEN,
                 address,
@@ -120,6 +150,7 @@ def check_reruns(trace: Trace, other: Trace, args: Any, program: Any) -> None:
     elif isinstance(trace, SeriesTrace) and not _equal_states(trace, again):
         address, what = None, "a series' state is another in a run at values that were the same before"
     else:
+        _refuse_unrepeatable(again, got)
         return
     if drew:
         raise ProgramError(
@@ -131,9 +162,21 @@ def check_reruns(trace: Trace, other: Trace, args: Any, program: Any) -> None:
     raise ProgramError(
         Fault.STATE,
         address,
-        f"{what}; use nothing that an earlier run leaves behind, no clock, and no random generator of its "
-        "own.",
+        f"{what}; {KEEPS_NOTHING}.",
     )
+
+
+def _refuse_unrepeatable(trace: Trace, expected: dict[str, Tensor]) -> None:
+    """Refuse log-probabilities that are others when they are evaluated again in the same run."""
+    once_more = replace(trace, known={})
+    once_more._keep_run(trace._run)
+    if (found := first_differing(expected, log_probs(once_more))) is not None:
+        raise ProgramError(
+            Fault.STATE,
+            found[0],
+            f"site {found[0]!r} has another log-probability when it is evaluated again; change no attribute "
+            "of its distribution, and nothing that this holds, in `log_prob`.",
+        )
 
 
 def _generators() -> list[Any]:

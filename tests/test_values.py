@@ -1,0 +1,110 @@
+"""Observations and values are tensors, arrays or numbers; a site that cannot be sampled is named."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from torch import Tensor
+
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.errors import InputError
+from bcppl.inference import importance_sampling
+from bcppl.traces import Series, assess, extend, generate, simulate, update
+from tests.invariance import number
+from tests.small_programs import normal_log
+
+N = 4
+
+
+def program(count: int = 1) -> None:
+    x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+    for k in range(count):
+        pyro.sample(f"y_{k}", dist.Normal(x, 1.0))
+    pyro.sample("pair", dist.Normal(torch.zeros(2, dtype=torch.float64), 1.0).to_event(1))
+
+
+PAIR = np.array([0.1, 0.2])
+KINDS: dict[str, Any] = {
+    "float": 0.25,
+    "whole number": 2,
+    "numpy float": np.float64(0.25),
+    "numpy float32": np.float32(0.25),
+    "array": np.array(0.25),
+    "tensor": torch.tensor(0.25),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_verb_takes_numbers_and_arrays(kind: str) -> None:
+    given, value = KINDS[kind], number(float(KINDS[kind]))
+    torch.manual_seed(0)
+    trace, weight = generate(program, (), {"y_0": given, "pair": PAIR}, N)
+    expected = normal_log(value, trace["x"], 1.0)
+    torch.testing.assert_close(weight - trace.log_prob("pair"), expected)
+    assert trace["y_0"].dtype == (
+        torch.float64 if kind in ("float", "numpy float", "array") else trace["y_0"].dtype
+    )
+    longer, more = extend(trace, (2,), {"y_1": given})
+    torch.testing.assert_close(more, expected)
+    torch.testing.assert_close(update(longer, observations={"y_1": given}).log_ratio, torch.zeros(N).double())
+    moved = update(trace, {"x": np.full(N, 0.5)}).trace
+    torch.testing.assert_close(moved["x"], torch.full((N,), 0.5, dtype=torch.float64))
+    population = importance_sampling(program, (), {"y_0": given, "pair": PAIR}, N)
+    torch.testing.assert_close(population.trace["y_0"], trace["y_0"])
+    assert assess(program, (), {"x": np.zeros(N), "y_0": given, "pair": PAIR}, N).shape == (N,)
+
+
+def test_a_step_of_a_series_takes_numbers() -> None:
+    walk = Series(
+        lambda: pyro.sample("x", dist.Normal(number(0.0), 1.0)),
+        lambda x: pyro.sample("y", dist.Normal(x, 1.0)),
+    )
+    trace, _ = generate(walk, (), {}, N)
+    longer, weight = extend(trace, (), {"y": 0.25})
+    torch.testing.assert_close(weight, normal_log(number(0.25), trace["x"], 1.0))
+    assert longer["y"].dtype == torch.float64
+
+
+def test_an_array_that_is_written_to_again_changes_no_trace() -> None:
+    pair = PAIR.copy()
+    trace, _ = generate(program, (), {"y_0": 0.25, "pair": pair}, N)
+    pair[:] = 7.0
+    assert trace["pair"].tolist() == PAIR.tolist()
+
+
+@pytest.mark.parametrize(
+    ("value", "kind"), [("0.25", "str"), (np.array(["a"]), "<U1 array"), (None, "NoneType")]
+)
+def test_what_is_no_number_is_refused(value: Any, kind: str) -> None:
+    with pytest.raises(
+        InputError, match=f"address 'y_0' is a {kind}; give a tensor, a numpy array or a number"
+    ):
+        generate(program, (), {"y_0": value, "pair": PAIR}, N)
+
+
+class NoSampler(LazyDistribution):
+    def __init__(self, x: Tensor) -> None:
+        self.x = x
+        super().__init__(len(x), ())
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return normal_log(value, self.x, 1.0)
+
+
+def test_a_site_that_cannot_be_sampled_is_named() -> None:
+    def lazy() -> None:
+        pyro.sample("y", NoSampler(pyro.sample("x", dist.Normal(number(0.0), 1.0))))
+
+    sentence = (
+        "site 'y' is to be sampled, but its distribution NoSampler defines no `sample`; give the site an"
+    )
+    with pytest.raises(InputError, match=sentence):
+        simulate(lazy, (), N)
+    with pytest.raises(InputError, match=sentence):
+        generate(lazy, (), {}, N)
+    assert generate(lazy, (), {"y": 0.25}, N)[1].shape == (N,)
