@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -79,7 +80,7 @@ def signature(trace: Trace) -> dict[str, Tensor]:
 def _tensors(name: str, state: object) -> dict[str, Tensor]:
     if isinstance(state, Tensor):
         return {name: state} if state.ndim else {}
-    parts = state.items() if isinstance(state, Mapping) else []
+    parts: Iterable[tuple[Any, Any]] = state.items() if isinstance(state, Mapping) else ()
     parts = enumerate(state) if isinstance(state, list | tuple) else parts
     return {n: v for key, part in parts for n, v in _tensors(f"{name} ({key})", part).items()}
 

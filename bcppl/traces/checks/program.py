@@ -76,9 +76,9 @@ def _cases(model: Model, recording: Any) -> tuple[Program | Series, Case, list[C
     """A model's program, with what a recording's measurements make of its arguments and observations."""
     scene, measurements = model.prepare(recording), list(recording.measurements)
     if not isinstance(model.program, Series):
-        case = (scene, [each.action for each in measurements]), model.observe(scene, measurements)
+        case: Case = (scene, [each.action for each in measurements]), model.observe(scene, measurements)
         return model.program, case, []
-    steps = [((scene, [each.action]), model.observe(scene, [each])) for each in measurements]
+    steps: list[Case] = [((scene, [each.action]), model.observe(scene, [each])) for each in measurements]
     return model.program, ((scene, []), {}), steps
 
 

@@ -141,13 +141,14 @@ def check_reruns(trace: Trace, other: Trace, args: Any, program: Any) -> None:
                 f"the program writes into the value of site {address!r}; compute a new tensor from it "
                 "(`x = x + 1`, not `x += 1`).",
             )
+    address: str | None
     if (found := first_differing(expected, got)) is not None:
         address, particle = found
         what = (
             f"site {address!r} has log-probability {float(got[address][particle]):.6g} in a run at values "
             f"where it had {float(expected[address][particle]):.6g} before"
         )
-    elif isinstance(trace, SeriesTrace) and not _equal_states(trace, again):
+    elif not _equal_states(trace, again):
         address, what = None, "a series' state is another in a run at values that were the same before"
     else:
         _refuse_unrepeatable(again, got)
@@ -181,10 +182,13 @@ def _refuse_unrepeatable(trace: Trace, expected: dict[str, Tensor]) -> None:
 
 def _generators() -> list[Any]:
     numpy = np.random.get_state()
-    return [torch.get_rng_state().numpy().tobytes(), numpy[1].tobytes(), numpy[2], random.getstate()]  # type: ignore[index, union-attr]
+    return [torch.get_rng_state().numpy().tobytes(), numpy[1].tobytes(), numpy[2], random.getstate()]  # type: ignore[index]
 
 
-def _equal_states(first: SeriesTrace, second: SeriesTrace) -> bool:
+def _equal_states(first: Trace, second: Trace) -> bool:
+    """Whether the states of two traces of a series are equal up to rounding; other traces have none."""
+    if not isinstance(first, SeriesTrace) or not isinstance(second, SeriesTrace):
+        return True
     pairs: list[bool] = []
 
     def compare(a: Any, b: Any) -> bool:
@@ -192,7 +196,8 @@ def _equal_states(first: SeriesTrace, second: SeriesTrace) -> bool:
         return True
 
     every = torch.arange(first.particles)
-    alike(*(indexed(each.state, every, each.particles) for each in (first, second)), compare)
+    one, other = (indexed(each.state, every, each.particles) for each in (first, second))
+    alike(one, other, compare)
     return all(pairs)
 
 
