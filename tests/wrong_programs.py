@@ -215,6 +215,11 @@ def observation_in_place() -> None:
     y *= 2.0
 
 
+@wrong(Fault.OVERWRITTEN, "x")
+def clamped_in_place() -> None:
+    normal("y", normal("x").clamp_(-1.0, 1.0))
+
+
 # ---- addresses
 
 

@@ -12,7 +12,7 @@ from bcppl.traces.checks.comparing import Start, log_probs
 from bcppl.traces.checks.densities import check_densities, check_numbers
 from bcppl.traces.checks.gradients import check_gradients
 from bcppl.traces.checks.particles import check_particles
-from bcppl.traces.checks.runs import check_addresses, check_reruns, undisturbed
+from bcppl.traces.checks.runs import check_addresses, check_reruns, check_values, undisturbed
 from bcppl.traces.checks.updates import check_updates
 from bcppl.traces.model import Model
 from bcppl.traces.run import Program
@@ -65,6 +65,7 @@ def check_program(
             # Evaluated before any other run could change what a site of it reads.
             log_probs(trace)
             log_probs(other := _another(trace))
+            check_values(trace)
             check_reruns(trace, other, given, program)
             check_particles(trace, other)
             check_updates(trace, other)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from types import FunctionType
 from typing import Any
@@ -18,6 +18,7 @@ from bcppl.traces.checks.comparing import Start, first_differing, log_probs, rer
 from bcppl.traces.dependence import alike, equal
 from bcppl.traces.faults import Fault, ProgramError
 from bcppl.traces.indexing import indexed
+from bcppl.traces.run import run
 from bcppl.traces.series import SeriesTrace
 from bcppl.traces.trace import Trace
 
@@ -116,11 +117,9 @@ def check_reruns(trace: Trace, other: Trace, args: Any, program: Any) -> None:
         program: the program or series itself, whose global variables are looked at.
 
     Raises:
-        ProgramError: a density or the state of a series is another (RANDOMNESS, STATE), or the program
-            writes into a site's value (OVERWRITTEN).
+        ProgramError: a density or the state of a series is another (RANDOMNESS, STATE).
     """
-    before, values = _Kept.of(args, program), {a: trace[a].clone() for a in trace.addresses if a in trace}
-    expected = log_probs(trace)
+    before, expected = _Kept.of(args, program), log_probs(trace)
     log_probs(rerun(other))
     if (found := first_differing(expected, log_probs(trace))) is not None:
         raise ProgramError(
@@ -133,38 +132,49 @@ def check_reruns(trace: Trace, other: Trace, args: Any, program: Any) -> None:
     again = rerun(trace)
     got = log_probs(again)
     drew = _generators() != generators
-    for address, value in values.items():
-        if not equal(value, trace[address]):
-            raise ProgramError(
-                Fault.OVERWRITTEN,
-                address,
-                f"the program writes into the value of site {address!r}; compute a new tensor from it "
-                "(`x = x + 1`, not `x += 1`).",
-            )
-    address: str | None
+    site: str | None = None
     if (found := first_differing(expected, got)) is not None:
-        address, particle = found
+        site, particle = found
         what = (
-            f"site {address!r} has log-probability {float(got[address][particle]):.6g} in a run at values "
-            f"where it had {float(expected[address][particle]):.6g} before"
+            f"site {site!r} has log-probability {float(got[site][particle]):.6g} in a run at values where it "
+            f"had {float(expected[site][particle]):.6g} before"
         )
     elif not _equal_states(trace, again):
-        address, what = None, "a series' state is another in a run at values that were the same before"
+        what = "a series' state is another in a run at values that were the same before"
     else:
         _refuse_unrepeatable(again, got)
         return
     if drew:
         raise ProgramError(
             Fault.RANDOMNESS,
-            address,
+            site,
             f"{what}, and the run draws random numbers; sample whatever is random by `pyro.sample`.",
         )
-    before.refuse_changed(address, what)
-    raise ProgramError(
-        Fault.STATE,
-        address,
-        f"{what}; {KEEPS_NOTHING}.",
-    )
+    before.refuse_changed(site, what)
+    raise ProgramError(Fault.STATE, site, f"{what}; {KEEPS_NOTHING}.")
+
+
+def check_values(trace: Trace) -> None:
+    """Check that a program, given values of its sites, leaves them as they are.
+
+    Raises:
+        ProgramError: it writes into one (OVERWRITTEN).
+    """
+    given = {}
+    for address, distribution in trace.distributions.items():
+        with suppress(NotImplementedError):
+            plates = len(distribution.batch_shape) - 1
+            given[address] = distribution.sample().movedim(plates, 0)
+    values = {address: value.clone() for address, value in given.items()}
+    run(trace.program, trace.args, trace.particles, values, {})
+    for address, value in given.items():
+        if not equal(value, values[address]):
+            raise ProgramError(
+                Fault.OVERWRITTEN,
+                address,
+                f"the program writes into the value of site {address!r}; compute a new tensor from it "
+                "(`x = x + 1`, not `x += 1`).",
+            )
 
 
 def _refuse_unrepeatable(trace: Trace, expected: dict[str, Tensor]) -> None:
@@ -181,8 +191,9 @@ def _refuse_unrepeatable(trace: Trace, expected: dict[str, Tensor]) -> None:
 
 
 def _generators() -> list[Any]:
-    numpy = np.random.get_state()
-    return [torch.get_rng_state().numpy().tobytes(), numpy[1].tobytes(), numpy[2], random.getstate()]  # type: ignore[index]
+    """The states of the generators of torch, numpy and Python."""
+    numpy: Any = np.random.get_state()
+    return [torch.get_rng_state().numpy().tobytes(), numpy[1].tobytes(), *numpy[2:], random.getstate()]
 
 
 def _equal_states(first: Trace, second: Trace) -> bool:
