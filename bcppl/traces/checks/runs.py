@@ -160,7 +160,7 @@ def check_values(trace: Trace) -> None:
     Raises:
         ProgramError: it writes into one (OVERWRITTEN).
     """
-    given = {}
+    given = {address: trace[address] for address in trace.addresses if address in trace}
     for address, distribution in trace.distributions.items():
         with suppress(NotImplementedError):
             plates = len(distribution.batch_shape) - 1
