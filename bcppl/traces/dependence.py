@@ -150,6 +150,7 @@ def _copied(value: Any, copies: dict[int, Any]) -> Any:
         copies[id(value)] = copy
         copy.__defaults__ = _copied(value.__defaults__, copies)
         copy.__kwdefaults__ = {k: _copied(v, copies) for k, v in (value.__kwdefaults__ or {}).items()} or None
+        copy.__dict__.update({name: _copied(each, copies) for name, each in value.__dict__.items()})
         for cell, original in zip(cells, value.__closure__ or (), strict=True):
             if (content := _content(original)) is not _EMPTY:
                 cell.cell_contents = _copied(content, copies)
@@ -219,7 +220,8 @@ def _parts_of_functions(a: Any, b: Any) -> list[tuple[Any, Any]]:
     if a.__code__ != b.__code__ or a.__globals__ is not b.__globals__:
         raise _UnlikeError
     cells = ([_content(cell) for cell in each.__closure__ or ()] for each in (a, b))
-    return [(a.__defaults__, b.__defaults__), (a.__kwdefaults__, b.__kwdefaults__), *_paired(*cells)]
+    parts = [(a.__defaults__, b.__defaults__), (a.__kwdefaults__, b.__kwdefaults__), *_paired(*cells)]
+    return [*parts, (a.__dict__, b.__dict__)] if a.__dict__ or b.__dict__ else parts
 
 
 def _paired(first: Any, second: Any) -> list[tuple[Any, Any]]:
