@@ -112,6 +112,13 @@ def network_in_training() -> None:
 
 
 @wrong(Fault.RANDOMNESS)
+def hidden_by_a_handler() -> None:
+    with pyro.poutine.block():
+        offset = normal("offset")
+    normal("y", normal("x") + offset)
+
+
+@wrong(Fault.RANDOMNESS)
 def simulation_within() -> None:
     x = normal("x")
     normal("y", x + simulate(lambda: normal("noise"), (), len(x))["noise"])
@@ -199,7 +206,30 @@ def counting_in_a_default(seen: list[int] = []) -> None:  # noqa: B006
     normal("y", normal("x"), float(len(seen)))
 
 
+LAST: list[Any] = [None]
+
+
+def step_by_a_global(x: Tensor) -> Tensor:
+    moved = normal("x", x if LAST[0] is None or len(LAST[0]) != len(x) else LAST[0])
+    LAST[0] = moved
+    normal("y", moved)
+    return moved
+
+
+WRONG["a global for a state"] = Wrong(
+    Fault.STATE, "x", Series(lambda: normal("x"), step_by_a_global), (), {}, (((), {"y": 0.3}),)
+)
+
+
 # ---- values written into
+
+
+@wrong(Fault.OVERWRITTEN, "x")
+def millimetres_in_place() -> None:
+    x = normal("x")
+    in_millimetres = x.numpy()
+    in_millimetres *= 1000.0
+    normal("y", x / 1000.0)
 
 
 @wrong(Fault.OVERWRITTEN, "x")
@@ -286,6 +316,18 @@ def entry_of_a_vector() -> None:
     normal("y", x[0, 1])
 
 
+@wrong(Fault.MIXING)
+def best_of_all() -> None:
+    x = normal("x")
+    normal("y", x - x.min())
+
+
+@wrong(Fault.MIXING, observations={"y": torch.tensor([0.3, 0.2, 0.1])})
+def scrambled_axes() -> None:
+    p = pyro.sample("p", dist.Normal(torch.zeros(3, dtype=torch.float64), 1.0).to_event(1))
+    pyro.sample("y", dist.Normal(p.reshape(3, -1).T, 1.0).to_event(1))
+
+
 @wrong(Fault.PLACE)
 def by_place() -> None:
     x = normal("x")
@@ -302,6 +344,15 @@ RENDERED: dict[int, Tensor] = {}
 
 def rendered_once(x: Tensor) -> Tensor:
     return RENDERED.setdefault(len(x), x.square())
+
+
+@wrong(Fault.COUNT)
+def until_all_converge() -> None:
+    x = normal("x")
+    root = torch.ones_like(x)
+    while bool(((root**3 + root - x).abs() > 1e-3).any()):
+        root = root - (root**3 + root - x) / (3.0 * root.square() + 1.0)
+    normal("y", root)
 
 
 @wrong(Fault.COUNT)
@@ -396,6 +447,26 @@ def cached_holder() -> None:
     x = normal("x")
     holder()["shift"] = normal("shift")
     pyro.sample("y", Reads(x, lambda: holder()["shift"]))
+
+
+class Fixed(LazyDistribution):
+    def __init__(self, x: Tensor) -> None:
+        self.x = x
+        super().__init__(len(x), ())
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return normal_log(value, self.x, 1.0)
+
+
+FIXED = Fixed(torch.zeros(10, dtype=torch.float64))
+
+
+def one_object_for_all_runs() -> None:
+    FIXED.__init__(normal("x"))  # type: ignore[misc]
+    pyro.sample("y", FIXED)
+
+
+WRONG["one_object_for_all_runs"] = Wrong(Fault.DEPENDENCE, "y", one_object_for_all_runs)
 
 
 class ClassWide(LazyDistribution):
@@ -501,6 +572,29 @@ class DrawsOutside(Custom):
         return torch.zeros_like(value)
 
 
+class UnitVector(Custom):
+    def __init__(self, shape: Any = ()) -> None:
+        dist.TorchDistribution.__init__(self, torch.Size(shape), torch.Size([3]), validate_args=False)
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        shape = (*sample_shape, *self.batch_shape, 3)
+        return torch.nn.functional.normalize(torch.randn(shape, dtype=torch.float64), dim=-1)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return torch.full(value.shape[:-1], -math.log(4.0 * math.pi), dtype=torch.float64)
+
+
+class Truncated(Custom):
+    support = constraints.interval(-1.0, 1.0)
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        low, high = torch.special.ndtr(torch.tensor([-1.0, 1.0], dtype=torch.float64))
+        return torch.special.ndtri(low + (high - low) * self.uniform(sample_shape))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return normal_log(value, 0.0, 1.0)
+
+
 class WithoutConstant(Custom):
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         return torch.randn(torch.Size(sample_shape) + self.batch_shape, dtype=torch.float64)
@@ -515,6 +609,11 @@ class VarianceForScale(WithoutConstant):
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         return math.sqrt(2.0) * super().sample(sample_shape)
+
+
+class TenPercentTooWide(WithoutConstant):
+    def log_prob(self, value: Tensor) -> Tensor:
+        return normal_log(value, 0.0, 1.1)
 
 
 class OneDrawForAll(WithoutConstant):
@@ -554,7 +653,8 @@ def without_jacobian() -> Any:
 
 def custom(fault: Fault, make: Callable[[], Any]) -> None:
     def program() -> None:
-        normal("y", pyro.sample("x", make()))
+        x = pyro.sample("x", make())
+        normal("y", x[..., 0] if x.ndim > 1 else x)
 
     WRONG[make.__name__] = Wrong(fault, "x", program)
 
@@ -566,9 +666,17 @@ class SeedsItself(VarianceForScale):
 
 
 custom(Fault.RANDOMNESS, SeedsItself)
-for make in (DeclaredReal, NoNumberBelowZero, DrawsOutside):
+for make in (DeclaredReal, NoNumberBelowZero, DrawsOutside, UnitVector):
     custom(Fault.SUPPORT, make)
-for make in (WithoutConstant, VarianceForScale, OneDrawForAll, Dice, without_jacobian):
+for make in (
+    WithoutConstant,
+    VarianceForScale,
+    TenPercentTooWide,
+    Truncated,
+    OneDrawForAll,
+    Dice,
+    without_jacobian,
+):
     custom(Fault.DENSITY, make)
 
 # ---- gradients

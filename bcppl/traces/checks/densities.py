@@ -32,7 +32,10 @@ from bcppl.traces.trace import Trace
 # Particles at values from the prior, where the program runs no simulator.
 MANY = 1000
 # Draws of one site; half of them are compared with as many of the fitted normal.
-DRAWS = 40_000
+DRAWS = 200_000
+# Numbers that all sites of that many particles may have together; fewer are drawn where they would have more.
+NUMBERS = 20_000_000
+FEWEST = 1000
 # Of one comparison to fail where draws and density agree.
 FALSE_ALARM = 1e-10
 # Coordinates of a site beyond which no normal overlaps enough.
@@ -55,7 +58,7 @@ def check_numbers(start: Start, particles: int) -> None:
     _refuse_impossible(trace)
     if not any(isinstance(each, LazyDistribution) for each in trace.distributions.values()):
         try:
-            many = start(MANY)
+            many = start(_affordable(trace, MANY))
         except ProgramError:
             raise
         except (InputError, RuntimeError, ValueError, IndexError, TypeError) as error:
@@ -117,13 +120,19 @@ def check_densities(trace: Trace) -> None:
     doubted = [a for a, each in trace.distributions.items() if _doubted(each)]
     if not doubted:
         return
-    copies = rerun(trace[torch.zeros(DRAWS, dtype=torch.int64)])
+    copies = rerun(trace[torch.zeros(_affordable(trace, DRAWS), dtype=torch.int64)])
     for address in doubted:
         try:
             draws = copies.distributions[address].sample()
         except NotImplementedError:
             continue
         _check_site(address, copies.distributions[address], draws)
+
+
+def _affordable(trace: Trace, particles: int) -> int:
+    """So many particles, or fewer where the sites have many numbers each."""
+    each = sum(math.prod((*d.batch_shape[:-1], *d.event_shape)) for d in trace.distributions.values())
+    return max(FEWEST, min(particles, NUMBERS // max(each, 1)))
 
 
 def _doubted(distribution: Any) -> bool:
@@ -165,6 +174,7 @@ def _check_site(address: str, distribution: Any, draws: Tensor) -> None:
     free = bijection.inv(draws.double())
     coordinates = free[first].reshape(len(free[first]), -1)
     half = len(coordinates) // 2
+    _refuse_surface(address, distribution, coordinates)
     fit = _fitted(coordinates[:half])
     if fit is None:
         _refuse_constant(address, distribution, bijection, free)
@@ -211,6 +221,21 @@ def _fitted(coordinates: Tensor) -> Any:
     if int(info) or not bool(torch.isfinite(factor).all()) or float(factor.diagonal().min()) <= 0.0:
         return None
     return torch.distributions.MultivariateNormal(coordinates.mean(0), scale_tril=factor, validate_args=False)
+
+
+def _refuse_surface(address: str, distribution: Any, coordinates: Tensor) -> None:
+    """Refuse draws (K, D) that are all of one length, such as unit vectors, or of one sum, such as shares."""
+    if coordinates.shape[1] == 1:
+        return
+    for measure, what in ((coordinates.norm(dim=1), "length"), (coordinates.sum(1), "sum")):
+        if float(measure.std()) <= 1e-9 * float(measure.mean().abs()):
+            raise ProgramError(
+                Fault.SUPPORT,
+                address,
+                f"all draws of site {address!r} have one {what}, but its {type(distribution).__name__} "
+                "declares a support that contains others, to which kernels would move; declare the support "
+                "that it has.",
+            )
 
 
 def _refuse_constant(address: str, distribution: Any, bijection: Any, free: Tensor) -> None:

@@ -16,6 +16,8 @@ from bcppl.traces.series import SeriesTrace
 from bcppl.traces.trace import Trace
 
 STATE = "the state of the series"
+# Particles that are run alone.
+SINGLE = 10
 VECTORISED = "compute with each particle's own values, along other axes than that of the particles"
 
 
@@ -48,9 +50,8 @@ def check_particles(trace: Trace, other: Trace) -> None:
                 "the particles; what is the same for all particles must have no axis of them, and what an "
                 "earlier run computed must not be used again for other values.",
             )
-    for some in (torch.arange(count // 2), torch.arange(count // 2, count), torch.tensor([count - 1])):
-        if len(some) == 0:
-            continue
+    places = torch.arange(count)
+    for some in (places[: count // 2], places[count // 2 :], *places[:SINGLE, None]):
         try:
             fewer = signature(rerun(trace[some]))
         except (InputError, RuntimeError, ValueError, IndexError, TypeError) as error:
@@ -110,18 +111,15 @@ def _unlike(expected: dict[str, Tensor], got: dict[str, Tensor]) -> str | None:
 
 def _mixing(trace: Trace, other: Trace, site: str) -> ProgramError:
     """The error of a site that depends on other particles: on all of them, or on a certain one."""
-    own, places = signature(trace), torch.arange(trace.particles)
-    matter = []
-    for particle in range(trace.particles):
-        stay = places != particle
-        mixed = signature(rerun(trace.where(stay, other)))
-        if _unlike({site: own[site][stay]}, {site: mixed[site][stay]}) is not None:
-            matter.append(particle)
-    if len(matter) == 1:
+    places = torch.arange(trace.particles)
+    first = _influential(trace, other, site)
+    second = _influential(rerun(trace[places.roll(1)]), other, site)
+    # The particle with the largest value is a certain one, too, and moves with its value.
+    if len(first) == 1 and first == second:
         return ProgramError(
             Fault.ONE_PARTICLE,
             _address(site),
-            f"{_where(site)} is another at all particles where only particle {matter[0]} has another value; "
+            f"{_where(site)} is another at all particles where only particle {first[0]} has another value; "
             "index along other axes than that of the particles (the last within a program: `x[..., k, :]` is "
             "the value of particle k), and choose by `torch.where`, not by an `if` on one value.",
         )
@@ -131,6 +129,18 @@ def _mixing(trace: Trace, other: Trace, site: str) -> ProgramError:
         f"{_where(site)} is another at a particle where only other particles have other values; a mean, a "
         f"maximum, an order or a sum over the particles is part of it: {VECTORISED}.",
     )
+
+
+def _influential(trace: Trace, other: Trace, site: str) -> list[int]:
+    """The particles whose values matter to other particles at a site."""
+    own, places = signature(trace)[site], torch.arange(trace.particles)
+    particles = []
+    for particle in range(trace.particles):
+        stay = places != particle
+        mixed = signature(rerun(trace.where(stay, other)))[site]
+        if _unlike({site: own[stay]}, {site: mixed[stay]}) is not None:
+            particles.append(particle)
+    return particles
 
 
 def _where(name: str) -> str:
