@@ -22,7 +22,7 @@ from bcppl.distributions.switch import Switch
 from bcppl.traces import Series, carried
 from tests.invariance import number
 from tests.small_programs import normal_log
-from tests.wrong_programs import Custom, WithoutJacobian, normal
+from tests.wrong_programs import Custom, Rollout, WithoutJacobian, normal
 
 RIGHT: dict[str, Right] = {}
 
@@ -216,19 +216,6 @@ def pose() -> None:
     mean = torch.tensor([0.1, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     part = pyro.sample("part", NormalPose(mean, covariance=0.01 * torch.eye(6, dtype=torch.float64)))
     pyro.sample("y", dist.Normal(part[..., :3], 0.1).to_event(1))
-
-
-class Rollout:
-    """A simulator's state, which a trace carries."""
-
-    def __init__(self, x: Tensor) -> None:
-        self.x = x
-
-    def __getitem__(self, index: Tensor) -> Rollout:
-        return Rollout(self.x[index])
-
-    def where(self, mask: Tensor, other: Rollout) -> Rollout:
-        return Rollout(torch.where(mask, self.x, other.x))
 
 
 @right()

@@ -6,7 +6,9 @@ import random
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ import torch
 
 from bcppl.errors import InputError
 from bcppl.models import camera_error, grasped_peg, look_and_touch, peg_in_hole, point_probe, which_hole
-from bcppl.traces import Fault, Model, ProgramError, check_program
+from bcppl.traces import Fault, Model, ProgramError, Series, check_program
 from tests.right_programs import RIGHT
 from tests.wrong_programs import WRONG, normal
 
@@ -75,6 +77,50 @@ def test_a_shipped_model_passes(name: str) -> None:
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_shipped_model_passes(name: str) -> None:
     check_program(SHIPPED[name].model, few(SHIPPED[name].model, 4), particles=5)
+
+
+def model_of(program: Any) -> Model:
+    """A model whose recordings are lists of numbers with their actions."""
+    return Model(
+        program=program,
+        prepare=lambda recording: 1.0,
+        observe=lambda scene, measurements: {f"y_{k}": each.seen for k, each in enumerate(measurements)},
+        pose="x",
+    )
+
+
+@dataclass(frozen=True)
+class Seen:
+    action: float
+    seen: float
+
+
+RECORDING = SimpleNamespace(measurements=[Seen(0.1, 0.3), Seen(0.2, 0.5)])
+
+
+def test_a_model_is_checked_with_what_it_makes_of_a_recording() -> None:
+    def program(scene: float, actions: list[float], wrong: bool = False) -> None:
+        x = normal("x", 0.0, scene)
+        for k, action in enumerate(actions):
+            normal(f"y_{k}", x + action - wrong * (k == 1) * x.mean())
+
+    check_program(model_of(program), RECORDING)
+    with pytest.raises(ProgramError, match="site 'y_1'"):
+        check_program(model_of(partial(program, wrong=True)), RECORDING)
+
+
+def test_a_model_of_a_series_is_checked_step_by_step() -> None:
+    def init(scene: float, actions: list[float]) -> Any:
+        return normal("x", 0.0, scene)
+
+    def step(x: Any, scene: float, actions: list[float], wrong: bool = False) -> Any:
+        (action,) = actions
+        normal("y_0", x + action - wrong * (action == 0.2) * x.mean())
+        return x
+
+    check_program(model_of(Series(init, step)), RECORDING)
+    with pytest.raises(ProgramError, match="site 'y_0'"):
+        check_program(model_of(Series(init, partial(step, wrong=True))), RECORDING)
 
 
 def states() -> list[Any]:

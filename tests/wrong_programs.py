@@ -20,7 +20,7 @@ from torch.distributions import constraints
 from torch.distributions.transforms import Transform
 
 from bcppl.distributions.lazy import LazyDistribution
-from bcppl.traces import Fault, Series, simulate
+from bcppl.traces import Fault, Series, carried, simulate
 from tests import small_programs
 from tests.invariance import number
 from tests.small_programs import normal_log
@@ -149,6 +149,22 @@ class Shifting(Reads):
 @wrong(Fault.STATE)
 def density_that_writes_into_itself() -> None:
     pyro.sample("y", Shifting(normal("x") + 1.0, lambda: 0.0))
+
+
+class Remembering(Reads):
+    noise: Any = 0.0
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        self.noise = torch.randn(len(self.x), dtype=torch.float64)
+        return self.x + self.noise
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return super().log_prob(value - self.noise)
+
+
+@wrong(Fault.STATE)
+def sampler_that_changes_its_density() -> None:
+    pyro.sample("y", Remembering(normal("x"), lambda: 0.0))
 
 
 @wrong(Fault.STATE, "y_0", iter([1.0, 2.0]), observations={})
@@ -447,6 +463,28 @@ def cached_holder() -> None:
     x = normal("x")
     holder()["shift"] = normal("shift")
     pyro.sample("y", Reads(x, lambda: holder()["shift"]))
+
+
+class Rollout:
+    """A simulator's state, which a trace carries."""
+
+    def __init__(self, x: Tensor) -> None:
+        self.x = x
+
+    def __getitem__(self, index: Tensor) -> Rollout:
+        return Rollout(self.x[index])
+
+    def where(self, mask: Tensor, other: Rollout) -> Rollout:
+        return Rollout(torch.where(mask, self.x, other.x))
+
+
+STARTS: list[Any] = [None]
+
+
+@wrong(Fault.DEPENDENCE)
+def state_that_begins_from_a_global() -> None:
+    STARTS[0] = normal("x")
+    normal("y", carried("rollout", lambda: Rollout(STARTS[0])).x)
 
 
 class Fixed(LazyDistribution):

@@ -10,6 +10,7 @@ function of C reads) are not seen; `check_program` detects them.
 
 from __future__ import annotations
 
+import builtins
 import dis
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -24,10 +25,15 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.traces.dependence import comparison
 
 Names = tuple[tuple[str, str | None], ...]
+# The variables of a module, the name of one of them, and of an attribute that is taken from it.
+Variable = tuple[dict[str, Any], str, str | None]
 # Of a container or an array that is copied; a larger one is compared as the same object.
 FEW, SMALL = 100, 10_000
 _MISSING = object()
-_NO_DATA = (FunctionType, ModuleType, type, property, classmethod, staticmethod, type(len))
+_Builtin = type(len)
+_NO_DATA = frozenset({FunctionType, ModuleType, type, property, classmethod, staticmethod, _Builtin})
+# What a class of distributions declares.
+_DECLARED = frozenset({"_abc_impl", "arg_constraints", "support", "cost", "broadcasts", "has_rsample"})
 
 
 def surroundings(distributions: Mapping[str, Any]) -> dict[str, Any]:
@@ -41,21 +47,29 @@ def surroundings(distributions: Mapping[str, Any]) -> dict[str, Any]:
 
 def surroundings_of(distribution: LazyDistribution) -> dict[Any, Any]:
     """The values that one distribution reads from outside, by name; containers and small arrays copied."""
-    classes = _own_classes(type(distribution))
+    kind = type(distribution)
+    classes = _own_classes(kind)
     if not classes:
         return {}
-    found: dict[Any, Any] = {}
-    read: set[Any] = set()
+    kept: dict[Any, Any] = {}
     for own in classes:
         for name, value in vars(own).items():
-            if type(value) is FunctionType:
-                _read(value, found, read)
-            elif not name.startswith("_abc_") and not name.startswith("__") and _is_data(value):
-                found[own, name] = value
+            if type(value) not in _NO_DATA and name not in _DECLARED and name[:2] != "__":
+                kept[own, name] = _kept(value)
+    variables = _of_methods(kind)
     for value in vars(distribution).values():
-        for function in _functions(value):
-            _read(function, found, read)
-    return {key: _kept(value) for key, value in found.items()}
+        if type(value) in (FunctionType, MethodType, partial):
+            for function in _functions(value):
+                variables += _variables(function)
+    for names, name, attribute in variables:
+        value = names.get(name, _MISSING)
+        if attribute is not None and not isinstance(value, Tensor | np.ndarray):
+            held = getattr(value, "__dict__", {}).get(attribute, _MISSING)
+            if held is not _MISSING and type(held) not in _NO_DATA:
+                kept[id(value), f"{name}.{attribute}"] = _kept(held)
+        if value is not _MISSING and type(value) not in _NO_DATA and not isinstance(value, type):
+            kept[id(names), name] = _kept(value)
+    return kept
 
 
 def changed(then: Mapping[Any, Any], now: Mapping[Any, Any]) -> str | None:
@@ -91,31 +105,48 @@ def _still(then: Any, now: Any) -> bool:
     return comparison()(then, now)
 
 
-def _read(function: FunctionType, found: dict[Any, Any], read: set[Any]) -> None:
-    """Add the values of the variables that a function loads, and those of its user's functions."""
-    names, key = function.__globals__, (function.__code__, id(function.__globals__))
-    if key in read or _is_installed(names.get("__name__", "")):
+@cache
+def _of_methods(kind: type) -> tuple[Variable, ...]:
+    """The variables that the methods of a class read."""
+    methods = (each for own in _own_classes(kind) for each in vars(own).values())
+    found = (_variables(each) for method in methods for each in _functions(getattr(method, "fget", method)))
+    return tuple(each for some in found for each in some)
+
+
+def _variables(function: FunctionType) -> tuple[Variable, ...]:
+    """The variables that a function reads, and those that the functions of its user read that it calls."""
+    key = function.__code__, id(function.__globals__)
+    if key not in _KNOWN:
+        # Kept from here on, so that a function that calls itself ends.
+        _KNOWN[key] = ()
+        _KNOWN[key] = tuple(_read(function))
+    return _KNOWN[key]
+
+
+def _read(function: FunctionType) -> Iterator[Variable]:
+    names = function.__globals__
+    if _is_installed(names.get("__name__", "")):
         return
-    read.add(key)
     for name, attribute in loaded(function.__code__):
         value = names.get(name, _MISSING)
-        if type(value) is FunctionType:
-            _read(value, found, read)
-        elif attribute is None or isinstance(value, Tensor | np.ndarray):
-            if _is_data(value):
-                found[id(names), name] = value
-        elif not (isinstance(value, ModuleType) and _is_installed(value.__name__)):
-            if _is_data(value):
-                found[id(names), name] = value
-            held = getattr(value, "__dict__", {}).get(attribute, _MISSING)
-            if type(held) is FunctionType:
-                _read(held, found, read)
-            elif _is_data(held):
-                found[id(value), f"{name}.{attribute}"] = held
+        if isinstance(value, ModuleType) and attribute is not None and not _is_installed(value.__name__):
+            called = vars(value).get(attribute)
+            yield from _variables(called) if type(called) is FunctionType else [(names, name, attribute)]
+        elif type(value) is FunctionType:
+            yield from _variables(value)
+            if attribute is not None:
+                yield names, name, attribute
+        elif not isinstance(value, ModuleType) and not _is_of_python(value) and name not in vars(builtins):
+            yield names, name, attribute
 
 
-def _is_data(value: Any) -> bool:
-    return value is not _MISSING and not isinstance(value, _NO_DATA)
+_KNOWN: dict[Any, tuple[Variable, ...]] = {}
+
+
+def _is_of_python(value: Any) -> bool:
+    """Whether a value is a class or a function of Python, bcppl or an installed package."""
+    module = getattr(value, "__module__", None) if isinstance(value, type | _Builtin) else None
+    return isinstance(module, str) and _is_installed(module)
 
 
 @lru_cache(maxsize=4096)
@@ -160,7 +191,10 @@ def _own_classes(kind: type) -> tuple[type, ...]:
 def _is_installed(module: str) -> bool:
     """Whether a module is bcppl's, Python's own, or installed: these write to no variables of their own."""
     root = module.partition(".")[0]
-    if root in ("bcppl", "builtins") or (root in sys.stdlib_module_names and root != "__main__"):
+    if root == "__main__":
+        # A notebook's too, which the file of its launcher would make an installed one.
+        return False
+    if root in ("bcppl", "builtins") or root in sys.stdlib_module_names:
         return True
     where = getattr(sys.modules.get(module), "__file__", None) or ""
     return "site-packages" in where or "dist-packages" in where

@@ -13,7 +13,7 @@ from bcppl.traces.checks.densities import check_densities, check_numbers
 from bcppl.traces.checks.gradients import check_gradients
 from bcppl.traces.checks.particles import check_particles
 from bcppl.traces.checks.runs import check_addresses, check_reruns, check_values, undisturbed
-from bcppl.traces.checks.updates import check_updates
+from bcppl.traces.checks.updates import check_simulated, check_updates
 from bcppl.traces.model import Model
 from bcppl.traces.run import Program
 from bcppl.traces.series import Series, SeriesTrace, runnable
@@ -38,8 +38,8 @@ def check_program(
     The program is run at values from its prior, then: again at other values (are the addresses the same?);
     again at the same values (is anything random, or left behind by a run?); with some particles' values
     replaced, in another order, and for fewer particles (is each particle's density its own?); by `update`
-    instead of a new run (is a dependence missed?). Draws of a site are compared with its density, and
-    gradients with differences. The random state is the same afterwards as before.
+    instead of a new run (is a dependence missed?), and with all sites sampled. Draws of a site are compared
+    with its density, and gradients with differences. The random state is the same afterwards as before.
 
     Args:
         program: a Pyro program; a series, of which `init` is checked and then each of `steps`; or a model.
@@ -69,6 +69,7 @@ def check_program(
             check_reruns(trace, other, given, program)
             check_particles(trace, other)
             check_updates(trace, other)
+            check_simulated(trace)
             check_densities(trace)
             check_gradients(trace)
 

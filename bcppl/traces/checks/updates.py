@@ -1,13 +1,16 @@
-"""Whether an update of each latent value gives the densities of a new run."""
+"""Whether updates and simulation give the densities of a new run at the same values."""
 
 from __future__ import annotations
 
 import torch
 
+from bcppl.distributions.support import masks
+from bcppl.errors import InputError
 from bcppl.traces.checks.comparing import differing, first_differing, log_probs, rerun
 from bcppl.traces.faults import Fault, ProgramError
 from bcppl.traces.trace import Trace
 from bcppl.traces.update import update
+from bcppl.traces.verbs import simulate
 
 
 def check_updates(trace: Trace, other: Trace) -> None:
@@ -32,6 +35,33 @@ def check_updates(trace: Trace, other: Trace) -> None:
         moved = update(trace, {address: value}).trace
         _compare(moved, address)
         _compare(moved.where(half, trace)[reverse], address)
+
+
+def check_simulated(trace: Trace) -> None:
+    """Check that sites have the same densities where their values were sampled as where they are given.
+
+    All sites are sampled, those that are observed too, unless one cannot be.
+
+    Raises:
+        ProgramError: a log-probability is another (STATE).
+    """
+    try:
+        simulated = simulate(trace.program, trace.args, trace.particles)
+    except InputError:
+        return
+    again = rerun(simulated)
+    for address in simulated.addresses:
+        if masks(simulated.distributions[address]):
+            continue
+        sampled, given = simulated.log_prob(address), again.log_prob(address)
+        if bool((other := differing(sampled, given)).any()):
+            particle = int(other.nonzero()[0])
+            raise ProgramError(
+                Fault.STATE,
+                address,
+                f"site {address!r} has log-probability {float(sampled[particle]):.6g} where its value was "
+                f"sampled and {float(given[particle]):.6g} where it is given; let `sample` leave nothing behind.",
+            )
 
 
 def _check_late(trace: Trace, other: Trace) -> None:
