@@ -16,9 +16,21 @@ import pytest
 import torch
 
 from bcppl.errors import InputError
-from bcppl.models import camera_error, grasped_peg, look_and_touch, peg_in_hole, point_probe, which_hole
+from bcppl.models import (
+    arm_calibration,
+    arm_in_view,
+    camera_error,
+    grasped_peg,
+    look_and_touch,
+    part_in_view,
+    peg_in_hole,
+    point_probe,
+    which_hole,
+)
 from bcppl.traces import Fault, Model, ProgramError, Series, check_program
 from tests.right_programs import RIGHT
+from tests.test_arm_calibration import arm_and_seating
+from tests.test_arm_in_view import drawn
 from tests.wrong_programs import WRONG, normal
 
 
@@ -77,6 +89,17 @@ def test_a_shipped_model_passes(name: str) -> None:
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_shipped_model_passes(name: str) -> None:
     check_program(SHIPPED[name].model, few(SHIPPED[name].model, 4), particles=5)
+
+
+@pytest.mark.long
+def test_the_shipped_programs_for_arms_and_clutter_pass() -> None:
+    arm, angles = arm_and_seating()
+    given = {**arm_calibration.observations([angles])}
+    check_program(arm_calibration.arm_calibration, (arm, [angles]), given, 5)
+    scene, seen = drawn(0.01)
+    check_program(arm_in_view.arm_in_view, (scene, len(seen)), seen, 5)
+    recording = few(look_and_touch.model, 1)
+    check_program(part_in_view.model, replace(recording, model="part_in_view"), particles=5)
 
 
 def model_of(program: Any) -> Model:

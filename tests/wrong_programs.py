@@ -283,6 +283,13 @@ def chance_decides_the_sites() -> None:
         normal("bad")
 
 
+@wrong(Fault.ADDRESSES, "x_1", observations={})
+def sampled_until_all_are_positive() -> None:
+    x, k = normal("x"), 0
+    while bool((x < 0.0).any()) and k < 3:
+        x, k = normal(f"x_{k}"), k + 1
+
+
 # ---- masked latents
 
 

@@ -22,14 +22,15 @@ def base(distribution: Any) -> Any:
     return base(distribution.base_dist) if isinstance(distribution, WRAPPERS) else distribution
 
 
-def masks(distribution: Any) -> bool:
+def masks(distribution: Any, depth: int = 10) -> bool:
     """Whether a distribution, or one that it is made of, leaves values out of its log-probability.
 
     That is what `.mask()` does. It may be made of others as their transformation, mixture or choice.
     """
     if isinstance(distribution, MaskedDistribution) and not torch.as_tensor(distribution._mask).all():
         return True
-    return any(map(masks, _components(vars(distribution).values())))
+    # One that holds itself in a ring holds no more than at this depth.
+    return depth > 0 and any(masks(each, depth - 1) for each in _components(vars(distribution).values()))
 
 
 def _components(attributes: Iterable[Any]) -> Iterator[Any]:

@@ -147,15 +147,18 @@ def _trusted(kind: type) -> bool:
     return kind is not Delta and kind.__module__.startswith(TRUSTED)
 
 
-def _made_of(value: Any) -> Iterator[type]:
+def _made_of(distribution: Any) -> Iterator[type]:
     """The classes of a distribution and of the distributions and transforms that it holds."""
-    if isinstance(value, Distribution | Transform):
-        yield type(value)
-        for each in vars(value).values():
-            yield from _made_of(each)
-    elif type(value) in (list, tuple):
-        for each in value:
-            yield from _made_of(each)
+    left, met = [distribution], {}
+    while left:
+        each = left.pop()
+        if type(each) in (list, tuple):
+            left += each
+        elif isinstance(each, Distribution | Transform) and id(each) not in met:
+            # A transform and its inverse hold one another.
+            met[id(each)] = each
+            left += vars(each).values()
+            yield type(each)
 
 
 def _check_site(address: str, distribution: Any, draws: Tensor) -> None:

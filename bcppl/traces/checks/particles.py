@@ -60,6 +60,15 @@ def check_particles(trace: Trace, other: Trace) -> None:
                 None,
                 f"the program runs with {count} particles and not with {len(some)}: {error}",
             ) from error
+        if own.keys() != fewer.keys():
+            site = min(own.keys() ^ fewer.keys())
+            raise ProgramError(
+                Fault.ADDRESSES,
+                _address(site),
+                f"{_where(site)} is there with {count} particles and not with {len(some)}, or the reverse; "
+                "visit the same sites whatever the values: bound a loop by a number, not by all particles' "
+                "values.",
+            )
         if (site := _unlike({a: v[some] for a, v in own.items()}, fewer)) is not None:
             raise ProgramError(
                 Fault.COUNT,

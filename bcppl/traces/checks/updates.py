@@ -60,7 +60,8 @@ def check_simulated(trace: Trace) -> None:
                 Fault.STATE,
                 address,
                 f"site {address!r} has log-probability {float(sampled[particle]):.6g} where its value was "
-                f"sampled and {float(given[particle]):.6g} where it is given; let `sample` leave nothing behind.",
+                f"sampled and {float(given[particle]):.6g} where it is given; let `sample` leave nothing "
+                "behind.",
             )
 
 
