@@ -19,6 +19,7 @@ from bcppl.inference.filters.step import Stepped
 from bcppl.inference.filters.tempering import Tempered
 from bcppl.inference.population import Population
 from bcppl.traces import Series, Trace, generate, propose
+from bcppl.traces.values import Value
 
 Program = Callable[..., Any]
 GIVE_STRATA = "give strata as a function that maps a value to its stratum."
@@ -27,7 +28,7 @@ GIVE_STRATA = "give strata as a function that maps a value to its stratum."
 def importance_sampling(
     program: Program | Series,
     args: tuple[Any, ...],
-    observations: Mapping[str, Tensor],
+    observations: Mapping[str, Value],
     particles: int,
     proposal: Program | None = None,
 ) -> Population:
@@ -57,7 +58,7 @@ def importance_sampling(
 def tempered_importance_sampling(
     program: Program | Series,
     args: tuple[Any, ...],
-    observations: Mapping[str, Tensor],
+    observations: Mapping[str, Value],
     particles: int,
     step: Tempered,
 ) -> Stepped:
@@ -89,7 +90,7 @@ def tempered_importance_sampling(
 def generate_stratified(
     program: Program | Series,
     args: tuple[Any, ...],
-    observations: Mapping[str, Tensor],
+    observations: Mapping[str, Value],
     particles: int,
     strata: int | Callable[[Tensor], Tensor] | None = None,
     *,

@@ -13,8 +13,11 @@ from torch import Tensor
 
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
-from bcppl.inference import importance_sampling
+from bcppl.inference import Observed, importance_sampling, tempered
+from bcppl.inference.kernels import metropolis_hastings
+from bcppl.inference.proposals import drift
 from bcppl.traces import Series, assess, extend, generate, simulate, update
+from bcppl.traces.anticipated import Anticipated
 from tests.invariance import number
 from tests.small_programs import normal_log
 
@@ -57,6 +60,14 @@ def test_every_verb_takes_numbers_and_arrays(kind: str) -> None:
     population = importance_sampling(program, (), {"y_0": given, "pair": PAIR}, N)
     torch.testing.assert_close(population.trace["y_0"], trace["y_0"])
     assert assess(program, (), {"x": np.zeros(N), "y_0": given, "pair": PAIR}, N).shape == (N,)
+
+
+def test_steps_and_forward_kernels_take_numbers() -> None:
+    torch.manual_seed(0)
+    population = importance_sampling(program, (0,), {"pair": PAIR}, N)
+    later, _ = tempered(metropolis_hastings(drift("x")))(population, Observed((1,), {"y_0": 0.25}))
+    torch.testing.assert_close(later.trace["y_0"], number(0.25))
+    assert torch.equal(Anticipated(population.trace, (1,), {"y_0": 0.25})["y_0"], number(0.25))
 
 
 def test_a_step_of_a_series_takes_numbers() -> None:

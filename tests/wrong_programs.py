@@ -503,6 +503,15 @@ class Fixed(LazyDistribution):
         return normal_log(value, self.x, 1.0)
 
 
+class Excepted(Fixed):
+    __caches__ = ("x",)
+
+
+@wrong(Fault.DEPENDENCE)
+def attribute_declared_a_cache() -> None:
+    pyro.sample("y", Excepted(normal("x")))
+
+
 FIXED = Fixed(torch.zeros(10, dtype=torch.float64))
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from bcppl.traces.series import SeriesTrace
 from bcppl.traces.trace import Trace, changed
 from bcppl.traces.update import update
+from bcppl.traces.values import Value, tensors
 from bcppl.traces.verbs import constrained
 
 
@@ -28,12 +29,16 @@ class Anticipated:
     Attributes:
         trace: of N particles.
         args: the program's arguments with those of the measurement.
-        measured: values at the measurement's addresses.
+        measured: tensors, arrays or numbers at the measurement's addresses.
     """
 
     trace: Trace
     args: tuple[Any, ...]
-    measured: Mapping[str, Tensor]
+    measured: Mapping[str, Value]
+
+    @cached_property
+    def _values(self) -> Mapping[str, Tensor]:
+        return tensors(self.measured)
 
     @cached_property
     def updated(self) -> Trace:
@@ -71,7 +76,7 @@ class Anticipated:
     @property
     def observations(self) -> Mapping[str, Tensor]:
         """The observed values, those of the measurement too."""
-        return {**self.trace.observations, **self.measured}
+        return {**self.trace.observations, **self._values}
 
     @property
     def distributions(self) -> Mapping[str, Any]:
@@ -88,7 +93,7 @@ class Anticipated:
         return self._shown.log_prob(*addresses)
 
     def __getitem__(self, address: str) -> Tensor:
-        value: Tensor = self.measured[address] if address in self.measured else self.trace[address]
+        value: Tensor = self._values[address] if address in self.measured else self.trace[address]
         return value
 
     def __contains__(self, address: object) -> bool:

@@ -19,6 +19,7 @@ from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import takes
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
+from bcppl.traces.values import Value
 
 
 class Observed(NamedTuple):
@@ -26,11 +27,11 @@ class Observed(NamedTuple):
 
     Attributes:
         args: the program's arguments up to and including the new measurement, as a tuple.
-        observations: values of the new addresses, of the sites' event shape.
+        observations: tensors, arrays or numbers at the new addresses, of the sites' event shape.
     """
 
     args: tuple[Any, ...]
-    observations: Mapping[str, Tensor]
+    observations: Mapping[str, Value]
 
 
 class StepInfo(NamedTuple):
