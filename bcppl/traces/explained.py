@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bcppl.distributions.support import masks
 from bcppl.errors import InferenceError, InputError, NotANumberError
 from bcppl.traces.faults import Fault, ProgramError
 
@@ -59,6 +60,29 @@ def unsampled(address: str, distribution: Any) -> InputError:
     return InputError(
         f"site {address!r} is to be sampled, but its distribution {type(distribution).__name__} defines no "
         "`sample`; give the site an observation, or the distribution a sampler."
+    )
+
+
+def refuse_masked(address: str, distribution: Any) -> None:
+    """Refuse the distribution of a latent site that masks some of its values."""
+    if masks(distribution):
+        raise ProgramError(
+            Fault.MASKED,
+            address,
+            f"site {address!r} is latent and its distribution is masked, so that the target would be "
+            "improper; sample it from its prior for every particle, and where it plays no part ignore its "
+            "value with `torch.where`.",
+        )
+
+
+def changed_outside(address: str, name: str) -> ProgramError:
+    """The error of a site that reads a variable which has changed before it was evaluated."""
+    return ProgramError(
+        Fault.DEPENDENCE,
+        address,
+        f"site {address!r} reads {name!r} from outside its distribution, and that has changed since the "
+        "program was run; hold all that the distribution depends on in it, as an attribute that is made in "
+        "each run.",
     )
 
 

@@ -15,12 +15,11 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.shortcuts import narrowed
-from bcppl.distributions.support import log_prob_inside, masks, support_of
+from bcppl.distributions.support import log_prob_inside, support_of
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.dependence import comparison, equal
-from bcppl.traces.explained import hidden_site, not_a_number, other_addresses
-from bcppl.traces.faults import Fault, ProgramError
+from bcppl.traces.explained import changed_outside, hidden_site, not_a_number, other_addresses, refuse_masked
 from bcppl.traces.indexing import Index, beside, particles_at
 from bcppl.traces.run import Program, Run, inward, run
 from bcppl.traces.surroundings import changed as surroundings_changed, evaluated, surroundings_of
@@ -152,13 +151,7 @@ class Trace:
             return log_prob_inside(narrowed(distribution), value)
         then, now = self._run.surroundings[address], surroundings_of(distribution)
         if (name := surroundings_changed(then, now)) is not None:
-            raise ProgramError(
-                Fault.DEPENDENCE,
-                address,
-                f"site {address!r} reads {name!r} from outside its distribution, and that has changed since "
-                "the program was run; hold all that the distribution depends on in it, as an attribute that "
-                "is made in each run.",
-            )
+            raise changed_outside(address, name)
         return evaluated(distribution, lambda: log_prob_inside(distribution, value))
 
     def __getitem__(self, key: str | Index) -> Any:
@@ -327,18 +320,6 @@ def refuse_masked_latents(trace: Trace) -> None:
     """Refuse a trace with a latent site that masks some of its values."""
     for address in trace.choices:
         refuse_masked(address, trace._run.distributions[address])
-
-
-def refuse_masked(address: str, distribution: Any) -> None:
-    """Refuse the distribution of a latent site that masks some of its values."""
-    if masks(distribution):
-        raise ProgramError(
-            Fault.MASKED,
-            address,
-            f"site {address!r} is latent and its distribution is masked, so that the target would be "
-            "improper; sample it from its prior for every particle, and where it plays no part ignore its "
-            "value with `torch.where`.",
-        )
 
 
 def _of_each_particle(value: Tensor, site: Any, particles: int) -> Tensor:

@@ -130,9 +130,9 @@ def check_densities(trace: Trace) -> None:
 
 
 def _affordable(trace: Trace, particles: int) -> int:
-    """So many particles, or fewer where the sites have many numbers each."""
+    """So many particles, or fewer where the sites have many numbers each; an even number."""
     each = sum(math.prod((*d.batch_shape[:-1], *d.event_shape)) for d in trace.distributions.values())
-    return max(FEWEST, min(particles, NUMBERS // max(each, 1)))
+    return max(FEWEST, min(particles, NUMBERS // max(each, 1) // 2 * 2))
 
 
 def _doubted(distribution: Any) -> bool:

@@ -221,7 +221,9 @@ class _Kept:
     @classmethod
     def of(cls, args: Any, program: Any) -> _Kept:
         live = {f"argument {k}": value for k, value in enumerate(args)}
-        for each in (program, getattr(program, "init", None), getattr(program, "step", None)):
+        for given in (program, getattr(program, "init", None), getattr(program, "step", None)):
+            # Of a partial application or a method, the function.
+            each = getattr(given, "func", getattr(given, "__func__", given))
             if isinstance(each, FunctionType):
                 live[f"the defaults of {each.__name__}"] = each.__defaults__
                 for name in each.__code__.co_names:
