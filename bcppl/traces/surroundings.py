@@ -109,8 +109,8 @@ def _still(then: Any, now: Any) -> bool:
 def _of_methods(kind: type) -> tuple[Variable, ...]:
     """The variables that the methods of a class read."""
     methods = (each for own in _own_classes(kind) for each in vars(own).values())
-    found = (_variables(each) for method in methods for each in _functions(getattr(method, "fget", method)))
-    return tuple(each for some in found for each in some)
+    names = (_variables(each) for method in methods for each in _functions(getattr(method, "fget", method)))
+    return tuple(each for some in names for each in some)
 
 
 def _variables(function: FunctionType) -> tuple[Variable, ...]:
@@ -152,16 +152,16 @@ def _is_of_python(value: Any) -> bool:
 @lru_cache(maxsize=4096)
 def loaded(code: CodeType) -> Names:
     """The global names that code loads, each with the attribute that is taken from it at once, if any."""
-    found: dict[tuple[str, str | None], None] = {}
+    names: dict[tuple[str, str | None], None] = {}
     name = None
     for each in dis.get_instructions(code):
         if name is not None:
-            found[name, each.argval if each.opname in ("LOAD_ATTR", "LOAD_METHOD") else None] = None
+            names[name, each.argval if each.opname in ("LOAD_ATTR", "LOAD_METHOD") else None] = None
         name = each.argval if each.opname in ("LOAD_GLOBAL", "LOAD_NAME") else None
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            found.update(dict.fromkeys(loaded(constant)))
-    return tuple(found)
+            names.update(dict.fromkeys(loaded(constant)))
+    return tuple(names)
 
 
 def _functions(value: Any) -> Iterator[FunctionType]:

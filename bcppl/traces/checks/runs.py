@@ -121,11 +121,11 @@ def check_reruns(trace: Trace, other: Trace, args: Any, program: Any) -> None:
     """
     before, expected = _Kept.of(args, program), log_probs(trace)
     log_probs(rerun(other))
-    if (found := first_differing(expected, log_probs(trace))) is not None:
+    if (where := first_differing(expected, log_probs(trace))) is not None:
         raise ProgramError(
             Fault.STATE,
-            found[0],
-            f"the log-probability of site {found[0]!r} is written over when another is evaluated; return a "
+            where[0],
+            f"the log-probability of site {where[0]!r} is written over when another is evaluated; return a "
             "new tensor each time.",
         )
     generators = _generators()
@@ -133,8 +133,8 @@ def check_reruns(trace: Trace, other: Trace, args: Any, program: Any) -> None:
     got = log_probs(again)
     drew = _generators() != generators
     site: str | None = None
-    if (found := first_differing(expected, got)) is not None:
-        site, particle = found
+    if (where := first_differing(expected, got)) is not None:
+        site, particle = where
         what = (
             f"site {site!r} has log-probability {float(got[site][particle]):.6g} in a run at values where it "
             f"had {float(expected[site][particle]):.6g} before"
@@ -181,11 +181,11 @@ def _refuse_unrepeatable(trace: Trace, expected: dict[str, Tensor]) -> None:
     """Refuse log-probabilities that are others when they are evaluated again in the same run."""
     once_more = replace(trace, known={})
     once_more._keep_run(trace._run)
-    if (found := first_differing(expected, log_probs(once_more))) is not None:
+    if (where := first_differing(expected, log_probs(once_more))) is not None:
         raise ProgramError(
             Fault.STATE,
-            found[0],
-            f"site {found[0]!r} has another log-probability when it is evaluated again; change no attribute "
+            where[0],
+            f"site {where[0]!r} has another log-probability when it is evaluated again; change no attribute "
             "of its distribution, and nothing that this holds, in `log_prob`.",
         )
 

@@ -70,11 +70,11 @@ def _check_late(trace: Trace, other: Trace) -> None:
     expected, late = log_probs(trace), rerun(trace)
     late.addresses  # noqa: B018
     rerun(other).addresses  # noqa: B018
-    if (found := first_differing(expected, log_probs(late))) is not None:
+    if (where := first_differing(expected, log_probs(late))) is not None:
         raise ProgramError(
             Fault.DEPENDENCE,
-            found[0],
-            f"site {found[0]!r} has another log-probability where the program was run at other values before "
+            where[0],
+            f"site {where[0]!r} has another log-probability where the program was run at other values before "
             "it is evaluated; hold all that its distribution depends on in the distribution, as an attribute "
             "that is made in each run.",
         )
