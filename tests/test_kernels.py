@@ -222,7 +222,7 @@ def test_no_particle_shapes_its_own_proposal(count: int) -> None:
         assert not others & mine and others | mine == tags
     for k in range(sweeps):
         assert moved[2 * k] | moved[2 * k + 1] == tags, "every particle is moved in every sweep"
-        assert all(each == moved[k % 2] for k, each in enumerate(moved)), "the halves stay from sweep to sweep"
+        assert all(each == moved[k % 2] for k, each in enumerate(moved)), "halves stay from sweep to sweep"
     # Particles stay in their places, and what is not moved stays.
     assert torch.equal(done.population.trace["tag"], trace["tag"])
     fresh = Trace(program, (), count, done.population.trace.choices, {})
