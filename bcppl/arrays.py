@@ -9,6 +9,8 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from bcppl.errors import InputError
+
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Numbers = npt.NDArray[np.int32]
@@ -33,6 +35,38 @@ class ArrayRecord:
         """The rows of several records, in their order."""
         return records[0]._mapped(lambda *each: np.concatenate(each), *records[1:])
 
+    def named(self) -> dict[str, npt.NDArray[Any]]:
+        """Every array by its name, that of a record within by both names, `state.tail`."""
+        named: dict[str, npt.NDArray[Any]] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, ArrayRecord):
+                value = value.named()
+            if isinstance(value, Mapping):
+                named |= {f"{field.name}.{key}": each for key, each in value.items()}
+            elif value is not None:
+                named[field.name] = value
+        return named
+
+    def renamed(self, named: Mapping[str, npt.NDArray[Any]]) -> Self:
+        """A copy with other arrays of the same names and types; only their second axis may be another.
+
+        Raises:
+            InputError: an array is missing, or has another type or shape.
+        """
+        values: dict[str, Any] = {}
+        for field in fields(self):
+            value, begin = getattr(self, field.name), f"{field.name}."
+            within = {name.removeprefix(begin): v for name, v in named.items() if name.startswith(begin)}
+            if isinstance(value, ArrayRecord):
+                value = value.renamed(within)
+            elif isinstance(value, Mapping):
+                value = {key: _alike(key, each, within) for key, each in value.items()}
+            elif value is not None:
+                value = _alike(field.name, value, named)
+            values[field.name] = value
+        return type(self)(**values)
+
     def _mapped(self, function: Any, *others: Self) -> Self:
         values: dict[str, Any] = {}
         for name in (field.name for field in fields(self)):
@@ -42,6 +76,19 @@ class ArrayRecord:
             else:
                 values[name] = None if each[0] is None else function(*each)
         return type(self)(**values)
+
+
+def _alike(name: str, mine: Any, named: Mapping[str, npt.NDArray[Any]]) -> Any:
+    theirs = named.get(name)
+    axes = [0, *range(2, mine.ndim)]
+    if (
+        not isinstance(theirs, np.ndarray)
+        or theirs.dtype != mine.dtype
+        or theirs.ndim != mine.ndim
+        or any(theirs.shape[axis] != mine.shape[axis] for axis in axes)
+    ):
+        raise InputError(f"a simulator's state has no array {name!r} of its type and shape.")
+    return theirs
 
 
 def _put(mine: Any, rows: Rows, theirs: Any) -> Any:

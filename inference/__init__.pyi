@@ -7,6 +7,7 @@ from bcppl.inference import (
     predictive as predictive,
     proposals as proposals,
     resampling as resampling,
+    saved as saved,
     summaries as summaries,
     targets as targets,
 )

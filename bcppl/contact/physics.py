@@ -11,6 +11,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -165,6 +166,21 @@ class Rollout:
     def diverged(self) -> Mask:
         """(N,) simulations that diverged even at half the time step."""
         return np.asarray(self._particles.level == _DIVERGED)
+
+    def named(self) -> dict[str, npt.NDArray[Any]]:
+        """The arrays of all that has been simulated, by name."""
+        return self._particles.named()
+
+    def renamed(self, named: Mapping[str, npt.NDArray[Any]]) -> Rollout:
+        """The rollouts of the same particles with all that had been simulated.
+
+        Raises:
+            InputError: an array is missing, or has another type or shape.
+        """
+        particles = self._particles.renamed(named)
+        if not ((particles.level >= _FULL) & (particles.level <= _DIVERGED) & (particles.free >= 0)).all():
+            raise InputError("a rollout's stamps or levels are out of range.")
+        return Rollout(self.simulation, particles)
 
     def __getitem__(self, index: Selection) -> Rollout:
         """Rollouts of some particles, in the order of an index tensor, a mask or a slice."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -13,6 +16,7 @@ from bcppl.arrays import Array, ArrayRecord
 from bcppl.contact.nuisances import Nuisances
 from bcppl.contact.physics import PegPhysics, Rollout, Selection, rows_of
 from bcppl.contact.sensing.location import ContactSensing, SensingState
+from bcppl.errors import InputError
 from bcppl.robot.motion import Probe
 
 
@@ -119,6 +123,28 @@ class ProbeRollout:
         rotation = poses.rotation_matrix(torch.where(lost, poses.identity(), pose))
         direction = (rotation @ force[..., None])[..., 0] / size
         return torch.where(lost | (size == 0.0), torch.nan, direction)
+
+    def stored(self) -> dict[str, npt.NDArray[Any]]:
+        """The numbers of all that has been simulated, by name (`bcppl.traces.carried.Storable`)."""
+        return {
+            **{f"rollout.{name}": array for name, array in self.rollout.named().items()},
+            **{f"sensed.{name}": array for name, array in self._sensed.named().items()},
+        }
+
+    def restored(self, numbers: Mapping[str, npt.NDArray[Any]]) -> ProbeRollout:
+        """The rollouts of the same particles with all that had been simulated.
+
+        Raises:
+            InputError: the numbers are those of other particles, or of another probe.
+        """
+        physics, sensed = (
+            {n.removeprefix(begin): each for n, each in numbers.items() if n.startswith(begin)}
+            for begin in ("rollout.", "sensed.")
+        )
+        rollout, record = self.rollout.renamed(physics), self._sensed.renamed(sensed)
+        if rollout.count != record.contacts.shape[1]:
+            raise InputError("a rollout's physics and contacts are of different lengths.")
+        return ProbeRollout(rollout, self.sensing, self.inputs, record)
 
     def __getitem__(self, index: Selection) -> ProbeRollout:
         """The rollouts of some particles, in the order of an index tensor, a mask or a slice."""

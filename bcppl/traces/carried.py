@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -31,6 +32,19 @@ class Carryable(Protocol):
 
     def where(self, mask: Tensor, other: Any) -> Any:
         """This state where `mask` (N,) is true, the other's elsewhere."""
+        ...
+
+
+@runtime_checkable
+class Storable(Protocol):
+    """State whose numbers can be kept in a file; one without is made again where a trace is read from one."""
+
+    def stored(self) -> Mapping[str, npt.NDArray[Any]]:
+        """Its numbers by name, all but those that a new state for the same particles has."""
+        ...
+
+    def restored(self, numbers: Mapping[str, npt.NDArray[Any]]) -> Any:
+        """A new state with these numbers in place of its own."""
         ...
 
 

@@ -75,7 +75,7 @@ FEW_PARTICLES = 5000
 
 
 @contextmanager
-def _own_state(box: list[Tensor], particles: int) -> Iterator[None]:
+def own_state(box: list[Tensor], particles: int) -> Iterator[None]:
     """Torch's generator and threads set to the run's own within, and the caller's put back afterwards."""
     outside, threads = torch.get_rng_state(), torch.get_num_threads()
     torch.set_rng_state(box[0])
@@ -176,7 +176,7 @@ def _steps(
     measurements = recording.measurements
     if start is None:
         state = [torch.Generator().manual_seed(seed).get_state()]
-        with _own_state(state, particles):
+        with own_state(state, particles):
             population = initialize(model, scene, particles)
         if model.pose not in population.trace:
             raise InputError(
@@ -203,7 +203,7 @@ def _steps(
         label = f"{measurement.kind} {count}"
         begun, before = time.perf_counter(), _effort(scene)
         try:
-            with _own_state(state, particles):
+            with own_state(state, particles):
                 population, happened = step(population, observed)
         except InferenceError as error:
             raise type(error)(f"{label}: {error}") from error
@@ -238,14 +238,14 @@ class _Truth:
         if recording.truth is None or moves or set(population.trace.choices) != self.latent:
             return
         pose = torch.as_tensor(recording.truth, dtype=torch.float64)[None]
-        with _own_state(self.state, 1):
+        with own_state(self.state, 1):
             one, _ = generate(model.program, (scene, []), {}, 1)
             self.trace = one.at({model.pose: pose})
 
     def assimilate(self, observed: Observed) -> None:
         """Extend its trace."""
         if self.trace is not None:
-            with _own_state(self.state, 1):
+            with own_state(self.state, 1):
                 self.trace, _ = extend(self.trace, *observed)
             if set(self.trace.choices) != self.latent:
                 self.trace = None

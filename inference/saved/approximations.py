@@ -1,0 +1,84 @@
+"""The approximation that guides a filter as plain data, and made again for a trace.
+
+The fits of images are computed again: they depend on the image alone. The quadratic approximation depends on
+the order in which measurements were assimilated, and is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from bcppl.errors import InputError
+from bcppl.inference.approximation import Fitted, GaussianApproximation
+from bcppl.inference.laplace import QuadraticApproximation
+from bcppl.sensors.capabilities import Approximated, FitsPose
+from bcppl.traces import Trace
+
+Content = dict[str, Any]
+
+
+def approximation_content(approximation: Any) -> Content | None:
+    """The plain data of an approximation, or None of None.
+
+    Raises:
+        InputError: it is of a kind that cannot be saved.
+    """
+    if approximation is None:
+        return None
+    if type(approximation) is not GaussianApproximation:
+        raise InputError(
+            f"an approximation of type {type(approximation).__name__} cannot be saved; save "
+            "`population.with_approximation(None)`, from which a filter computes it again."
+        )
+    relevant = approximation.relevant
+    return {
+        "pose": approximation.pose,
+        "fits": list(approximation.fits),
+        "contacts": [contact.number for contact in approximation.contacts],
+        "quadratic": None if approximation.quadratic is None else list(approximation.quadratic),
+        "relevant": [list(relevant), list(relevant.values())],
+        "stale": approximation.stale,
+    }
+
+
+def approximation_of(content: Content | None, trace: Trace) -> GaussianApproximation | None:
+    """The approximation that `approximation_content` was given, for the same trace made again.
+
+    Raises:
+        InputError: the trace has other measurements.
+    """
+    if content is None:
+        return None
+    try:
+        scene, actions = trace.args
+        fits = {name: _fitted(name, scene, actions, trace) for name in content["fits"]}
+        contacts = tuple(_contact(number, scene, actions, trace) for number in content["contacts"])
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"the file has an approximation of other measurements than the trace ({error}); "
+            "give the scene and the actions that it was saved with."
+        ) from error
+    quadratic = content["quadratic"]
+    return replace(
+        GaussianApproximation(content["pose"], scene),
+        fits=fits,
+        contacts=contacts,
+        quadratic=None if quadratic is None else QuadraticApproximation(*quadratic),
+        relevant=dict(zip(*content["relevant"], strict=True)),
+        stale=content["stale"],
+    )
+
+
+def _fitted(name: str, scene: Any, actions: Sequence[Any], trace: Trace) -> Fitted:
+    for number, action in enumerate(actions):
+        sensor = scene.sensor(action)
+        if isinstance(sensor, FitsPose) and sensor.instrument(action) == name:
+            return Fitted(action, sensor.fit(number, action, trace.observations))
+    raise LookupError(f"no measurement by {name!r}")
+
+
+def _contact(number: int, scene: Any, actions: Sequence[Any], trace: Trace) -> Approximated:
+    action = actions[number]
+    return Approximated(number, action, trace.observations[scene.sensor(action).address(number)])
