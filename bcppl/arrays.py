@@ -49,7 +49,7 @@ class ArrayRecord:
         return named
 
     def renamed(self, named: Mapping[str, npt.NDArray[Any]]) -> Self:
-        """A copy with other arrays of the same names and types; only their second axis may be another.
+        """A copy with other arrays of the same names, types and shapes; a second axis without entries may grow.
 
         Raises:
             InputError: an array is missing, or has another type or shape.
@@ -80,7 +80,7 @@ class ArrayRecord:
 
 def _alike(name: str, mine: Any, named: Mapping[str, npt.NDArray[Any]]) -> Any:
     theirs = named.get(name)
-    axes = [0, *range(2, mine.ndim)]
+    axes = [axis for axis in range(mine.ndim) if axis != 1 or mine.shape[1]]
     if (
         not isinstance(theirs, np.ndarray)
         or theirs.dtype != mine.dtype

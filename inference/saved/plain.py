@@ -1,9 +1,9 @@
-"""Plain data in a file: tensors, arrays, numbers, text, and mappings and sequences of them, equal to the bit.
+"""Plain data in a file, equal to the bit: tensors, arrays, numbers, text, mappings and sequences of them.
 
-Nothing else is written, and nothing that is read runs code. An HDF5 file holds two datasets: `structure`, JSON
-text in which an array is its place, type, shape and strides, and `numbers`, the arrays' bytes. One dataset for
-each array would make a series of a thousand steps take a hundred times as long. Strides are kept, since sums
-round by them.
+Nothing else is written, and nothing that is read runs code. An HDF5 file holds two datasets: `structure`,
+JSON text in which an array is its type, shape and strides, and `numbers`, the arrays' bytes in the same
+order. With one dataset for each array a series of a thousand steps would take sixty times as long. Strides
+are kept, since sums round by them.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         each = [plain(part) for part in value]
         return type(value)(*each) if hasattr(value, "_fields") else type(value)(each)
-    raise NotPlainError(type(value).__qualname__)
+    raise NotPlainError(type(value).__name__)
 
 
 def write(file: h5py.File, content: Mapping[str, Any]) -> None:

@@ -71,7 +71,7 @@ def load(path: Location, program: Program | Series, args: Any = None) -> Populat
 
 
 def load_several(path: Location, program: Program | Series, args: Any = None) -> list[Population]:
-    """The populations of one program in a file that `save` wrote, in their order; it raises what `load` does."""
+    """The populations of one program in a file that `save` wrote, in order; it raises what `load` does."""
     with opened(path) as content:
         return [population_of(each, program, _given(args, each)) for each in content["populations"]]
 
@@ -88,6 +88,11 @@ def random_state(path: Location) -> Tensor:
 
 
 def population_content(population: Population) -> Content:
+    """The plain data of a population: of its trace, its other fields, and what sums it has cached.
+
+    Raises:
+        InputError: something is no plain data.
+    """
     own = {f.name: getattr(population, f.name) for f in fields(population)}
     trace, approximation = own.pop("trace"), own.pop("approximation")
     computed = {n: population.__dict__[n] for n in COMPUTED if n in population.__dict__}

@@ -1,13 +1,14 @@
 """Traces as plain data, and traces made again of those by running their program at the same values.
 
-What a run computes from values and arguments is computed again. What it cannot give again to the bit is kept:
-log-probabilities, which were evaluated in batches of other particles, the numbers of carried simulator states,
-and of a series without history the state before its newest step.
+What a run computes from values and arguments is computed again. What it cannot give again to the bit is
+kept: log-probabilities, which were evaluated in batches of other particles, the numbers of carried simulator
+states, and of a series without history the state before its newest step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -63,7 +64,7 @@ def _values(trace: Trace, carries: bool = True) -> Content:
         "known": dict(trace.known),
         "hidden": sorted(trace.hidden),
         "args": None,
-        "kinds": ", ".join(type(arg).__qualname__ for arg in trace.args),
+        "kinds": ", ".join(type(arg).__name__ for arg in trace.args),
         "carried": {},
     }
     # A past step of a series is moved no more, and its simulators are not asked again.
@@ -71,10 +72,8 @@ def _values(trace: Trace, carries: bool = True) -> Content:
         _ = trace._run  # makes the carried states those of the present values
         states = {name: entry.state for name, entry in trace.carried.items() if name in trace._run.carried}
         content["carried"] = {n: dict(s.stored()) for n, s in states.items() if isinstance(s, Storable)}
-    try:
+    with suppress(NotPlainError):
         content["args"] = plain(tuple(trace.args))
-    except NotPlainError:
-        pass
     return content
 
 
@@ -93,7 +92,7 @@ def name_of(program: Program | Series) -> str:
     program = program.series if isinstance(program, Stage) else program
     inner: Any = program.step if isinstance(program, Series) else program
     inner = getattr(inner, "func", inner)
-    return str(getattr(inner, "__qualname__", type(inner).__qualname__))
+    return str(getattr(inner, "__name__", type(inner).__name__))
 
 
 def _evaluated(trace: Trace, particles: Tensor) -> dict[str, Tensor]:
@@ -108,18 +107,18 @@ def trace_of(content: Content, program: Program | Series, given: Arguments) -> T
     Raises:
         InputError: the program or its arguments are others than those that the content is of; names the site.
     """
-    kind = Series if "before" in content else None
-    if isinstance(program, Series) != (kind is Series):
-        series, one = ("a series", "one program") if kind is Series else ("one program", "a series")
-        raise InputError(f"the file is of {series}, but the program given is {one}; give that of the file.")
-    own = f"{name_of(program)!r} and these arguments"
-    of = f"the file is of {content['program']!r}"
+    series = "before" in content
+    if isinstance(program, Series) != series:
+        kinds = ("a series", "one program") if series else ("one program", "a series")
+        raise InputError(f"the file is of {kinds[0]}, but the program given is {kinds[1]}; give its own.")
+    first = content["before"]["steps"] + 1 if series and content["before"] is not None else 0
+    args = [_arguments(values, given(k)) for k, values in enumerate(content["steps"], start=first)]
+    own, of = repr(name_of(program)), f"the file is of {content['program']!r}"
     try:
         if isinstance(program, Series):
-            trace: Trace = _series(content, program, given)
+            trace: Trace = _series(content, program, args, first)
         else:
-            (values,) = content["steps"]
-            trace, _ = _ran(Trace, program, values, _arguments(values, given(0)))
+            trace, _ = _ran(Trace, program, content["steps"][0], args[0])
         again = _evaluated(trace, content["checked"])
     except InputError as error:
         raise InputError(f"{of}, and {own} cannot be run at its values: {error}") from error
@@ -130,7 +129,7 @@ def trace_of(content: Content, program: Program | Series, given: Arguments) -> T
         if not torch.allclose(again[address], expected, rtol=TOLERANCE, atol=TOLERANCE):
             which = int((again[address] - expected).nan_to_num().abs().argmax())
             raise InputError(
-                f"{of}, and {own} give site {address!r} log-probability {float(again[address][which]):.6g} "
+                f"{of}, and {own} gives site {address!r} log-probability {float(again[address][which]):.6g} "
                 f"where that gave {float(expected[which]):.6g}; give the program and the arguments that it "
                 "was saved with."
             )
@@ -151,22 +150,20 @@ def _arguments(values: Content, given: tuple[Any, ...] | None) -> tuple[Any, ...
     return tuple(given)
 
 
-def _series(content: Content, series: Series, given: Arguments) -> SeriesTrace:
+def _series(content: Content, series: Series, args: Sequence[tuple[Any, ...]], first: int) -> SeriesTrace:
     before: SeriesTrace | None = None
-    number = 0
-    if content["before"] is not None:
+    if first:
         held = content["before"]
         before = Forgotten(Stage(series, held["steps"]), (), held["particles"], {}, {})
         before.__dict__["_result"] = held["state"]
-        number = held["steps"] + 1
-    if series.history == (content["before"] is not None) and len(content["steps"]) + number > 1:
+    if first + len(args) > 1 and series.history == bool(first):
         raise InputError(f"it was made with `history={not series.history}`; give it so.")
-    for number, values in enumerate(content["steps"], start=number):
+    for number, (values, each) in enumerate(zip(content["steps"], args, strict=True), start=first):
         picks = () if values["chosen"] is None else (values["chosen"],)
-        stage = Stage(series, number, before, picks)
-        before, ran = _ran(SeriesTrace, stage, values, _arguments(values, given(number)))
+        before, ran = _ran(SeriesTrace, Stage(series, number, before, picks), values, each)
         # As `SeriesTrace.next_stage` leaves a past step.
         before.__dict__["_result"] = ran.result
+    assert before is not None
     trace = before
     del trace.__dict__["_result"]
     if content["origin"] is None:
