@@ -49,7 +49,9 @@ class ArrayRecord:
         return named
 
     def renamed(self, named: Mapping[str, npt.NDArray[Any]]) -> Self:
-        """A copy with other arrays of the same names, types and shapes; a second axis without entries may grow.
+        """A copy with other arrays of the same names, types and shapes.
+
+        A second axis without entries, that of stamps before the first, may have some.
 
         Raises:
             InputError: an array is missing, or has another type or shape.

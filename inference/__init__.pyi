@@ -1,4 +1,5 @@
 from bcppl.inference import (
+    calibration as calibration,
     chains as chains,
     collectors as collectors,
     design as design,

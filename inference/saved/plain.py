@@ -133,7 +133,7 @@ def _made(description: Any, numbers: bytes) -> Any:
         names, parts = rest
         each = [made(one) for one in parts]
         if kind == "named":
-            return namedtuple("State", names)(*each)  # type: ignore[misc]
+            return namedtuple("State", names)(*each)
         return each if kind == "list" else tuple(each)
 
     content = made(description)

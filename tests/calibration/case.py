@@ -12,16 +12,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from multiprocessing import get_context
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.inference.calibration.ranks import ranks
+from bcppl.inference.calibration.rounds import gathered
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.kernels import Kernel, moved_by
@@ -30,7 +30,6 @@ from bcppl.inference.resampling import adaptive, systematic
 from bcppl.inference.targets import POSTERIOR
 from bcppl.poses import Freedom
 from bcppl.traces import extend, generate, simulate
-from tests.calibration.ranks import ranks
 
 AXES = ("x", "y", "z", "turn x", "turn y", "turn z")
 DRAWS = 49  # L: of N particles, so that those that are taken are nearly independent
@@ -116,16 +115,8 @@ def draw(case: Case, seed: int) -> Drawn:
 Job = Callable[[int], Any]
 
 
-def _alone(job: Job, seed: int) -> Any:
-    torch.set_num_threads(1)
-    return job(seed)
-
-
 def gather(job: Job, rounds: int, seed: int, processes: int = 1) -> list[Any]:
     """`job(seed + k)` for k below `rounds`; with several processes the job must be picklable."""
-    if processes == 1:
-        return [job(seed + k) for k in range(rounds)]
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    # MuJoCo's threads do not survive a fork.
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        return list(pool.map(_alone, [job] * rounds, range(seed, seed + rounds), chunksize=4))
+    done = dict(gathered(job, range(seed, seed + rounds), processes, progress=False))
+    return [done[number] for number in range(rounds)]

@@ -19,9 +19,9 @@ import pytest
 import torch
 from scipy.stats import binomtest
 
+from bcppl.inference.calibration.ranks import p_value, ranks
 from tests.calibration.case import DRAWS, gather
 from tests.calibration.mutants import CASES, MUTANTS, case_of, covered, rank
-from tests.calibration.ranks import p_value, ranks
 
 SEED, ROUNDS = 1804_06788, 300
 # Of the smallest p-value times the number of quantities (Bonferroni); the last for few rounds.
