@@ -138,11 +138,9 @@ class Calibration:
         for k, name in enumerate(self.names):
             mean, spread = self.ranks[:, k].mean() / self.posterior_draws, self.ranks[:, k].std() / uniform
             half, most = self.coverage(name)
+            numbers = f"{self.p_values[name]:7.5f} {mean:6.3f} {spread:6.2f} {half:6.3f} {most:6.3f}"
             comment = _comment(self.p_values[name] * len(self.names), mean, spread)
-            lines.append(
-                f"{name:{width}}  {self.p_values[name]:7.5f} {mean:6.3f} {spread:6.2f} {half:6.3f} {most:6.3f}"
-                f"{comment}"
-            )
+            lines.append(f"{name:{width}}  {numbers}{comment}")
         lines.append(
             f"{len(self)} draws, {np.median(self.effective_sample_sizes):.0f} effective particles (median); "
             f"all quantities together: p {self.p_value:.3g}"

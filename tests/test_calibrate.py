@@ -1,0 +1,172 @@
+"""`calibrate` finds inferences that are wrong, in each way of a catalogue, and no right one."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+
+from bcppl import poses
+from bcppl.distributions.poses import NormalPose, UniformPose
+from bcppl.errors import InputError, NoWeightError
+from bcppl.inference import importance_sampling
+from bcppl.inference.calibration import Calibration, Joint, calibrate, ranks_figure
+from bcppl.inference.calibration.ranks import band, p_value
+from bcppl.inference.population import Population
+from tests.invariance import number
+from tests.mutant_inferences import MUTANTS, NORMAL, SOUND, Data, exact, normal_inference
+
+DRAWS = 49
+
+
+@pytest.mark.parametrize("name", SOUND)
+def test_exact_posteriors_are_calibrated(name: str) -> None:
+    calibration = calibrate(*SOUND[name], 100)
+    assert calibration.p_value > 0.01, calibration
+    assert all(abs(each.shift_z) < 4 and abs(each.spread_z) < 4 for each in calibration.averaged.values())
+    for quantity in calibration.names:
+        half, most = calibration.coverage(quantity)
+        assert abs(half - 0.5) < 0.18 and abs(most - 0.9) < 0.11
+
+
+def test_the_band_holds_its_share_of_curves() -> None:
+    generator = np.random.default_rng(3)
+    low, high = band(100, DRAWS, 0.9)
+    inside = []
+    for _ in range(1000):
+        ranked = generator.integers(0, DRAWS + 1, 100)
+        curve = np.bincount(ranked, minlength=DRAWS + 1).cumsum()[:-1] / 100
+        inside.append(bool(((curve >= low) & (curve <= high)).all()))
+        # The band and the p-value are one test.
+        assert inside[-1] == (p_value(ranked, DRAWS) > 0.1) or abs(p_value(ranked, DRAWS) - 0.1) < 0.02
+    assert 0.87 < np.mean(inside) < 0.94
+
+
+def posed() -> None:
+    """A pose that is measured twice: its translation, and its tangent coordinates."""
+    centre = poses.as_pose([0.4, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0])
+    pose = pyro.sample("pose", UniformPose(centre, (0.01, 0.005, 0.002), 0.4))
+    which = pyro.sample("which", dist.Bernoulli(number(0.4)))
+    spread = torch.diag(torch.tensor([0.005, 0.005, 0.005, 0.2, 0.2, 0.2]).double()) ** 2
+    pyro.sample("seen", NormalPose(pose, spread * (1.0 + which[..., None, None])))
+
+
+def weighted(data: Data) -> Population:
+    return importance_sampling(posed, (), data, 300)
+
+
+def offset(data: Data) -> Population:
+    """Poses a quarter of a radian about x from where they are."""
+    population = weighted(data)
+    turned = poses.retract(population["pose"], torch.tensor([0.0, 0, 0, 0.25, 0, 0]).double())
+    return population.with_trace(population.trace.at({"pose": turned}))
+
+
+def test_poses_and_choices_are_ranked() -> None:
+    joint = Joint(posed, (), ("seen",))
+    calibration = calibrate(joint, weighted, 30, posterior_draws=19)
+    assert calibration.names[:8] == (
+        *(f"pose {axis}" for axis in ("x", "y", "z", "turn x", "turn y", "turn z")),
+        "which",
+        "distance",
+    )
+    assert calibration.p_value > 0.01
+    turned = calibrate(joint, offset, 30, posterior_draws=19)
+    assert turned.p_values["pose turn x"] < 1e-3 < turned.p_values["pose x"]
+
+
+# ---------------------------------------------------------------- how it runs
+
+
+def test_it_goes_on_from_a_folder(tmp_path: Path) -> None:
+    joint, inference = NORMAL, partial(normal_inference, exact)
+    whole = calibrate(joint, inference, 8, seed=3)
+    calibrate(joint, inference, 5, seed=3, folder=tmp_path / "runs")
+    written = (tmp_path / "runs/round_000002.npz").stat().st_mtime_ns
+    (tmp_path / "runs/round_000004.npz").unlink()
+    asked: list[Data] = []
+
+    def counted(data: Data) -> Population:
+        asked.append(data)
+        return inference(data)
+
+    again = calibrate(joint, counted, 8, seed=3, folder=tmp_path / "runs")
+    assert len(asked) == 4 and (tmp_path / "runs/round_000002.npz").stat().st_mtime_ns == written
+    assert np.array_equal(whole.ranks, again.ranks) and np.array_equal(whole.posterior, again.posterior)
+    with pytest.raises(InputError, match="calibration of other settings"):
+        calibrate(joint, inference, 8, seed=4, folder=tmp_path / "runs")
+    (tmp_path / "runs/round_000001.npz").write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"round_000001\.npz is no round"):
+        calibrate(joint, inference, 8, seed=3, folder=tmp_path / "runs")
+
+
+def test_in_several_processes_it_gives_the_same() -> None:
+    joint, inference = NORMAL, partial(normal_inference, exact)
+    one, two = (calibrate(joint, inference, 4, seed=1, processes=k) for k in (1, 2))
+    assert np.array_equal(one.ranks, two.ranks) and np.allclose(one.posterior, two.posterior, rtol=1e-12)
+    with pytest.raises(InputError, match="rounds cannot be sent to another process"):
+        calibrate(joint, lambda data: inference(data), 2, processes=2)
+
+
+def test_quantities_of_ones_own_are_ranked() -> None:
+    joint = Joint(NORMAL.program, (), ("y",), {"product": lambda values, data: values["x"].prod(-1)})
+    assert "product" in calibrate(joint, partial(normal_inference, exact), 3).names
+    joint = Joint(NORMAL.program, (), ("y",), {"all": lambda values, data: values["x"]})
+    with pytest.raises(InputError, match="test quantity 'all' gives no tensor of shape"):
+        calibrate(joint, partial(normal_inference, exact), 3)
+
+
+def test_torch_goes_on_as_before() -> None:
+    state = torch.get_rng_state()
+    calibrate(NORMAL, partial(normal_inference, exact), 2)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def observing() -> None:
+    x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+    pyro.sample("y", dist.Normal(x, 1.0), obs=number(0.3))
+
+
+def hopeless(data: Data) -> Population:
+    raise NoWeightError("no particle has any weight.")
+
+
+def test_what_cannot_be_calibrated_is_named() -> None:
+    inference = partial(normal_inference, exact)
+    with pytest.raises(InputError, match=r"observes 'y' itself \(`obs=` or `pyro.factor`\)"):
+        calibrate(Joint(observing, (), ("y",)), inference, 2)
+    with pytest.raises(InputError, match="'z' is one the program never visits"):
+        calibrate(Joint(NORMAL.program, (), ("z",)), inference, 2)
+    with pytest.raises(InputError, match="observed addresses are given as 'y'; give a list"):
+        Joint(NORMAL.program, (), "y")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="every site is observed"):
+        calibrate(Joint(NORMAL.program, (), ("y", "x", "offset")), inference, 2)
+    with pytest.raises(InputError, match="ranked among 149 draws of 100 particles"):
+        calibrate(NORMAL, inference, 2, posterior_draws=149)
+    with pytest.raises(InputError, match="a calibration of 0 draws"):
+        calibrate(NORMAL, inference, 0)
+    with pytest.raises(NoWeightError, match=r"round of seed \d+: no particle"):
+        calibrate(NORMAL, hopeless, 2)
+    with pytest.raises(InputError, match="a int was given in place of a population"):
+        calibrate(NORMAL, lambda data: 3, 2)
+    with pytest.raises(InputError, match="latent value at 'pose', which the population lacks"):
+        calibrate(Joint(posed, (), ("seen",)), lambda data: inference({"y": torch.zeros(2).double()}), 1)
+
+
+def test_the_figure_and_the_table_name_what_is_wrong() -> None:
+    sound = calibrate(*SOUND["normal"], 60)
+    narrow = calibrate(*MUTANTS["too narrow by a half"], 40)
+    shifted = calibrate(*MUTANTS["shifted by 1 sd"], 40)
+    assert "too" not in str(sound) and "posterior too narrow" in str(narrow)
+    assert "truths below the posterior" in str(shifted).splitlines()[1]
+    for calibration, orange in ((sound, False), (narrow, True)):
+        figure = ranks_figure(calibration)
+        curves = [line for panel in figure.axes for line in panel.lines]
+        assert any(line.get_color() == "#D55E00" for line in curves) == orange
+        assert len([panel for panel in figure.axes if panel.get_title()]) == len(calibration.names) + 1
+    assert isinstance(sound, Calibration) and len(sound) == 60
