@@ -47,7 +47,7 @@ def band(count: int, draws: int, level: float = 0.95) -> tuple[Array, Array]:
     gamma = float(np.quantile(_uniform(count, draws), 1.0 - level))
     levels = (np.arange(draws) + 1.0) / (draws + 1.0)
     low, high = binom.ppf(0.5 * gamma, count, levels), binom.ppf(1.0 - 0.5 * gamma, count, levels)
-    return low / count, high / count
+    return np.asarray(low) / count, np.asarray(high) / count
 
 
 @functools.cache
@@ -55,7 +55,8 @@ def _tails(count: int, draws: int) -> tuple[Array, Array]:
     """P(X <= r) and P(X >= r) of binomial counts r up to `count`, at all ranks but one: (L, count + 1)."""
     levels = (np.arange(draws) + 1.0)[:, None] / (draws + 1.0)
     counts = np.arange(count + 1)[None]
-    return binom.cdf(counts, count, levels), binom.sf(counts - 1, count, levels)
+    low, high = binom.cdf(counts, count, levels), binom.sf(counts - 1, count, levels)
+    return np.asarray(low), np.asarray(high)
 
 
 def _gamma(frequencies: Counts) -> Array:

@@ -119,7 +119,7 @@ def population_of(content: Content, program: Program | Series, given: Arguments)
         approximation = approximation_of(content["approximation"], trace)
     own = content["fields"]
     for name, value in own.items():
-        if isinstance(value, Tensor) and value.shape[:1] != (trace.particles,):
+        if isinstance(value, Tensor) and len(value) not in (0, trace.particles):
             raise InputError(f"its {name} are of {len(value)} particles, the trace of {trace.particles}.")
     unknown = own.keys() - {f.name for f in fields(Population)}
     if unknown:
