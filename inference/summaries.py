@@ -22,6 +22,7 @@ from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.poses import FREE, Freedom
+from bcppl.traces import Trace
 from bcppl.traces.series import SeriesTrace
 
 Address = str | tuple[str, int]
@@ -38,29 +39,38 @@ WEIGHTLESS = (
 
 def values_at(population: Population, address: Address) -> Tensor:
     """The values (N, *event) at a latent address."""
-    trace = population.trace
-    name = address if isinstance(address, str) else address[0]
-    latent_address("a summary of {} was asked for", name, trace.choices)
-    if isinstance(address, str):
-        return trace.choices[address]
-    if not isinstance(trace, SeriesTrace):
-        raise InputError(
-            f"a summary of {name!r} after step {address[1]} was asked for, but the program is no Series; "
-            "give the address alone."
-        )
-    return trace[address]
+    name, then = _site(population, address)
+    return then.choices[name] if isinstance(address, str) else population.trace[address]
 
 
 def is_pose(population: Population, address: Address) -> bool:
     """Whether a latent address holds poses (N, 7): its distribution has a `freedom`."""
-    values_at(population, address)
     return _freedom(population, address) is not None
 
 
+def _site(population: Population, address: Address) -> tuple[str, Trace]:
+    """The name of a latent address, and the trace of the step that has it."""
+    trace = population.trace
+    if isinstance(address, str):
+        latent_address("a summary of {} was asked for", address, trace.choices)
+        return address, trace
+    name, number = address
+    if not isinstance(trace, SeriesTrace):
+        raise InputError(
+            f"a summary of {name!r} after step {number} was asked for, but the program is no Series; "
+            "give the address alone."
+        )
+    # A step may have others than the newest, such as what only `init` samples.
+    then = trace._after(number)[0]
+    latent_address(f"a summary of step {number} was asked for at {{}}", name, then.choices)
+    return name, then
+
+
 def _freedom(population: Population, address: Address) -> Freedom | None:
-    # A pose is one at every step.
-    name = address if isinstance(address, str) else address[0]
-    return freedom_of(population.trace.distributions[name])
+    name, then = _site(population, address)
+    # A pose is one at every step, and the newest distributions are there.
+    newest = population.trace
+    return freedom_of((newest if name in newest.choices else then).distributions[name])
 
 
 def _belief(population: Population, address: Address) -> Belief:

@@ -98,3 +98,34 @@ def test_an_earlier_step_of_a_series_is_weighed_by_where_it_led() -> None:
     )
     with pytest.raises(InputError, match="step 3 of a series"):
         mean(found, ("x", 3))
+
+
+def test_what_a_series_samples_at_its_beginning_alone_is_summarised_too() -> None:
+    """Wherever `trace["a", 0]` has a value: addresses of `init`, poses, and the entries of plates."""
+
+    def init() -> torch.Tensor:
+        pyro.sample("hole", UniformPose(poses.identity(), (0.02, 0.01, 0.0), 0.5, "z"))
+        pyro.sample("kind", dist.Bernoulli(number(0.5)[0]))
+        with pyro.plate("three", 3, dim=-2):
+            return pyro.sample("a", dist.Normal(number(0.0)[0], 1.0)).movedim(-1, 0)
+
+    def step(a: torch.Tensor) -> torch.Tensor:
+        pyro.sample("b", dist.Normal(a.sum(-1), 1.0))
+        return a
+
+    torch.manual_seed(0)
+    trace, _ = generate(Series(init, step), (), {}, 4)
+    trace, _ = extend(trace[[3, 3, 0, 1]], (), {})
+    found = Population(trace[[1, 0, 2, 2]], number(0.5, 0.25, 0.25, 0.0).log())
+    weights = number(0.5, 0.25, 0.25, 0.0)
+    torch.testing.assert_close(mean(found, ("a", 0)), weights @ found.trace["a", 0])
+    assert mean(found, ("a", -2)).shape == (3,) and quantiles(found, ("a", 0), [0.1, 0.9]).shape == (2, 3)
+    assert covariance(found, ("a", 0)).shape == (3, 3)
+    assert mean(found, ("hole", 0)).shape == (7,) and covariance(found, ("hole", 0)).shape == (6, 6)
+    assert float(probabilities(found, ("kind", 0)).probabilities.sum()) == pytest.approx(1.0)
+    torch.testing.assert_close(mean(found, ("b", 1)), mean(found, "b"))
+    for address in (("a", 1), ("b", 0)):
+        with pytest.raises(InputError, match=rf"step {address[1]} .* at '{address[0]}', which is no latent"):
+            mean(found, address)
+    with pytest.raises(InputError, match="'a', which is no latent address; latent are b"):
+        mean(found, "a")
