@@ -1,4 +1,22 @@
-"""Markov chains, one for each particle, all moved at once: the kernels of SMC by themselves."""
+"""Markov chains, one for each particle, all moved at once: the kernels of SMC by themselves.
+
+    import pyro
+    import pyro.distributions as dist
+    import torch
+    from bcppl.inference import importance_sampling, markov_chains
+    from bcppl.inference.kernels import metropolis_hastings
+    from bcppl.inference.proposals import drift
+
+    def weighed():
+        mass = pyro.sample("mass", dist.Normal(torch.tensor(2.0).double(), 0.5))
+        pyro.sample("reading", dist.Normal(mass, 0.3))
+
+    population = importance_sampling(weighed, (), {"reading": torch.tensor(2.4).double()}, 1000)
+    chains = markov_chains(metropolis_hastings(drift("mass")), population, moves=20)
+    print(chains.draws["mass"].shape)  # 20 moves of 1000 chains
+
+A kernel is fitted once to the starts, and then stays, however long the chains are.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,15 @@
 """Collectors: functions of each step of a run, evaluated without changing it.
 
-    watched = collect(smc(model, recording, step=step), size=effective_sample_size, hole=mean("hole"))
+    from bcppl.inference import collect, smc, tempered
+    from bcppl.inference.collectors import effective_sample_size, mean
+    from bcppl.models import load_recording
+    from bcppl.models.point_probe import model
+
+    run = smc(model, load_recording("point_probe_10_pushes"), step=tempered(), particles=50)
+    watched = collect(run, size=effective_sample_size, part=mean("part"))
     for belief, info in watched:
-        ...
-    watched["size"]                                         # (steps,)
+        print(info.label)
+    print(watched["size"])  # (steps,)
 
 Named after the collectors of `particles` (Chopin and Papaspiliopoulos, An Introduction to Sequential Monte
 Carlo, 2020).

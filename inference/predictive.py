@@ -1,5 +1,18 @@
 """How surprising each measurement is under the belief: posterior predictive checks.
 
+    import pyro
+    import pyro.distributions as dist
+    import torch
+    from bcppl.inference import importance_sampling
+    from bcppl.inference.predictive import surprise
+
+    def weighed():
+        mass = pyro.sample("mass", dist.Normal(torch.tensor(2.0).double(), 0.5))
+        pyro.sample("reading", dist.Normal(mass, 0.3))
+
+    population = importance_sampling(weighed, (), {"reading": torch.tensor(2.4).double()}, 1000)
+    print(surprise(population))  # by address
+
 A belief that is sure and wrong often shows in what was measured: an image that no pose explains, for
 something unknown stands before the camera; a camera that would have to be farther off than its stated error;
 contacts where the belief has none. Such a measurement is one whose p value is small: the probability that

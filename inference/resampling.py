@@ -1,5 +1,11 @@
 """Resampling: schemes, ancestors (count,) from log weights (N,), and when to resample.
 
+    import torch
+    from bcppl.inference.resampling import systematic
+
+    log_weights = torch.tensor([0.1, 0.2, 0.7]).double().log()
+    print(systematic(log_weights, 10).bincount())  # 1, 2 and 7 offspring
+
 Each scheme is unbiased: a particle's expected number of offspring is count times its normalised weight. A
 particle without weight has none. Ancestors are in increasing order. All take time linear in N and count,
 except `multinomial` and the remainder of `residual`, which search. Douc, Cappe and Moulines, Comparison of

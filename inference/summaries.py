@@ -1,5 +1,19 @@
 """Summaries of a population at any of its latent addresses: moments, quantiles, probabilities.
 
+    import pyro
+    import pyro.distributions as dist
+    import torch
+    from bcppl.inference import importance_sampling
+    from bcppl.inference.summaries import covariance, mean, quantiles
+
+    def weighed():
+        mass = pyro.sample("mass", dist.Normal(torch.tensor(2.0).double(), 0.5))
+        pyro.sample("reading", dist.Normal(mass, 0.3))
+
+    population = importance_sampling(weighed, (), {"reading": torch.tensor(2.4).double()}, 1000)
+    print(mean(population, "mass"), covariance(population, "mass"))
+    print(quantiles(population, "mass", [0.05, 0.95]))
+
 At the address of a pose (its distribution has a `freedom`) these are the belief's: a mean pose (7,), and six
 tangent coordinates at it, metres and radians, 0 along held axes (`bcppl.beliefs`). All raise InputError where
 no latent site has the address, and NoWeightError where no particle has any weight.

@@ -1,4 +1,21 @@
-"""Targets: the densities that kernels leave invariant."""
+"""Targets: the densities that kernels leave invariant.
+
+    import pyro
+    import pyro.distributions as dist
+    import torch
+    from bcppl.inference import importance_sampling
+    from bcppl.inference.targets import POSTERIOR, Target
+
+    def weighed():
+        mass = pyro.sample("mass", dist.Normal(torch.tensor(2.0).double(), 0.5))
+        pyro.sample("reading", dist.Normal(mass, 0.3))
+
+    population = importance_sampling(weighed, (), {"reading": torch.tensor(2.4).double()}, 1000)
+    half = Target({"reading": 0.5})  # the prior times the square root of the likelihood
+    print(POSTERIOR(population.trace) - half(population.trace))
+
+A target is a function of a trace: log-probabilities (N,), up to a constant.
+"""
 
 from __future__ import annotations
 

@@ -125,7 +125,9 @@ def test_what_a_series_samples_at_its_beginning_alone_is_summarised_too() -> Non
     assert float(probabilities(found, ("kind", 0)).probabilities.sum()) == pytest.approx(1.0)
     torch.testing.assert_close(mean(found, ("b", 1)), mean(found, "b"))
     for address in (("a", 1), ("b", 0)):
-        with pytest.raises(InputError, match=rf"step {address[1]} was asked for at '{address[0]}', which is no latent"):
+        with pytest.raises(
+            InputError, match=rf"step {address[1]} was asked for at '{address[0]}', which is no latent"
+        ):
             mean(found, address)
     with pytest.raises(InputError, match="'a' was asked for, which is no latent address; latent are b"):
         mean(found, "a")

@@ -11,9 +11,9 @@
         pyro.sample("reading", dist.Normal(mass, 0.3))
 
     def inference(data):
-        return importance_sampling(weighed, (), data, particles=500)
+        return importance_sampling(weighed, (), data, particles=200)
 
-    calibration = calibrate(Joint(weighed, (), ["reading"]), inference, draws=50)
+    calibration = calibrate(Joint(weighed, (), ["reading"]), inference, draws=25)
     print(calibration)  # a p-value for every test quantity, and coverage
     ranks_figure(calibration).savefig("calibration.png")
 

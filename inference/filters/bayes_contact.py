@@ -1,5 +1,15 @@
 """BayesContact's own filter, as a baseline: a random walk before each measurement, and importance weights.
 
+    from itertools import islice
+
+    from bcppl.inference import bayes_contact
+    from bcppl.models import load_recording
+    from bcppl.models.point_probe import model
+
+    recording = load_recording("point_probe_10_pushes")
+    for belief, info in islice(bayes_contact.infer(model, recording, particles=50), 3):
+        print(info.label, info.effective_sample_size)
+
 The paper weights a moved particle by w p(o | q) p(q) / pi, which is right for the first measurement only:
 the pose does not move, so the measurements before belong in the weight too. The weight used here is that of
 the SMC sampler with the drift as its forward and its backward kernel (Del Moral, Doucet and Jasra, JRSS B 68,

@@ -1,5 +1,14 @@
 """SMC guided by a Gaussian approximation of the posterior, with tempering where the approximation is poor.
 
+    from itertools import islice
+
+    from bcppl.inference import guided_smc
+    from bcppl.models import load_recording
+    from bcppl.models.look_and_touch import model
+
+    for belief, info in islice(guided_smc.infer(model, load_recording("peg_probe"), particles=20), 2):
+        print(info.label, belief.mean)
+
 A measurement is assimilated by SMCP3: a forward kernel moves particles to where the approximation places the
 part given the new measurement, and the weights correct for it. That spares the many small steps by which
 tempering assimilates a sharp likelihood. Where too few particles keep weight, the step is undone and the

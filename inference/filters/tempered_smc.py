@@ -1,5 +1,15 @@
 """The default inference program: tempered SMC, its moves fitted to the other particles.
 
+    from itertools import islice
+
+    from bcppl.inference import tempered_smc
+    from bcppl.models import load_recording
+    from bcppl.models.point_probe import model
+
+    recording = load_recording("point_probe_10_pushes")
+    for belief, info in islice(tempered_smc.infer(model, recording, particles=20, sweeps=(2, 2)), 3):
+        print(info.label, belief.mean)
+
 Half of the moves are random walks, half are drawn from a normal that is fitted to the other half of the
 particles. Where a move costs little (pushes, depth images), a measurement is tempered by small steps, with
 many moves of every particle after each. Once moves cost simulations the steps are larger, and the particles
