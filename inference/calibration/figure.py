@@ -19,8 +19,8 @@ ACROSS = 4
 def ranks_figure(calibration: Calibration, level: float = 0.95) -> Figure:
     """The ECDF of every quantity's ranks minus that of uniform ones, and expected coverage.
 
-    The grey band holds the whole curve of a calibrated inference with a probability of `level`, in each panel
-    by itself (Saeilynoja et al. 2022). A curve that leaves it is orange: one that is high on the left and low
+    The grey bands hold the curves of a calibrated inference with a probability of `level` or more, all panels
+    together (Saeilynoja et al. 2022, and Bonferroni's correction). A curve that leaves it is orange: one that is high on the left and low
     on the right speaks for a posterior that is too narrow, the other way round for one that is too wide, and
     one to one side for one that is shifted. The last panel has the share of truths within regions of each
     mass: those of highest density, and TARP's.
@@ -33,8 +33,9 @@ def ranks_figure(calibration: Calibration, level: float = 0.95) -> Figure:
     rows = math.ceil(count / across)
     figure = Figure(figsize=(2.6 * across, 2.3 * rows + 0.4), layout="constrained")
     axes = np.atleast_1d(figure.subplots(rows, across, squeeze=False)).ravel()
+    own = 1.0 - (1.0 - level) / len(calibration.names)
     for panel, name in zip(axes, calibration.names, strict=False):
-        _ecdf(panel, calibration, name, level)
+        _ecdf(panel, calibration, name, own)
     _coverage(axes[count - 1], calibration)
     for panel in axes[count:]:
         panel.set_axis_off()
