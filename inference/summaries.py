@@ -54,7 +54,11 @@ WEIGHTLESS = (
 def values_at(population: Population, address: Address) -> Tensor:
     """The values (N, *event) at a latent address."""
     name, then = _site(population, address)
-    return then.choices[name] if isinstance(address, str) else population.trace[address]
+    if isinstance(address, str):
+        return then.choices[name]
+    assert isinstance(population.trace, SeriesTrace)
+    value: Tensor = population.trace[address]
+    return value
 
 
 def is_pose(population: Population, address: Address) -> bool:

@@ -20,10 +20,10 @@ def ranks_figure(calibration: Calibration, level: float = 0.95) -> Figure:
     """The ECDF of every quantity's ranks minus that of uniform ones, and expected coverage.
 
     The grey bands hold the curves of a calibrated inference with a probability of `level` or more, all panels
-    together (Saeilynoja et al. 2022, and Bonferroni's correction). A curve that leaves it is orange: one that is high on the left and low
-    on the right speaks for a posterior that is too narrow, the other way round for one that is too wide, and
-    one to one side for one that is shifted. The last panel has the share of truths within regions of each
-    mass: those of highest density, and TARP's.
+    together (Saeilynoja et al. 2022, and Bonferroni's correction). A curve that leaves its band is orange.
+    High on the left and low on the right it speaks for a posterior that is too narrow, the other way round
+    for one that is too wide, all to one side for one that is shifted. The last panel has the share of truths
+    within regions of each mass: those of highest density, and TARP's.
 
     Returns:
         A figure of its own, made without pyplot.

@@ -73,7 +73,7 @@ def load(path: Location, program: Program | Series, args: Any = None) -> Populat
 def load_several(path: Location, program: Program | Series, args: Any = None) -> list[Population]:
     """The populations of one program in a file that `save` wrote, in order; it raises what `load` does."""
     with opened(path) as content:
-        return [population_of(each, program, _given(args, each)) for each in content["populations"]]
+        return [population_of(each, program, given_arguments(args, each)) for each in content["populations"]]
 
 
 def random_state(path: Location) -> Tensor:
@@ -129,8 +129,12 @@ def population_of(content: Content, program: Program | Series, given: Arguments)
     return population
 
 
-def _given(args: Any, content: Content) -> Arguments:
-    """The arguments of each step; one tuple is of the newest, whose number is the last."""
+def given_arguments(args: Any, content: Content) -> Arguments:
+    """The arguments of each step; one tuple is of the newest, whose number is the last.
+
+    Raises:
+        InputError: they are no tuple, nor one for each step of a series.
+    """
     if args is None:
         return lambda number: None
     if not isinstance(args, tuple | list):
