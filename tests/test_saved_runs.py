@@ -10,22 +10,27 @@ from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 
 from bcppl.contact.probe_rollout import ProbeRollout
 from bcppl.distributions.contact import ContactsInTime
+from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
-from bcppl.inference import importance_sampling, saved
+from bcppl.inference import importance_sampling, saved, smc, tempered
+from bcppl.inference.kernels import metropolis_hastings
+from bcppl.inference.proposals import drift
 from bcppl.recordings import save
-from bcppl.traces import extend, simulate
+from bcppl.traces import Model, Series, extend, simulate
 from bcppl.traces.carried import carried
 from tests.calibration.touch import CENTER, PHYSICS, PRIOR, PROBE, SENSING
 from tests.resume_saved import numbers_of
-from tests.test_resumed_runs import RESUMED, RUNS, whole_run
+from tests.test_resumed_runs import RESUMED, RUNS, assert_same, whole_run
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*leaves out stamps")
 
@@ -120,3 +125,33 @@ def test_a_simulators_state_of_another_shape_is_refused(name: str) -> None:
         fresh.restored({**kept, "rollout.level": np.full(3, 7)})
     with pytest.raises(InputError, match="of different lengths"):
         fresh.restored({**kept, "sensed.contacts": kept["sensed.contacts"][:, :4]})
+
+
+@pytest.mark.parametrize("history", [True, False])
+def test_a_run_of_a_pose_that_moves_is_resumed(history: bool, tmp_path: Path) -> None:
+    """Its steps have arguments of their own, which are those of the recording."""
+    spread = 0.01 * torch.ones(6, dtype=torch.float64)
+
+    def place(scene: Any, actions: list[Any]) -> torch.Tensor:
+        return pyro.sample("part", NormalPose(CENTER, spread))
+
+    def carry(pose: torch.Tensor, scene: Any, actions: list[Any]) -> torch.Tensor:
+        (push,) = actions
+        pose = pyro.sample("part", NormalPose(pose, float(push.times[-1]) * 0.001 * spread))
+        pyro.sample("seen", dist.Normal(pose[:, :3], 0.005).to_event(1))
+        return pose
+
+    recording = RUNS["tempered, pushes"][2]()
+    model = Model(
+        Series(place, carry, history=history),
+        prepare=lambda recording: object(),
+        observe=lambda scene, taken: {"seen": CENTER[:3] + 0.001},
+        pose="part",
+    )
+    step = tempered(metropolis_hastings(drift("part")), sweeps=2)
+    run = list(smc(model, recording, step=step, particles=20))
+    saved.save_step(run[1], tmp_path / "step.h5", recording)
+    start = saved.load_step(tmp_path / "step.h5", model, recording)
+    assert_same(run[2:], list(smc(model, recording, step=step, start=start)))
+    if history:
+        assert torch.equal(start.population.trace["part", 0], run[1].population.trace["part", 0])
