@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -34,10 +35,10 @@ def load_recording(name: str | Path) -> Recording:
 
 def simulated_in(world: str) -> Callable[..., Recording]:
     """The `simulate_recording` of a module of `bcppl.models.worlds`, which is imported when it is called."""
+    return partial(_simulated, world)  # a closure could not be sent to another process
 
-    def simulate_recording(seed: int, **options: Any) -> Recording:
-        module: Any = import_module(f"bcppl.models.worlds.{world}")
-        recording: Recording = module.simulate_recording(seed, **options)
-        return recording
 
-    return simulate_recording
+def _simulated(world: str, seed: int, **options: Any) -> Recording:
+    module: Any = import_module(f"bcppl.models.worlds.{world}")
+    recording: Recording = module.simulate_recording(seed, **options)
+    return recording

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import functools
+import pickle
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,10 +18,13 @@ import torch
 from bcppl import poses
 from bcppl.distributions.poses import NormalPose, UniformPose
 from bcppl.errors import InputError, NoWeightError
-from bcppl.inference import importance_sampling
-from bcppl.inference.calibration import Calibration, Joint, calibrate, ranks_figure
+from bcppl.inference import Step, importance_sampling, tempered_smc
+from bcppl.inference.calibration import Calibration, Joint, Recorded, calibrate, ranks_figure
 from bcppl.inference.calibration.ranks import band, p_value
 from bcppl.inference.population import Population
+from bcppl.models import point_probe
+from bcppl.recordings import Recording
+from bcppl.traces import Series
 from tests.invariance import number
 from tests.mutant_inferences import MUTANTS, NORMAL, SOUND, Data, exact, normal_inference
 
@@ -234,3 +240,28 @@ def test_the_figure_and_the_table_name_what_is_wrong() -> None:
         assert any(line.get_color() == "#D55E00" for line in curves) == orange
         assert len([panel for panel in figure.axes if panel.get_title()]) == len(calibration.names) + 1
     assert isinstance(sound, Calibration) and len(sound) == 60
+
+
+def located(recording: Recording) -> Iterator[Step]:
+    """The shipped filter, with few particles and moves, on the first measurements."""
+    short = replace(recording, measurements=recording.measurements[:2])
+    seed = int(torch.randint(2**31, ()))
+    return tempered_smc.infer(point_probe.model, short, particles=24, sweeps=(1, 1), seed=seed)
+
+
+def test_the_pose_of_a_models_own_world_is_ranked() -> None:
+    joint = Recorded(point_probe.model)
+    again = pickle.loads(pickle.dumps(joint))
+    assert again.model.program is point_probe.model.program
+    calibration = calibrate(again, located, 2, posterior_draws=9)
+    prior = joint.prior(joint.draw().data, 3)
+    axes = prior.freedoms["part"].axes
+    assert len(calibration.names) == len(axes) + 1 and calibration.names[-1] == "distance"
+    assert prior.values["part"].shape == (3, 7)
+
+
+def test_a_model_without_a_world_is_refused() -> None:
+    with pytest.raises(InputError, match="simulates no recordings"):
+        Recorded(replace(point_probe.model, simulate_recording=None))
+    with pytest.raises(InputError, match="pose moves"):
+        Recorded(replace(point_probe.model, program=Series(lambda scene, actions: None, lambda state: None)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -136,6 +136,12 @@ class Recorded:
             raise InputError("the model simulates no recordings; give one with a `simulate_recording`.")
         if isinstance(self.model.program, Series):
             raise InputError("the model's pose moves; calibrate one with a pose that stays.")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For other processes: settings of an inference are a read-only view, which cannot be sent."""
+        name, settings = self.model.inference
+        model = replace(self.model, inference=(name, dict(settings)))
+        return type(self), (model, dict(self.options), self.quantities)
 
     def draw(self) -> Drawn:
         """A recording, and its true pose."""
