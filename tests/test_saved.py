@@ -56,14 +56,15 @@ def test_what_is_loaded_is_what_was_saved(name: str, tmp_path: Path) -> None:
     assert_equal(before, bits(again))
 
 
-def test_log_probabilities_are_not_evaluated_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "address"), [("groups", "mean"), ("series", "x"), ("chosen", "x")])
+def test_log_probabilities_are_not_evaluated_again(name: str, address: str, tmp_path: Path) -> None:
     """In other batches they would round otherwise: here one is marked."""
-    population = KEPT["groups"].begun(5)
-    population.trace.log_prob("mean")
-    population.trace.known["mean"][7] = -123.0
+    population = KEPT[name].begun(5)
+    population.trace.log_prob(address)
+    population.trace.known[address][7] = -123.0
     saved.save(population, tmp_path / "p.h5")
-    again = saved.load(tmp_path / "p.h5", KEPT["groups"].program)
-    assert float(again.trace.log_prob("mean")[7]) == -123.0
+    again = saved.load(tmp_path / "p.h5", KEPT[name].program)
+    assert float(again.trace.log_prob(address)[7]) == -123.0
 
 
 def test_strides_are_kept_because_sums_round_by_them(tmp_path: Path) -> None:
