@@ -22,6 +22,7 @@ from bcppl.traces.carried import carried
 from bcppl.traces.checks import Fault, ProgramError, check_program
 from bcppl.traces.model import Model
 from bcppl.traces.series import Series
+from bcppl.traces.structural import Structure, structural
 from bcppl.traces.trace import Trace
 from bcppl.traces.update import Regenerated, Update, extend, regenerate, update
 from bcppl.traces.verbs import Proposed, assess, generate, propose, simulate
@@ -33,6 +34,7 @@ __all__ = [
     "Proposed",
     "Regenerated",
     "Series",
+    "Structure",
     "Trace",
     "Update",
     "assess",
@@ -43,5 +45,6 @@ __all__ = [
     "propose",
     "regenerate",
     "simulate",
+    "structural",
     "update",
 ]

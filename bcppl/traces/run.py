@@ -27,6 +27,7 @@ from bcppl.distributions.shortcuts import drawn
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry, carrying
 from bcppl.traces.explained import explained, unfit, unfit_particles, unsampled
+from bcppl.traces.structural import STRUCTURAL, UnchosenError
 from bcppl.traces.surroundings import surroundings
 from bcppl.traces.values import Value, tensors
 
@@ -47,6 +48,7 @@ class Run:
         coincident: addresses with a plate or an event axis of N entries (`bcppl.traces.verbs`).
         whole: the first address, if its distribution had N entries before it was expanded to the particles.
         surroundings: what lazy sites read from outside, where they do (`bcppl.traces.surroundings`).
+        structural: addresses whose values determine which others are visited, in the order of the program.
     """
 
     distributions: dict[str, Any]
@@ -57,6 +59,7 @@ class Run:
     coincident: frozenset[str]
     whole: frozenset[str]
     surroundings: Mapping[str, dict[Any, Any]]
+    structural: tuple[str, ...] = ()
 
     def refuse_unvisited(self, addresses: Iterable[str]) -> None:
         """Refuse addresses that the program did not visit."""
@@ -103,8 +106,10 @@ def run(
             raise reason from error
     values, fixed = recorder.values, frozenset(recorder.fixed)
     coincident, whole = frozenset(recorder.coincident), frozenset(plate.whole)
-    outside = surroundings(recorder.distributions)
-    return Run(recorder.distributions, values, fixed, used, result, coincident, whole, outside)
+    outside, structural = surroundings(recorder.distributions), tuple(recorder.structural)
+    return Run(
+        recorder.distributions, values, fixed, used, result, coincident, whole, outside, structural
+    )
 
 
 @contextmanager
@@ -176,6 +181,7 @@ class _Recorder(Messenger):
         self.values: dict[str, Tensor] = {}
         self.fixed: set[str] = set()
         self.coincident: set[str] = set()
+        self.structural: list[str] = []
 
     def _pyro_sample(self, message: Any) -> None:
         if _is_no_choice(message):
@@ -202,6 +208,10 @@ class _Recorder(Messenger):
         self.distributions[address] = distribution
         if self.particles > 1 and self._coincides(distribution):
             self.coincident.add(address)
+        if message["infer"].get(STRUCTURAL):
+            self.structural.append(address)
+            if address not in self.given and message["value"] is None:
+                raise UnchosenError(address, distribution, self.values)
         if address in self.given:
             value = self.given[address]
             self._has_shape(address, value, distribution)

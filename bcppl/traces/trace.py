@@ -22,6 +22,7 @@ from bcppl.traces.dependence import comparison, equal
 from bcppl.traces.explained import changed_outside, hidden_site, not_a_number, other_addresses, refuse_masked
 from bcppl.traces.indexing import Index, beside, particles_at
 from bcppl.traces.run import Program, Run, inward, run
+from bcppl.traces.structural import Structure
 from bcppl.traces.surroundings import changed as surroundings_changed, evaluated, surroundings_of
 from bcppl.traces.values import Value, tensors
 
@@ -98,6 +99,11 @@ class Trace:
     def addresses(self) -> list[str]:
         """All addresses in the order of the program."""
         return list(self._run.distributions)
+
+    @property
+    def structure(self) -> Structure:
+        """The values of the structural sites (`bcppl.traces.structural`)."""
+        return Structure({a: int(self._run.values[a].reshape(-1)[0]) for a in self._run.structural})
 
     @property
     def result(self) -> Any:

@@ -1,0 +1,246 @@
+"""Strata: a posterior over programs' structures, one population of particles for each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from bcppl.beliefs import Belief, effective_sample_size, normalised
+from bcppl.errors import InputError
+from bcppl.inference.population import Population
+from bcppl.inference.summaries import Probabilities
+from bcppl.traces import Structure, Trace
+from bcppl.traces.trace import shapes
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Strata:
+    """Weighted particles of several structures: a population for each, their weights on one scale.
+
+    The weight of a particle is comparable with that of any other, of whatever structure: the posterior
+    probability of a structure is the share of its particles in the sum of all weights. The log evidence of
+    each population is that of the observations and its structure together. `strata["x"]` are the values
+    (N, *event) of all particles at an address, stratum after stratum.
+
+    Attributes:
+        populations: by structure; each with some weight.
+        log_evidence: log of the estimated evidence of all observations, summed over structures.
+    """
+
+    populations: Mapping[Structure, Population]
+    log_evidence: float
+
+    @classmethod
+    def of(cls, populations: Iterable[Population], log_evidence: float) -> Strata:
+        """The strata of populations, joined where they have one structure; those without weight are left out.
+
+        Raises:
+            NoWeightError: no particle has any weight.
+            NotANumberError: a weight is NaN.
+        """
+        parts: dict[Structure, list[Population]] = {}
+        for each in populations:
+            if len(each):
+                parts.setdefault(each.trace.structure, []).append(each)
+        whole = {structure: joined(each) for structure, each in parts.items()}
+        log_total = _log_total(whole.values())
+        return cls(
+            {
+                structure: replace(each, log_evidence=log_evidence + each.log_total - log_total)
+                for structure, each in whole.items()
+                if each.log_total > -math.inf
+            },
+            log_evidence,
+        )
+
+    def __len__(self) -> int:
+        return sum(len(population) for population in self.populations.values())
+
+    @property
+    def structures(self) -> list[Structure]:
+        """The structures, in order."""
+        return list(self.populations)
+
+    @cached_property
+    def log_weights(self) -> Tensor:
+        """(N,) of all particles, stratum after stratum."""
+        return torch.cat([each.log_weights for each in self.populations.values()])
+
+    @cached_property
+    def log_total(self) -> float:
+        """Log of the sum of all weights."""
+        return _log_total(self.populations.values())
+
+    @cached_property
+    def effective_sample_size(self) -> float:
+        """1 / sum of squared normalised weights, of all particles together."""
+        return effective_sample_size(self.log_weights)
+
+    @cached_property
+    def shares(self) -> dict[Structure, float]:
+        """The posterior probability of each structure; of one that has no particles left it is estimated 0."""
+        return {s: math.exp(each.log_total - self.log_total) for s, each in self.populations.items()}
+
+    def map(self, change: Callable[[Population], Population]) -> Strata:
+        """Every population changed by a function that keeps weights: extended, or moved."""
+        return Strata({s: change(each) for s, each in self.populations.items()}, self.log_evidence)
+
+    def reweighed(self, log_factors: Mapping[Structure, Tensor]) -> Strata:
+        """Every weight times exp(log_factor), and the evidence times the weighted mean of the factors.
+
+        Args:
+            log_factors: by structure, one (N_s,) for each of its particles.
+
+        Raises:
+            NoWeightError: no particle has any weight left.
+            NotANumberError: a weight is NaN or +inf.
+        """
+        # `replace` keeps nothing that was computed from the old weights.
+        populations = [
+            replace(each, log_weights=each.log_weights + log_factors[s])
+            for s, each in self.populations.items()
+        ]
+        return Strata.of(populations, self.log_evidence + _log_total(populations) - self.log_total)
+
+    def given(self, values: Mapping[str, int]) -> Strata:
+        """The strata whose structural sites have some values; the evidence is that of these values too.
+
+        Raises:
+            InputError: there are none.
+        """
+        chosen = [
+            each for s, each in self.populations.items() if all(s.get(a) == v for a, v in values.items())
+        ]
+        if not chosen:
+            raise InputError(f"no stratum has {dict(values)}; there are {_listed(self.structures)}.")
+        return Strata.of(chosen, self.log_evidence + _log_total(chosen) - self.log_total)
+
+    def visiting(self, address: str) -> Strata:
+        """The strata whose programs visit an address; the evidence is that of its being visited too.
+
+        Raises:
+            InputError: none does.
+        """
+        chosen = [each for each in self.populations.values() if address in each.trace]
+        if not chosen:
+            raise InputError(f"no stratum has a value at {address!r}; there are {_listed(self.structures)}.")
+        return Strata.of(chosen, self.log_evidence + _log_total(chosen) - self.log_total)
+
+    def __getitem__(self, address: str) -> Tensor:
+        missing = [s for s, each in self.populations.items() if address not in each.trace]
+        if missing:
+            raise InputError(
+                f"{_listed(missing)} of the strata have no value at {address!r}; "
+                f"use visiting({address!r}) for the others."
+            )
+        values = [_of_each(each.trace, address) for each in self.populations.values()]
+        return torch.cat(values)
+
+    def belief(self, address: str) -> Belief:
+        """The particles of all strata read as a posterior over the pose at an address.
+
+        Raises:
+            InputError: a structure has no latent site with that address, or no pose is there.
+        """
+        freedom = {each.belief(address).freedom for each in self.populations.values()}
+        if len(freedom) > 1:
+            raise InputError(f"the pose at {address!r} has other free axes in some strata than in others.")
+        return Belief(self[address], self.log_weights, freedom.pop())
+
+    def __repr__(self) -> str:
+        shares = ", ".join(
+            f"{s!r}: {share:.3f} ({len(self.populations[s])} particles)" for s, share in self.shares.items()
+        )
+        return (
+            f"Strata(effective sample size {self.effective_sample_size:.1f}, "
+            f"log evidence {self.log_evidence:.4f}, {shares})"
+        )
+
+
+def probabilities(strata: Strata, address: str) -> Probabilities:
+    """The posterior probability of each value of a structural site.
+
+    They sum to less than 1 where some structures do not visit the site: to the probability that it is
+    visited.
+
+    Raises:
+        InputError: no structure visits a structural site at the address.
+    """
+    summed: dict[int, float] = {}
+    for structure, share in strata.shares.items():
+        if address in structure:
+            summed[structure[address]] = summed.get(structure[address], 0.0) + share
+    if not summed:
+        raise InputError(f"{address!r} is no structural site of {_listed(strata.structures)}.")
+    values = sorted(summed)
+    return Probabilities(
+        torch.tensor(values), torch.tensor([summed[v] for v in values], dtype=torch.float64)
+    )
+
+
+def mean(strata: Strata, address: str) -> Tensor:
+    """The weighted mean (*event) over the particles of all structures: an average over models.
+
+    Raises:
+        InputError: a structure does not visit the address, or the values' shapes differ.
+    """
+    weights = normalised(strata.log_weights)
+    return torch.einsum("n,n...->...", weights, strata[address].to(torch.float64))
+
+
+def joined(populations: Iterable[Population]) -> Population:
+    """One population of the particles of several of one structure, in their order, with their weights.
+
+    Its log evidence and its approximation are those of the first.
+    """
+    first, *others = populations
+    for other in others:
+        first = replace(
+            first,
+            trace=_joined(first.trace, other.trace),
+            log_weights=torch.cat([first.log_weights, other.log_weights]),
+            founders=torch.cat([first.founders, other.founders]),
+        )
+    return first
+
+
+def _joined(first: Trace, second: Trace) -> Trace:
+    if set(first.addresses) != set(second.addresses):
+        raise InputError(
+            f"two traces of {first.structure} visit other addresses ({shapes(first.choices)}, and "
+            f"{shapes(second.choices)}); let a structural site determine which are visited."
+        )
+    rows = torch.arange(len(first) + len(second))
+    mine = first[rows.clamp_max(len(first) - 1)]
+    result: Trace = mine.where(rows < len(first), second[(rows - len(first)).clamp_min(0)])
+    return result
+
+
+def _of_each(trace: Trace, address: str) -> Tensor:
+    """Values (N, *event) also of an observed address."""
+    value: Tensor = trace[address]
+    return value if address in trace.choices else value.expand(len(trace), *value.shape)
+
+
+def _log_total(populations: Iterable[Population]) -> float:
+    """Log of the sum of the weights of some populations.
+
+    Raises:
+        NoWeightError: none has any.
+        NotANumberError: a weight is NaN.
+    """
+    populations = list(populations)
+    totals = torch.tensor([each.log_total for each in populations], dtype=torch.float64)
+    if not bool(torch.isfinite(totals.max())):
+        together = torch.cat([each.log_weights for each in populations])
+        normalised(together, [a for each in populations for a in each.trace.impossible()])
+    return float(torch.logsumexp(totals, 0))
+
+
+def _listed(structures: Iterable[Structure]) -> str:
+    return ", ".join(map(str, structures))
