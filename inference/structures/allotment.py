@@ -39,21 +39,21 @@ def resample_strata(
     if count < len(shares):
         return _together(strata, count, scheme)
     counts = allotted(shares, count, min(least, count // len(shares)))
-    populations = [
-        _drawn(each, scheme(each.log_weights, mine), each.log_total - math.log(mine))
-        for each, mine in zip(strata.populations.values(), counts, strict=True)
+    parts = [
+        (structure, _drawn(each, scheme(each.log_weights, mine), each.log_total - math.log(mine)))
+        for (structure, each), mine in zip(strata.populations.items(), counts, strict=True)
     ]
-    return Strata.of(populations, strata.log_evidence)
+    return Strata.of(parts, strata.log_evidence)
 
 
 def _together(strata: Strata, count: int, scheme: Scheme) -> Strata:
-    ancestors, populations, start = scheme(strata.log_weights, count), [], 0
-    for each in strata.populations.values():
+    ancestors, parts, start = scheme(strata.log_weights, count), [], 0
+    for structure, each in strata.populations.items():
         mine = ancestors[(start <= ancestors) & (ancestors < start + len(each))] - start
         start += len(each)
         if len(mine):
-            populations.append(_drawn(each, mine, 0.0))
-    return Strata.of(populations, strata.log_evidence)
+            parts.append((structure, _drawn(each, mine, 0.0)))
+    return Strata.of(parts, strata.log_evidence)
 
 
 def _drawn(population: Population, ancestors: torch.Tensor, log_weight: float) -> Population:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
@@ -38,9 +39,9 @@ def branch_strata(strata: Strata, observed: Observed) -> tuple[Strata, dict[Stru
         InputError: as for `bcppl.traces.extend`; a new structural site has no list of values; or the program
             is a series.
     """
-    populations: list[Population] = []
+    parts: list[tuple[Structure, Population]] = []
     log_likelihoods: dict[Structure, Tensor] = {}
-    for population in strata.populations.values():
+    for structure, population in strata.populations.items():
         trace = population.trace
         if isinstance(trace, SeriesTrace):
             raise InputError(
@@ -54,12 +55,13 @@ def branch_strata(strata: Strata, observed: Observed) -> tuple[Strata, dict[Stru
         for new in structures_of(visit, Structure({})):
             given = {**observed.observations, **new.observations}
             longer, log_weight = extend(trace, observed.args, given)
-            log_prior = longer.log_prob(*new) if new else 0.0
-            populations.append(
-                replace(population, trace=longer, log_weights=population.log_weights + log_prior)
-            )
-            log_likelihoods[longer.structure] = log_weight - log_prior
-    return Strata.of(populations, strata.log_evidence), log_likelihoods
+            log_prior = longer.log_prob(*new) if new else torch.zeros(len(longer), dtype=torch.float64)
+            whole = structure.with_values(new)
+            log_weights = population.log_weights + log_prior
+            parts.append((whole, replace(population, trace=longer, log_weights=log_weights)))
+            # A particle whose structure is impossible has no weight, whatever it explains.
+            log_likelihoods[whole] = torch.where(log_prior == -torch.inf, 0.0, log_weight - log_prior)
+    return Strata.of(parts, strata.log_evidence), log_likelihoods
 
 
 def extend_strata(strata: Strata, observed: Observed) -> Strata:

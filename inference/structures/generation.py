@@ -59,13 +59,15 @@ def generate_strata(
 
     leaves = list(structures_of(visit, Structure({})))
     wanted = [1.0 if shares is None else float(shares(each)) for each in leaves]
-    populations, founded = [], 0
+    parts, founded = [], 0
     for leaf, count in zip(leaves, allotted(wanted, particles, least=1), strict=True):
         trace, log_weights = generate(program, args, {**observations, **leaf.observations}, count)
         # The sum over a stratum estimates the evidence of its structure, however many particles it has.
-        populations.append(_population(trace, log_weights + math.log(particles / count), founded))
+        parts.append(
+            (trace.structure, _population(trace, log_weights + math.log(particles / count), founded))
+        )
         founded += count
-    return _strata(populations, particles)
+    return _strata(parts, particles)
 
 
 def sample_strata(
@@ -82,7 +84,7 @@ def sample_strata(
     Raises:
         InputError: as for `generate`.
     """
-    populations: list[Population] = []
+    parts: list[tuple[Structure, Population]] = []
 
     def drawn(structure: Structure, choices: Mapping[str, Tensor], count: int) -> None:
         given = {**observations, **structure.observations}
@@ -98,11 +100,12 @@ def sample_strata(
         # What was drawn from the program has weight 1: only observed sites count.
         observed = [a for a in trace.addresses if a not in trace.choices and a not in structure]
         log_weights = trace.log_prob(*observed).clone() if observed else torch.zeros(count).double()
-        populations.append(_population(trace, log_weights, sum(map(len, populations))))
+        founded = sum(len(each) for _, each in parts)
+        parts.append((trace.structure, _population(trace, log_weights, founded)))
 
     particles = whole_number("sample_strata is given {} particles", particles)
     drawn(Structure({}), {}, particles)
-    return _strata(populations, particles)
+    return _strata(parts, particles)
 
 
 def structures_of(visit: Callable[[Mapping[str, Tensor]], None], given: Structure) -> Iterator[Structure]:
@@ -177,6 +180,6 @@ def _population(trace: Trace, log_weights: Tensor, founded: int) -> Population:
     return Population(trace, log_weights, founders=founders, log_pairs=math.inf)
 
 
-def _strata(populations: list[Population], particles: int) -> Strata:
-    total = torch.logsumexp(torch.cat([each.log_weights for each in populations]), 0)
-    return Strata.of(populations, float(total) - math.log(particles))
+def _strata(parts: list[tuple[Structure, Population]], particles: int) -> Strata:
+    total = torch.logsumexp(torch.cat([each.log_weights for _, each in parts]), 0)
+    return Strata.of(parts, float(total) - math.log(particles))

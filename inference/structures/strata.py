@@ -36,17 +36,17 @@ class Strata:
     log_evidence: float
 
     @classmethod
-    def of(cls, populations: Iterable[Population], log_evidence: float) -> Strata:
-        """The strata of populations, joined where they have one structure; those without weight are left out.
+    def of(cls, populations: Iterable[tuple[Structure, Population]], log_evidence: float) -> Strata:
+        """The strata of populations with their structures, joined where they have one structure; those without weight are left out.
 
         Raises:
             NoWeightError: no particle has any weight.
             NotANumberError: a weight is NaN.
         """
         parts: dict[Structure, list[Population]] = {}
-        for each in populations:
+        for structure, each in populations:
             if len(each):
-                parts.setdefault(each.trace.structure, []).append(each)
+                parts.setdefault(structure, []).append(each)
         whole = {structure: joined(each) for structure, each in parts.items()}
         log_total = _log_total(whole.values())
         return cls(
@@ -83,7 +83,7 @@ class Strata:
 
     @cached_property
     def shares(self) -> dict[Structure, float]:
-        """The posterior probability of each structure; of one that has no particles left it is estimated 0."""
+        """The posterior probability of each structure; one without particles is left out."""
         return {s: math.exp(each.log_total - self.log_total) for s, each in self.populations.items()}
 
     def map(self, change: Callable[[Population], Population]) -> Strata:
@@ -101,11 +101,16 @@ class Strata:
             NotANumberError: a weight is NaN or +inf.
         """
         # `replace` keeps nothing that was computed from the old weights.
-        populations = [
-            replace(each, log_weights=each.log_weights + log_factors[s])
+        return self._among(
+            (s, replace(each, log_weights=each.log_weights + log_factors[s]))
             for s, each in self.populations.items()
-        ]
-        return Strata.of(populations, self.log_evidence + _log_total(populations) - self.log_total)
+        )
+
+    def _among(self, parts: Iterable[tuple[Structure, Population]]) -> Strata:
+        """The strata of some populations; the evidence changes as the sum of the weights does."""
+        parts = list(parts)
+        total = _log_total(each for _, each in parts)
+        return Strata.of(parts, self.log_evidence + (total - self.log_total))
 
     def given(self, values: Mapping[str, int]) -> Strata:
         """The strata whose structural sites have some values; the evidence is that of these values too.
@@ -114,11 +119,11 @@ class Strata:
             InputError: there are none.
         """
         chosen = [
-            each for s, each in self.populations.items() if all(s.get(a) == v for a, v in values.items())
+            (s, each) for s, each in self.populations.items() if all(s.get(a) == v for a, v in values.items())
         ]
         if not chosen:
             raise InputError(f"no stratum has {dict(values)}; there are {_listed(self.structures)}.")
-        return Strata.of(chosen, self.log_evidence + _log_total(chosen) - self.log_total)
+        return self._among(chosen)
 
     def visiting(self, address: str) -> Strata:
         """The strata whose programs visit an address; the evidence is that of its being visited too.
@@ -126,10 +131,10 @@ class Strata:
         Raises:
             InputError: none does.
         """
-        chosen = [each for each in self.populations.values() if address in each.trace]
+        chosen = [(s, each) for s, each in self.populations.items() if address in each.trace]
         if not chosen:
             raise InputError(f"no stratum has a value at {address!r}; there are {_listed(self.structures)}.")
-        return Strata.of(chosen, self.log_evidence + _log_total(chosen) - self.log_total)
+        return self._among(chosen)
 
     def __getitem__(self, address: str) -> Tensor:
         missing = [s for s, each in self.populations.items() if address not in each.trace]
@@ -178,9 +183,7 @@ def probabilities(strata: Strata, address: str) -> Probabilities:
     if not summed:
         raise InputError(f"{address!r} is no structural site of {_listed(strata.structures)}.")
     values = sorted(summed)
-    return Probabilities(
-        torch.tensor(values), torch.tensor([summed[v] for v in values], dtype=torch.float64)
-    )
+    return Probabilities(torch.tensor(values), torch.tensor([summed[v] for v in values], dtype=torch.float64))
 
 
 def mean(strata: Strata, address: str) -> Tensor:

@@ -1,0 +1,103 @@
+"""Moves of strata: functions `(strata, target) -> (strata, acceptance)` that leave a target invariant.
+
+    means = by_structure(lambda s: hmc([f"mean_{j}" for j in range(s["count"])]))
+    move = in_turn(within(means), jump(birth))
+    for _ in range(1000):  # N reversible-jump chains
+        strata, acceptance = move(strata, POSTERIOR)
+
+Weights stay with their particles, and so does the evidence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from bcppl.arguments import whole_number
+from bcppl.errors import InputError
+from bcppl.inference.kernels import Kernel, Move, Until, moved_by, refuse_other
+from bcppl.inference.population import Population
+from bcppl.inference.structures.strata import Strata
+from bcppl.inference.targets import Target
+from bcppl.traces import Structure, Trace
+
+
+class MovedStrata(NamedTuple):
+    """Strata whose particles were moved.
+
+    Attributes:
+        strata: with the same weights.
+        acceptance: the share of proposals that were accepted, by kind of move; NaN where none was made.
+    """
+
+    strata: Strata
+    acceptance: tuple[float, ...]
+
+
+StrataMove = Callable[[Strata, Target], MovedStrata]
+
+
+def within(kernel: Kernel, sweeps: int | Until = 1) -> StrataMove:
+    """A move of every particle by a kernel that is fitted within its stratum; structures stay.
+
+    Args:
+        kernel: of the sites that all structures have, or one `by_structure`.
+        sweeps: moves of every particle.
+
+    Raises:
+        InputError: what is given is no kernel.
+    """
+    refuse_other("within", kernel)
+
+    def move(strata: Strata, target: Target) -> MovedStrata:
+        moved = {
+            structure: moved_by(each, kernel, target_in(target, each.trace), sweeps)
+            for structure, each in strata.populations.items()
+            # Where a structure determines all, there is nothing to move.
+            if each.trace.choices
+        }
+        total = sum(len(each.population) for each in moved.values())
+        accepted = sum(len(each.population) * each.acceptance for each in moved.values())
+        share = accepted / total if total else math.nan
+        populations = {s: moved[s].population if s in moved else p for s, p in strata.populations.items()}
+        return MovedStrata(Strata(populations, strata.log_evidence), (share,))
+
+    return move
+
+
+def by_structure(choose: Callable[[Structure], Kernel]) -> Kernel:
+    """The kernel that a function gives for a population's structure."""
+
+    def kernel(population: Population) -> Move:
+        return choose(population.trace.structure)(population)
+
+    return kernel
+
+
+def in_turn(*moves: StrataMove, times: int = 1) -> StrataMove:
+    """Several moves one after another, all of them a number of times.
+
+    Raises:
+        InputError: there is no move, or no whole number of times, 1 or more.
+    """
+    times = whole_number("moves of strata are to be made {} times", times)
+    if not moves:
+        raise InputError("in_turn is given no move; give one or more, such as within(kernel) and jump(...).")
+
+    def move(strata: Strata, target: Target) -> MovedStrata:
+        shares: list[tuple[float, ...]] = []
+        for _ in range(times):
+            made: tuple[float, ...] = ()
+            for each in moves:
+                strata, acceptance = each(strata, target)
+                made += acceptance
+            shares.append(made)
+        return MovedStrata(strata, tuple(sum(each) / times for each in zip(*shares, strict=True)))
+
+    return move
+
+
+def target_in(target: Target, trace: Trace) -> Target:
+    """The target on the sites of one structure: others may visit sites that this one does not."""
+    return Target({a: e for a, e in target.exponents.items() if a in trace.distributions})
