@@ -52,7 +52,7 @@ def branch_strata(strata: Strata, observed: Observed) -> tuple[Strata, dict[Stru
         def visit(given: Mapping[str, Tensor], first: Population = population[:1]) -> None:
             extend(first.trace, observed.args, {**observed.observations, **given})
 
-        for new in structures_of(visit, Structure({})):
+        for new in structures_of(visit):
             given = {**observed.observations, **new.observations}
             longer, log_weight = extend(trace, observed.args, given)
             log_prior = longer.log_prob(*new) if new else torch.zeros(len(longer), dtype=torch.float64)

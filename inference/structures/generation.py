@@ -12,7 +12,7 @@ each structure gives an unbiased estimate of the evidence, as in stratified samp
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -52,22 +52,7 @@ def generate_strata(
         InputError: there are fewer particles than structures, or as for `generate`; a structural site has no
             list of values (use `sample_strata`).
     """
-    particles = whole_number("generate_strata is given {} particles", particles)
-
-    def visit(given: Mapping[str, Tensor]) -> None:
-        generate(program, args, {**observations, **given}, 1)
-
-    leaves = list(structures_of(visit, Structure({})))
-    wanted = [1.0 if shares is None else float(shares(each)) for each in leaves]
-    parts, founded = [], 0
-    for leaf, count in zip(leaves, allotted(wanted, particles, least=1), strict=True):
-        trace, log_weights = generate(program, args, {**observations, **leaf.observations}, count)
-        # The sum over a stratum estimates the evidence of its structure, however many particles it has.
-        parts.append(
-            (trace.structure, _population(trace, log_weights + math.log(particles / count), founded))
-        )
-        founded += count
-    return _strata(parts, particles)
+    return weighed(enumerated(program, args, observations, particles, shares))
 
 
 def sample_strata(
@@ -84,9 +69,57 @@ def sample_strata(
     Raises:
         InputError: as for `generate`.
     """
-    parts: list[tuple[Structure, Population]] = []
+    return weighed(drawn(program, args, observations, particles))
 
-    def drawn(structure: Structure, choices: Mapping[str, Tensor], count: int) -> None:
+
+def weighed(strata: Strata) -> Strata:
+    """Strata of a prior weighted by the likelihood of what is observed."""
+    return strata.reweighed({s: log_likelihood(each.trace) for s, each in strata.populations.items()})
+
+
+def likelihood_sites(trace: Trace, earlier: Collection[str] = ()) -> list[str]:
+    """The addresses, other than `earlier` ones, that are neither latent nor structural."""
+    structure = trace.structure
+    return [a for a in trace.addresses if a not in trace.choices and a not in structure and a not in earlier]
+
+
+def log_likelihood(trace: Trace, earlier: Collection[str] = ()) -> Tensor:
+    """Log-probability (N,) of these sites."""
+    observed = likelihood_sites(trace, earlier)
+    return trace.log_prob(*observed) if observed else torch.zeros(len(trace), dtype=torch.float64)
+
+
+def enumerated(
+    program: Program,
+    args: tuple[Any, ...],
+    observations: Mapping[str, Tensor],
+    particles: int,
+    shares: Callable[[Structure], float] | None = None,
+) -> Strata:
+    """Strata of the prior of every structure, as for `generate_strata`."""
+    particles = whole_number("strata are given {} particles", particles)
+
+    def visit(given: Mapping[str, Tensor]) -> None:
+        generate(program, args, {**observations, **given}, 1)
+
+    leaves = list(structures_of(visit))
+    wanted = [1.0 if shares is None else float(shares(each)) for each in leaves]
+    parts = []
+    for leaf, count in zip(leaves, allotted(wanted, particles, least=1), strict=True):
+        trace, _ = generate(program, args, {**observations, **leaf.observations}, count)
+        log_prior = trace.log_prob(*trace.structure) if trace.structure else torch.zeros(count).double()
+        # The sum over a stratum estimates the evidence of its structure, however many particles it has.
+        parts.append((trace, log_prior + math.log(particles / count)))
+    return _strata(parts, particles)
+
+
+def drawn(
+    program: Program, args: tuple[Any, ...], observations: Mapping[str, Tensor], particles: int
+) -> Strata:
+    """Strata of the prior, their structures drawn from it as for `sample_strata`."""
+    parts: list[tuple[Trace, Tensor]] = []
+
+    def branch(structure: Structure, choices: Mapping[str, Tensor], count: int) -> None:
         given = {**observations, **structure.observations}
         try:
             trace, _ = generate(program, args, given, count, choices)
@@ -95,30 +128,28 @@ def sample_strata(
             for value in values.unique().tolist():
                 mine = (values == value).nonzero().flatten()
                 earlier = {a: v[mine] for a, v in unchosen.values.items() if a not in given}
-                drawn(structure.with_values({unchosen.address: value}), earlier, len(mine))
+                branch(structure.with_values({unchosen.address: value}), earlier, len(mine))
             return
-        # What was drawn from the program has weight 1: only observed sites count.
-        observed = [a for a in trace.addresses if a not in trace.choices and a not in structure]
-        log_weights = trace.log_prob(*observed).clone() if observed else torch.zeros(count).double()
-        founded = sum(len(each) for _, each in parts)
-        parts.append((trace.structure, _population(trace, log_weights, founded)))
+        # What was drawn has weight 1; a structural site that the caller observes counts.
+        observed = [a for a in trace.structure if a not in structure]
+        log_prior = trace.log_prob(*observed) if observed else torch.zeros(count, dtype=torch.float64)
+        parts.append((trace, log_prior.clone()))
 
-    particles = whole_number("sample_strata is given {} particles", particles)
-    drawn(Structure({}), {}, particles)
+    particles = whole_number("strata are given {} particles", particles)
+    branch(Structure({}), {}, particles)
     return _strata(parts, particles)
 
 
-def structures_of(visit: Callable[[Mapping[str, Tensor]], None], given: Structure) -> Iterator[Structure]:
-    """The structures of a program that has some structural values already: those that are new.
+def structures_of(visit: Callable[[Mapping[str, Tensor]], None]) -> Iterator[Structure]:
+    """The values of the structural sites to which a program is given no value, one structure after another.
 
     Args:
         visit: runs the program with values of structural sites by address.
-        given: the values that are new so far.
 
     Raises:
         InputError: a site has no list of values, or there are more than ten thousand structures.
     """
-    pending, leaves = [given], 0
+    pending, leaves = [Structure({})], 0
     while pending:
         structure = pending.pop()
         try:
@@ -174,12 +205,14 @@ def allotted(wanted: Sequence[float], count: int, least: int = 0) -> list[int]:
     return [least + each for each in counts]
 
 
-def _population(trace: Trace, log_weights: Tensor, founded: int) -> Population:
-    founders = torch.arange(founded, founded + len(trace))
-    # Strata are no independent draws, so that the founders do not tell the variance of the evidence.
-    return Population(trace, log_weights, founders=founders, log_pairs=math.inf)
-
-
-def _strata(parts: list[tuple[Structure, Population]], particles: int) -> Strata:
-    total = torch.logsumexp(torch.cat([each.log_weights for _, each in parts]), 0)
-    return Strata.of(parts, float(total) - math.log(particles))
+def _strata(parts: Sequence[tuple[Trace, Tensor]], particles: int) -> Strata:
+    """Strata of traces and their log weights, whose sum over all particles estimates `particles` times Z."""
+    populations, founded = [], 0
+    for trace, log_weights in parts:
+        founders = torch.arange(founded, founded + len(trace))
+        # Strata are no independent draws: the variance of the evidence is not known from the founders.
+        population = Population(trace, log_weights, founders=founders, log_pairs=math.inf)
+        populations.append((trace.structure, population))
+        founded += len(trace)
+    total = torch.logsumexp(torch.cat([log_weights for _, log_weights in parts]), 0)
+    return Strata.of(populations, float(total) - math.log(particles))

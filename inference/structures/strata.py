@@ -37,7 +37,7 @@ class Strata:
 
     @classmethod
     def of(cls, populations: Iterable[tuple[Structure, Population]], log_evidence: float) -> Strata:
-        """The strata of populations with their structures, joined where they have one structure; those without weight are left out.
+        """The strata of populations, joined where they have one structure, without those without weight.
 
         Raises:
             NoWeightError: no particle has any weight.
