@@ -90,7 +90,7 @@ class TemperedStrata:
     def sample(
         self, program: Program, args: tuple[Any, ...], observations: Mapping[str, Tensor], particles: int
     ) -> SteppedStrata:
-        """Strata whose structures are drawn from a program, as by `sample_strata`, the likelihood tempered."""
+        """Strata of structures drawn from a program, as by `sample_strata`, the likelihood tempered."""
         return self._temper(drawn(program, args, observations, particles), particles)
 
     def extend(self, strata: Strata, observed: Observed, particles: int | None = None) -> SteppedStrata:
