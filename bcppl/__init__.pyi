@@ -40,5 +40,6 @@ from bcppl.traces import (
     propose as propose,
     regenerate as regenerate,
     simulate as simulate,
+    structural as structural,
     update as update,
 )

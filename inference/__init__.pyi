@@ -9,6 +9,7 @@ from bcppl.inference import (
     proposals as proposals,
     resampling as resampling,
     saved as saved,
+    structures as structures,
     summaries as summaries,
     targets as targets,
 )

@@ -139,7 +139,7 @@ def test_chains_over_structures_reach_the_posterior_from_one_of_them() -> None:
         strata, _ = move(strata, POSTERIOR)
         if moves >= 12:
             shares.append([strata.shares.get(Structure({"count": k}), 0.0) for k in range(3)])
-    torch.testing.assert_close(matrix(shares).mean(0), POSTERIOR_OF_COUNT, rtol=0.0, atol=0.02)
+    torch.testing.assert_close(matrix(shares).mean(0), POSTERIOR_OF_COUNT, rtol=0.0, atol=0.03)
 
 
 def test_weights_go_with_their_particles() -> None:
@@ -205,7 +205,7 @@ def too_many(trace: Trace) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         (Jump(more, fewer, split, wrong, check=True), "does not give 'term_0'"),
         (Jump(more, fewer, split, check=True), "leaves out the forward choice 'part'"),
         (Jump(fewer, more, sampling_nothing, split), "needs a value for address 'part'"),
-        (Jump(more, fewer, lambda trace: ({}, {"part": trace["term_0"]}), split), "never visits"),
+        (Jump(more, fewer, lambda trace: ({}, {"part": trace["term_0"]}), split), "coordinates too many"),
         (Jump(more, fewer, too_many, merged), "'y', which is no latent"),
         (Jump(more, lambda s: None, split, merged), "does not lead back"),
         (Jump(more, fewer, lambda trace: 3), "returns a int"),

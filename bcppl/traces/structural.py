@@ -84,7 +84,8 @@ def structural(name: str, distribution: Any) -> int:
         UnchosenError: the site is given no value; it is never sampled for each particle by itself.
         InputError: it is given values that differ from particle to particle, or lies in a plate.
     """
-    value = pyro.sample(name, distribution, infer={STRUCTURAL: True})
+    infer: Any = {STRUCTURAL: True}
+    value = pyro.sample(name, distribution, infer=infer)
     first = value.reshape(-1)[0]
     if not bool((value == first).all()):
         raise InputError(
