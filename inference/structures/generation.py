@@ -74,7 +74,9 @@ def sample_strata(
 
 def weighed(strata: Strata) -> Strata:
     """Strata of a prior weighted by the likelihood of what is observed."""
-    return strata.reweighed({s: log_likelihood(each.trace) for s, each in strata.populations.items()})
+    return strata.reweighed(
+        {s: log_prob_of(each.trace, likelihood_sites(each.trace)) for s, each in strata.populations.items()}
+    )
 
 
 def likelihood_sites(trace: Trace, earlier: Collection[str] = ()) -> list[str]:
@@ -83,10 +85,9 @@ def likelihood_sites(trace: Trace, earlier: Collection[str] = ()) -> list[str]:
     return [a for a in trace.addresses if a not in trace.choices and a not in structure and a not in earlier]
 
 
-def log_likelihood(trace: Trace, earlier: Collection[str] = ()) -> Tensor:
-    """Log-probability (N,) of these sites."""
-    observed = likelihood_sites(trace, earlier)
-    return trace.log_prob(*observed) if observed else torch.zeros(len(trace), dtype=torch.float64)
+def log_prob_of(trace: Trace, sites: Sequence[str]) -> Tensor:
+    """Log-probability (N,) of some sites, of none too."""
+    return trace.log_prob(*sites) if sites else torch.zeros(len(trace), dtype=torch.float64)
 
 
 def enumerated(
@@ -107,7 +108,7 @@ def enumerated(
     parts = []
     for leaf, count in zip(leaves, allotted(wanted, particles, least=1), strict=True):
         trace, _ = generate(program, args, {**observations, **leaf.observations}, count)
-        log_prior = trace.log_prob(*trace.structure) if trace.structure else torch.zeros(count).double()
+        log_prior = log_prob_of(trace, list(trace.structure))
         # The sum over a stratum estimates the evidence of its structure, however many particles it has.
         parts.append((trace, log_prior + math.log(particles / count)))
     return _strata(parts, particles)
@@ -132,8 +133,7 @@ def drawn(
             return
         # What was drawn has weight 1; a structural site that the caller observes counts.
         observed = [a for a in trace.structure if a not in structure]
-        log_prior = trace.log_prob(*observed) if observed else torch.zeros(count, dtype=torch.float64)
-        parts.append((trace, log_prior.clone()))
+        parts.append((trace, log_prob_of(trace, observed).clone()))
 
     particles = whole_number("strata are given {} particles", particles)
     branch(Structure({}), {}, particles)

@@ -98,7 +98,8 @@ def jump(*jumps: Jump) -> StrataMove:
                 mine = (choice == number).nonzero().flatten()
                 if len(mine) == 0:
                     continue
-                jumped = _jumped(population[mine], way, len(ways), jumps, target)
+                jumping = population if len(ways) == 1 else population[mine]
+                jumped = _jumped(jumping, way, len(ways), jumps, target)
                 if jumped.population is not None:
                     stays[mine[jumped.accepted]] = False
                     parts.append((jumped.structure, jumped.population))

@@ -100,4 +100,6 @@ def in_turn(*moves: StrataMove, times: int = 1) -> StrataMove:
 
 def target_in(target: Target, trace: Trace) -> Target:
     """The target on the sites of one structure: others may visit sites that this one does not."""
+    if target.exponents.keys() <= trace.observations.keys():
+        return target
     return Target({a: e for a, e in target.exponents.items() if a in trace.distributions})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -199,29 +199,55 @@ def mean(strata: Strata, address: str) -> Tensor:
 def joined(populations: Iterable[Population]) -> Population:
     """One population of the particles of several of one structure, in their order, with their weights.
 
-    Its log evidence and its approximation are those of the first.
+    A particle stays in its half (`bcppl.inference.kernels.halving`), so that it is in that of its copies. The
+    log evidence and the approximation are those of the first.
     """
-    first, *others = populations
+    populations = list(populations)
+    first = populations[0]
+    if len(populations) == 1:
+        return first
+    halved = all(len(each.sides) for each in populations)
+    return replace(
+        first,
+        trace=_joined([each.trace for each in populations]),
+        log_weights=torch.cat([each.log_weights for each in populations]),
+        founders=torch.cat([each.founders for each in populations]),
+        # Numbers of families that are equal by chance make groups larger than they have to be.
+        families=torch.cat([each.families for each in populations]) if halved else first.families[:0],
+        sides=torch.cat([each.sides for each in populations]) if halved else first.sides[:0],
+    )
+
+
+def _joined(traces: Sequence[Trace]) -> Trace:
+    first, *others = traces
     for other in others:
-        first = replace(
-            first,
-            trace=_joined(first.trace, other.trace),
-            log_weights=torch.cat([first.log_weights, other.log_weights]),
-            founders=torch.cat([first.founders, other.founders]),
-        )
-    return first
-
-
-def _joined(first: Trace, second: Trace) -> Trace:
-    if set(first.addresses) != set(second.addresses):
-        raise InputError(
-            f"two traces of {first.structure} visit other addresses ({shapes(first.choices)}, and "
-            f"{shapes(second.choices)}); let a structural site determine which are visited."
-        )
-    rows = torch.arange(len(first) + len(second))
-    mine = first[rows.clamp_max(len(first) - 1)]
-    result: Trace = mine.where(rows < len(first), second[(rows - len(first)).clamp_min(0)])
-    return result
+        if set(first.choices) != set(other.choices):
+            raise InputError(
+                f"two traces of {first.structure} have other latent addresses ({shapes(first.choices)}, and "
+                f"{shapes(other.choices)}); let a structural site determine which are visited."
+            )
+    carried = dict(first.carried)
+    count = len(first)
+    for other in others:
+        rows = torch.arange(count + len(other))
+        mine, theirs = rows.clamp_max(count - 1), (rows - count).clamp_min(0)
+        # A simulator's state that cannot be joined with the others' is made again when it is asked for.
+        carried = {
+            name: both
+            for name, entry in carried.items()
+            if name in other.carried
+            and (both := entry.take(mine).where(rows < count, other.carried[name].take(theirs))) is not None
+        }
+        count += len(other)
+    known = set(first.known).intersection(*(each.known for each in others))
+    return replace(
+        first,
+        particles=count,
+        choices={a: torch.cat([each.choices[a] for each in traces]) for a in first.choices},
+        carried=carried,
+        known={a: torch.cat([each.known[a] for each in traces]) for a in first.known if a in known},
+        hidden=first.hidden.union(*(each.hidden for each in others)),
+    )
 
 
 def _of_each(trace: Trace, address: str) -> Tensor:

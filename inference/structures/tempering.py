@@ -32,7 +32,7 @@ from bcppl.inference.structures.generation import (
     drawn,
     enumerated,
     likelihood_sites,
-    log_likelihood,
+    log_prob_of,
 )
 from bcppl.inference.structures.moves import StrataMove
 from bcppl.inference.structures.strata import Strata
@@ -108,10 +108,13 @@ class TemperedStrata:
     def _temper(self, strata: Strata, particles: int, earlier: Collection[str] = ()) -> SteppedStrata:
         """Temper the sites at other than `earlier` addresses, which the weights do not yet count."""
         exponent, done, resampled, acceptances = 0.0, [], 0, []
+        sites: dict[Structure, list[str]] = {}
         while exponent < 1.0:
-            log_likelihoods = {
-                s: log_likelihood(each.trace, earlier) for s, each in strata.populations.items()
-            }
+            # Which sites there are is a matter of the structure alone.
+            for structure, each in strata.populations.items():
+                if structure not in sites:
+                    sites[structure] = likelihood_sites(each.trace, earlier)
+            log_likelihoods = {s: log_prob_of(each.trace, sites[s]) for s, each in strata.populations.items()}
             reached, exponent = exponent, self._after(exponent, strata, log_likelihoods)
             done.append(exponent)
             # 0 times -inf is no number, so a particle that cannot be loses its weight here, once.
@@ -120,11 +123,8 @@ class TemperedStrata:
                 strata = resample_strata(strata, particles, least=self.least, scheme=self.scheme)
                 resampled += 1
             if self.move is not None:
-                tempered = {
-                    a for each in strata.populations.values() for a in likelihood_sites(each.trace, earlier)
-                }
-                target = Target(dict.fromkeys(tempered, exponent) if exponent < 1.0 else {})
-                strata, acceptance = self.move(strata, target)
+                tempered = {a for each in sites.values() for a in each} if exponent < 1.0 else set()
+                strata, acceptance = self.move(strata, Target(dict.fromkeys(tempered, exponent)))
                 acceptances.append(acceptance)
         accepted = torch.tensor(acceptances).nanmean(dim=0).tolist() if acceptances else ()
         info = StrataInfo(tuple(done), resampled, tuple(accepted), strata.effective_sample_size)
