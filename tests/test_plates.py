@@ -12,7 +12,12 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
+from bcppl.inference.kernels import hmc, metropolis_hastings, moved_by, sequence
+from bcppl.inference.population import Population
+from bcppl.inference.proposals import drift
+from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, assess, extend, generate, propose, regenerate, simulate, update
+from bcppl.traces.gradient import log_prob_with_grad
 
 N, POINTS, GROUPS = 4, 5, 3
 WIDTHS = torch.linspace(0.5, 1.5, POINTS, dtype=torch.float64)
@@ -167,3 +172,66 @@ def test_counts_and_structure_that_differs_by_argument() -> None:
     assert torch.equal(drawn.log_weight, torch.zeros(N, dtype=torch.float64)), "nothing depends on it"
     with pytest.raises(InputError, match="no longer visits address 'many'"):
         extend(trace, (("one",),), {})
+
+
+def several(places: int) -> None:
+    """Plates, one within the other, a vector site, and a site in a plate that depends on both."""
+    mean = pyro.sample("mean", dist.Normal(torch.tensor(0.0, dtype=torch.float64), 2.0))
+    width = pyro.sample("width", dist.Gamma(torch.tensor(2.0, dtype=torch.float64), 1.0))
+    vector = pyro.sample("vector", dist.Normal(mean[:, None].expand(-1, places), width[:, None]).to_event(1))
+    with pyro.plate("rows", places, dim=-3):
+        row = pyro.sample("row", dist.Normal(vector.T[:, None], 1.0))
+        with pyro.plate("columns", places, dim=-2):
+            each = pyro.sample("each", dist.Normal(row, width))
+            pyro.sample("y", dist.Normal(each, 1.0))
+
+
+@pytest.mark.parametrize("particles", [1, 2, POINTS - 1, POINTS, POINTS + 1])
+def test_particles_are_as_in_a_larger_population_however_many_entries_a_plate_has(particles: int) -> None:
+    seen = {"y": torch.linspace(-1, 1, POINTS * POINTS, dtype=torch.float64).reshape(POINTS, POINTS)}
+    large, _ = generate(several, (POINTS,), seen, 4 * POINTS)
+    index = torch.arange(particles) + 3
+    choices = {a: v[index] for a, v in large.choices.items()}
+    small, log_weight = generate(several, (POINTS,), seen, particles, choices)
+    torch.testing.assert_close(log_weight, large.log_prob()[index])
+    for address in large.addresses:
+        torch.testing.assert_close(small.log_prob(address), large.log_prob(address)[index])
+    for address, value in large.choices.items():
+        moved = update(large, {address: value * 1.1})
+        torch.testing.assert_close(
+            update(small, {address: value[index] * 1.1}).log_ratio, moved.log_ratio[index]
+        )
+        leaves = value.clone().requires_grad_(), value[index].clone().requires_grad_()
+        for trace, leaf in zip((large, small), leaves, strict=True):
+            log_prob_with_grad(trace, {address: leaf}).sum().backward()
+        assert leaves[0].grad is not None and leaves[1].grad is not None
+        torch.testing.assert_close(leaves[1].grad, leaves[0].grad[index])
+
+
+@pytest.mark.parametrize("particles", [3, 5, 8])
+def test_kernels_move_as_many_particles_as_a_plate_has_entries(particles: int) -> None:
+    """A conjugate hierarchy: groups of chains as many as entries, or fewer, have its posterior means."""
+
+    def hierarchy() -> None:
+        mean = pyro.sample("mean", dist.Normal(torch.tensor(0.0, dtype=torch.float64), 2.0))
+        with pyro.plate("points", POINTS):
+            x = pyro.sample("x", dist.Normal(mean, 1.0))
+            pyro.sample("y", dist.Normal(x, 0.5))
+
+    y = torch.tensor([0.3, -1.0, 2.0, 1.1, 0.4], dtype=torch.float64)
+    precision = 1 / 4 + POINTS / 1.25
+    centre, wide = float(y.sum() / 1.25 / precision), precision**-0.5
+    moved = []
+    torch.manual_seed(0)
+    for _ in range(60):
+        mean = centre + wide * torch.randn(particles, dtype=torch.float64)
+        x = (mean[:, None] + 4 * y) / 5 + 5**-0.5 * torch.randn(particles, POINTS, dtype=torch.float64)
+        start, _ = generate(hierarchy, (), {"y": y}, particles, {"mean": mean, "x": x})
+        population = Population(start, torch.zeros(particles, dtype=torch.float64))
+        kernel = sequence([metropolis_hastings(drift("x")), hmc("mean", "x", steps=3)])
+        trace = moved_by(population, kernel, POSTERIOR).population.trace
+        before, after = (torch.cat([t["mean"][:, None], t["x"]], dim=1) for t in (start, trace))
+        moved.append(torch.cat([after - before, after**2 - before**2], dim=1))
+    change = torch.cat(moved)
+    assert bool((change.std(dim=0) > 0.01).all())
+    assert float((change.mean(dim=0) / (change.std(dim=0) / len(change) ** 0.5)).abs().max()) < 3.7
