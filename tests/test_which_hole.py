@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
+import pyro
 import pytest
 import torch
+from pyro.distributions import Categorical
 
 from bcppl import poses
 from bcppl.cli import loading
 from bcppl.contact.physics import PegPhysics
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import box_peg
+from bcppl.inference import Population, structures
+from bcppl.inference.structures import Strata
+from bcppl.inference.summaries import probabilities
 from bcppl.models import which_hole
 from bcppl.models.worlds import which_hole as world
 from bcppl.recordings import ProbeWindow
-from bcppl.traces import extend, generate, update
+from bcppl.traces import Structure, extend, generate, structural, update
 
 
 @pytest.mark.parametrize("seed", [0, 2])
@@ -68,3 +76,38 @@ def test_it_is_offered_by_name_and_refuses_what_cannot_be_chosen_from() -> None:
     ]:
         with pytest.raises(InputError, match=message):
             which_hole.prepare(recording, holes=holes)
+
+
+def test_strata_over_the_holes_agree_with_the_padded_program() -> None:
+    """The same poses under each hole: the same densities, and the same posterior over holes."""
+    recording, true = world.simulate_recording(0), world.which(0)
+    scene = which_hole.prepare(recording)
+    measurements = recording.measurements[:3]  # an image, and touches that settle one half
+    args = (scene, [m.action for m in measurements])
+    seen = scene.observed(measurements)
+
+    def by_strata(scene: which_hole.PlateScene, actions: Sequence[Any]) -> None:
+        which = structural("which", Categorical(torch.ones(len(scene.hole_from_part))))
+        hole = pyro.sample("hole", scene.prior)
+        part = poses.compose(hole, scene.hole_from_part[which])
+        for number, action in enumerate(actions):
+            scene.sensor(action).observe(number, action, part)
+
+    torch.manual_seed(0)
+    near = torch.from_numpy(recording.truth).expand(6, 7).clone()
+    near[:, :3] += 2e-4 * torch.randn(6, 3, dtype=torch.float64)
+    choices = {"which": torch.arange(4).repeat_interleave(6), "hole": near.repeat(4, 1)}
+    padded, log_weights = generate(which_hole.which_hole, args, seen, 24, choices)
+    population = Population(padded, log_weights)
+    parts = []
+    for which in range(4):
+        structure = Structure({"which": which})
+        trace, weights = generate(by_strata, args, {**seen, **structure.observations}, 6, {"hole": near})
+        assert trace.structure == structure and "which" not in trace.choices
+        torch.testing.assert_close(weights, log_weights[6 * which : 6 * which + 6])
+        parts.append((structure, Population(trace, weights)))
+    strata = Strata.of(parts, 0.0)
+    share = structures.probabilities(strata, "which").probabilities
+    torch.testing.assert_close(share, probabilities(population, "which").probabilities)
+    assert float(share[true % 2 :: 2].sum()) > 0.99
+    torch.testing.assert_close(strata.belief("hole").mean, population.belief("hole").mean)
