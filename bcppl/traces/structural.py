@@ -1,14 +1,24 @@
 """Choices that determine which sites a program visits: one value for all particles of a trace.
 
-    def mixture(x):
-        count = structural("count", dist.Categorical(probabilities)) + 1
-        means = [pyro.sample(f"mean_{j}", dist.Normal(zero, 3.0)) for j in range(count)]
-        ...
+    import pyro
+    import pyro.distributions as dist
+    import torch
+    from bcppl.traces import generate, structural
 
-The value is a Python int, so the program branches on it with `if` and `for`. A trace is a run for one value:
-`generate(mixture, (x,), {"count": torch.tensor(1), "y": y}, particles)` conditions on it, and its
-log-probability counts as that of any other site. A posterior over several values is one trace for each, a
-`bcppl.inference.structures.Strata`.
+    def program():
+        if structural("slipped", dist.Bernoulli(0.1)):
+            shift = pyro.sample("shift", dist.Normal(torch.tensor(0.0), 2.0))
+        else:
+            shift = torch.tensor(0.0)
+        pyro.sample("y", dist.Normal(shift, 0.5))
+
+    seen = {"slipped": torch.tensor(1), "y": torch.tensor(1.2)}
+    trace, log_weight = generate(program, (), seen, particles=100)
+    print(trace, trace.structure)
+
+The value is a Python int, so the program branches on it with `if` and `for`. A trace is a run for one value,
+conditioned on it as on an observation: its log-probability counts as that of any other site. A posterior over
+several values is one trace for each, a `bcppl.inference.structures.Strata`.
 """
 
 from __future__ import annotations

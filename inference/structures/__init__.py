@@ -1,12 +1,21 @@
 """Programs whose sites depend on a latent choice: particles in strata, one for each structure.
 
-def mixture(x):
-count = structural("count", dist.Categorical(torch.ones(3))) + 1
-means = [pyro.sample(f"mean_{j}", dist.Normal(0.0, 3.0)) for j in range(count)]
-...
+    import pyro
+    import pyro.distributions as dist
+    import torch
+    from bcppl.inference.structures import generate_strata, probabilities
+    from bcppl.traces import structural
 
-strata = generate_strata(mixture, (x,), {"y": y}, particles=3000)
-print(probabilities(strata, "count"), strata.log_evidence)
+    def summed():
+        count = structural("count", dist.Categorical(torch.ones(3))) + 1
+        terms = [pyro.sample(f"term_{j}", dist.Normal(torch.tensor(0.0), 1.0)) for j in range(count)]
+        pyro.sample("y", dist.Normal(torch.stack(terms).sum(dim=0), 0.5))
+
+    strata = generate_strata(summed, (), {"y": torch.tensor(2.0)}, particles=3000)
+    print(probabilities(strata, "count"), strata.log_evidence)
+
+Strata are resampled (`resample_strata`), given new measurements (`extend_strata`), tempered
+(`tempered_strata`), and moved, within structures (`within`) and across them (`jump`).
 """
 
 from bcppl.inference.structures.allotment import resample_strata

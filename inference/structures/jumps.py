@@ -108,8 +108,6 @@ def jump(*jumps: Jump) -> StrataMove:
                 taken[which] += len(jumped.accepted)
             if bool(stays.any()):
                 parts.append((structure, population if bool(stays.all()) else population[stays]))
-        order = {structure: k for k, structure in enumerate(strata.structures)}
-        parts.sort(key=lambda part: order.get(part[0], len(order)))
         moved = Strata.of(parts, strata.log_evidence)
         return MovedStrata(moved, tuple((taken / made).flatten().tolist()))
 

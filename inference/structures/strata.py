@@ -37,7 +37,9 @@ class Strata:
 
     @classmethod
     def of(cls, populations: Iterable[tuple[Structure, Population]], log_evidence: float) -> Strata:
-        """The strata of populations, joined where they have one structure, without those without weight.
+        """The strata of populations, by structure in order, without those that have no weight.
+
+        Populations of the same structure are joined.
 
         Raises:
             NoWeightError: no particle has any weight.
@@ -47,7 +49,7 @@ class Strata:
         for structure, each in populations:
             if len(each):
                 parts.setdefault(structure, []).append(each)
-        whole = {structure: joined(each) for structure, each in parts.items()}
+        whole = {each: joined(parts[each]) for each in sorted(parts, key=lambda s: tuple(s.items()))}
         log_total = _log_total(whole.values())
         return cls(
             {
