@@ -34,11 +34,11 @@ def test_values_are_whole_numbers_whatever_the_type_of_the_site(site: dist.Torch
     def program() -> int:
         return structural("k", site)
 
-    observed = Structure({"k": 1}).observations
-    trace, log_weight = generate(program, (), observed, 4)
-    assert trace.result == 1 and type(trace.result) is int
     expected = site.log_prob(torch.tensor(1.0)).to(torch.float64).expand(4)
-    torch.testing.assert_close(log_weight, expected, rtol=1e-6, atol=1e-6)
+    for observed in (Structure({"k": 1}).observations, {"k": torch.tensor(1)}):
+        trace, log_weight = generate(program, (), observed, 4)
+        assert trace.result == 1 and type(trace.result) is int
+        torch.testing.assert_close(log_weight, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_a_structure_without_value_is_refused_and_names_what_to_use() -> None:

@@ -214,6 +214,8 @@ class _Recorder(Messenger):
                 raise UnchosenError(address, distribution, self.values)
         if address in self.given:
             value = self.given[address]
+            if address in self.structural:
+                value = value.to(torch.float64)  # every discrete density takes it, and few a whole number
             self._has_shape(address, value, distribution)
             message["value"], message["is_observed"] = inward(value, distribution), True
             self.values[address] = value
