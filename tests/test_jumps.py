@@ -12,13 +12,16 @@ import pytest
 import torch
 from torch import Tensor
 
+from bcppl import poses
+from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.structures import Jump, Strata, in_turn, jump, jumps, translate, translation, within
 from bcppl.inference.structures.translation import sampling_nothing
 from bcppl.inference.targets import POSTERIOR, Target
-from bcppl.traces import Structure, Trace, generate
+from bcppl.traces import Structure, Trace, generate, structural
+from tests.exact_targets import CENTER, WIDE
 from tests.invariance import largest_z, matrix, number
 from tests.smcp3_programs import flat, silent, turned_over
 from tests.structural_programs import (
@@ -52,6 +55,8 @@ def around(structure: Structure) -> dict[str, int]:
 def back_around(structure: Structure) -> dict[str, int]:
     return {"count": (structure["count"] - 1) % 3}
 
+
+AWAY = poses.as_pose([0.3, 0.1, -0.2, 0.8, 0.0, 0.6, 0.0])
 
 MOVES = {
     "split and merge": [birth],
@@ -217,3 +222,61 @@ def test_jumps_that_are_wrong_are_refused(kind: Jump, message: str) -> None:
         jump(kind)(exact_strata(60), POSTERIOR)
     with pytest.raises(InputError, match="no Jump"):
         jump()
+
+
+def either() -> None:
+    """A pose under one of two priors; both have it at the same address."""
+    which = structural("which", dist.Bernoulli(0.4))
+    pyro.sample("pose", NormalPose(poses.compose(CENTER, AWAY) if which else CENTER, WIDE))
+
+
+def shifted(trace: Trace) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """The pose with its offset from the centre stretched by a factor that is drawn, then carried away."""
+    factor = pyro.sample("factor", dist.LogNormal(number(0.4), 0.3))
+    tangent = poses.local(CENTER, trace["pose"]) * torch.where(torch.arange(6) < 3, factor[:, None], 1.0)
+    return {"pose": poses.compose(poses.retract(CENTER, tangent), AWAY)}, {"factor": 1.0 / factor}
+
+
+def shifted_back(trace: Trace) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    factor = pyro.sample("factor", dist.LogNormal(number(-0.4), 0.3))
+    tangent = poses.local(CENTER, poses.compose(trace["pose"], poses.inverse(AWAY)))
+    tangent = tangent * torch.where(torch.arange(6) < 3, factor[:, None], 1.0)
+    return {"pose": poses.retract(CENTER, tangent)}, {"factor": 1.0 / factor}
+
+
+def z_of_poses() -> float:
+    """The particles draw the prior, from either structure; what they are moved to is the prior again."""
+    torch.manual_seed(0)
+    parts, founded = [], 0
+    for which, size in ((0, 12_000), (1, 8_000)):
+        structure = Structure({"which": which})
+        trace, _ = generate(either, (), structure.observations, size)
+        founders = torch.arange(founded, founded + size)
+        parts.append((structure, Population(trace, torch.zeros(size), founders=founders)))
+        founded += size
+    start = Strata.of(parts, 0.0)
+    to = Jump(
+        lambda s: None if s["which"] else {"which": 1},
+        lambda s: {"which": 0} if s["which"] else None,
+        shifted,
+        shifted_back,
+        check=True,
+    )
+
+    def read(strata: Strata) -> Tensor:
+        rows = torch.zeros(founded, 14, dtype=torch.float64)
+        for structure, each in strata.populations.items():
+            centre = poses.compose(CENTER, AWAY) if structure["which"] else CENTER
+            tangent = poses.local(centre, each.trace["pose"])
+            rows[each.founders, 0] = float(structure["which"])
+            rows[each.founders, 1:7] = tangent
+            rows[each.founders, 7:13] = tangent**2
+        return rows
+
+    return largest_z(read(start), read(jump(to)(start, POSTERIOR).strata))
+
+
+def test_jumps_of_poses_have_the_jacobian_of_the_tangent_space(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert z_of_poses() < 3.7
+    monkeypatch.setattr(translation, "log_abs_det_jacobian", flat)
+    assert z_of_poses() > 6.0

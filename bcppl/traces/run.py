@@ -211,7 +211,8 @@ class _Recorder(Messenger):
         if message["infer"].get(STRUCTURAL):
             self.structural.append(address)
             if address not in self.given and message["value"] is None:
-                raise UnchosenError(address, distribution, self.values)
+                earlier = {a: v for a, v in self.values.items() if a not in self.fixed}
+                raise UnchosenError(address, distribution, earlier)
         if address in self.given:
             value = self.given[address]
             if address in self.structural:

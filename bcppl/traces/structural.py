@@ -72,7 +72,8 @@ class UnchosenError(InputError):
     Attributes:
         address: of the site.
         distribution: of the site, of batch shape (N,).
-        values: of the sites visited before, by address, given ones too; particle axis first.
+        values: of the sites visited before, by address, given ones too; the particle axis first. What the
+            program itself fixes (`obs=`, `pyro.factor`) is left out.
     """
 
     def __init__(self, address: str, distribution: Any, values: Mapping[str, Tensor]) -> None:

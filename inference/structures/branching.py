@@ -22,7 +22,7 @@ from bcppl.inference.filters.step import Observed
 from bcppl.inference.population import Population
 from bcppl.inference.structures.generation import structures_of
 from bcppl.inference.structures.strata import Strata
-from bcppl.traces import Structure, extend
+from bcppl.traces import Structure, extend, update
 from bcppl.traces.series import SeriesTrace
 
 
@@ -50,7 +50,7 @@ def branch_strata(strata: Strata, observed: Observed) -> tuple[Strata, dict[Stru
             )
 
         def visit(given: Mapping[str, Tensor], first: Population = population[:1]) -> None:
-            extend(first.trace, observed.args, {**observed.observations, **given})
+            update(first.trace, args=observed.args, observations={**observed.observations, **given})
 
         for new in structures_of(visit):
             given = {**observed.observations, **new.observations}

@@ -25,6 +25,7 @@ from bcppl.inference.structures.strata import Strata
 from bcppl.traces import Structure, Trace, generate
 from bcppl.traces.run import Program
 from bcppl.traces.structural import UnchosenError
+from bcppl.traces.verbs import constrained
 
 MOST = 10_000  # structures that are enumerated
 
@@ -101,7 +102,7 @@ def enumerated(
     particles = whole_number("strata are given {} particles", particles)
 
     def visit(given: Mapping[str, Tensor]) -> None:
-        generate(program, args, {**observations, **given}, 1)
+        constrained(program, args, 1, {**observations, **given}, {})
 
     leaves = list(structures_of(visit))
     wanted = [1.0 if shares is None else float(shares(each)) for each in leaves]
@@ -144,7 +145,7 @@ def structures_of(visit: Callable[[Mapping[str, Tensor]], None]) -> Iterator[Str
     """The values of the structural sites to which a program is given no value, one structure after another.
 
     Args:
-        visit: runs the program with values of structural sites by address.
+        visit: runs the program with values of structural sites by address; no site need be evaluated.
 
     Raises:
         InputError: a site has no list of values, or there are more than ten thousand structures.

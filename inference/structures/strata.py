@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -87,10 +87,6 @@ class Strata:
     def shares(self) -> dict[Structure, float]:
         """The posterior probability of each structure; one without particles is left out."""
         return {s: math.exp(each.log_total - self.log_total) for s, each in self.populations.items()}
-
-    def map(self, change: Callable[[Population], Population]) -> Strata:
-        """Every population changed by a function that keeps weights: extended, or moved."""
-        return Strata({s: change(each) for s, each in self.populations.items()}, self.log_evidence)
 
     def reweighed(self, log_factors: Mapping[Structure, Tensor]) -> Strata:
         """Every weight times exp(log_factor), and the evidence times the weighted mean of the factors.

@@ -107,7 +107,8 @@ class TemperedStrata:
 
     def _temper(self, strata: Strata, particles: int, earlier: Collection[str] = ()) -> SteppedStrata:
         """Temper the sites at other than `earlier` addresses, which the weights do not yet count."""
-        exponent, done, resampled, acceptances = 0.0, [], 0, []
+        exponent, done, resampled = 0.0, [], 0
+        acceptances: list[tuple[float, ...]] = []
         sites: dict[Structure, list[str]] = {}
         while exponent < 1.0:
             # Which sites there are is a matter of the structure alone.
@@ -126,7 +127,9 @@ class TemperedStrata:
                 tempered = {a for each in sites.values() for a in each} if exponent < 1.0 else set()
                 strata, acceptance = self.move(strata, Target(dict.fromkeys(tempered, exponent)))
                 acceptances.append(acceptance)
-        accepted = torch.tensor(acceptances).nanmean(dim=0).tolist() if acceptances else ()
+        accepted = (
+            torch.tensor(acceptances, dtype=torch.float64).nanmean(dim=0).tolist() if acceptances else ()
+        )
         info = StrataInfo(tuple(done), resampled, tuple(accepted), strata.effective_sample_size)
         return SteppedStrata(strata, info)
 
