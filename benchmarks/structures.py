@@ -232,10 +232,10 @@ METHODS = {
 
 def main() -> None:
     parser = report.options(__doc__.partition("\n")[0])
-    parser.add_argument("--particles", type=int, default=2000)
+    parser.add_argument("--particles", type=int, default=10_000)
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    seeds = range(chosen.seed, chosen.seed + (4 if chosen.quick else 30))
+    seeds = range(chosen.seed, chosen.seed + (4 if chosen.quick else 20))
     evidence = by_quadrature(DATA)
     exact = evidence / evidence.sum()
     lines, rows, cost = [["quadrature", *exact.tolist(), 0.0, math.nan, math.nan, math.nan]], [], {}
