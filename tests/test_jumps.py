@@ -245,7 +245,7 @@ def shifted_back(trace: Trace) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
 
 
 def z_of_poses() -> float:
-    """The particles draw the prior, from either structure; what they are moved to is the prior again."""
+    """The particles draw the prior, from either structure, and so do those that they are moved to."""
     torch.manual_seed(0)
     parts, founded = [], 0
     for which, size in ((0, 12_000), (1, 8_000)):

@@ -74,7 +74,7 @@ def sample_strata(
 
 
 def weighed(strata: Strata) -> Strata:
-    """Strata of a prior weighted by the likelihood of what is observed."""
+    """Strata of a prior weighted by the likelihood of the observations."""
     return strata.reweighed(
         {s: log_prob_of(each.trace, likelihood_sites(each.trace)) for s, each in strata.populations.items()}
     )

@@ -46,7 +46,7 @@ def within(kernel: Kernel, sweeps: int | Until = 1) -> StrataMove:
         sweeps: moves of every particle.
 
     Raises:
-        InputError: what is given is no kernel.
+        InputError: the argument is no kernel.
     """
     refuse_other("within", kernel)
 
