@@ -27,6 +27,7 @@ from tests.smcp3_programs import flat, silent, turned_over
 from tests.structural_programs import (
     EVIDENCES,
     POSTERIOR_OF_COUNT,
+    PRIOR,
     SEEN,
     SPREADS,
     birth,
@@ -46,6 +47,67 @@ def proposed(trace: Trace) -> None:
     count = len(trace.choices)
     rest = torch.stack([trace[f"term_{j}"] for j in range(count)]).sum(dim=0)
     pyro.sample(f"term_{count}", dist.Normal(0.5 * (1.2 - rest), 1.1))
+
+
+def split_vector(trace: Trace) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """One entry, drawn, is halved, with a remainder, and the other part is put last."""
+    terms = trace["terms"]
+    which = pyro.sample("which", dist.Categorical(torch.ones(terms.shape[1], dtype=torch.float64)))
+    part = pyro.sample("part", dist.Normal(number(0.0), 0.8))
+    chosen = torch.nn.functional.one_hot(which, terms.shape[1]).to(torch.float64)
+    half = (terms * chosen).sum(dim=1) / 2
+    return {"terms": torch.cat([terms - chosen * (half - part)[:, None], (half - part)[:, None]], dim=1)}, {
+        "which": which
+    }
+
+
+def merge_vector(trace: Trace) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    terms, last = trace["terms"][:, :-1], trace["terms"][:, -1]
+    which = pyro.sample("which", dist.Categorical(torch.ones(terms.shape[1], dtype=torch.float64)))
+    chosen = torch.nn.functional.one_hot(which, terms.shape[1]).to(torch.float64)
+    part = ((terms * chosen).sum(dim=1) - last) / 2
+    return {"terms": terms + chosen * last[:, None]}, {"which": which, "part": part}
+
+
+def as_vector(strata: Strata) -> Strata:
+    """The same particles of a program whose terms are one vector, as long as there are terms."""
+
+    def program(places: int) -> None:
+        count = structural("count", dist.Categorical(PRIOR)) + 1
+        spread = matrix(SPREADS[:count])
+        terms = pyro.sample("terms", dist.Normal(torch.zeros_like(spread), spread).to_event(1))
+        with pyro.plate("places", places):
+            pyro.sample("y", dist.Normal(terms.sum(dim=1), 1.0))
+
+    parts = []
+    for structure, each in strata.populations.items():
+        terms = torch.stack(list(each.trace.choices.values()), dim=1)
+        given = {"y": SEEN, **structure.observations}
+        trace, _ = generate(program, (3,), given, len(each), {"terms": terms})
+        torch.testing.assert_close(trace.log_prob(), each.trace.log_prob())
+        parts.append((structure, each.with_trace(trace)))
+    return Strata.of(parts, strata.log_evidence)
+
+
+def test_a_vector_may_have_another_length_in_each_structure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def z() -> float:
+        torch.manual_seed(0)
+        start = as_vector(exact_strata(20_000))
+        strata, _ = jump(Jump(more, fewer, split_vector, merge_vector, check=True))(start, POSTERIOR)
+        rows = []
+        for each in (start, strata):
+            row = torch.zeros(len(start), 5, dtype=torch.float64)
+            for structure, population in each.populations.items():
+                terms, count = population["terms"], structure["count"]
+                row[population.founders, count] = 1.0
+                row[population.founders, 3] = terms[:, 0]
+                row[population.founders, 4] = terms[:, -1] ** 2
+            rows.append(row)
+        return largest_z(*rows)
+
+    assert z() < 3.7
+    monkeypatch.setattr(translation, "assessed", silent)
+    assert z() > 10.0
 
 
 def around(structure: Structure) -> dict[str, int]:
