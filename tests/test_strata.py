@@ -15,6 +15,7 @@ from bcppl.errors import InputError
 from bcppl.inference import Observed
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.structures import (
+    Jump,
     Strata,
     allotment,
     by_structure,
@@ -31,7 +32,8 @@ from bcppl.inference.structures import (
     within,
 )
 from bcppl.inference.structures.generation import allotted
-from bcppl.traces import Structure, structural
+from bcppl.inference.targets import POSTERIOR
+from bcppl.traces import Series, Structure, structural
 from tests.invariance import matrix, number
 from tests.structural_programs import (
     EVIDENCES,
@@ -309,6 +311,23 @@ def test_tempering_without_moves_reweighs_and_resamples() -> None:
     strata, info = tempered_strata(share=0.9).generate(summed, (3,), OBSERVED, 6000)
     assert info.acceptance == () and len(info.exponents) > 1 and info.resampled > 0
     assert strata.log_evidence == pytest.approx(LOG_EVIDENCE, abs=0.15)
+
+
+def test_strata_of_a_series_are_refused_where_their_pasts_would_be_mixed() -> None:
+    def begin() -> Tensor:
+        return structural("kind", dist.Bernoulli(0.5)) + pyro.sample("x", dist.Normal(number(0.0), 1.0))
+
+    def step(state: Tensor) -> Tensor:
+        pyro.sample("y", dist.Normal(state, 1.0))
+        return state
+
+    strata = generate_strata(Series(begin, step), (), {}, 20)
+    assert strata.structures == [{"kind": 0}, {"kind": 1}]
+    with pytest.raises(InputError, match="strata of a series cannot be extended"):
+        extend_strata(strata, Observed((), {"y": number(0.0)}))
+    other = Jump(lambda s: {"kind": 1 - s["kind"]}, lambda s: {"kind": 1 - s["kind"]})
+    with pytest.raises(InputError, match="cannot be joined"):
+        jump(other)(strata, POSTERIOR)
 
 
 def test_tempering_refuses_exponents_that_do_not_end_with_1() -> None:

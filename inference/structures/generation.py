@@ -22,8 +22,9 @@ from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.structures.strata import Strata
-from bcppl.traces import Structure, Trace, generate
+from bcppl.traces import Series, Structure, Trace, generate
 from bcppl.traces.run import Program
+from bcppl.traces.series import runnable
 from bcppl.traces.structural import UnchosenError
 from bcppl.traces.verbs import constrained
 
@@ -31,7 +32,7 @@ MOST = 10_000  # structures that are enumerated
 
 
 def generate_strata(
-    program: Program,
+    program: Program | Series,
     args: tuple[Any, ...],
     observations: Mapping[str, Tensor],
     particles: int,
@@ -57,7 +58,7 @@ def generate_strata(
 
 
 def sample_strata(
-    program: Program, args: tuple[Any, ...], observations: Mapping[str, Tensor], particles: int
+    program: Program | Series, args: tuple[Any, ...], observations: Mapping[str, Tensor], particles: int
 ) -> Strata:
     """Particles of structures that are drawn from the program, also where it has infinitely many.
 
@@ -92,7 +93,7 @@ def log_prob_of(trace: Trace, sites: Sequence[str]) -> Tensor:
 
 
 def enumerated(
-    program: Program,
+    program: Program | Series,
     args: tuple[Any, ...],
     observations: Mapping[str, Tensor],
     particles: int,
@@ -102,7 +103,7 @@ def enumerated(
     particles = whole_number("strata are given {} particles", particles)
 
     def visit(given: Mapping[str, Tensor]) -> None:
-        constrained(program, args, 1, {**observations, **given}, {})
+        constrained(runnable(program), args, 1, {**observations, **given}, {})
 
     leaves = list(structures_of(visit))
     wanted = [1.0 if shares is None else float(shares(each)) for each in leaves]
@@ -116,7 +117,7 @@ def enumerated(
 
 
 def drawn(
-    program: Program, args: tuple[Any, ...], observations: Mapping[str, Tensor], particles: int
+    program: Program | Series, args: tuple[Any, ...], observations: Mapping[str, Tensor], particles: int
 ) -> Strata:
     """Strata of the prior, their structures drawn from it as for `sample_strata`."""
     parts: list[tuple[Trace, Tensor]] = []

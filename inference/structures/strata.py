@@ -15,6 +15,7 @@ from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.summaries import Probabilities
 from bcppl.traces import Structure, Trace
+from bcppl.traces.series import SeriesTrace
 from bcppl.traces.trace import shapes
 
 
@@ -218,6 +219,11 @@ def joined(populations: Iterable[Population]) -> Population:
 
 def _joined(traces: Sequence[Trace]) -> Trace:
     first, *others = traces
+    if isinstance(first, SeriesTrace):
+        raise InputError(
+            "particles of a series that come from several structures cannot be joined, as their pasts differ; "
+            "write the program with a loop over the steps."
+        )
     for other in others:
         if set(first.choices) != set(other.choices):
             raise InputError(

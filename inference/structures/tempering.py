@@ -37,7 +37,7 @@ from bcppl.inference.structures.generation import (
 from bcppl.inference.structures.moves import StrataMove
 from bcppl.inference.structures.strata import Strata
 from bcppl.inference.targets import Target
-from bcppl.traces import Structure
+from bcppl.traces import Series, Structure
 from bcppl.traces.run import Program
 
 
@@ -77,7 +77,7 @@ class TemperedStrata:
 
     def generate(
         self,
-        program: Program,
+        program: Program | Series,
         args: tuple[Any, ...],
         observations: Mapping[str, Tensor],
         particles: int,
@@ -88,7 +88,11 @@ class TemperedStrata:
         return self._temper(enumerated(program, args, observations, particles, shares), particles)
 
     def sample(
-        self, program: Program, args: tuple[Any, ...], observations: Mapping[str, Tensor], particles: int
+        self,
+        program: Program | Series,
+        args: tuple[Any, ...],
+        observations: Mapping[str, Tensor],
+        particles: int,
     ) -> SteppedStrata:
         """Strata of structures drawn from a program, as by `sample_strata`, the likelihood tempered."""
         return self._temper(drawn(program, args, observations, particles), particles)
