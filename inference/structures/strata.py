@@ -221,8 +221,8 @@ def _joined(traces: Sequence[Trace]) -> Trace:
     first, *others = traces
     if isinstance(first, SeriesTrace):
         raise InputError(
-            "particles of a series from several structures cannot be joined, as their pasts differ; write the "
-            "program with a loop over the steps."
+            "particles of a series from several structures cannot be joined, as their pasts differ; write "
+            "the program with a loop over the steps."
         )
     for other in others:
         if set(first.choices) != set(other.choices):
