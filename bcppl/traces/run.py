@@ -107,9 +107,7 @@ def run(
     values, fixed = recorder.values, frozenset(recorder.fixed)
     coincident, whole = frozenset(recorder.coincident), frozenset(plate.whole)
     outside, structural = surroundings(recorder.distributions), tuple(recorder.structural)
-    return Run(
-        recorder.distributions, values, fixed, used, result, coincident, whole, outside, structural
-    )
+    return Run(recorder.distributions, values, fixed, used, result, coincident, whole, outside, structural)
 
 
 @contextmanager

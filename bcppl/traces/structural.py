@@ -63,7 +63,7 @@ class Structure(Mapping[str, int]):
     @property
     def observations(self) -> dict[str, Tensor]:
         """The values as observations of a trace, float64: a trace is conditioned on its structure."""
-        return {address: torch.tensor(float(value)).double() for address, value in self._values.items()}
+        return {address: torch.tensor(value, dtype=torch.float64) for address, value in self._values.items()}
 
 
 class UnchosenError(InputError):
