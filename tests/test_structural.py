@@ -8,7 +8,16 @@ import pytest
 import torch
 
 from bcppl.errors import InputError
-from bcppl.traces import Structure, extend, generate, simulate, structural, update
+from bcppl.traces import (
+    ProgramError,
+    Structure,
+    check_program,
+    extend,
+    generate,
+    simulate,
+    structural,
+    update,
+)
 from bcppl.traces.structural import UnchosenError
 from tests.invariance import number
 from tests.small_programs import normal_log
@@ -83,3 +92,19 @@ def test_structures_compare_by_their_values() -> None:
     assert first == second == {"a": 1, "b": 0} and hash(first) == hash(second)
     assert first != Structure({"a": 1}) and len({first, second, Structure({"a": 1})}) == 2
     assert repr(first) == "Structure(a=1, b=0)"
+
+
+def test_a_program_is_checked_for_each_structure_by_itself() -> None:
+    for count in range(3):
+        check_program(summed, (3,), {"y": SEEN, **Structure({"count": count}).observations})
+
+    def writes(places: int) -> None:
+        """One structure is right, the other writes into the value of a site."""
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        if structural("doubled", dist.Bernoulli(0.5)):
+            x *= 2.0
+        pyro.sample("y", dist.Normal(x, 1.0))
+
+    check_program(writes, (1,), {"y": number(0.4), "doubled": number(0.0)})
+    with pytest.raises(ProgramError, match="'x'"):
+        check_program(writes, (1,), {"y": number(0.4), "doubled": number(1.0)})

@@ -162,6 +162,8 @@ def check_values(trace: Trace) -> None:
     """
     given = {address: trace[address] for address in trace.addresses if address in trace}
     for address, distribution in trace.distributions.items():
+        if address in trace.structure:
+            continue
         with suppress(NotImplementedError):
             plates = len(distribution.batch_shape) - 1
             given[address] = distribution.sample().movedim(plates, 0)

@@ -10,7 +10,7 @@ from bcppl.traces.checks.comparing import differing, first_differing, log_probs,
 from bcppl.traces.faults import Fault, ProgramError
 from bcppl.traces.trace import Trace
 from bcppl.traces.update import update
-from bcppl.traces.verbs import simulate
+from bcppl.traces.verbs import constrained
 
 
 def check_updates(trace: Trace, other: Trace) -> None:
@@ -40,13 +40,14 @@ def check_updates(trace: Trace, other: Trace) -> None:
 def check_simulated(trace: Trace) -> None:
     """Check that sites have the same densities where their values were sampled as where they are given.
 
-    All sites are sampled, those that are observed too, unless one cannot be.
+    All sites are sampled, those that are observed too, unless one cannot be; the structure stays.
 
     Raises:
         ProgramError: a log-probability is another (STATE).
     """
     try:
-        simulated = simulate(trace.program, trace.args, trace.particles)
+        structure = trace.structure.observations
+        simulated, _ = constrained(trace.program, trace.args, trace.particles, structure, {})
     except InputError:
         return
     again = rerun(simulated)
