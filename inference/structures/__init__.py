@@ -20,6 +20,7 @@ Strata are resampled (`resample_strata`), given new measurements (`extend_strata
 
 from bcppl.inference.structures.allotment import resample_strata
 from bcppl.inference.structures.branching import branch_strata, extend_strata
+from bcppl.inference.structures.files import load_strata, save_strata
 from bcppl.inference.structures.generation import generate_strata, sample_strata
 from bcppl.inference.structures.jumps import Jump, jump
 from bcppl.inference.structures.moves import MovedStrata, StrataMove, by_structure, in_turn, within
@@ -46,10 +47,12 @@ __all__ = [
     "generate_strata",
     "in_turn",
     "jump",
+    "load_strata",
     "mean",
     "probabilities",
     "resample_strata",
     "sample_strata",
+    "save_strata",
     "tempered_strata",
     "translate",
     "within",
