@@ -1,4 +1,5 @@
 from bcppl.inference import (
+    annealing as annealing,
     calibration as calibration,
     chains as chains,
     collectors as collectors,
@@ -9,6 +10,7 @@ from bcppl.inference import (
     proposals as proposals,
     resampling as resampling,
     saved as saved,
+    series as series,
     summaries as summaries,
     targets as targets,
 )

@@ -33,7 +33,7 @@ def effective_sample_sizes(log_weights: Tensor) -> Tensor:
 
 
 def systematic(log_weights: Tensor) -> Tensor:
-    """Ancestors (M, N) within each group, one uniform draw a group (Carpenter et al., IEE Proc. 146, 1999)."""
+    """Ancestors (M, N) within each group, by one uniform draw and equal steps in each."""
     groups, count = log_weights.shape
     offset = torch.rand(groups, 1, dtype=torch.float64)
     below = log_weights.exp().cumsum_(dim=1).mul_(count).sub_(offset).ceil_().clamp_(0, count)

@@ -1,8 +1,8 @@
 """M particle filters of N particles each for one series, run as one batch of M x N particles.
 
-Gordon, Salmond and Smith, Novel approach to nonlinear/non-Gaussian Bayesian state estimation, IEE Proc. F 140,
-1993 (the bootstrap filter). The estimate of the likelihood is unbiased, also where each filter resamples when
-its own effective sample size falls (Del Moral, Feynman-Kac formulae, 2004, section 7.4).
+Gordon, Salmond and Smith, Novel approach to nonlinear/non-Gaussian Bayesian state estimation, IEE Proc. F
+140, 1993 (the bootstrap filter). The estimate of the likelihood is unbiased, also where each filter resamples
+when its own effective sample size falls (Del Moral, Feynman-Kac formulae, 2004, section 7.4).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.inference.series import groups
-from bcppl.inference.series.states import merged
+from bcppl.inference.series.states import merged, merged_entries
 from bcppl.traces import Series, Trace, extend, generate
 from bcppl.traces.carried import Entry
 from bcppl.traces.dependence import equal
@@ -103,8 +103,12 @@ class Filters:
         self.seen.append((address, args, value))
 
     def _begun(self) -> Trace:
-        given = {address: value.repeat_interleave(self.count, dim=0) for address, value in self.static.items()}
-        return generate(replace(self.series, history=False), self.args, {}, self.log_weights.numel(), given)[0]
+        given = {
+            address: value.repeat_interleave(self.count, dim=0) for address, value in self.static.items()
+        }
+        return generate(replace(self.series, history=False), self.args, {}, self.log_weights.numel(), given)[
+            0
+        ]
 
     def _resampled(self) -> tuple[Trace, Tensor]:
         """The particles from which the next step begins, and their log weights (M, N)."""
@@ -138,11 +142,6 @@ class Filters:
             for step in ahead.seen[len(each.seen) :]:
                 each._advance(*step)
         particles = mask.repeat_interleave(self.count)
-        carried = {
-            name: together
-            for name, entry in self.carried.items()
-            if name in other.carried and (together := entry.where(particles, other.carried[name])) is not None
-        }
         return replace(
             self,
             static=merged(mask, self.static, other.static),
@@ -150,6 +149,6 @@ class Filters:
             increments=torch.where(mask, self.increments, other.increments),
             state=merged(particles, self.state, other.state) if self.seen else None,
             seen=list(self.seen),
-            carried=carried,
+            carried=merged_entries(particles, self.carried, other.carried),
             identity=object(),
         )

@@ -1,8 +1,8 @@
 """Smoothing: whole paths of a series given all observations, drawn backwards through a filter's particles.
 
-    filtered = [start, *(population for population, _ in steps(tempered(), start, observed))]
-    paths = smooth(filtered, 500)
-    paths["x", 3].mean()  # of the state after three steps, given the observations of all
+filtered = [start, *(population for population, _ in steps(tempered(), start, observed))]
+paths = smooth(filtered, 500)
+paths["x", 3].mean()  # of the state after three steps, given the observations of all
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ def smooth(filtered: Sequence[Population], draws: int) -> SeriesTrace:
     traces = [population.trace for population in filtered]
     if not traces or not all(isinstance(trace, SeriesTrace) for trace in traces):
         raise InputError("smooth is given no populations of a series; give a list, one after each step.")
-    for first, second in pairwise(traces):
-        if second.steps != first.steps + 1:  # type: ignore[attr-defined]
+    for first, second in pairwise([trace.steps for trace in traces if isinstance(trace, SeriesTrace)]):
+        if second != first + 1:
             raise InputError(
-                f"smooth is given a population after {second.steps} steps "  # type: ignore[attr-defined]
-                f"behind one after {first.steps}; give one after each step."  # type: ignore[attr-defined]
+                f"smooth is given a population after {second} steps behind one after {first}; "
+                "give one after each step."
             )
     index = multinomial(filtered[-1].log_weights, draws)[torch.randperm(draws)]
     chosen = [index]
@@ -73,7 +73,8 @@ def smooth(filtered: Sequence[Population], draws: int) -> SeriesTrace:
         index = chosen.pop()
         values = {address: value[index] for address, value in trace.choices.items()}
         paths, _ = extend(paths, trace.args, trace.observations, values)
-    return paths  # type: ignore[no-any-return]
+    assert isinstance(paths, SeriesTrace)
+    return paths
 
 
 def _backward(before: Population, after: Population, index: Tensor) -> Tensor:

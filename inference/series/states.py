@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bcppl.traces.carried import Entry
 from bcppl.traces.indexing import beside
 
 
@@ -25,6 +26,12 @@ def merged(mask: Tensor, first: Any, second: Any) -> Any:
         parts = [merged(mask, a, b) for a, b in zip(first, second, strict=True)]
         return type(first)(*parts) if hasattr(first, "_fields") else type(first)(parts)
     return first.where(mask, second) if hasattr(first, "where") else first
+
+
+def merged_entries(mask: Tensor, first: Mapping[str, Entry], second: Mapping[str, Entry]) -> dict[str, Entry]:
+    """The simulator states that both carry, merged likewise; one that cannot be is made again when needed."""
+    both = {name: entry.where(mask, second[name]) for name, entry in first.items() if name in second}
+    return {name: entry for name, entry in both.items() if entry is not None}
 
 
 def same(first: Any, second: Any, particles: int) -> Tensor:

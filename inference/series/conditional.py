@@ -20,8 +20,8 @@ from bcppl.errors import InputError
 from bcppl.inference.kernels import Kernel, Move
 from bcppl.inference.population import Population
 from bcppl.inference.series import groups
-from bcppl.inference.series.states import merged, same
-from bcppl.inference.series.unrolled import Unrolled, by_step, numbered
+from bcppl.inference.series.states import merged, merged_entries, same
+from bcppl.inference.series.unrolling import Unrolled, by_step, numbered
 from bcppl.inference.targets import Target
 from bcppl.traces import Trace, extend, generate, update
 from bcppl.traces.carried import Entry
@@ -124,6 +124,7 @@ class _Conditional:
         observations, path = self._observations(number), self._path(number)
         start = resumed(self.series, before.state, number - 1, len(self.free), before.carried)
         onto, _ = extend(start, self.arguments[number - 1], observations, path)
+        assert isinstance(onto, SeriesTrace)
         ancestors = groups.multinomial(before.log_weights, self.count)
         ancestors[:, -1] = self._ancestor(number, onto, before.log_weights)
         rows = groups.rows(ancestors, self.count)
@@ -131,22 +132,24 @@ class _Conditional:
         return self._joined(number, free, onto, rows, ancestors, path)
 
     def _joined(
-        self, number: int, free: Trace, onto: Trace, rows: Tensor, ancestors: Tensor, path: Mapping[str, Tensor]
+        self,
+        number: int,
+        free: Trace,
+        onto: Trace,
+        rows: Tensor,
+        ancestors: Tensor,
+        path: Mapping[str, Tensor],
     ) -> _Particles:
         """The particles that were drawn, and the steps to the path from the particles at `rows` (M x N,)."""
         assert isinstance(free, SeriesTrace) and isinstance(onto, SeriesTrace)
         observed = [a for a in onto.addresses if a not in onto.choices]
         likelihood = [self._log_density(number, each, observed) for each in (free, onto)]
         log_likelihood = torch.where(self.free, likelihood[0], likelihood[1][rows])
-        onto = onto.chosen(rows)
-        carried = {}
-        for name, entry in free.carried.items():
-            together = entry.where(self.free, onto.carried[name]) if name in onto.carried else None
-            carried |= {} if together is None else {name: together}
+        led: SeriesTrace = onto.chosen(rows)
         return _Particles(
-            merged(self.free, free.state, onto.state),
-            carried,
-            {address: merged(self.free, free[address], onto[address]) for address in path},
+            merged(self.free, free.state, led.state),
+            merged_entries(self.free, free.carried, led.carried),
+            {address: merged(self.free, free[address], led[address]) for address in path},
             ancestors,
             groups.reweighed(self.equal, log_likelihood)[0],
         )

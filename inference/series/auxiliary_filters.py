@@ -1,12 +1,12 @@
 """Auxiliary particle filters: resampling looks ahead, and new states are drawn by a proposal.
 
-    def ahead(trace, observed):  # log of what p(y | state) is, about
-        return dist.Normal(trace["x"], 1.2).log_prob(observed.observations["y"])
+def ahead(trace, observed):  # log of what p(y | state) is, about
+return dist.Normal(trace["x"], 1.2).log_prob(observed.observations["y"])
 
-    def towards(trace, observed):
-        pyro.sample("x", dist.Normal((trace["x"] + observed.observations["y"]) / 2, 0.7))
+def towards(trace, observed):
+pyro.sample("x", dist.Normal((trace["x"] + observed.observations["y"]) / 2, 0.7))
 
-    for population, info in steps(auxiliary(towards, look_ahead=ahead), start, observed): ...
+for population, info in steps(auxiliary(towards, look_ahead=ahead), start, observed): ...
 """
 
 from __future__ import annotations

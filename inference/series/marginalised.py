@@ -70,9 +70,7 @@ class SeriesLikelihood(LazyDistribution):
         )
 
 
-def marginal(
-    series: Series, *static: str, observed: str, particles: int, threshold: float = 0.5
-) -> Marginal:
+def marginal(series: Series, *static: str, observed: str, particles: int, threshold: float = 0.5) -> Marginal:
     """The program of a series' static parameters given its observations, with filters for its states.
 
     Args:
@@ -95,7 +93,9 @@ def marginal(
     if not static:
         raise InputError("marginal is given no static parameter; name the addresses that `init` samples.")
     particles = whole_number("the filters of a series are to have {} particles", particles)
-    threshold = number_within("the filters of a series are given the threshold {}", threshold, least=0, most=1)
+    threshold = number_within(
+        "the filters of a series are given the threshold {}", threshold, least=0, most=1
+    )
     return Marginal(series, static, observed, particles, threshold)
 
 
@@ -116,7 +116,7 @@ class Marginal:
             self.series.init(*args)
         if missing := [address for address in self.static if address not in parameters.values]:
             raise InputError(
-                f"a series' `init` samples no static parameter {missing[0]!r}; name addresses that it samples."
+                f"a series' `init` samples no static parameter {missing[0]!r}; name what it samples."
             )
         values = [parameters.values[address] for address in self.static]
         begin = partial(
@@ -170,6 +170,6 @@ class _Until(Messenger):
         if len(self.values) == len(self.addresses):
             raise _CompleteError
 
-    def __exit__(self, kind: Any, error: Any, traceback: Any) -> bool:
+    def __exit__(self, kind: Any, error: Any, traceback: Any) -> bool:  # type: ignore[override]
         super().__exit__(kind, error, traceback)
         return kind is _CompleteError

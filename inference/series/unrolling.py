@@ -1,4 +1,4 @@
-"""A series as one program, with an address for each step: "x", which `init` samples, then "x/1", "x/2", ..."""
+"""A series as one program, with an address for each step: "x" of `init`, then "x/1", "x/2", ..."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Unrolled:
 
 
 def unrolled(series: Series) -> Unrolled:
-    """The program `(steps, *args)` that runs a series' `init` with `args` and a step for each entry of `steps`.
+    """The program `(steps, *args)` of a series: `init(*args)`, and a step with each of the arguments.
 
     Its traces hold whole paths, whose values kernels can move: static parameters given the path by any kernel
     of `bcppl.inference.kernels`, the path given the parameters by `particle_gibbs`. What step t (from 1)
