@@ -42,7 +42,7 @@ class Size(NamedTuple):
     gibbs_moves: int = 40
     runs: int = 8
     thetas: int = 200
-    states: int = 150
+    states: int = 300
     path_particles: int = 20
     seeds: int = 20
     filtered: int = 400

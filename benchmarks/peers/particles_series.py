@@ -60,7 +60,7 @@ def smc_squared(observed: Any, prior: Any, states: int, thetas: int) -> dict[str
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=200)
-    parser.add_argument("--states", type=int, default=150, help="particles of each filter")
+    parser.add_argument("--states", type=int, default=300, help="particles of each filter")
     parser.add_argument("--chains", type=int, default=8)
     parser.add_argument("--moves", type=int, default=1000)
     parser.add_argument("--runs", type=int, default=8, help="of SMC^2")
