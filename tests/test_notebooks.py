@@ -218,8 +218,8 @@ def test_where_to_touch_chooses_and_ends_in_the_hole(kernel: Any, smaller: Small
             ("filters, ([],), {}, 150", "filters, ([],), {}, 60"),
         ],
         "smoothing": [("onward), (), {}, 300)", "onward), (), {}, 100)")],
-        "hares": [("SUBSTEPS = 5", "SUBSTEPS = 2")],
-        "posterior": [("sweeps=30", "sweeps=4"), ("collected, 600, moved", "collected, 200, moved")],
+        "hares": [("SUBSTEPS = 5", "SUBSTEPS = 3")],
+        "posterior": [("sweeps=30", "sweeps=15"), ("collected, 600, moved", "collected, 200, moved")],
     }
 )
 def test_series_agree_with_references_that_are_no_particle_filters(kernel: Any, smaller: Smaller) -> None:
