@@ -20,7 +20,8 @@ from bcppl.inference.series import marginal
 from bcppl.inference.series.nested import Filters
 from bcppl.inference.summaries import mean
 from bcppl.inference.targets import POSTERIOR
-from bcppl.traces import Series, Trace, generate, simulate, update
+from bcppl.traces import Series, Trace, extend, generate, simulate, update
+from bcppl.traces.carried import carried
 from tests.invariance import equal_weights, number
 from tests.linear_series import AUTOREGRESSION, SEEN, log_evidence, observed, posterior, step
 
@@ -174,6 +175,54 @@ def test_increments_may_be_tempered_and_evidence_is_kept_by_windows() -> None:
         total = filters.increments.sum(dim=0)
         names = [a for a in population.trace.addresses if a != "rho"]
         torch.testing.assert_close(population.trace.log_prob(*names), total, rtol=0, atol=1e-12)
+
+
+def test_a_simulator_that_a_step_carries_goes_on_in_its_filter() -> None:
+    """It is begun once for each of the M x N particles, and follows them through all choices and merges."""
+    begun: list[int] = []
+
+    class Counter:
+        """The pose that a simulator was begun for, and how many steps it has made."""
+
+        def __init__(self, owner: Tensor, steps: Tensor) -> None:
+            self.owner, self.steps = owner, steps
+
+        def __getitem__(self, index: Tensor) -> Counter:
+            return Counter(self.owner[index], self.steps[index])
+
+        def where(self, mask: Tensor, other: Counter) -> Counter:
+            pairs = ((self.owner, other.owner), (self.steps, other.steps))
+            return Counter(*(torch.where(mask, a, b) for a, b in pairs))
+
+    def begin() -> dict[str, Tensor]:
+        return {"pose": pyro.sample("pose", dist.Normal(number(0.0), 1.0))}
+
+    def probe(state: dict[str, Tensor]) -> dict[str, Tensor]:
+        pose = state["pose"]
+
+        def start() -> Counter:
+            begun.append(len(pose))
+            return Counter(pose, torch.zeros_like(pose))
+
+        counter = carried("probe", start)
+        assert torch.equal(counter.owner, pose)
+        counter.steps += 1.0
+        x = pyro.sample("x", dist.Normal(pose, 1.0))
+        pyro.sample("y", dist.Normal(x, 0.5))
+        return {"pose": pose, "steps": counter.steps.clone()}
+
+    torch.manual_seed(0)
+    program = marginal(Series(begin, probe), "pose", observed="y", particles=6, threshold=1.0)
+    trace, _ = generate(program, ([()] * 3,), observed(3), 4)
+    # The shape of an observation is read from one run of its own.
+    assert begun == [1, 24]
+    moved = update(trace, {"pose": trace["pose"] + 0.1}).trace
+    moved.log_prob()
+    mixed = moved.where(torch.tensor([True, False, True, False]), trace)[torch.tensor([3, 0, 0, 1])]
+    before = len(begun)
+    longer, _ = extend(mixed, ([()] * 4,), {"y/4": SEEN[3]})
+    filters = longer.distributions["y/4"].filters
+    assert len(begun) == before and bool((filters.state["steps"] == 4.0).all())
 
 
 def in_a_plate() -> dict[str, Tensor]:

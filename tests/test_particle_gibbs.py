@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.inference import markov_chains
-from bcppl.inference.kernels import metropolis_hastings, sequence
+from bcppl.inference.kernels import hmc, metropolis_hastings, sequence
 from bcppl.inference.proposals import drift
 from bcppl.inference.series import conditional, particle_gibbs, unrolled
 from bcppl.inference.series.conditional import _Conditional
@@ -144,12 +144,15 @@ def test_a_discrete_path_reaches_its_smoothing_distribution() -> None:
     assert float(((shares - exact) / (exact * (1 - exact) / 4000).sqrt()).abs().max()) < 4.0
 
 
-def test_paths_and_a_parameter_reach_the_posterior() -> None:
+@pytest.mark.parametrize(
+    "move", [metropolis_hastings(drift("rho", (0.5, 2.0))), hmc("rho", steps=3)], ids=["drift", "hmc"]
+)
+def test_paths_and_a_parameter_reach_the_posterior(move: Any) -> None:
     torch.manual_seed(1)
-    count = 8
+    count = 6
     trace, _ = generate(unrolled(AUTOREGRESSION), ([()] * count,), observed(count), 300)
-    kernel = sequence(particle_gibbs("rho", particles=10), metropolis_hastings(drift("rho", (0.5, 2.0))))
-    rho = markov_chains(kernel, trace, 25, every=25, addresses="rho", progress=False).draws["rho"][-1]
+    kernel = sequence(particle_gibbs("rho", particles=10), move)
+    rho = markov_chains(kernel, trace, 15, every=15, addresses="rho", progress=False).draws["rho"][-1]
     grid, chance, _ = posterior(count)
     values, exact = torch.stack([rho, rho**2]), torch.stack([grid, grid**2]) @ chance
     z = (values.mean(dim=1) - exact) / (values.std(dim=1) / math.sqrt(300))
