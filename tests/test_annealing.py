@@ -113,7 +113,7 @@ def test_annealed_importance_sampling_is_unbiased() -> None:
 LADDER = [0.0, 0.004, 0.03, 0.2, 1.0]
 
 
-def exchanged(seed: int, moves: int = 80, chains: int = 40) -> replicas.Replicas:
+def exchanged(seed: int, moves: int = 50, chains: int = 40) -> replicas.Replicas:
     torch.manual_seed(seed)
     start, _ = generate(two_modes, (), SEEN, chains * len(LADDER))
     kernel = metropolis_hastings(drift("x"))
@@ -123,7 +123,7 @@ def exchanged(seed: int, moves: int = 80, chains: int = 40) -> replicas.Replicas
 def test_replicas_have_both_modes_by_their_probability() -> None:
     run = exchanged(0)
     x = run.chains.draws["x"]
-    assert x.shape == (80, 40)
+    assert x.shape == (50, 40)
     share = (x > 0).double().mean(dim=0)  # of each chain, which are nearly independent
     assert abs(float((share.mean() - RIGHT) / (share.std() / math.sqrt(40)))) < 4.0
     assert float(x[x > 0].std()) == pytest.approx(WIDTH / math.sqrt(1 + WIDTH**2 / 9), rel=0.05)

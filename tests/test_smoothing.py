@@ -100,12 +100,12 @@ def test_moved_particles_and_series_without_history_are_smoothed() -> None:
     series = with_known(RHO)
     short = Series(series.init, series.step, history=False)
     kernel = metropolis_hastings(drift("x"))
-    mean, _ = smoothed(RHO, T)
+    mean, _ = smoothed(RHO, 10)
     estimates = []
     for seed in range(5):
         torch.manual_seed(seed)
-        paths = smooth(filtered(short, 100, kernel=kernel, resample=always()), 100)
-        assert paths.steps == T and len(paths) == 100
+        paths = smooth(filtered(short, 60, 10, kernel=kernel, resample=always()), 60)
+        assert paths.steps == 10 and len(paths) == 60
         estimates.append(paths["x"].mean())
     off = torch.stack(estimates) - mean[-1]
     assert abs(float(off.mean() / (off.std() / math.sqrt(5)))) < 5.0

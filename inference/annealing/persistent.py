@@ -40,7 +40,7 @@ def persistent_sampling(
 
     Each iteration draws N of all particles so far, moves them at the next exponent, and adds them. A particle
     is weighed against the mixture of the tempered posteriors of all iterations, each over its estimated
-    evidence (section 3.1). The evidence is consistent, and not unbiased: estimates stand in the mixture.
+    evidence. The evidence is consistent, and not unbiased: estimates stand in the mixture.
 
     Args:
         program: a Pyro program.
@@ -93,7 +93,7 @@ def persistent_sampling(
 
 
 def _log_mixture(log_likelihood: Tensor, exponents: list[float], log_evidences: list[float]) -> Tensor:
-    """Log density (K,) of all particles' own mixture over that of the prior (eq. 14)."""
+    """Log density (K,) of all particles' own mixture over that of the prior."""
     parts = {pair: 0 for pair in zip(exponents, log_evidences, strict=True)}
     for pair in zip(exponents, log_evidences, strict=True):
         parts[pair] += 1

@@ -29,7 +29,7 @@ class Replicas(NamedTuple):
     Attributes:
         chains: those at exponent 1, C of them.
         rejection: (K - 1,) the share of proposed exchanges between neighbouring exponents that were rejected.
-            Their sum estimates the communication barrier, and equal ones are best (Syed et al., section 5).
+            Their sum estimates the communication barrier, and equal ones are best (Syed et al.).
         round_trips: how many states have gone from exponent 1 to the first one and back.
         log_evidence: by steps between neighbouring exponents (Xie, Lewis, Fan, Kuo and Chen, Systematic
             Biology 60, 2011), of the likelihood from the first exponent on: of all of it if that is 0.

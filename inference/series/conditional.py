@@ -155,7 +155,7 @@ class _Conditional:
         )
 
     def _ancestor(self, number: int, onto: SeriesTrace, log_weights: Tensor) -> Tensor:
-        """The particle (M,) from which the path is to descend (Lindsten et al., algorithm 2, step 5).
+        """The particle (M,) from which the path is to descend (Lindsten et al., algorithm 2).
 
         `onto` are the steps to the path from each of M x N particles.
         """
