@@ -148,19 +148,19 @@ def parameters(observed: Tensor, size: Size, seed: int) -> list[Row]:
     lines: list[list[Any]] = []
     rates: dict[str, float] = {}
 
-    def add(name: str, found: Estimates) -> None:
-        off = (found.means - centre) / spread
+    def add(name: str, estimated: Estimates) -> None:
+        off = (estimated.means - centre) / spread
         effective = len(off) / float(off.square().mean())
         z = float(off.mean() / (off.std() / math.sqrt(len(off))))
-        rates[name] = effective / found.seconds
-        lines.append([name, len(off), float(off.mean()), z, effective, found.seconds, rates[name]])
+        rates[name] = effective / estimated.seconds
+        lines.append([name, len(off), float(off.mean()), z, effective, estimated.seconds, rates[name]])
         rows.append(Row(f"{name}: effective draws a second", rates[name], "1/s"))
         if not name.startswith("particles"):
             rows.append(Row(f"{name}: |z| of the posterior mean", abs(z), "standard errors", 3.5))
-        if found.log_evidences is not None:
-            ratio = (found.log_evidences - evidence).exp()
+        if estimated.log_evidences is not None:
+            ratio = (estimated.log_evidences - evidence).exp()
             rows.append(Row(f"{name}: Z-hat / Z", float(ratio.mean()), ""))
-            rows.append(Row(f"{name}: deviation of log Z", float(found.log_evidences.std()), "nats"))
+            rows.append(Row(f"{name}: deviation of log Z", float(estimated.log_evidences.std()), "nats"))
             z = float((ratio.mean() - 1.0) / (ratio.std() / math.sqrt(len(ratio))))
             rows.append(Row(f"{name}: |z| of Z-hat / Z", abs(z), "standard errors", 3.5))
 
@@ -172,8 +172,8 @@ def parameters(observed: Tensor, size: Size, seed: int) -> list[Row]:
     for name, method in methods.items():
         torch.manual_seed(seed)
         add(name, method(observed, size))
-    for method_name, found in peers(size, seed).items():
-        add(f"particles, {'PMMH' if method_name == 'pmmh' else 'SMC^2'}", found)
+    for method_name, estimated in peers(size, seed).items():
+        add(f"particles, {'PMMH' if method_name == 'pmmh' else 'SMC^2'}", estimated)
     columns = ["method", "runs", "bias / sd", "z", "effective", "seconds", "effective a second"]
     show(f"rho, exact {centre:.4f} +- {spread:.4f}", columns, lines)
     for name in ("PMMH", "SMC^2"):

@@ -52,8 +52,8 @@ def nudge(trace: Trace) -> None:
 
 
 def z_of(values: list[float], exact: float) -> float:
-    found = torch.tensor(values, dtype=torch.float64)
-    return float((found.mean() - exact) / (found.std() / math.sqrt(len(found))))
+    estimates = torch.tensor(values, dtype=torch.float64)
+    return float((estimates.mean() - exact) / (estimates.std() / math.sqrt(len(estimates))))
 
 
 def test_persistent_sampling_has_the_evidence_and_the_moments() -> None:

@@ -45,13 +45,13 @@ def wide(trace: Trace, observed: Observed) -> None:
 
 def log_ratios(step: Any, particles: int, seeds: int) -> Tensor:
     """Log Z-hat / Z of several runs."""
-    found = []
+    estimates = []
     for seed in range(seeds):
         torch.manual_seed(seed)
         begun = importance_sampling(with_known(RHO), (), {}, particles)
         *_, last = steps(step, begun, [Observed((), {"y": y}) for y in SEEN[:T]])
-        found.append(last.population.log_evidence - EXACT)
-    return torch.tensor(found, dtype=torch.float64)
+        estimates.append(last.population.log_evidence - EXACT)
+    return torch.tensor(estimates, dtype=torch.float64)
 
 
 def z_of_mean(log_ratio: Tensor) -> float:

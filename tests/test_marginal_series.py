@@ -118,9 +118,11 @@ def chains_of(reestimated: bool, count: int, moves: int) -> Tensor:
 
 def largest(values: Tensor) -> float:
     grid, chance, _ = posterior(T)
-    found = torch.stack([values, values**2, (values > 0.5).to(torch.float64)])
+    estimates = torch.stack([values, values**2, (values > 0.5).to(torch.float64)])
     exact = torch.stack([grid, grid**2, (grid > 0.5).to(torch.float64)]) @ chance
-    return float(((found.mean(dim=1) - exact) / (found.std(dim=1) / math.sqrt(len(values)))).abs().max())
+    return float(
+        ((estimates.mean(dim=1) - exact) / (estimates.std(dim=1) / math.sqrt(len(values)))).abs().max()
+    )
 
 
 def test_pmmh_leaves_the_posterior_and_chains_that_estimate_again_do_not() -> None:

@@ -76,8 +76,8 @@ def main() -> None:
     ):
         for _ in range(count):
             begun = time.process_time()
-            found = run(observed, prior, arguments.states, size)
-            emit(peer="particles", method=name, seconds=time.process_time() - begun, **found)
+            estimated = run(observed, prior, arguments.states, size)
+            emit(peer="particles", method=name, seconds=time.process_time() - begun, **estimated)
 
 
 if __name__ == "__main__":
