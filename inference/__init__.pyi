@@ -1,4 +1,5 @@
 from bcppl.inference import (
+    annealing as annealing,
     calibration as calibration,
     chains as chains,
     collectors as collectors,
@@ -10,6 +11,7 @@ from bcppl.inference import (
     resampling as resampling,
     saved as saved,
     structures as structures,
+    series as series,
     summaries as summaries,
     targets as targets,
 )

@@ -15,6 +15,7 @@ from bcppl.exports import exported
 
 HEAVY = ("torch", "pyro", "scipy", "matplotlib", "mujoco", "numpy", "trimesh", "numba", "h5py")
 DOORS = ("bcppl", "bcppl.inference", "bcppl.inference.design", "bcppl.inference.planning")
+DOORS += ("bcppl.inference.annealing", "bcppl.inference.series")
 DOORS += ("bcppl.models", "bcppl.models.worlds", "bcppl.contact.sensing")
 
 

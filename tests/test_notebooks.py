@@ -206,3 +206,39 @@ def test_where_to_touch_chooses_and_ends_in_the_hole(kernel: Any, smaller: Small
     after = re.findall(r"ADD ([\d.]+) mm", printed["touch"])
     assert len(after) == (2 if smaller else 3) and float(after[-1]) < 0.25 * float(before)
     assert "inserted: True" in printed["insert"]
+
+
+@shipped_or(
+    {
+        "imports": [("SEED, T = 0, 60", "SEED, T = 0, 15")],
+        "reference": [("GRID, DRAWS = 100, 1500", "GRID, DRAWS = 60, 400")],
+        "methods": [
+            ("CHAINS, MOVES, GIBBS_MOVES = 40, 60, 40", "CHAINS, MOVES, GIBBS_MOVES = 20, 9, 6"),
+            ("particles=100", "particles=30"),
+            ("filters, ([],), {}, 150", "filters, ([],), {}, 60"),
+        ],
+        "smoothing": [("onward), (), {}, 300)", "onward), (), {}, 100)")],
+        "hares": [("SUBSTEPS = 5", "SUBSTEPS = 3")],
+        "posterior": [("sweeps=30", "sweeps=15"), ("collected, 600, moved", "collected, 200, moved")],
+    }
+)
+def test_series_agree_with_references_that_are_no_particle_filters(kernel: Any, smaller: Smaller) -> None:
+    printed, drawn = run("series", kernel, smaller)
+    assert drawn == {"smoothing", "figure"}
+    rows = re.findall(
+        r"^(reference|particle Gibbs|PMMH|SMC²) +(-?[\d.]+) +(-?[\d.]+) +(-?[\d.]+)",
+        printed["methods"],
+        flags=re.MULTILINE,
+    )
+    table = {name: [float(v) for v in values] for name, *values in rows}
+    assert len(table) == 4
+    allowed = (0.6, 0.1, 0.15) if smaller else (0.15, 0.03, 0.05)
+    for name, values in table.items():
+        off = [abs(a - b) for a, b in zip(values, table["reference"], strict=True)]
+        assert all(a < b for a, b in zip(off, allowed, strict=True)), name
+    (ours,), (exact,) = (
+        re.findall(rf"{label} (-?[\d.]+)", printed["methods"]) for label in ("by SMC²", ", reference")
+    )
+    assert abs(float(ours) - float(exact)) < (1.0 if smaller else 0.7)
+    off = [float(each) for each in re.findall(r" (-?[\d.]+)$", printed["posterior"], flags=re.MULTILINE)]
+    assert len(off) == 8 and max(map(abs, off)) < (1.5 if smaller else 0.4)

@@ -32,6 +32,7 @@ from torch import Tensor
 
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
+from bcppl.traces.carried import Entry
 from bcppl.traces.indexing import Index, composed, indexed
 from bcppl.traces.run import Program, Run
 from bcppl.traces.trace import Trace
@@ -295,6 +296,23 @@ class SeriesTrace(Trace):
 
 class Forgotten(SeriesTrace):
     """An earlier step of which only the state is kept."""
+
+
+def resumed(
+    series: Series, state: Any, steps: int, particles: int, carried: Mapping[str, Entry] | None = None
+) -> SeriesTrace:
+    """A trace of which only the state after some steps is known, for `extend` to run on.
+
+    Args:
+        series: what was run.
+        state: what its newest step returned, the particle axis first.
+        steps: how many were run after `init`.
+        particles: N.
+        carried: simulator states by name (`bcppl.traces.carried`).
+    """
+    trace = Forgotten(Stage(series, steps), (), particles, {}, {}, carried=dict(carried or {}))
+    trace.__dict__["_result"] = state
+    return trace
 
 
 def _forgotten(number: int) -> InputError:

@@ -57,6 +57,38 @@ def linear_gaussian(steps: int, seed: int = 0) -> tuple[np.ndarray[Any, Any], fl
     return observed, float(log_evidence)
 
 
+# x_0 ~ N(0, 1), x_t = rho x_{t-1} + N(0, 1), y_t = x_t + N(0, SERIES_NOISE^2), rho uniform on [-1, 1].
+SERIES_RHO, SERIES_NOISE = 0.9, 0.7
+
+
+def autoregression(steps: int, seed: int = 0) -> np.ndarray[Any, Any]:
+    """Observations (T,) of the autoregression at SERIES_RHO, the first y being y_1."""
+    generator = np.random.default_rng(seed)
+    x = generator.normal()
+    observed = np.empty(steps)
+    for k in range(steps):
+        x = SERIES_RHO * x + generator.normal()
+        observed[k] = x + SERIES_NOISE * generator.normal()
+    return observed
+
+
+def autoregression_posterior(observed: np.ndarray[Any, Any]) -> tuple[float, float, float]:
+    """Posterior mean and standard deviation of rho, and the log evidence: Kalman's filter on a grid."""
+    rho = (np.arange(4000) + 0.5) / 2000.0 - 1.0
+    mean, variance, log = np.zeros_like(rho), np.ones_like(rho), np.zeros_like(rho)
+    for y in observed:
+        mean, variance = rho * mean, rho**2 * variance + 1.0
+        spread = variance + SERIES_NOISE**2
+        log -= 0.5 * (np.log(2 * np.pi * spread) + (y - mean) ** 2 / spread)
+        gain = variance / spread
+        mean, variance = mean + gain * (y - mean), (1 - gain) * variance
+    weights = np.exp(log - log.max())
+    evidence = float(log.max() + np.log(weights.mean()))
+    weights /= weights.sum()
+    centre = float(weights @ rho)
+    return centre, float(np.sqrt(weights @ (rho - centre) ** 2)), evidence
+
+
 def emit(**fields: Any) -> None:
     """Print one result as a JSON line."""
     print(json.dumps(fields), flush=True)

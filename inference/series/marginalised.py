@@ -1,0 +1,175 @@
+"""The program of a series' static parameters, its states integrated out by particle filters.
+
+    walk = marginal(Series(init, step), "rho", observed="y", particles=100)
+    observed = {f"y/{t}": y for t, y in enumerate(ys, 1)}
+    trace, _ = generate(walk, ([()] * len(ys),), observed, 20)
+    chains = markov_chains(metropolis_hastings(drift("rho")), trace, moves=1000)  # PMMH
+
+Its sites are the parameters, and the observations under the addresses of `unrolled(series)`. The likelihood
+of each step is a filter's unbiased estimate, which belongs to the particle. So shipped kernels are
+pseudo-marginal (Andrieu and Roberts, Annals of Statistics 37, 2009): Metropolis-Hastings is PMMH (Andrieu,
+Doucet and Holenstein, Particle Markov chain Monte Carlo methods, JRSS B 72, 2010, section 2.4.2), and SMC
+over the steps with such moves is SMC^2 (Chopin, Jacob and Papaspiliopoulos, JRSS B 75, 2013, section 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import pyro
+import torch
+from pyro.poutine.messenger import Messenger
+from torch import Tensor
+
+from bcppl.arguments import number_within, whole_number
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.errors import InputError
+from bcppl.inference.series.nested import Filters
+from bcppl.traces import Series, carried, extend, simulate
+
+
+class SeriesLikelihood(LazyDistribution):
+    """The likelihood of one step of a series given those before it, as M particle filters estimate it.
+
+    An estimate is drawn once. It belongs to the filters, which the trace carries, and which are made again
+    where a static parameter changes and at no other time: `log_prob` of what has not changed is the same
+    number whenever it is asked for. Pseudo-marginal kernels leave their target invariant only so.
+
+    Attributes:
+        filters: M of them.
+        number: of the step, from 1.
+        address: of the observation in the series' step.
+        args: the arguments of the step.
+    """
+
+    cost = 2
+
+    def __init__(
+        self,
+        filters: Filters,
+        number: int,
+        address: str,
+        args: tuple[Any, ...],
+        event_shape: tuple[int, ...],
+    ) -> None:
+        self.filters, self.number, self.address, self.args = filters, number, address, args
+        super().__init__(len(filters.log_weights), event_shape)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Estimate (M,) of the log-likelihood of the step's observation, (*event_shape)."""
+        return self.filters.log_increment(self.number, self.address, self.args, value)
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """Refused: filters only weigh observations."""
+        raise InputError(
+            f"observation {self.address!r} of a series has no value, and its filters only weigh one; give "
+            "it, or simulate `unrolled(series)`, which has the same addresses."
+        )
+
+
+def marginal(series: Series, *static: str, observed: str, particles: int, threshold: float = 0.5) -> Marginal:
+    """The program of a series' static parameters given its observations, with filters for its states.
+
+    Args:
+        series: `init` samples the static parameters, whatever their distribution depends on before them, and
+            returns them in the state.
+        static: addresses of the static parameters, one or more.
+        observed: the address at which each step observes.
+        particles: N of each filter. A standard deviation of the estimated log-likelihood of 1 to 1.5 is a
+            good compromise (Doucet, Pitt, Deligiannidis and Kohn, Biometrika 102, 2015).
+        threshold: a filter resamples when its effective sample size is below this share of N.
+
+    Returns:
+        A program `(steps, *args)`: `steps` is a list of the arguments of each step, `args` are those of
+        `init`. Step t is observed at f"{observed}/{t}", t from 1.
+
+    Raises:
+        InputError: no static parameter is named, or a number is out of range; when it runs: `init` samples
+            no such address, or a step visits no such observation.
+    """
+    if not static:
+        raise InputError("marginal is given no static parameter; name the addresses that `init` samples.")
+    particles = whole_number("the filters of a series are to have {} particles", particles)
+    threshold = number_within(
+        "the filters of a series are given the threshold {}", threshold, least=0, most=1
+    )
+    return Marginal(series, static, observed, particles, threshold)
+
+
+@dataclass(frozen=True, eq=False)
+class Marginal:
+    """The program that `marginal` makes."""
+
+    series: Series
+    static: tuple[str, ...]
+    observed: str
+    particles: int
+    threshold: float
+    _shapes: dict[int, tuple[int, ...]] = field(default_factory=dict, repr=False)
+
+    def __call__(self, steps: Sequence[tuple[Any, ...]], *args: Any) -> None:
+        """Sample the static parameters, and visit the observation of each step."""
+        with _Until(self.static) as parameters:
+            self.series.init(*args)
+        if missing := [address for address in self.static if address not in parameters.values]:
+            raise InputError(
+                f"a series' `init` samples no static parameter {missing[0]!r}; name what it samples."
+            )
+        values = [parameters.values[address] for address in self.static]
+        begin = partial(
+            Filters.before, self.series, args, self.particles, self.threshold, self.static, *values
+        )
+        filters = carried(f"filters of {self.observed}", begin)
+        for number, each in enumerate(steps, 1):
+            shape = self._event_shape(args, each)
+            site = SeriesLikelihood(filters, number, self.observed, each, shape)
+            pyro.sample(f"{self.observed}/{number}", site)
+
+    def _event_shape(self, args: tuple[Any, ...], step: tuple[Any, ...]) -> tuple[int, ...]:
+        """The shape of the observation, from one run of the first step."""
+        if not self._shapes:
+            with torch.random.fork_rng(devices=[]):
+                trace, _ = extend(simulate(self.series, args), step, {})
+            if self.observed not in trace.addresses:
+                raise InputError(
+                    f"a series' step visits no observation {self.observed!r}; "
+                    f"it visits {', '.join(trace.addresses) or 'none'}."
+                )
+            site = trace.distributions[self.observed]
+            self._shapes[1] = (*site.batch_shape[:-1], *site.event_shape)
+        return self._shapes[1]
+
+
+class _CompleteError(Exception):
+    """All addresses have values."""
+
+
+class _Until(Messenger):
+    """Runs a program until some addresses have values; other sites are no part of the run around it."""
+
+    def __init__(self, addresses: Sequence[str]) -> None:
+        super().__init__()
+        self.addresses = addresses
+        self.values: dict[str, Tensor] = {}
+
+    def _pyro_sample(self, message: Any) -> None:
+        if message["name"] not in self.addresses:
+            message["stop"] = True
+
+    def _pyro_post_sample(self, message: Any) -> None:
+        if message["name"] not in self.addresses:
+            return
+        value, site = message["value"], message["fn"]
+        plates = len(site.batch_shape) - 1
+        if value.ndim < len(site.batch_shape) + len(site.event_shape):
+            value = value.unsqueeze(plates)
+        self.values[message["name"]] = value.expand(site.shape()).movedim(plates, 0)
+        if len(self.values) == len(self.addresses):
+            raise _CompleteError
+
+    def __exit__(self, kind: Any, error: Any, traceback: Any) -> bool:  # type: ignore[override]
+        super().__exit__(kind, error, traceback)
+        return kind is _CompleteError
