@@ -10,8 +10,8 @@ from bcppl.inference import (
     proposals as proposals,
     resampling as resampling,
     saved as saved,
-    structures as structures,
     series as series,
+    structures as structures,
     summaries as summaries,
     targets as targets,
 )

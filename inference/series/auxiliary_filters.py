@@ -1,6 +1,6 @@
 """Auxiliary particle filters: resampling looks ahead, and new states are drawn by a proposal.
 
-def ahead(trace, observed):  # log of what p(y | state) is, about
+def ahead(trace, observed):  # about log p(y | state)
 return dist.Normal(trace["x"], 1.2).log_prob(observed.observations["y"])
 
 def towards(trace, observed):
