@@ -1,21 +1,33 @@
 """Series with static parameters, and their smoothing: two programs of a series, a kernel, a step, a verb.
 
-A series is a pair of programs `Series(init, step)` (`bcppl.traces.series`). What `init` samples and every
-state keeps is a static parameter.
+    import pyro
+    import pyro.distributions as dist
+    import torch
+    from bcppl.inference import markov_chains
+    from bcppl.inference.kernels import metropolis_hastings
+    from bcppl.inference.proposals import drift
+    from bcppl.inference.series import marginal
+    from bcppl.traces import Series, generate
 
     def init():
-        drift = pyro.sample("drift", dist.Normal(0.0, 1.0))
-        return {"drift": drift, "x": pyro.sample("x", dist.Normal(0.0, 1.0))}
+        rate = pyro.sample("rate", dist.Normal(torch.tensor(0.0).double(), 1.0))
+        return {"rate": rate, "x": pyro.sample("x", dist.Normal(0.0, 1.0))}
 
     def step(state):
-        x = pyro.sample("x", dist.Normal(state["x"] + state["drift"], 0.5))
+        x = pyro.sample("x", dist.Normal(state["x"] + state["rate"], 0.5))
         pyro.sample("y", dist.Normal(x, 0.3))
-        return {"drift": state["drift"], "x": x}
+        return {"rate": state["rate"], "x": x}
 
+    program = marginal(Series(init, step), "rate", observed="y", particles=50)
+    seen = {f"y/{t}": torch.tensor(0.4 * t) for t in range(1, 6)}
+    start, _ = generate(program, ([()] * 5,), seen, 20)
+    chains = markov_chains(metropolis_hastings(drift("rate")), start, 20)  # PMMH, 20 chains at once
+
+What `init` samples and every state keeps is a static parameter. `marginal` is the program of the parameters
+alone, its likelihood estimated by particle filters: Metropolis-Hastings on it is PMMH, SMC on it SMC^2.
 `unrolled(series)` is one program with an address for each step: kernels move paths, `particle_gibbs` as a
-whole. `marginal(series, "drift", ...)` has the parameters alone, its likelihood estimated by particle
-filters: Metropolis-Hastings on it is PMMH, SMC on it SMC^2. `auxiliary` is a filter's step with a proposal
-and a prediction; `smooth` draws whole paths from what a filter yields.
+whole. `auxiliary` is a filter's step with a proposal and a prediction; `smooth` draws whole paths from what a
+filter yields.
 """
 
 from bcppl.exports import exported
