@@ -43,7 +43,9 @@ def drawn(distribution: Any) -> Tensor | None:
     if type(distribution) is not dist.Normal:
         return None
     mean = distribution.loc
-    if mean.numel() < MANY or mean.dtype != torch.float64 or mean.device.type != "cpu" or mean.requires_grad:
+    if mean.numel() < MANY or mean.dtype != torch.float64 or mean.device.type != "cpu":
+        return None
+    if mean.requires_grad or distribution.scale.requires_grad:
         return None
     uniform = torch.rand(distribution.batch_shape, dtype=torch.float64).mul_(2.0).sub_(1.0 - 2.0**-53)
     return uniform.erfinv_().mul_(_once(distribution.scale) * math.sqrt(2.0)).add_(mean)

@@ -27,6 +27,7 @@ from bcppl.distributions.shortcuts import drawn
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry, carrying
 from bcppl.traces.explained import explained, unfit, unfit_particles, unsampled
+from bcppl.traces.graph import graph, kept, taken_out
 from bcppl.traces.structural import STRUCTURAL, UnchosenError
 from bcppl.traces.surroundings import surroundings
 from bcppl.traces.values import Value, tensors
@@ -95,12 +96,17 @@ def run(
     particles = whole_number("a program was to be run for {} particles", particles)
     given = tensors(given)
     recorder = _Recorder(particles, given, draws_lazy)
-    with carrying(carried, particles) as used, torch.no_grad(), pyro.validation_enabled(False):
+    with carrying(carried, particles) as used, graph(), pyro.validation_enabled(False):
         try:
             with _apart(), recorder, _Particles(PARTICLES, particles, dim=-1) as plate:
                 result = program(*args)
         except (RuntimeError, TypeError, ValueError) as error:
-            reason = explained(error, particles, next(reversed(recorder.distributions), None))
+            last = next(reversed(recorder.distributions), None)
+            if kept() and "requires grad" in str(error):
+                raise taken_out(
+                    "the program" + ("" if last is None else f", after site {last!r},")
+                ) from error
+            reason = explained(error, particles, last)
             if reason is error:
                 raise
             raise reason from error

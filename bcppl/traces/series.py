@@ -33,6 +33,7 @@ from torch import Tensor
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
+from bcppl.traces.graph import kept
 from bcppl.traces.indexing import Index, composed, indexed
 from bcppl.traces.run import Program, Run
 from bcppl.traces.trace import Trace
@@ -200,7 +201,7 @@ class SeriesTrace(Trace):
         """The sum over all steps; each step's is kept, so that asking after every step costs no more."""
         links: list[tuple[SeriesTrace, Tensor | None]] = []
         node: SeriesTrace | None = self
-        while node is not None and "_total" not in node.__dict__:
+        while node is not None and (kept() or "_total" not in node.__dict__):
             links.append((node, node.stage.chosen))
             if isinstance(node, Forgotten):
                 raise _forgotten(node.steps)
@@ -210,7 +211,9 @@ class SeriesTrace(Trace):
             own = node.log_prob(*node.addresses) if node.addresses else torch.zeros(node.particles)
             if total is not None:
                 own = own + (total if chosen is None else total.index_select(0, chosen))
-            total = node.__dict__["_total"] = own.to(torch.float64)
+            total = own.to(torch.float64)
+            if not kept():
+                node.__dict__["_total"] = total
         assert total is not None
         return total
 

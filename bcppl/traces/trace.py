@@ -20,6 +20,7 @@ from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.dependence import comparison, equal
 from bcppl.traces.explained import changed_outside, hidden_site, not_a_number, other_addresses, refuse_masked
+from bcppl.traces.graph import graph, kept, refuse_cut, taken_out
 from bcppl.traces.indexing import Index, beside, particles_at
 from bcppl.traces.run import Program, Run, inward, run
 from bcppl.traces.structural import Structure
@@ -62,6 +63,17 @@ class Trace:
         self.carried.update(again.carried)
         return again
 
+    @cached_property
+    def _attached(self) -> Run:
+        """The same run with gradients kept: one without them is attached to some tensors only, or to none."""
+        return run(
+            self.program, self.args, self.particles, {**self.choices, **self.observations}, self.carried
+        )
+
+    @property
+    def _ran(self) -> Run:
+        return self._attached if kept() else self._run
+
     @classmethod
     def of_run(
         cls,
@@ -86,14 +98,16 @@ class Trace:
     def _keep_run(self, ran: Run) -> None:
         """Keep the run that these values come from, so that the program is not run again for them."""
         self.__dict__["_run"] = ran
+        if kept():
+            self.__dict__["_attached"] = ran
         self.carried.update(ran.carried)
 
     @property
     def distributions(self) -> Mapping[str, Any]:
         """The distribution of every site at these values, by address in the program's order."""
         if self.hidden:
-            return _Hiding(self._run.distributions, hidden=self.hidden)
-        return MappingProxyType(self._run.distributions)
+            return _Hiding(self._ran.distributions, hidden=self.hidden)
+        return MappingProxyType(self._ran.distributions)
 
     @property
     def addresses(self) -> list[str]:
@@ -125,17 +139,21 @@ class Trace:
     def _site(self, address: str) -> Tensor:
         if address in self.hidden:
             raise hidden_site(address)
+        if kept():
+            # What was evaluated without gradients is a constant; what is evaluated with them is not kept.
+            self._run.refuse_unvisited([address])
+            return self._evaluated(address)
         if address not in self.known:
             self._run.refuse_unvisited([address])
             self.known[address] = self._evaluated(address)
         return self.known[address]
 
     def _evaluated(self, address: str) -> Tensor:
-        distribution = self._run.distributions[address]
+        distribution = self._ran.distributions[address]
         if address in self.choices:
             refuse_masked(address, distribution)
         # A value that another one has moved out of the support is impossible, not a mistake.
-        with torch.no_grad(), pyro.validation_enabled(False):
+        with graph(), pyro.validation_enabled(False):
             value = self._log_prob_of(address, distribution)
         batch = distribution.batch_shape
         if value.shape not in ((), batch):
@@ -152,10 +170,23 @@ class Trace:
         return value
 
     def _log_prob_of(self, address: str, distribution: Any) -> Tensor:
-        value = inward(self._run.values[address], distribution)
-        if address not in self._run.surroundings:
-            return log_prob_inside(narrowed(distribution), value)
-        then, now = self._run.surroundings[address], surroundings_of(distribution)
+        value = inward(self._ran.values[address], distribution)
+        if not kept():
+            return self._log_prob_at(address, narrowed(distribution), value)
+        try:
+            attached = self._log_prob_at(address, distribution, value)
+        except RuntimeError as error:
+            if "requires grad" not in str(error):
+                raise
+            raise taken_out(f"site {address!r}") from error
+        if not attached.requires_grad:
+            refuse_cut(address, distribution)
+        return attached
+
+    def _log_prob_at(self, address: str, distribution: Any, value: Tensor) -> Tensor:
+        if address not in self._ran.surroundings:
+            return log_prob_inside(distribution, value)
+        then, now = self._ran.surroundings[address], surroundings_of(distribution)
         if (name := surroundings_changed(then, now)) is not None:
             raise changed_outside(address, name)
         return evaluated(distribution, lambda: log_prob_inside(distribution, value))
@@ -224,7 +255,7 @@ class Trace:
         hidden = frozenset(addresses)
         self._run.refuse_unvisited(hidden)
         secret = replace(self, known=dict(self.known), hidden=self.hidden | hidden)
-        secret._keep_run(self._run)
+        secret._keep_run(self._ran)
         return secret
 
     def at(self, values: Mapping[str, Value]) -> Trace:
@@ -342,6 +373,10 @@ def _of_each_particle(value: Tensor, site: Any, particles: int) -> Tensor:
 def changed(first: Trace, second: Trace, addresses: Iterable[str]) -> Iterator[str]:
     """Those of some addresses of two traces whose values or distributions differ."""
     same, then, now = comparison(), first._run, second._run
+    if kept():
+        # Equal numbers may depend on different tensors.
+        yield from addresses
+        return
     for address in addresses:
         if (
             not equal(then.values[address], now.values[address])

@@ -17,6 +17,7 @@ from bcppl.distributions.support import refuse_several_poses
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.faults import Fault, ProgramError
+from bcppl.traces.graph import kept
 from bcppl.traces.indexing import indexed
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.series import Series, SeriesTrace, Stage, runnable
@@ -166,7 +167,8 @@ def _traced(
 
 def copied(observations: Mapping[str, Value]) -> dict[str, Tensor]:
     """Observations as a trace keeps them: an array that is written to again does not change it."""
-    return {address: value.detach().clone() for address, value in tensors(observations).items()}
+    values = tensors(observations).items()
+    return {a: value.clone() if kept() else value.detach().clone() for a, value in values}
 
 
 def _refuse_fixed(ran: Run) -> None:

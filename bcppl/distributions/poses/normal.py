@@ -53,7 +53,7 @@ class NormalPose(PoseDistribution):
             torch.zeros(freedom.dimension, dtype=torch.float64), scale_tril=scale, validate_args=False
         )
         turns = [k for k, axis in enumerate(freedom.axes) if axis >= 3]
-        widest = float(matrix.diagonal(dim1=-2, dim2=-1)[..., turns].max().sqrt()) if turns else 0.0
+        widest = float(matrix.detach().diagonal(dim1=-2, dim2=-1)[..., turns].max().sqrt()) if turns else 0.0
         # Beyond half a radian the neighbouring windings carry more than 1e-16 of the mass.
         self._windings = (0.0,) if widest < 0.5 else (0.0, -2.0 * math.pi, 2.0 * math.pi)
         middle = torch.as_tensor(center, dtype=torch.float64)
