@@ -27,7 +27,15 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import latent_address, whole_number
-from bcppl.inference.kernels import Kernel, fitted, halved, halves, refuse_other, scattered
+from bcppl.inference.kernels import (
+    Kernel,
+    fitted,
+    halved,
+    halves,
+    moved_by,
+    refuse_other,
+    scattered,
+)
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.resampling import Scheme, systematic
@@ -65,6 +73,7 @@ def markov_chains(
     *,
     addresses: Collection[str] | str | None = None,
     every: int = 1,
+    warm_up: int = 0,
     scheme: Scheme | None = systematic,
     progress: bool = True,
 ) -> Chains:
@@ -82,6 +91,8 @@ def markov_chains(
         target: left invariant by the chains.
         addresses: the latent addresses to record, or one; by default all.
         every: record after each so many moves.
+        warm_up: moves before the first recorded one, discarded. For each of them the kernel is fitted again
+            to the other half of the chains, so that an adaptive kernel is tuned to where they are.
         scheme: resamples; None starts a chain at every particle, whatever its weight.
         progress: show a bar, on a terminal or in a notebook.
 
@@ -91,12 +102,15 @@ def markov_chains(
     refuse_other("markov_chains", kernel)
     moves = whole_number("chains are to make {} moves", moves)
     every = whole_number("chains are to be recorded every {} moves", every)
+    warm_up = whole_number("chains are to warm up for {} moves", warm_up, least=0)
     if isinstance(start, Trace):
         start = Population(start, torch.zeros(start.particles, dtype=torch.float64))
     population = start
     weights = population.log_weights
     if scheme is not None and bool((weights != weights[0]).any()):
         population = population.selected(scheme(weights))
+    if warm_up:
+        population = moved_by(population, kernel, target, warm_up).population
     trace, count = population.trace, len(population)
     addresses = [addresses] if isinstance(addresses, str) else addresses
     recorded = list(trace.choices if addresses is None else addresses)

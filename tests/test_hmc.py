@@ -174,9 +174,9 @@ def test_mutant_that_forgets_the_momentum(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_mutant_that_drops_the_jacobian_of_the_support(monkeypatch: pytest.MonkeyPatch) -> None:
-    sound = hamiltonian._Unconstrained.values
+    sound = hamiltonian.Unconstrained.values
     monkeypatch.setattr(
-        hamiltonian._Unconstrained,
+        hamiltonian.Unconstrained,
         "values",
         lambda self, z: (sound(self, z)[0], torch.zeros(len(z), dtype=torch.float64)),
     )

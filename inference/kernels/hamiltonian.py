@@ -49,45 +49,58 @@ def hmc(
         support without unconstrained coordinates; moving raises it where a site that depends on the
         addresses runs a simulator or passes no gradient on. A trajectory that diverges is rejected.
     """
-    named = tuple(a for each in addresses for a in ([each] if isinstance(each, str) else each))
-    if not named:
-        raise InputError("hmc was given no address to move; name at least one.")
+    named = named_addresses("hmc", addresses)
     step_size = number_within("hmc was given step size {}", step_size, above=0.0)
     steps = whole_number("hmc was given {} steps", steps)
     jitter = number_within("hmc was given jitter {}", jitter, least=0.0, below=1.0)
 
     def kernel(population: Population) -> Move:
-        factor = _factor(_Unconstrained(named, population.trace), population)
-
-        def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-            space = _Unconstrained(named, trace)
-            exponents = target.exponents if isinstance(target, Target) else {}
-            start = space.read(trace)
-            scale = 1.0 + jitter * (2.0 * torch.rand(len(trace), 1, dtype=torch.float64) - 1.0)
-            momentum = torch.randn_like(start)
-            position, last = leapfrog(
-                lambda z: space.gradient(trace, z, exponents) @ factor,
-                start,
-                momentum,
-                step_size * scale.to(start.device),
-                steps,
-                factor,
-            )
-            sound = (torch.isfinite(position) & torch.isfinite(last)).all(dim=1)
-            position = torch.where(sound[:, None], position, start)
-            values, log_jacobian = space.values(position)
-            # Where an exponential has overflowed or underflowed, the particle has left the support.
-            sound &= torch.isfinite(log_jacobian) & space.inside(values)
-            values = {a: torch.where(beside(sound, v), v, trace[a]) for a, v in values.items()}
-            log_ratio = 0.5 * (momentum**2 - last**2).sum(dim=1) + log_jacobian - space.values(start)[1]
-            log_ratio = torch.where(sound, log_ratio, -torch.inf)
-            new = update(trace, values).trace
-            space.refuse_moved_bounds(new)
-            return decided(target, trace, new, log_ratio)
-
-        return move
+        factor = _factor(Unconstrained(named, population.trace), population)
+        return hamiltonian_move(named, factor, step_size, steps, jitter)
 
     return kernel
+
+
+def named_addresses(kernel: str, addresses: Sequence[str | Sequence[str]]) -> tuple[str, ...]:
+    """Addresses that were given one by one or as a list; InputError where there is none."""
+    named = tuple(a for each in addresses for a in ([each] if isinstance(each, str) else each))
+    if not named:
+        raise InputError(f"{kernel} was given no address to move; name at least one.")
+    return named
+
+
+def hamiltonian_move(
+    addresses: tuple[str, ...], factor: Tensor, step_size: float, steps: int, jitter: float
+) -> Move:
+    """The move of `hmc` with an inverse mass matrix of Cholesky factor `factor` (D, D)."""
+
+    def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
+        space = Unconstrained(addresses, trace)
+        exponents = target.exponents if isinstance(target, Target) else {}
+        start = space.read(trace)
+        scale = 1.0 + jitter * (2.0 * torch.rand(len(trace), 1, dtype=torch.float64) - 1.0)
+        momentum = torch.randn_like(start)
+        position, last = leapfrog(
+            lambda z: space.gradient(trace, z, exponents) @ factor,
+            start,
+            momentum,
+            step_size * scale.to(start.device),
+            steps,
+            factor,
+        )
+        sound = (torch.isfinite(position) & torch.isfinite(last)).all(dim=1)
+        position = torch.where(sound[:, None], position, start)
+        values, log_jacobian = space.values(position)
+        # Where an exponential has overflowed or underflowed, the particle has left the support.
+        sound &= torch.isfinite(log_jacobian) & space.inside(values)
+        values = {a: torch.where(beside(sound, v), v, trace[a]) for a, v in values.items()}
+        log_ratio = 0.5 * (momentum**2 - last**2).sum(dim=1) + log_jacobian - space.values(start)[1]
+        log_ratio = torch.where(sound, log_ratio, -torch.inf)
+        new = update(trace, values).trace
+        space.refuse_moved_bounds(new)
+        return decided(target, trace, new, log_ratio)
+
+    return move
 
 
 def leapfrog(
@@ -111,7 +124,7 @@ def leapfrog(
     return position, momentum
 
 
-class _Unconstrained:
+class Unconstrained:
     """Latent values read as vectors (N, D) without bounds."""
 
     def __init__(self, addresses: tuple[str, ...], trace: Trace) -> None:
@@ -160,15 +173,21 @@ class _Unconstrained:
 
     def gradient(self, trace: Trace, position: Tensor, exponents: Mapping[str, float]) -> Tensor:
         """Gradient (N, D) of the log-density of the position."""
+        return self.density(trace, position, exponents)[1]
+
+    def density(
+        self, trace: Trace, position: Tensor, exponents: Mapping[str, float]
+    ) -> tuple[Tensor, Tensor]:
+        """The log-density (N,) of positions (N, D), up to a constant, and its gradient (N, D)."""
         leaf = position.detach().requires_grad_()
         with torch.enable_grad():
             values, log_jacobian = self.values(leaf)
             density = log_prob_with_grad(trace, values, exponents) + log_jacobian
         if not density.requires_grad:
-            return torch.zeros_like(position)
+            return density, torch.zeros_like(position)
         # Where it is NaN, so is the momentum, and the trajectory counts as one that diverges.
         (gradient,) = torch.autograd.grad(density.sum(), leaf)
-        return gradient
+        return density.detach(), gradient
 
 
 def _bounds(support: Any) -> list[Tensor]:
@@ -180,7 +199,7 @@ def _all(mask: Tensor) -> Tensor:
     return mask.reshape(len(mask), -1).all(dim=1)
 
 
-def _factor(space: _Unconstrained, population: Population) -> Tensor:
+def _factor(space: Unconstrained, population: Population) -> Tensor:
     """Cholesky factor (D, D) of the weighted covariance, its correlations shrunk."""
     position = space.read(population.trace)
     weights = normalised(population.log_weights)

@@ -1,0 +1,1 @@
+"""Learning for inference: gradients, trained proposals, adapted kernels."""
