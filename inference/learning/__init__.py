@@ -1,1 +1,16 @@
-"""Learning for inference: gradients, trained proposals, adapted kernels."""
+"""Learning for inference: trained proposals, networks that read measurements, adapted kernels."""
+
+from bcppl.inference.learning.adaptive_hmc import adaptive_hmc
+from bcppl.inference.learning.amortised import Amortised
+from bcppl.inference.learning.objectives import evidence_bound, forward_kl
+from bcppl.inference.learning.training import Checks, Trained, train
+
+__all__ = [
+    "Amortised",
+    "Checks",
+    "Trained",
+    "adaptive_hmc",
+    "evidence_bound",
+    "forward_kl",
+    "train",
+]
