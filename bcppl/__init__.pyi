@@ -37,6 +37,7 @@ from bcppl.traces import (
     assess as assess,
     extend as extend,
     generate as generate,
+    gradients as gradients,
     propose as propose,
     regenerate as regenerate,
     simulate as simulate,

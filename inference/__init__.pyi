@@ -5,6 +5,7 @@ from bcppl.inference import (
     collectors as collectors,
     design as design,
     kernels as kernels,
+    learning as learning,
     planning as planning,
     predictive as predictive,
     proposals as proposals,
@@ -39,6 +40,7 @@ from bcppl.inference.importance import (
     importance_sampling as importance_sampling,
     tempered_importance_sampling as tempered_importance_sampling,
 )
+from bcppl.inference.learning import adaptive_hmc as adaptive_hmc, train as train
 from bcppl.inference.population import Population as Population
 from bcppl.inference.progress import watched as watched
 from bcppl.inference.repetitions import Repeated as Repeated, repeated as repeated

@@ -76,14 +76,14 @@ def test_forward_kl_is_that_of_the_closed_form() -> None:
 
 @pytest.mark.parametrize("samples", [1, 5])
 def test_the_evidence_bound_is_that_of_the_closed_form(samples: int) -> None:
-    """With one sample it is log Z - KL; with more it is between that and log Z, which the posterior attains."""
+    """With one sample it is log Z - KL; with more it is larger; at the posterior it is log Z."""
     torch.manual_seed(0)
     guide = Linear(0.3, 0.2, -0.1)
     bound = partial(evidence_bound, program=program, args=(), observations=SEEN, samples=samples)
     loss = bound(Amortised(guide).given(SEEN), batch=200_000)()
     exact = divergence(guide, 1.5) - LOG_EVIDENCE
     if samples == 1:
-        assert float(loss) == pytest.approx(float(exact), abs=0.01)
+        assert float(loss.detach()) == pytest.approx(float(exact.detach()), abs=0.01)
         for given, right in zip(
             *(torch.autograd.grad(v, list(guide.parameters())) for v in (loss, exact)), strict=True
         ):

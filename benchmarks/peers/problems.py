@@ -87,6 +87,19 @@ def autoregression_posterior(observed: np.ndarray[Any, Any]) -> tuple[float, flo
     weights /= weights.sum()
     centre = float(weights @ rho)
     return centre, float(np.sqrt(weights @ (rho - centre) ** 2)), evidence
+# Logistic regression: rows, standardised features that are correlated as 0.5^|i - j|, prior N(0, I).
+ROWS, FEATURES, CORRELATION, EFFECT = 1000, 50, 0.5, 0.5
+
+
+def logistic_regression(seed: int = 0) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Features (ROWS, FEATURES) and labels (ROWS,), 0 or 1, of true coefficients from N(0, EFFECT^2)."""
+    generator = np.random.default_rng(seed)
+    order = np.arange(FEATURES)
+    factor = np.linalg.cholesky(CORRELATION ** np.abs(np.subtract.outer(order, order)))
+    features = generator.normal(size=(ROWS, FEATURES)) @ factor.T
+    features = (features - features.mean(axis=0)) / features.std(axis=0)
+    chances = 1.0 / (1.0 + np.exp(-features @ generator.normal(scale=EFFECT, size=FEATURES)))
+    return features, (generator.uniform(size=ROWS) < chances).astype(np.float64)
 
 
 def emit(**fields: Any) -> None:
