@@ -14,8 +14,8 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.inference import markov_chains, rejuvenate
 from bcppl.inference.kernels import hamiltonian
-from bcppl.inference.learning import adaptive_hmc as room
-from bcppl.inference.learning.adaptive_hmc import adaptive_hmc, learned_factor, tuned
+from bcppl.inference.learning import hmc_adaptation as room
+from bcppl.inference.learning.hmc_adaptation import adaptive_hmc, learned_factor, tuned
 from bcppl.inference.learning.mass import fisher_covariance
 from bcppl.inference.population import Population
 from bcppl.inference.targets import POSTERIOR, Target
