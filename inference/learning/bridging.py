@@ -1,0 +1,131 @@
+"""Bridging: SMC from a proposal to the posterior, for a proposal that is good but not good enough.
+
+The weights of importance sampling are tempered as a likelihood is: between the proposal q and the posterior p
+lie the densities q^(1 - e) p^e (Neal, Annealed importance sampling, Statistics and Computing 11, 2001, eq. 3,
+with the resampling and the adaptive exponents of `bcppl.inference.filters.tempering`). The closer the
+proposal, the fewer exponents; from the prior it is tempering.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bcppl.arguments import whole_number
+from bcppl.errors import InputError
+from bcppl.inference.exponents import next_exponent
+from bcppl.inference.filters.step import StepInfo, Stepped
+from bcppl.inference.filters.tempering import kept_share
+from bcppl.inference.kernels import Kernel, Until, moved_by, refuse_other
+from bcppl.inference.population import Population
+from bcppl.inference.resampling import adaptive
+from bcppl.inference.targets import POSTERIOR
+from bcppl.traces import Trace, assess, generate, propose
+
+Program = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class Bridge:
+    """The log-density (N,) of q^(1 - e) p^e, a target.
+
+    Attributes:
+        start: the log-density of q.
+        exponent: e.
+    """
+
+    start: Callable[[Trace], Tensor]
+    exponent: float
+
+    def __call__(self, trace: Trace) -> Tensor:
+        """The log-density (N,) of a trace."""
+        return self.exponent * trace.log_prob() + (1.0 - self.exponent) * self.start(trace)
+
+
+def bridged(
+    program: Program,
+    args: tuple[Any, ...],
+    observations: Mapping[str, Tensor],
+    particles: int,
+    proposal: Program,
+    kernel: Kernel,
+    *,
+    sweeps: int | Until = 3,
+    share: float = 0.5,
+) -> Stepped:
+    """Weighted particles of the posterior by SMC from a proposal, and the record of the run.
+
+    Args:
+        program: a Pyro program.
+        args: its arguments.
+        observations: values by address, of the shape of the sites' events.
+        particles: N.
+        proposal: `proposal(*args)`, as for `importance_sampling`; latent addresses that it leaves out are
+            drawn from the program.
+        kernel: moves the particles after each exponent; `hmc` by gradients of the posterior, which its target
+            does not depend on. Delayed acceptance has no stages here.
+        sweeps: how many moves of every particle after each resampling, or `until(...)`.
+        share: exponents keep the conditional effective sample size above this share of the particles.
+
+    Raises:
+        InputError: what is given is no kernel, a number is out of range, the proposal samples no address, or
+            what `importance_sampling` refuses.
+    """
+    refuse_other("bridged", kernel)
+    share = kept_share(share)
+    if not isinstance(sweeps, Until):
+        sweeps = whole_number("bridging is to move the particles in {} sweeps", sweeps)
+    proposed = propose(proposal, args, particles)
+    if not proposed.choices:
+        raise InputError("a proposal for bridging samples no address; temper from the prior instead.")
+    trace, _ = generate(program, args, observations, particles, proposed.choices)
+    start = _Start(proposal, args, tuple(proposed.choices))
+    population = Population(trace, torch.zeros(particles, dtype=torch.float64))
+    ratio, exponents, acceptances, resampled = trace.log_prob() - start(trace), [0.0], [], 0
+    resample = adaptive()
+    ancestors, before = None, float("nan")
+    while exponents[-1] < 1.0:
+        last = exponents[-1]
+        exponent = 1.0 if share <= 0.0 else next_exponent(population.log_weights, ratio, last, share)
+        exponents.append(exponent)
+        weighed = population.reweighed((exponent - last) * ratio)
+        population, chosen = resample(weighed)
+        if chosen is not None:
+            target: Any = Bridge(start, exponent) if exponent < 1.0 else POSTERIOR
+            resampled, before = resampled + 1, weighed.effective_sample_size
+            ancestors = chosen if ancestors is None else ancestors[chosen]
+            moved = moved_by(population, kernel, target, sweeps)
+            population = moved.population
+            acceptances.append(moved.acceptance)
+        if exponent < 1.0:
+            ratio = population.trace.log_prob() - start(population.trace)
+    size = population.effective_sample_size
+    info = StepInfo(
+        sum(acceptances) / len(acceptances) if acceptances else float("nan"),
+        tuple(exponents[1:]),
+        resampled,
+        before if resampled else size,
+        size,
+        population.log_evidence,
+        ancestors,
+    )
+    return Stepped(population, info)
+
+
+@dataclass(frozen=True)
+class _Start:
+    """The log-density (N,) of a trace's latent values: some from a proposal, the others from the program."""
+
+    proposal: Program
+    args: tuple[Any, ...]
+    addresses: tuple[str, ...]
+
+    def __call__(self, trace: Trace) -> Tensor:
+        values = {address: trace[address] for address in self.addresses}
+        others = [address for address in trace.choices if address not in values]
+        total = assess(self.proposal, self.args, values, trace.particles)
+        return total + trace.log_prob(*others) if others else total
