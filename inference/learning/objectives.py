@@ -18,7 +18,7 @@ from torch import Tensor
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.inference.learning.amortised import Amortised
-from bcppl.traces import assess, generate, gradients, simulate
+from bcppl.traces import Trace, assess, generate, gradients, simulate
 from bcppl.traces.graph import carries
 from bcppl.traces.run import Program
 
@@ -66,21 +66,21 @@ def forward_kl(
                 )
         seen = {address: joint[address] for address in observed}
 
-        def guide() -> None:
+        def guide(_: Trace) -> None:
             proposal.guide(seen, *drawn)
 
         latent = {a: v for a, v in joint.choices.items() if a not in seen}
         if not asked:
-            asked.extend(_sampled(guide, latent, batch))
+            asked.extend(_sampled(guide, joint, latent))
         with gradients():
-            return -assess(guide, (), {a: latent[a] for a in asked}, batch).mean()
+            return -assess(guide, (joint,), {a: latent[a] for a in asked}, batch).mean()
 
     return loss
 
 
-def _sampled(guide: Callable[[], None], latent: Mapping[str, Tensor], batch: int) -> list[str]:
+def _sampled(guide: Program, joint: Trace, latent: Mapping[str, Tensor]) -> list[str]:
     """The addresses that a proposal samples."""
-    addresses = list(simulate(guide, (), batch).choices)
+    addresses = list(simulate(guide, (joint,), joint.particles).choices)
     for address in addresses:
         if address not in latent:
             raise InputError(
