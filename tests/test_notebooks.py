@@ -242,3 +242,53 @@ def test_series_agree_with_references_that_are_no_particle_filters(kernel: Any, 
     assert abs(float(ours) - float(exact)) < (1.0 if smaller else 0.7)
     off = [float(each) for each in re.findall(r" (-?[\d.]+)$", printed["posterior"], flags=re.MULTILINE)]
     assert len(off) == 8 and max(map(abs, off)) < (1.5 if smaller else 0.4)
+        "invariance": [("count=20_000", "count=4000")],
+        "chains": [("[:50]", "[:10]"), ("moves=200", "moves=60")],
+        "smc": [("range(20)", "range(4)")],
+    }
+)
+def test_own_kernel_is_right_and_its_mutant_is_not(kernel: Any, smaller: Smaller) -> None:
+    printed, drawn = run("own_kernel", kernel, smaller)
+    assert drawn == {"see", "chains"}
+    tested = "".join(printed[cell] for cell in ("invariance", "mutant", "learned", "compose"))
+    found = re.findall(r"^(.+?):? +largest \|z\| +([\d.]+), acceptance ([\d.]+)$", tested, re.MULTILINE)
+    z = {name: float(value) for name, value, _ in found}
+    assert len(z) == 8 and all(float(taken) > 0.05 for *_, taken in found)
+    assert z.pop("forgetful") > (6.0 if smaller else 12.0)
+    assert max(z.values()) < 4.5
+    shares = re.findall(r"^(.+?) +([\d.]+) of the time in the first mode", printed["chains"], re.MULTILINE)
+    times = {name: float(value) for name, value in shares}
+    assert len(times) == 4 and times["random walk"] == 1.0 and times["HMC"] == 1.0
+    assert all(abs(times[name] - 0.5) < 0.1 for name in ("HMC and exchange", "walk or exchange"))
+    assert len(re.findall(r"standard deviation [\d.]+$", printed["smc"], re.MULTILINE)) == 2
+
+
+@shipped_or(
+    {
+        "train": [("steps=1000", "steps=60"), ("every=100", "every=30")],
+        "bridge": [
+            ("seen, 75, proposal", "seen, 30, proposal"),
+            ("seen, 75, tempered", "seen, 30, tempered"),
+        ],
+        "worth": [
+            ("RUNS = 5", "RUNS = 2"),
+            ("seen, 2000, proposal", "seen, 200, proposal"),
+            ("seen, 1000, proposal", "seen, 50, proposal"),
+            ("for k in range(3)", "for k in range(1)"),
+            ("/ 3)", "/ 1)"),
+            ("seen, 2000)", "seen, 200)"),
+        ],
+    }
+)
+def test_learned_proposal_learns_and_is_put_beside_the_prior(kernel: Any, smaller: Smaller) -> None:
+    printed, drawn = run("learned_proposal", kernel, smaller)
+    assert drawn == {"model", "train", "figure"}
+    before, after = map(float, re.findall(r"loss (-?[\d.]+) before, (-?[\d.]+) at best", printed["train"])[0])
+    assert after < before - (0.2 if smaller else 3.0)
+    sizes = [float(v) for v in re.findall(r"effective sample size +([\d.]+) of", printed["use"])]
+    assert len(sizes) == 2 and all(size >= 1.0 for size in sizes)
+    (error,) = re.findall(r"^error ([\d.]+) mm", printed["use"], re.MULTILINE)
+    assert float(error) < (10.0 if smaller else 2.0)
+    exponents = [int(v) for v in re.findall(r"(\d+) exponents", printed["bridge"])]
+    assert len(exponents) == 2 and (smaller or exponents[0] < exponents[1])
+    assert len(re.findall(r"([\d.]+) effective draws a second$", printed["worth"], re.MULTILINE)) == 4
