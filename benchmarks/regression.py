@@ -24,7 +24,7 @@ import numpy as np
 from peer import ask
 from report import Row, cores, finish, options, show
 
-CHAINS, DRAWS, SWEEPS = 256, 200, 1
+CHAINS, DRAWS, SWEEPS = 256, 400, 1
 AGREEMENT = 4.5  # standard errors, of the largest of 100 differences
 
 

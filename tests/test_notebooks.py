@@ -242,6 +242,10 @@ def test_series_agree_with_references_that_are_no_particle_filters(kernel: Any, 
     assert abs(float(ours) - float(exact)) < (1.0 if smaller else 0.7)
     off = [float(each) for each in re.findall(r" (-?[\d.]+)$", printed["posterior"], flags=re.MULTILINE)]
     assert len(off) == 8 and max(map(abs, off)) < (1.5 if smaller else 0.4)
+
+
+@shipped_or(
+    {
         "invariance": [("count=20_000", "count=4000")],
         "chains": [("[:50]", "[:10]"), ("moves=200", "moves=60")],
         "smc": [("range(20)", "range(4)")],

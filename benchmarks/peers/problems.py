@@ -87,6 +87,8 @@ def autoregression_posterior(observed: np.ndarray[Any, Any]) -> tuple[float, flo
     weights /= weights.sum()
     centre = float(weights @ rho)
     return centre, float(np.sqrt(weights @ (rho - centre) ** 2)), evidence
+
+
 # Logistic regression: rows, standardised features that are correlated as 0.5^|i - j|, prior N(0, I).
 ROWS, FEATURES, CORRELATION, EFFECT = 1000, 50, 0.5, 0.5
 
