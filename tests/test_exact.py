@@ -196,7 +196,7 @@ CASES = {
     "chain": (CHAIN, 0.02),
     "shells, D = 2": (SHELLS_2, 0.04),
     "points 2 1 .5": (POINTS_2, 0.02),
-    "points 5 3 1": (POINTS_5, 0.03),
+    "points 5 3 1": (POINTS_5, 0.04),
 }
 LONGER = {"shells, D = 5": (SHELLS_5, 0.05)}
 

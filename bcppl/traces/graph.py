@@ -1,20 +1,22 @@
 """Gradients through the verbs: within `gradients()` they keep torch's graph, which they do without otherwise.
 
-import pyro
-import pyro.distributions as dist
-import torch
+    import pyro
+    import pyro.distributions as dist
+    import torch
 
-from bcppl.traces import assess, gradients
+    from bcppl.traces import assess, gradients
 
-def program():
-    x = pyro.sample("x", dist.Normal(0.0, scale))
-    pyro.sample("y", dist.Normal(x, 1.0))
+    def program():
+        x = pyro.sample("x", dist.Normal(0.0, scale))
+        pyro.sample("y", dist.Normal(x, 1.0))
 
-scale = torch.tensor(2.0, requires_grad=True)
-x = torch.tensor([0.5, 1.0], requires_grad=True)
-with gradients():
-    log_prob = assess(program, (), {"x": x, "y": torch.zeros(2)}, 2)
-print(torch.autograd.grad(log_prob.sum(), [x, scale]))
+    scale = torch.tensor(2.0, requires_grad=True)
+    x = torch.tensor([0.5, 1.0], requires_grad=True)
+    with gradients():
+        log_prob = assess(program, (), {"x": x, "y": torch.zeros(2)}, 2)
+    print(torch.autograd.grad(log_prob.sum(), [x, scale]))
+
+The gradient is that of each particle's log-density with respect to its own value, and to the scale.
 """
 
 from __future__ import annotations

@@ -1,12 +1,14 @@
 """Auxiliary particle filters: resampling looks ahead, and new states are drawn by a proposal.
 
-def ahead(trace, observed):  # about log p(y | state)
-return dist.Normal(trace["x"], 1.2).log_prob(observed.observations["y"])
+    def ahead(trace, observed):  # about log p(y | state)
+        return dist.Normal(trace["x"], 1.2).log_prob(observed.observations["y"])
 
-def towards(trace, observed):
-pyro.sample("x", dist.Normal((trace["x"] + observed.observations["y"]) / 2, 0.7))
+    def towards(trace, observed):
+        pyro.sample("x", dist.Normal((trace["x"] + observed.observations["y"]) / 2, 0.7))
 
-for population, info in steps(auxiliary(towards, look_ahead=ahead), start, observed): ...
+    for population, info in steps(auxiliary(towards, look_ahead=ahead), start, observed): ...
+
+Both read the trace before the step, and the observations of the step.
 """
 
 from __future__ import annotations
