@@ -1,25 +1,27 @@
 """Amortised proposals: programs that propose latent values given whatever was observed.
 
-import pyro
-import pyro.distributions as dist
-import torch
+    import pyro
+    import pyro.distributions as dist
+    import torch
 
-from bcppl.inference import importance_sampling
-from bcppl.inference.learning import Amortised, forward_kl, train
+    from bcppl.inference import importance_sampling
+    from bcppl.inference.learning import Amortised, forward_kl, train
 
-def program():
-x = pyro.sample("x", dist.Normal(0.0, 2.0))
-pyro.sample("y", dist.Normal(x, 1.0))
+    def program():
+        x = pyro.sample("x", dist.Normal(0.0, 2.0))
+        pyro.sample("y", dist.Normal(x, 1.0))
 
-gain = torch.nn.Parameter(torch.zeros(()))
+    gain = torch.nn.Parameter(torch.zeros(()))
 
-def guess(observed):
-pyro.sample("x", dist.Normal(gain * observed["y"], 1.0))
+    def guess(observed):
+        pyro.sample("x", dist.Normal(gain * observed["y"], 1.0))
 
-proposal = Amortised(guess)
-train([gain], forward_kl(proposal, program, (), ["y"]), steps=300)
-seen = {"y": torch.tensor(1.5)}
-print(importance_sampling(program, (), seen, 100, proposal.given(seen)))
+    proposal = Amortised(guess)
+    train([gain], forward_kl(proposal, program, (), ["y"]), steps=300)
+    seen = {"y": torch.tensor(1.5)}
+    print(importance_sampling(program, (), seen, 100, proposal.given(seen)))
+
+The same guess serves every observation that the program may give.
 """
 
 from __future__ import annotations
