@@ -152,3 +152,17 @@ def test_what_does_not_fit_is_refused() -> None:
         PoseHead(5, CENTER, [0.01] * 6, freedom=PLANAR)
     with pytest.raises(InputError, match="wide component of PoseHead"):
         PoseHead(5, CENTER, [0.01] * 3, wide=0.0, freedom=PLANAR)
+
+
+@pytest.mark.parametrize("default", [torch.float32, torch.float64])
+def test_networks_work_in_double_precision(default: torch.dtype) -> None:
+    """Where torch's default type is float64, and converted to it."""
+    torch.set_default_dtype(default)
+    try:
+        networks = torch.nn.ModuleList([encoder(), SetEncoder(3, features=8), PoseHead(8, CENTER, [0.1] * 6)])
+    finally:
+        torch.set_default_dtype(torch.float32)
+    images, points = torch.full((2, 12, 16), 0.75, dtype=torch.float64), torch.zeros(2, 4, 3).double()
+    for module in (networks, networks.double()):
+        read, sets, head = module
+        assert len(head(read(images)).sample()) == len(head(sets(points)).sample()) == 2

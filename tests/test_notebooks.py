@@ -48,6 +48,8 @@ def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     manager.shutdown_kernel(now=True)
 
 
+RESET = "%reset -f\nimport torch\ntorch.set_default_dtype(torch.float32)"
+
 # Names of cells, and what is replaced in each.
 Smaller = Mapping[str, Sequence[tuple[str, str]]]
 
@@ -60,7 +62,7 @@ def run(name: str, kernel: Any, smaller: Smaller) -> Ran:
         for shipped, few in replacements:
             assert cells[cell].source.count(shipped) == 1, f"{name}, cell {cell}: {shipped}"
             cells[cell].source = cells[cell].source.replace(shipped, few)
-    notebook.cells.insert(0, nbformat.v4.new_code_cell("%reset -f", id="reset"))
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(RESET, id="reset"))
     client = nbclient.NotebookClient(notebook, timeout=480, km=kernel)
     client.execute()
     outputs = {cell.id: cell.outputs for cell in notebook.cells if cell.cell_type == "code"}

@@ -1,4 +1,28 @@
-"""Learning for inference: trained proposals, networks that read measurements, adapted kernels."""
+"""Learning for inference: trained proposals, networks that read measurements, adapted kernels.
+
+    import pyro
+    import pyro.distributions as dist
+    import torch
+    from bcppl.inference import importance_sampling
+    from bcppl.inference.learning import Amortised, forward_kl, train
+
+    def weighed():
+        mass = pyro.sample("mass", dist.Normal(torch.tensor(2.0), 0.5))
+        pyro.sample("reading", dist.Normal(mass, 0.3))
+
+    network = torch.nn.Linear(1, 1)
+
+    def guess(observed):  # of any reading
+        pyro.sample("mass", dist.Normal(network(observed["reading"][..., None])[..., 0], 0.3))
+
+    proposal = Amortised(guess)
+    print(train(network, forward_kl(proposal, weighed, (), ["reading"]), steps=300))
+    seen = {"reading": torch.tensor(2.4)}
+    print(importance_sampling(weighed, (), seen, 100, proposal.given(seen)))
+
+`evidence_bound` trains for one set of observations; `networks` reads depth images and sets of touches;
+`bridged` is SMC from a proposal to the posterior; `adaptive_hmc` tunes its own step size, mass and length.
+"""
 
 from bcppl.inference.learning.amortised import Amortised
 from bcppl.inference.learning.bridging import bridged

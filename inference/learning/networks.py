@@ -72,7 +72,7 @@ class DepthEncoder(nn.Module):
         measured = torch.isfinite(images) & (images > 0.0)
         away = ((images - self.background) / self.spread).clamp(-4.0, 4.0)
         pixels = torch.stack([torch.where(measured, away, 0.0), measured.to(images.dtype)], dim=1)
-        return self.whole(self.convolutions(pixels.to(torch.float32)))
+        return self.whole(self.convolutions(pixels.to(_type_of(self.convolutions))))
 
 
 class SetEncoder(nn.Module):
@@ -114,7 +114,7 @@ class SetEncoder(nn.Module):
         """Features of sets of vectors (B, K, inputs)."""
         there = ~torch.isnan(vectors).any(dim=-1, keepdim=True)
         scaled = (vectors - self.center) / self.spread
-        read = self.each(torch.where(there, scaled, 0.0).to(torch.float32))
+        read = self.each(torch.where(there, scaled, 0.0).to(_type_of(self.each)))
         mean = torch.where(there, read, 0.0).sum(dim=-2) / there.sum(dim=-2).clamp(min=1)
         # What is read is 0 or more.
         return self.whole(torch.cat([mean, torch.where(there, read, 0.0).amax(dim=-2)], dim=-1))
@@ -169,7 +169,7 @@ class PoseHead(nn.Module):
     def forward(self, features: Tensor) -> MixturePose:
         """The mixture for features (B, features); it has B entries."""
         size, count = self.freedom.dimension, self.components
-        numbers = self.last(features).to(torch.float64).unflatten(-1, (count, -1))
+        numbers = self.last(features.to(_type_of(self.last))).to(torch.float64).unflatten(-1, (count, -1))
         weight, mean, scale, below = numbers.split([1, size, size, self.below.shape[1]], dim=-1)
         sizes = self.spread * torch.exp(LARGEST - nn.functional.softplus(LARGEST - scale))
         factor = torch.eye(size, dtype=torch.float64).repeat(*sizes.shape[:-1], 1, 1)
@@ -186,3 +186,8 @@ class PoseHead(nn.Module):
             torch.cat([covariance, whole], dim=-3),
             self.freedom,
         )
+
+
+def _type_of(module: nn.Module) -> torch.dtype:
+    """The type of a module's parameters: torch's default type when it was made, or what it was converted to."""
+    return next(module.parameters()).dtype
