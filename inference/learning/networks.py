@@ -189,5 +189,5 @@ class PoseHead(nn.Module):
 
 
 def _type_of(module: nn.Module) -> torch.dtype:
-    """The type of a module's parameters: torch's default type when it was made, or what it was converted to."""
+    """The type of a module's parameters: torch's default when it was made, or what it was converted to."""
     return next(module.parameters()).dtype
