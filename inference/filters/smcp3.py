@@ -160,14 +160,14 @@ def moved_trace(
     # The next step of a series begins from the values of the last, which stay.
     latent: Values = {} if observed is not None and isinstance(old, SeriesTrace) else old.choices
     chosen = simulate(forward, (shown,), count)
-    _refuse_observed("forward", chosen.choices, shown)
+    refuse_observed_choices("forward", chosen.choices, shown)
     values, back = _read(
         chosen.result, chosen.choices, latent, lambda: shown.brought if isinstance(shown, Anticipated) else []
     )
     new, log_ratio = _updated(old, values, observed)
     fresh = [a for a in values if a not in latent]
     reverse = assessed(backward, (new,), back, count)
-    _refuse_observed("backward", reverse.choices, new)
+    refuse_observed_choices("backward", reverse.choices, new)
     inputs = charted(OLD, latent, old.distributions)
     for address, value in values.items():
         if address in latent:
@@ -192,7 +192,7 @@ def moved_trace(
         before, choices = _read(reverse.result, reverse.choices, {a: new[a] for a in latent}, list)
         if not isinstance(reverse.result, tuple):
             choices = {**choices, **{a: new[a] for a in fresh}}
-        _refuse_other_choices(chosen.choices, choices)
+        refuse_other_choices(chosen.choices, choices)
         undone = {(OLD, a): before.get(a, new[a]) for a in latent}
         refuse_apart("the backward program", inputs, undone | {(FORWARD, a): v for a, v in choices.items()})
     log_chosen = chosen.log_prob()
@@ -212,7 +212,8 @@ def _updated(old: Trace, values: Values, observed: Observed | None) -> tuple[Tra
     return updated.trace, updated.log_ratio
 
 
-def _refuse_observed(which: str, choices: Values, seen: Trace | Anticipated) -> None:
+def refuse_observed_choices(which: str, choices: Values, seen: Trace | Anticipated) -> None:
+    """Refuse a program of a pair that samples where something is observed."""
     for address in choices:
         if address in seen.observations:
             raise InputError(
@@ -238,7 +239,8 @@ def _read(
     return new, {a: latent.get(a, v) for a, v in choices.items() if a not in brought}
 
 
-def _refuse_other_choices(forward: Values, returned: Values) -> None:
+def refuse_other_choices(forward: Values, returned: Values) -> None:
+    """Refuse a backward program that returns other choices than the forward program makes."""
     wrong = sorted(set(forward).symmetric_difference(returned))
     if wrong:
         raise InputError(

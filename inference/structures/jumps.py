@@ -20,11 +20,12 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
+from bcppl.inference.filters.smcp3 import Values
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Program
 from bcppl.inference.structures.moves import MovedStrata, StrataMove, target_in
 from bcppl.inference.structures.strata import Strata
-from bcppl.inference.structures.translation import Values, sampling_nothing, translated
+from bcppl.inference.structures.translation import sampling_nothing, translated
 from bcppl.inference.targets import Target
 from bcppl.traces import Structure, Trace
 

@@ -25,6 +25,15 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
+from bcppl.inference.filters.smcp3 import (
+    BACKWARD,
+    FORWARD,
+    NEW,
+    OLD,
+    Values,
+    refuse_observed_choices,
+    refuse_other_choices,
+)
 from bcppl.inference.kernels.jacobian import (
     Key,
     charted,
@@ -38,10 +47,6 @@ from bcppl.traces import Trace, generate, simulate
 from bcppl.traces.gradient import result_with_grad, with_gradients
 from bcppl.traces.trace import shapes
 from bcppl.traces.verbs import assessed
-
-OLD, FORWARD, NEW, BACKWARD = "old value", "forward choice", "new value", "backward choice"
-
-Values = Mapping[str, Tensor]
 
 
 class Translated(NamedTuple):
@@ -80,7 +85,7 @@ def translated(
     """
     count = old.particles
     chosen = simulate(forward, (old,), count)
-    _refuse_observed("forward", chosen.choices, old)
+    refuse_observed_choices("forward", chosen.choices, old)
     values, back = _read("forward", chosen.result, chosen.choices)
     new = renewed(values)
     _refuse_other_than_latent("forward", values, new)
@@ -89,7 +94,7 @@ def translated(
     if back is None:
         back = {a: old.choices[a] for a in simulate(backward, (new,), count).choices if a in old.choices}
     reverse = assessed(backward, (new,), back, count)
-    _refuse_observed("backward", reverse.choices, new)
+    refuse_observed_choices("backward", reverse.choices, new)
     undone, forth = _read("backward", reverse.result, reverse.choices)
     lost = [a for a in old.choices if a not in new.choices and a not in undone]
     before = {a: v for a, v in old.choices.items() if a not in lost}
@@ -113,7 +118,7 @@ def translated(
     log_jacobian = log_abs_det_jacobian(again, inputs, outputs, check=check)
     if check:
         forth = {a: new[a] for a in chosen.choices if a in new.choices} if forth is None else forth
-        _refuse_other_choices(chosen.choices, forth)
+        refuse_other_choices(chosen.choices, forth)
         ends = {(OLD, a): undone[a] if a in undone else new[a] for a in before}
         refuse_apart("the backward program", inputs, ends | {(FORWARD, a): v for a, v in forth.items()})
     log_chosen, zero = chosen.log_prob(), torch.zeros(count, dtype=torch.float64)
@@ -180,15 +185,6 @@ def _read(which: str, result: Any, choices: Values) -> tuple[Values, Values | No
     )
 
 
-def _refuse_observed(which: str, choices: Values, seen: Trace) -> None:
-    for address in choices:
-        if address in seen.observations:
-            raise InputError(
-                f"the {which} program of a translator samples {address!r}, which is observed; sample at "
-                "latent addresses, and give other choices names of their own."
-            )
-
-
 def _refuse_other_than_latent(which: str, values: Values, trace: Trace) -> None:
     for address in values:
         if address not in trace.choices:
@@ -196,13 +192,3 @@ def _refuse_other_than_latent(which: str, values: Values, trace: Trace) -> None:
                 f"the {which} program of a translator gives a value of {address!r}, which is no latent "
                 f"address there; latent are {shapes(trace.choices)}."
             )
-
-
-def _refuse_other_choices(forward: Values, returned: Values) -> None:
-    wrong = sorted(set(forward).symmetric_difference(returned))
-    if wrong:
-        raise InputError(
-            f"the backward program of a translator {'leaves out' if wrong[0] in forward else 'gives'} the "
-            f"forward choice {wrong[0]!r}; the forward program chooses "
-            f"{', '.join(sorted(forward)) or 'nothing'}."
-        )
