@@ -157,3 +157,25 @@ def test_nothing_is_learned_from_copies(by: Callable[[Population, Fitted], None]
         assert spied.moved
         for learned, values in zip(spied.learned, spied.moved, strict=True):
             assert not learned & values
+
+
+def coins() -> None:
+    pyro.sample("coin", dist.Categorical(torch.tensor([0.3, 0.7], dtype=torch.float64)))
+
+
+def test_equal_discrete_values_are_no_copies() -> None:
+    """A proposal fitted to the other half leaves the coin's probability as it is; halves by value do not."""
+
+    def fit(population: Population) -> Callable[[Trace], None]:
+        heads = (population["coin"].double().mean() + 0.5) / 2.0
+        return lambda trace: pyro.sample("coin", dist.Categorical(torch.stack([1.0 - heads, heads])))
+
+    torch.manual_seed(0)
+    changes = []
+    for _ in range(200):
+        population = halved(equal_weights(simulate(coins, (), 40)))
+        assert abs(int(population.sides.sum()) - 20) <= 1
+        moved_coins = moved_by(population, metropolis_hastings(Fitted(fit)), POSTERIOR, 1).population["coin"]
+        changes.append((moved_coins - population["coin"]).double().mean())
+    change = torch.stack(changes)
+    assert abs(float(change.mean() / (change.std() / math.sqrt(len(change))))) < 3.5

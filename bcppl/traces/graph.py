@@ -43,7 +43,7 @@ def gradients() -> Iterator[None]:
     `simulate`, `generate`, `assess`, `propose`, `update` and `log_prob` are then attached to every tensor
     that asks for gradients: values and observations that they are given, parameters that a program closes
     over. Draws of reparameterised distributions are attached to the parameters of these, others are
-    constants. Every log-probability is evaluated anew, also one that the trace has kept. A trace that is
+    constants. Every log-probability is evaluated again, also one that the trace has kept. A trace that is
     made within and evaluated after the context is evaluated without gradients.
 
     Raises:

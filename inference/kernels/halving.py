@@ -29,7 +29,9 @@ def halved(population: Population) -> Population:
         sides = _split(population.families)
         if _smaller(sides) >= LEAST * len(population):
             return replace(population, sides=sides)
-    families = _equal(population)
+        families = _copies(population, torch.arange(len(population)))
+    else:
+        families = _copies(population, population.founders)
     return replace(population, families=families, sides=_split(families))
 
 
@@ -44,13 +46,17 @@ def _smaller(sides: Tensor) -> int:
     return min(count, len(sides) - count)
 
 
-def _equal(population: Population) -> Tensor:
-    """The number (N,) of each particle's group of equal latent values."""
-    count = len(population)
-    columns = [v.reshape(count, -1).double() for v in population.trace.choices.values()]
-    if not columns:
-        return torch.arange(count)
-    return torch.unique(torch.cat(columns, dim=1), dim=0, return_inverse=True)[1]
+def _copies(population: Population, otherwise: Tensor) -> Tensor:
+    """The number (N,) of each particle's group of copies: those with equal continuous values.
+
+    Discrete values are equal by chance too. A side that depended on them would let a particle shape its own
+    proposal, so without a continuous value the groups are `otherwise`.
+    """
+    values = [v for v in population.trace.choices.values() if v.is_floating_point()]
+    if not values:
+        return otherwise
+    rows = torch.cat([v.reshape(len(population), -1).double() for v in values], dim=1)
+    return torch.unique(rows, dim=0, return_inverse=True)[1]
 
 
 def _split(families: Tensor) -> Tensor:
