@@ -188,7 +188,8 @@ def points(diagonal: tuple[float, ...], log_c: float) -> Case:
     return Case(program, [{"seen": seen}], exact, ("pose",), particles=1200, sweeps=2)
 
 
-POINTS_2, POINTS_5 = points((2.0, 1.0, 0.5), 0.934116), points((5.0, 3.0, 1.0), 4.841425)
+POINTS_2 = points((2.0, 1.0, 0.5), 0.934116)
+POINTS_5 = replace(points((5.0, 3.0, 1.0), 4.841425), particles=2400)
 
 CASES = {
     "hidden": (HIDDEN, 0.02),
@@ -196,7 +197,7 @@ CASES = {
     "chain": (CHAIN, 0.02),
     "shells, D = 2": (SHELLS_2, 0.04),
     "points 2 1 .5": (POINTS_2, 0.02),
-    "points 5 3 1": (POINTS_5, 0.04),
+    "points 5 3 1": (POINTS_5, 0.03),
 }
 LONGER = {"shells, D = 5": (SHELLS_5, 0.05)}
 
