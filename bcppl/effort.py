@@ -19,7 +19,7 @@ class Effort:
         seconds: wall time.
     """
 
-    # Simulators that differ in nothing but their cost so far are the same (`bcppl.traces.dependence`).
+    # Simulators that differ in nothing but their cost so far are equal (`bcppl.traces.dependence`).
     __caches__ = ("calls", "items", "amount", "seconds")
 
     calls: int = 0

@@ -13,7 +13,7 @@ import torch
 from torch.distributions.utils import lazy_property
 from trimesh.caching import Cache
 
-from bcppl.traces.dependence import _layout
+from bcppl.traces.dependence.equality import _layout
 
 PLAIN = (bool, int, float, str, bytes, type(None), type, ModuleType)
 # Whatever they hold is determined by what they are asked.

@@ -24,9 +24,10 @@ from bcppl import poses
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
-from bcppl.traces import Series, carried, check_program, dependence, generate, update
+from bcppl.traces import Series, carried, check_program, generate, update
 from bcppl.traces.carried import Entry
-from bcppl.traces.dependence import comparison, snapshot
+from bcppl.traces.dependence import equality
+from bcppl.traces.dependence.equality import comparison, snapshot
 from tests.invariance import number
 
 N = 6
@@ -464,11 +465,11 @@ def through_a_state() -> None:
 
 STATES = sys.modules["bcppl.traces.carried"]
 MUTANTS: dict[str, tuple[Any, str, Any, Callable[[], None]]] = {
-    "tensors are all equal": (dependence, "equal", lambda a, b: True, through_a_closure),
+    "tensors are all equal": (equality, "equal", lambda a, b: True, through_a_closure),
     "tensors of states are all equal": (STATES, "equal", lambda a, b: True, through_a_state),
-    "cells left out": (dependence, "_parts_of_functions", lambda a, b: [], through_a_closure),
-    "cells of beginnings left out": (dependence, "_parts_of_functions", lambda a, b: [], through_a_state),
-    "attributes left out": (dependence, "_attributes", lambda *_: [], through_a_closure),
+    "cells left out": (equality, "_parts_of_functions", lambda a, b: [], through_a_closure),
+    "cells of beginnings left out": (equality, "_parts_of_functions", lambda a, b: [], through_a_state),
+    "attributes left out": (equality, "_attributes", lambda *_: [], through_a_closure),
 }
 
 

@@ -20,7 +20,7 @@ from bcppl.inference.kernels import delayed_acceptance, hamiltonian, hmc, moved_
 from bcppl.inference.kernels.kernel import Kernel
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace, carried, generate, simulate
-from bcppl.traces.gradient import log_prob_with_grad
+from bcppl.traces.differentiation.programs import log_prob_with_grad
 from tests.invariance import equal_weights, largest_z, number
 
 DRAWS = 10_000

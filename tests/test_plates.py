@@ -17,7 +17,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, assess, extend, generate, propose, regenerate, simulate, update
-from bcppl.traces.gradient import log_prob_with_grad
+from bcppl.traces.differentiation.programs import log_prob_with_grad
 
 N, POINTS, GROUPS = 4, 5, 3
 WIDTHS = torch.linspace(0.5, 1.5, POINTS, dtype=torch.float64)

@@ -318,7 +318,7 @@ def distributions_alone(first: Any, second: Any, addresses: Any) -> Any:
     return (a for a in addresses if not same(then[a], now[a]))
 
 
-SAME = sys.modules["bcppl.traces.dependence"].comparison
+SAME = sys.modules["bcppl.traces.dependence.equality"].comparison
 
 
 @pytest.mark.parametrize(

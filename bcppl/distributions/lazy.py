@@ -19,10 +19,10 @@ class LazyDistribution(TorchDistribution):
 
     Subclasses run their simulator in `log_prob` and `sample`, never in `__init__`, so that a program
     can be traced for the price of its Python. A log-probability is evaluated again when an attribute, or
-    anything that an attribute holds, has changed (`bcppl.traces.dependence`). Attributes that only cache what
-    the others determine are therefore cached properties, or are named in `__caches__`. A subclass may be a
-    dataclass, with `eq=False`: this class's `__init__`, called at the end of its `__post_init__`, checks the
-    ranges that its fields declare (`bcppl.distributions.parameters`).
+    anything that an attribute holds, has changed (`bcppl.traces.dependence.equality`). Attributes that only
+    cache what the others determine are therefore cached properties, or are named in `__caches__`. A subclass
+    may be a dataclass, with `eq=False`: this class's `__init__`, called at the end of its `__post_init__`,
+    checks the ranges that its fields declare (`bcppl.distributions.parameters`).
 
     Attributes:
         cost: of a log-probability: 0 arithmetic, 1 rendering, 2 physics. Kernels evaluate the cheap sites

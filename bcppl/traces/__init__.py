@@ -20,7 +20,7 @@ A program is a Pyro program, run under one plate of particles; `Series` runs ste
 
 from bcppl.traces.carried import carried
 from bcppl.traces.checks import Fault, ProgramError, check_program
-from bcppl.traces.graph import gradients
+from bcppl.traces.differentiation.graph import gradients
 from bcppl.traces.model import Model
 from bcppl.traces.series import Series
 from bcppl.traces.structural import Structure, structural

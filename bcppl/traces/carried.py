@@ -3,7 +3,7 @@
 A program asks for one by name, `rollout = carried("probe", partial(begin, pose, probe))`. The first time,
 `begin` makes it; when the same particles are run again, the one that the trace carries is handed back. What
 the state depends on is what `begin` holds: its arguments, its defaults, the variables of its surroundings
-(see `bcppl.traces.dependence`). When one of them changes, a new state is made.
+(see `bcppl.traces.dependence.equality`). When one of them changes, a new state is made.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bcppl.traces.dependence import Array, alike, equal, snapshot
+from bcppl.traces.dependence.equality import Array, alike, equal, snapshot
 from bcppl.traces.indexing import beside
 
 

@@ -26,10 +26,10 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.shortcuts import drawn
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry, carrying
+from bcppl.traces.dependence.surroundings import surroundings
+from bcppl.traces.differentiation.graph import graph, kept, taken_out
 from bcppl.traces.explained import explained, unfit, unfit_particles, unsampled
-from bcppl.traces.graph import graph, kept, taken_out
 from bcppl.traces.structural import STRUCTURAL, UnchosenError
-from bcppl.traces.surroundings import surroundings
 from bcppl.traces.values import Value, tensors
 
 Program = Callable[..., Any]
@@ -48,7 +48,7 @@ class Run:
         result: what it returned.
         coincident: addresses with a plate or an event axis of N entries (`bcppl.traces.verbs`).
         whole: the first address, if its distribution had N entries before it was expanded to the particles.
-        surroundings: what lazy sites read from outside, where they do (`bcppl.traces.surroundings`).
+        surroundings: what lazy sites read from outside (`bcppl.traces.dependence.surroundings`).
         structural: addresses whose values determine which others are visited, in the order of the program.
     """
 

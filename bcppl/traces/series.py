@@ -33,7 +33,7 @@ from torch import Tensor
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
-from bcppl.traces.graph import kept
+from bcppl.traces.differentiation.graph import kept
 from bcppl.traces.indexing import Index, composed, indexed
 from bcppl.traces.run import Program, Run
 from bcppl.traces.trace import Trace

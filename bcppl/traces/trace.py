@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import UserDict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -10,21 +9,20 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
-import pyro
 import torch
 from torch import Tensor
 
-from bcppl.distributions.shortcuts import narrowed
-from bcppl.distributions.support import log_prob_inside, support_of
+from bcppl.distributions.support import support_of
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
-from bcppl.traces.dependence import comparison, equal
-from bcppl.traces.explained import changed_outside, hidden_site, not_a_number, other_addresses, refuse_masked
-from bcppl.traces.graph import graph, kept, refuse_cut, taken_out
+from bcppl.traces.dependence.equality import comparison, equal
+from bcppl.traces.dependence.surroundings import changed as surroundings_changed
+from bcppl.traces.differentiation.graph import kept
+from bcppl.traces.evaluation import Hiding, log_probability
+from bcppl.traces.explained import hidden_site, other_addresses, refuse_masked
 from bcppl.traces.indexing import Index, beside, particles_at
-from bcppl.traces.run import Program, Run, inward, run
+from bcppl.traces.run import Program, Run, run
 from bcppl.traces.structural import Structure
-from bcppl.traces.surroundings import changed as surroundings_changed, evaluated, surroundings_of
 from bcppl.traces.values import Value, tensors
 
 
@@ -106,7 +104,7 @@ class Trace:
     def distributions(self) -> Mapping[str, Any]:
         """The distribution of every site at these values, by address in the program's order."""
         if self.hidden:
-            return _Hiding(self._ran.distributions, hidden=self.hidden)
+            return Hiding(self._ran.distributions, hidden=self.hidden)
         return MappingProxyType(self._ran.distributions)
 
     @property
@@ -149,47 +147,7 @@ class Trace:
         return self.known[address]
 
     def _evaluated(self, address: str) -> Tensor:
-        distribution = self._ran.distributions[address]
-        if address in self.choices:
-            refuse_masked(address, distribution)
-        # A value that another one has moved out of the support is impossible, not a mistake.
-        with graph(), pyro.validation_enabled(False):
-            value = self._log_prob_of(address, distribution)
-        batch = distribution.batch_shape
-        if value.shape not in ((), batch):
-            raise InputError(
-                f"site {address!r} has log-probabilities of shape {tuple(value.shape)}; its distribution "
-                f"must give {tuple(batch)}, one for each particle and each entry of its plates."
-            )
-        value = value.to(torch.float64).expand(batch)
-        if len(batch) > 1:
-            value = value.sum(tuple(range(len(batch) - 1)))
-        # The maximum is NaN where any is.
-        if not bool(value.max() < torch.inf):
-            raise not_a_number(address, value, self.choices.get(address), self.observations.get(address))
-        return value
-
-    def _log_prob_of(self, address: str, distribution: Any) -> Tensor:
-        value = inward(self._ran.values[address], distribution)
-        if not kept():
-            return self._log_prob_at(address, narrowed(distribution), value)
-        try:
-            attached = self._log_prob_at(address, distribution, value)
-        except RuntimeError as error:
-            if "requires grad" not in str(error):
-                raise
-            raise taken_out(f"site {address!r}") from error
-        if not attached.requires_grad:
-            refuse_cut(address, distribution)
-        return attached
-
-    def _log_prob_at(self, address: str, distribution: Any, value: Tensor) -> Tensor:
-        if address not in self._ran.surroundings:
-            return log_prob_inside(distribution, value)
-        then, now = self._ran.surroundings[address], surroundings_of(distribution)
-        if (name := surroundings_changed(then, now)) is not None:
-            raise changed_outside(address, name)
-        return evaluated(distribution, lambda: log_prob_inside(distribution, value))
+        return log_probability(self._ran, address, self.choices, self.observations)
 
     def __getitem__(self, key: str | Index) -> Any:
         if isinstance(key, str):
@@ -339,18 +297,6 @@ class Trace:
                     f"a new value for {address!r} was given or asked for, which is no latent address; "
                     f"latent are {', '.join(self.choices) or 'none'}."
                 )
-
-
-class _Hiding(UserDict[str, Any]):
-    """The distributions of a trace, those at `hidden` addresses named but not given."""
-
-    def __init__(self, distributions: Mapping[str, Any], hidden: frozenset[str]) -> None:
-        self.data, self.hidden = dict(distributions), hidden
-
-    def __getitem__(self, address: str) -> Any:
-        if address in self.hidden:
-            raise hidden_site(address)
-        return self.data[address]
 
 
 def refuse_masked_latents(trace: Trace) -> None:

@@ -16,8 +16,8 @@ from torch import Tensor
 from bcppl.distributions.support import refuse_several_poses
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
+from bcppl.traces.differentiation.graph import kept
 from bcppl.traces.faults import Fault, ProgramError
-from bcppl.traces.graph import kept
 from bcppl.traces.indexing import indexed
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.series import Series, SeriesTrace, Stage, runnable

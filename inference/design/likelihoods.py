@@ -13,7 +13,7 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.support import log_prob_inside
 from bcppl.errors import InferenceError
 from bcppl.traces import Trace
-from bcppl.traces.dependence import comparison
+from bcppl.traces.dependence.equality import comparison
 from bcppl.traces.run import inward
 
 # Observations times particles that are evaluated together: they then stay in the processor's cache.

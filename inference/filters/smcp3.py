@@ -44,7 +44,7 @@ from bcppl.inference.proposals import Fitted, Program, Proposal, program_of
 from bcppl.inference.resampling import Resample, adaptive, check_resample
 from bcppl.traces import Trace, extend, simulate, update
 from bcppl.traces.anticipated import Anticipated
-from bcppl.traces.gradient import result_with_grad, with_gradients
+from bcppl.traces.differentiation.programs import result_with_grad, with_gradients
 from bcppl.traces.series import SeriesTrace
 from bcppl.traces.verbs import assessed
 

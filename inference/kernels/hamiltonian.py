@@ -18,7 +18,7 @@ from bcppl.inference.proposals.spread import FLOOR
 from bcppl.inference.summaries import weighted_covariance
 from bcppl.inference.targets import Target
 from bcppl.traces import Trace, update
-from bcppl.traces.gradient import log_prob_with_grad
+from bcppl.traces.differentiation.programs import log_prob_with_grad
 from bcppl.traces.indexing import beside
 from bcppl.traces.run import inward
 

@@ -19,7 +19,7 @@ from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.inference.learning.amortised import Amortised
 from bcppl.traces import Trace, assess, generate, gradients, simulate
-from bcppl.traces.graph import carries
+from bcppl.traces.differentiation.graph import carries
 from bcppl.traces.run import Program
 
 Objective = Callable[[], Tensor]

@@ -98,7 +98,7 @@ def name_of(program: Program | Series) -> str:
 def _evaluated(trace: Trace, particles: Tensor) -> dict[str, Tensor]:
     """The log-probability (K,) of every site of a few particles, evaluated from nothing but their values."""
     few = replace(trace.chosen(particles), carried={}, known={})
-    return {address: few._evaluated(address) for address in few.addresses}
+    return {address: few.log_prob(address) for address in few.addresses}
 
 
 def trace_of(content: Content, program: Program | Series, given: Arguments) -> Trace:

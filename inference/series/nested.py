@@ -19,7 +19,7 @@ from bcppl.inference.series import groups
 from bcppl.inference.series.states import merged, merged_entries
 from bcppl.traces import Series, Trace, extend, generate
 from bcppl.traces.carried import Entry
-from bcppl.traces.dependence import equal
+from bcppl.traces.dependence.equality import equal
 from bcppl.traces.indexing import indexed
 from bcppl.traces.series import SeriesTrace, resumed
 

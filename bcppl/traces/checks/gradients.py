@@ -9,8 +9,8 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.support import freedom_of, support_of
 from bcppl.errors import InputError
 from bcppl.traces.checks.comparing import log_probs
+from bcppl.traces.differentiation.programs import log_prob_with_grad
 from bcppl.traces.faults import Fault, ProgramError
-from bcppl.traces.gradient import log_prob_with_grad
 from bcppl.traces.trace import Trace
 
 # Of a difference, in units of a value.

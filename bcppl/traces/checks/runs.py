@@ -15,7 +15,7 @@ from pyro.distributions import Delta
 from torch import Tensor
 
 from bcppl.traces.checks.comparing import Start, first_differing, log_probs, rerun
-from bcppl.traces.dependence import alike, equal
+from bcppl.traces.dependence.equality import alike, equal
 from bcppl.traces.faults import Fault, ProgramError
 from bcppl.traces.indexing import indexed
 from bcppl.traces.run import run

@@ -19,7 +19,7 @@ def check_updates(trace: Trace, other: Trace) -> None:
     Every latent value in turn is replaced by another draw; then particles are merged with those before and
     reordered, as kernels do. The log-probability of every site has to be that of a new run at the same
     values. It is not where a site depends on a latent value through something that is no part of it
-    (`bcppl.traces.dependence`), such as an object that both runs share and one writes into.
+    (`bcppl.traces.dependence.equality`), such as an object that both runs share and one writes into.
 
     Args:
         trace: of N particles.

@@ -22,7 +22,7 @@ import numpy as np
 from torch import Tensor
 
 from bcppl.distributions.lazy import LazyDistribution
-from bcppl.traces.dependence import comparison
+from bcppl.traces.dependence.equality import comparison
 
 Names = tuple[tuple[str, str | None], ...]
 # The variables of a module, the name of one of them, and of an attribute that is taken from it.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.traces.dependence import alike, equal
+from bcppl.traces.dependence.equality import alike, equal
 from bcppl.traces.run import Program, Run, inward, run
 from bcppl.traces.trace import Trace
 
@@ -84,7 +84,7 @@ def log_prob_with_grad(
 def _parameters(before: Any, now: Any) -> tuple[list[Tensor], bool | None]:
     """The tensors of a distribution that ask for gradients, and whether it depends on the new values.
 
-    None where its structure is not understood (`bcppl.traces.dependence`).
+    None where its structure is not understood (`bcppl.traces.dependence.equality`).
     """
     parameters, changed = [], []
 

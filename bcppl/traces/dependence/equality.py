@@ -10,7 +10,7 @@ objects, partial applications, or functions with equal code, whose parts are the
 the others determine do not count: the attributes that a class names in `__caches__`, and the values of
 `functools.cached_property` where not both have one or it is no number and no array.
 What is stored neither in a value nor in its parts is not seen: a write into an object that both runs share.
-Global variables that a lazy site reads are compared besides (`bcppl.traces.surroundings`).
+Global variables that a lazy site reads are compared besides (`bcppl.traces.dependence.surroundings`).
 """
 
 from __future__ import annotations

@@ -1,0 +1,1 @@
+"""Gradients through programs and the verbs."""
