@@ -5,8 +5,10 @@ error; the log of the mean of the estimated evidence over the exact one, which i
 (the mean of a logarithm is lower by about half the variance); and the posterior moments: the largest |z| of a
 mean over the axes, and the mean ratio of estimated to exact variance.
 
-A bias is explained where it is within two standard errors of minus half the variance of log Z. With --file
-cells are written as they are done, and a later call adds those that are missing.
+A bias is explained where it is within two standard errors of minus half the variance of log Z; for other
+kernels that are known to be biased `REASONS` states why. All kernels of a problem have the same seeds, so
+their errors are correlated: a bias common to all of them is one draw, not fourteen. With --file cells are
+written as they are done, and a later call adds those that are missing.
 """
 
 from __future__ import annotations
@@ -72,6 +74,17 @@ KERNELS: dict[str, Callable[[int, int], Tempered]] = {
     "hmc": lambda d, n: tempered(hmc("x")),
     "hmc, always moved": lambda d, n: tempered(hmc("x"), always_move=True),
     "waste-free": waste_free,
+}
+
+UNTIL = (
+    "particles stop while they still correlate with where they began, by about 0.75, and all at a sweep that "
+    "depends on them; repeat the moves, or ask for a larger displacement"
+)
+# Why a kernel may be biased here, by name.
+REASONS = {
+    "drift until displaced": UNTIL,
+    "mixture until displaced": UNTIL,
+    "waste-free": "five states of a random walk hardly leave where they began; give fewer, longer chains",
 }
 
 
@@ -237,6 +250,9 @@ def main() -> None:
             "",
         ]
         show(f"{problem}: {runs} runs of each kernel", columns, lines)
+        for kernel, *_, verdict in lines:
+            if verdict == "biased":
+                print(f"biased, {kernel}: {REASONS.get(kernel, 'unexplained')}")
     finish(rows, arguments.json)
 
 
