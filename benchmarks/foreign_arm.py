@@ -1,0 +1,238 @@
+"""An arm of six joints under impedance control, a peg at its wrist sensor, and a part, in MuJoCo.
+
+Joints have dry friction, the controller follows its command with a lag, the sensor carries the peg's weight
+and inertia, and contact is a spring and a damper of stated stiffness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import butter, sosfilt, sosfilt_zi
+from scipy.spatial.transform import Rotation
+
+from bcppl.geometry.parts import Part
+
+Array = npt.NDArray[np.float64]
+Motion = Generator[Array, float, None]  # yields commanded poses (7,), is sent the force that is felt, N
+
+STEP = 1e-4  # s of physics
+TICK = 10  # steps of a tick of the controller
+NOMINAL = 1e6  # N/m: 3 to 8 N press a nominal contact in by less than 10 um
+SHARE = 0.1  # of MuJoCo's impedance: small, so that a contact is the spring that it is asked to be
+
+ARM = """
+<mujoco>
+  <option timestep="{step}" cone="elliptic" impratio="20" integrator="implicitfast" tolerance="1e-10"/>
+  <compiler angle="radian"/>
+  <default><joint damping="0.02"/><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body pos="0 0 0.30">
+      <inertial pos="0 0 0" mass="2" diaginertia="0.01 0.01 0.01"/>
+      <joint axis="0 0 1" frictionloss="{f[0]}" armature="0.03"/>
+      <body>
+        <inertial pos="0 0 0.15" mass="1.6" diaginertia="0.012 0.012 0.002"/>
+        <joint axis="0 1 0" frictionloss="{f[1]}" armature="0.03"/>
+        <body pos="0 0 0.36">
+          <inertial pos="0.13 0 0" mass="0.9" diaginertia="0.001 0.006 0.006"/>
+          <joint axis="0 1 0" frictionloss="{f[2]}" armature="0.02"/>
+          <body pos="0.36 0 0">
+            <inertial pos="0 0 0" mass="0.2" diaginertia="2e-4 2e-4 2e-4"/>
+            <joint axis="1 0 0" frictionloss="{f[3]}" armature="0.004"/>
+            <body>
+              <inertial pos="0 0 0" mass="0.2" diaginertia="2e-4 2e-4 2e-4"/>
+              <joint axis="0 1 0" frictionloss="{f[4]}" armature="0.004"/>
+              <body>
+                <inertial pos="0 0 -0.02" mass="0.2" diaginertia="2e-4 2e-4 2e-4"/>
+                <joint axis="0 0 1" frictionloss="{f[5]}" armature="0.002"/>
+                <body name="peg" pos="0 0 -0.06">
+                  <inertial pos="0 0 -0.04" mass="{mass}" diaginertia="2e-4 2e-4 3e-5"/>
+                  <site name="sensor"/>
+                </body>
+              </body>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <sensor><force site="sensor"/><torque site="sensor"/></sensor>
+</mujoco>
+"""
+
+
+@dataclass(frozen=True)
+class Mechanics:
+    """What differs from scene to scene; of it a recording states only `spring` and `damper`.
+
+    Attributes:
+        stiffness: of contact, N/m.
+        restitution: the damping ratio of contact for a mass of 0.5 kg.
+        friction: between peg and part.
+        joint_friction: of the shoulder, N m; joints towards the wrist have less.
+        tool_mass: below the sensor, kg.
+        lag: time constant of the controller's command, s.
+        cut_off: of the sensor's low-pass filter of second order, Hz.
+        spring, damper: (6,) N/m and N m/rad; N s/m and N m s/rad, of the impedance control.
+    """
+
+    stiffness: float
+    restitution: float
+    friction: float
+    joint_friction: float
+    tool_mass: float
+    lag: float
+    cut_off: float
+    spring: Array
+    damper: Array
+
+
+class Log(NamedTuple):
+    """What happened, at every tick: `command` as asked for, the rest as it was.
+
+    Attributes:
+        times: (T,) s.
+        command, world_from_peg: (T, 7).
+        wrench: (T, 6) after the sensor's filter, without noise.
+        depth: (T,) penetration of the deepest contact, m; -inf without one.
+        force: (T,) sum of the contacts' normal forces, N.
+    """
+
+    times: Array
+    command: Array
+    world_from_peg: Array
+    wrench: Array
+    depth: Array
+    force: Array
+
+
+def carried_out(
+    motion: Motion, seconds: float, part: Part, peg: Part, truth: Array, mechanics: Mechanics
+) -> Log:
+    """The log of a motion, after whose end the command stays where it is.
+
+    Args:
+        motion: yields a command at every tick; the first is where the arm stands.
+        seconds: to simulate.
+        part: its pieces collide with those of the peg.
+        peg: its frame is the wrench sensor's.
+        truth: (7,) world_from_part.
+        mechanics: of the arm and the contact.
+    """
+    model = _model(part, peg, truth, mechanics)
+    data = mujoco.MjData(model)
+    command = next(motion)
+    _stand(model, data, command)
+    sensor = _Sensor(mechanics.cut_off)
+    followed, share = command, 1.0 - np.exp(-STEP * TICK / mechanics.lag)
+    jacobian = np.zeros((6, model.nv))
+    rows: list[tuple[Array, ...]] = []
+    for _ in range(round(seconds / (STEP * TICK))):
+        place, turn = data.site_xpos[0], Rotation.from_matrix(data.site_xmat[0].reshape(3, 3))
+        mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], 0)
+        followed = _towards(followed, command, share)
+        turned = Rotation.from_quat(followed[3:], scalar_first=True) * turn.inv()
+        away = np.append(followed[:3] - place, turned.as_rotvec())
+        push = jacobian.T @ (mechanics.spring * away - mechanics.damper * (jacobian @ data.qvel))
+        readings = np.empty((TICK, 6))
+        for k in range(TICK):
+            data.qfrc_applied[:] = push + data.qfrc_bias
+            mujoco.mj_step(model, data)
+            readings[k] = data.sensordata  # MuJoCo's readings are of the state before the step,
+            if k == 0:  # and so are the places of the sites and the contacts
+                turn = Rotation.from_matrix(data.site_xmat[0].reshape(3, 3))
+                reached = np.append(data.site_xpos[0], turn.as_quat(scalar_first=True))
+                contact = _contact(model, data)
+        wrench = sensor.filtered(readings)
+        rows.append((command, reached, wrench[0], contact))
+        command = _next(motion, sensor.force(wrench[-1]), command)
+    times = STEP * TICK * np.arange(len(rows))
+    commands, reached, wrench, contact = (np.array(column) for column in zip(*rows, strict=True))
+    return Log(times, commands, reached, wrench, *contact.T)
+
+
+class _Sensor:
+    """The wrist sensor's filter, and the force that the controller takes for that of contact."""
+
+    def __init__(self, cut_off: float) -> None:
+        self._sections = butter(2, cut_off, fs=1.0 / STEP, output="sos")
+        self._state: Array | None = None
+        self._zero = np.zeros(3)
+
+    def filtered(self, readings: Array) -> Array:
+        """Wrenches (T, 6) after the filter, which starts as if the first reading had always been there."""
+        if self._state is None:
+            self._state = sosfilt_zi(self._sections)[:, :, None] * readings[0]
+            self._zero = readings[0, :3].copy()
+        wrench, self._state = sosfilt(self._sections, readings, axis=0, zi=self._state)
+        return np.asarray(wrench)
+
+    def force(self, wrench: Array) -> float:
+        """The length of the force (N) beyond that at the start."""
+        return float(np.linalg.norm(wrench[:3] - self._zero))
+
+
+def _next(motion: Motion, force: float, last: Array) -> Array:
+    try:
+        return motion.send(force)
+    except StopIteration:
+        return last
+
+
+def _towards(pose: Array, goal: Array, share: float) -> Array:
+    quaternion = goal[3:] if pose[3:] @ goal[3:] >= 0.0 else -goal[3:]
+    moved = pose + share * (np.append(goal[:3], quaternion) - pose)
+    moved[3:] /= np.linalg.norm(moved[3:])
+    return moved
+
+
+def _contact(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """Penetration (m) of the deepest contact, -inf without one, and the sum of normal forces (N)."""
+    wrench, force = np.zeros(6), 0.0
+    for k in range(data.ncon):
+        mujoco.mj_contactForce(model, data, k, wrench)
+        force += wrench[0]
+    return np.array([-min(data.contact.dist, default=np.inf), force])
+
+
+def _model(part: Part, peg: Part, truth: Array, mechanics: Mechanics) -> mujoco.MjModel:
+    joints = mechanics.joint_friction * np.array([1.0, 1.0, 0.7, 0.15, 0.15, 0.1])
+    spec = mujoco.MjSpec.from_string(ARM.format(step=STEP, f=joints, mass=mechanics.tool_mass))
+    fixed = spec.worldbody.add_body(pos=truth[:3], quat=truth[3:])
+    for name, body, solid, collides in (("peg", spec.body("peg"), peg, 1), ("part", fixed, part, 2)):
+        for k, piece in enumerate(solid.pieces):
+            geom = body.add_geom(friction=[mechanics.friction, 0.0, 0.0], condim=3)
+            geom.contype, geom.conaffinity = collides, 3 - collides
+            geom.solimp[:3] = SHARE, SHARE, 0.001
+            if piece.kind == "box":
+                geom.type, geom.size, geom.pos = mujoco.mjtGeom.mjGEOM_BOX, piece.size, piece.center
+            else:
+                mesh = spec.add_mesh(name=f"{name}_{k}", uservert=np.ravel(piece.size))
+                geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, mesh.name
+    model = spec.compile()
+    # A contact's force is (-b v - k r - a) / R with R = (1 - d) A / d; solref's k and b are divided by d.
+    inverse_mass = model.body_invweight0[model.body("peg").id, 0]
+    damper = 2.0 * mechanics.restitution * np.sqrt(0.5 * mechanics.stiffness)
+    model.geom_solref[:] = -(1.0 - SHARE) * inverse_mass * np.array([mechanics.stiffness, damper])
+    return model
+
+
+def _stand(model: mujoco.MjModel, data: mujoco.MjData, pose: Array) -> None:
+    """Set the joints so that the sensor is at a pose, by damped least squares."""
+    wanted = Rotation.from_quat(pose[3:], scalar_first=True)
+    jacobian = np.zeros((6, model.nv))
+    for _ in range(200):
+        mujoco.mj_forward(model, data)
+        turn = Rotation.from_matrix(data.site_xmat[0].reshape(3, 3))
+        away = np.append(pose[:3] - data.site_xpos[0], (wanted * turn.inv()).as_rotvec())
+        mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], 0)
+        damped = jacobian @ jacobian.T + 1e-6 * np.eye(6)
+        data.qpos += np.clip(jacobian.T @ np.linalg.solve(damped, away), -0.2, 0.2)
+    mujoco.mj_forward(model, data)
+    if np.linalg.norm(away) > 1e-6:
+        raise ValueError(f"the arm does not reach the pose {pose}")
