@@ -227,7 +227,7 @@ def _touching(strokes: Sequence[Stroke], height: float, manner: str) -> Motion:
     for _ in range(500):
         yield here
     for stroke in strokes:
-        for pose in _way(here, stroke.start, height + LENGTH, 0.42):
+        for pose in _way(here, stroke.start, height + LENGTH, 0.42):  # noqa: UP028 (rows are sent nothing)
             yield pose
         here = stroke.start
         for _ in range(30):
