@@ -143,8 +143,10 @@ def carried_out(
         for k in range(TICK):
             data.qfrc_applied[:] = push + data.qfrc_bias
             mujoco.mj_step(model, data)
-            readings[k] = data.sensordata  # MuJoCo's readings are of the state before the step,
-            if k == 0:  # and so are the places of the sites and the contacts
+            # MuJoCo's readings, places and contacts are of the state before the step; its wrench is that of
+            # the wrist on the peg, the opposite of what the part, gravity and inertia exert.
+            readings[k] = -data.sensordata
+            if k == 0:
                 turn = Rotation.from_matrix(data.site_xmat[0].reshape(3, 3))
                 reached = np.append(data.site_xpos[0], turn.as_quat(scalar_first=True))
                 contact = _contact(model, data)

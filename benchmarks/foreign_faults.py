@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 from foreign_world import windows
+from scipy.ndimage import label, median_filter
 from scipy.spatial.transform import Rotation
 
 from bcppl.errors import InputError
@@ -159,12 +160,15 @@ def part_occluded(recording: Recording, share: float = 1.0 / 3.0) -> Recording:
     """
     first, *rest = recording.measurements
     name, depth = first.action.camera.name, np.array(first.observation.depth)
-    if name not in recording.background or not (part := recording.background[name] - depth > SEEN).any():
+    before = recording.background.get(name, depth) - depth
+    pieces, count = label(median_filter(np.nan_to_num(before), 3) > SEEN)
+    if count == 0:
         raise InputError(f"view {name!r} shows no part before a known background; take another recording.")
+    part = pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])  # the largest: others are noise
     rows, columns = np.nonzero(part)
     last = round(float(np.quantile(columns, share)))
     block = np.s_[max(rows.min() - 8, 0) : rows.max() + 9, max(columns.min() - 8, 0) : last]
-    front = np.quantile(depth[part], 0.02) - 0.05
+    front = np.nanquantile(depth[part], 0.02) - 0.05
     noise = np.random.default_rng(0).laplace(0.0, 0.001, depth.shape).astype(depth.dtype)
     depth[block] = front + noise[block]
     hidden = Measurement(first.action, DepthImage(depth, first.observation.rgb))
