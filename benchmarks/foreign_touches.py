@@ -1,0 +1,213 @@
+"""How accurate and how honest the default inference is in a world that it was not made with.
+
+Every scene of `foreign_world` is touched in two manners, by a contact softer and one stiffer than nominal,
+and read at two rates: eight recordings of the same two views. `--check` prints the gap between peg and part
+at the true pose instead, from which a wrong recording would show.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import time
+import warnings
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import foreign_check
+import numpy as np
+from foreign_world import CONTACTS, MANNERS, RATES, kept
+from jobs import each
+from report import Row, finish, options, show
+
+import bcppl
+from bcppl.beliefs import Belief, rotation_deviation, translation_deviation
+from bcppl.cli.predictive_checks import MARK, PredictiveChecks
+
+SCENES, QUICK = 50, 1
+PARTICLES = 75
+MASSES = (0.5, 0.9)
+REGIONS = {"translation": translation_deviation, "rotation": rotation_deviation}
+HELD = tuple(itertools.product(REGIONS, MASSES))
+GOALS = {"taps": 0.5, "presses": 0.2}  # mm, of the median ADD
+FAR = 2.0  # mm: a belief this far off is wrong
+QUANTILES = {"median": 0.5, "90 %": 0.9, "99 %": 0.99, "worst": 1.0}
+
+
+class Case(NamedTuple):
+    """One recording, and the seed of inference."""
+
+    seed: int
+    manner: str
+    contact: str
+    rate: int
+    inference: int
+
+
+class Result(NamedTuple):
+    """What the default inference makes of a recording.
+
+    Attributes:
+        case: which recording.
+        add: mm, weighted, at the end; inf after an error.
+        vision: mm, weighted, after the views.
+        held: by region and mass, whether it holds the truth at the end.
+        seen: the same after the views.
+        distance: squared Mahalanobis distance of the truth at the end, six degrees of freedom.
+        warned: whether a measurement was marked or a warning given.
+        seconds: wall time.
+        error: in one line; empty where there was none.
+    """
+
+    case: Case
+    add: float
+    vision: float
+    held: tuple[bool, ...]
+    seen: tuple[bool, ...]
+    distance: float
+    warned: bool
+    seconds: float
+    error: str = ""
+
+
+def inferred(case: Case, particles: int, folder: Path | None) -> Result:
+    """The result of one recording."""
+    recording = kept(*case[:4], folder)
+    points, begun = recording.part.surface_points(), time.perf_counter()
+    try:
+        with warnings.catch_warnings(record=True) as given:
+            warnings.simplefilter("always", RuntimeWarning)
+            run = bcppl.infer(
+                bcppl.models.look_and_touch.model, recording, particles=particles, seed=case.inference
+            )
+            steps = list(run)
+    except Exception as error:  # one scene that fails is one result, not the end of the benchmark
+        nothing = (False,) * len(HELD)
+        message = f"{type(error).__name__}: {' '.join(str(error).split())}"[:200]
+        return Result(case, math.inf, math.inf, nothing, nothing, math.inf, True, math.nan, message)
+    seconds = time.perf_counter() - begun
+    checks = PredictiveChecks()
+    marked = [checks.cell(step).endswith(MARK) for step in steps]
+    warned = any(marked) or checks.warning(steps[-1]) is not None
+    warned |= any(issubclass(warning.category, RuntimeWarning) for warning in given)
+    views = [step for step in steps if step.info.label.startswith("view")]
+    seen, end = views[-1].belief, steps[-1].belief
+    adds = [1e3 * belief.weighted_add(points, recording.truth) for belief in (end, seen)]
+    off = bcppl.poses.local(end.mean, bcppl.poses.as_pose(recording.truth)).numpy()
+    distance = float(off @ np.linalg.pinv(end.covariance.numpy(), rcond=1e-12, hermitian=True) @ off)
+    holds = [_holds(belief, recording.truth) for belief in (end, seen)]
+    return Result(case, adds[0], adds[1], *holds, distance, warned, seconds)
+
+
+def _holds(belief: Belief, truth: Any) -> tuple[bool, ...]:
+    return tuple(bool(belief.credible_region(m, REGIONS[name]).contains(truth)) for name, m in HELD)
+
+
+def line(name: str, several: Sequence[Result], vision: bool = False) -> list[Any]:
+    """A group's line of the table."""
+    adds = [one.vision if vision else one.add for one in several]
+    held = np.array([one.seen if vision else one.held for one in several])
+    return [
+        name,
+        len(several),
+        *[quantile(adds, level) for level in QUANTILES.values()],
+        sum(add > FAR for add in adds),
+        *[f"{100 * share:.0f}" for share in held.mean(axis=0)],
+        "" if vision else quantile([one.distance for one in several], 0.5),
+        "" if vision else sum(one.warned for one in several),
+        "" if vision else sum(add > FAR and not one.warned for add, one in zip(adds, several, strict=True)),
+        "" if vision else float(np.nanmedian([one.seconds for one in several])),
+    ]
+
+
+def quantile(values: Sequence[float], level: float) -> float:
+    """The smallest value that has at least a share `level` of the values at or below it."""
+    return float(np.sort(values)[max(0, math.ceil(level * len(values)) - 1)])
+
+
+def groups(results: Sequence[Result]) -> dict[str, list[Result]]:
+    """Results by manner, contact and rate, then by manner."""
+    grouped: dict[str, list[Result]] = {}
+    for one in results:
+        case = one.case
+        grouped.setdefault(f"{case.manner}, {case.contact}, {case.rate} Hz", []).append(one)
+    for one in results:
+        grouped.setdefault(f"{one.case.manner}, all", []).append(one)
+    return grouped
+
+
+def rows_of(results: Sequence[Result]) -> list[Row]:
+    """What is reported, with goals for the medians."""
+    rows: list[Row] = []
+    for name, several in groups(results).items():
+        adds = [one.add for one in several]
+        goal = GOALS[several[0].case.manner]
+        for level, share in QUANTILES.items():
+            value = quantile(adds, share)
+            rows.append(Row(f"{name}: ADD, {level}", value, "mm", goal if level == "median" else None))
+        for k, (region, mass) in enumerate(HELD):
+            share = 100 * float(np.mean([one.held[k] for one in several]))
+            rows.append(Row(f"{name}: {100 * mass:.0f} % region of the {region} holds the truth", share, "%"))
+        silent = sum(one.add > FAR and not one.warned for one in several)
+        rows.append(Row(f"{name}: over {FAR:g} mm off without a warning", silent, "runs", 0.0))
+        rows.append(Row(f"{name}: with a warning", sum(one.warned for one in several), "runs"))
+    return [row._replace(value=math.nan) if math.isinf(row.value) else row for row in rows]
+
+
+def checked(case: Case, folder: Path | None) -> foreign_check.Gaps:
+    """The gaps of one recording."""
+    return foreign_check.gaps_of(kept(*case[:4], folder))
+
+
+def asked() -> argparse.Namespace:
+    """The command line's options."""
+    parser = options(__doc__ or "")
+    parser.add_argument("--scenes", type=int, help=f"how many; {SCENES}, with --quick {QUICK}")
+    parser.add_argument("--particles", type=int, default=PARTICLES)
+    parser.add_argument("--jobs", type=int, default=1, help="recordings at a time, of one thread each")
+    parser.add_argument("--seeds", type=int, default=1, help="seeds of inference for each recording")
+    parser.add_argument("--manners", nargs="+", choices=MANNERS, default=list(MANNERS))
+    parser.add_argument("--contacts", nargs="+", choices=CONTACTS, default=list(CONTACTS))
+    parser.add_argument("--rates", nargs="+", type=int, choices=RATES, default=list(RATES))
+    parser.add_argument(
+        "--keep", type=Path, metavar="FOLDER", help="recordings are kept in, and taken from, it"
+    )
+    parser.add_argument("--check", action="store_true", help="the gaps at the true poses, and no inference")
+    return parser.parse_args()
+
+
+def main() -> None:
+    given = asked()
+    count = given.scenes if given.scenes is not None else QUICK if given.quick else SCENES
+    seeds = range(given.seed, given.seed + count)
+    kinds = list(itertools.product(given.manners, given.contacts, given.rates))
+    if given.check:
+        lines = []
+        for kind in kinds:
+            cases = [Case(seed, *kind, 0) for seed in seeds]
+            several = each(partial(checked, folder=given.keep), cases, given.jobs)
+            lines.append([f"{kind[0]}, {kind[1]}, {kind[2]} Hz", *foreign_check.summary(several)])
+        show("gap between peg and part at the true pose", ["", *foreign_check.COLUMNS], lines)
+        return
+    # Kinds of one scene one after another: an interrupted run has all kinds of the scenes that it got to.
+    cases = [Case(seed, *kind, k) for seed in seeds for kind in kinds for k in range(given.seeds)]
+    results: list[Result] = []
+    for first in range(0, len(cases), max(given.jobs, 1)):
+        batch = cases[first : first + max(given.jobs, 1)] if given.jobs > 1 else [cases[first]]
+        for one in each(partial(inferred, particles=given.particles, folder=given.keep), batch, given.jobs):
+            results.append(one)
+            end = one.error or f"{one.add:.3f} mm, vision {one.vision:.2f} mm, {one.distance:.1f} squared"
+            print(*one.case, end, "warned" if one.warned else "", f"{one.seconds:.1f} s", flush=True)
+    regions = [f"{name} {100 * mass:.0f} %" for name, mass in HELD]
+    lines = [line(name, several) for name, several in groups(results).items()]
+    lines.append(line("vision alone", results, vision=True))
+    columns = ["", "runs", *[f"ADD {q}" for q in QUANTILES], f"> {FAR:g} mm", *regions, "squared distance"]
+    show("mm, and % of regions that hold the truth", [*columns, "warned", "silent", "s"], lines)
+    finish(rows_of(results), given.json)
+
+
+if __name__ == "__main__":
+    main()
