@@ -13,8 +13,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import butter, sosfilt, sosfilt_zi
-from scipy.spatial.transform import Rotation
+from scipy.signal import butter, lfilter, lfilter_zi
 
 from bcppl.geometry.parts import Part
 
@@ -133,11 +132,9 @@ def carried_out(
     jacobian = np.zeros((6, model.nv))
     rows: list[tuple[Array, ...]] = []
     for _ in range(round(seconds / (STEP * TICK))):
-        place, turn = data.site_xpos[0], Rotation.from_matrix(data.site_xmat[0].reshape(3, 3))
         mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], 0)
         followed = _towards(followed, command, share)
-        turned = Rotation.from_quat(followed[3:], scalar_first=True) * turn.inv()
-        away = np.append(followed[:3] - place, turned.as_rotvec())
+        away = _away(data, followed)
         push = jacobian.T @ (mechanics.spring * away - mechanics.damper * (jacobian @ data.qvel))
         readings = np.empty((TICK, 6))
         for k in range(TICK):
@@ -147,8 +144,7 @@ def carried_out(
             # the wrist on the peg, the opposite of what the part, gravity and inertia exert.
             readings[k] = -data.sensordata
             if k == 0:
-                turn = Rotation.from_matrix(data.site_xmat[0].reshape(3, 3))
-                reached = np.append(data.site_xpos[0], turn.as_quat(scalar_first=True))
+                reached = np.append(data.site_xpos[0], _turn(data))
                 contact = _contact(model, data)
         wrench = sensor.filtered(readings)
         rows.append((command, reached, wrench[0], contact))
@@ -162,17 +158,21 @@ class _Sensor:
     """The wrist sensor's filter, and the force that the controller takes for that of contact."""
 
     def __init__(self, cut_off: float) -> None:
-        self._sections = butter(2, cut_off, fs=1.0 / STEP, output="sos")
+        b, a = butter(2, cut_off, fs=1.0 / STEP)
+        self._steady = lfilter_zi(b, a)[:, None]
+        # A tick of the filter as a matrix: its outputs and its next state are linear in inputs and state.
+        inputs, state = np.split(np.eye(TICK + 2), [TICK])
+        self._tick = np.vstack(lfilter(b, a, inputs, axis=0, zi=state))
         self._state: Array | None = None
         self._zero = np.zeros(3)
 
     def filtered(self, readings: Array) -> Array:
         """Wrenches (T, 6) after the filter, which starts as if the first reading had always been there."""
         if self._state is None:
-            self._state = sosfilt_zi(self._sections)[:, :, None] * readings[0]
+            self._state = self._steady * readings[0]
             self._zero = readings[0, :3].copy()
-        wrench, self._state = sosfilt(self._sections, readings, axis=0, zi=self._state)
-        return np.asarray(wrench)
+        wrench, self._state = np.split(self._tick @ np.vstack([readings, self._state]), [TICK])
+        return wrench
 
     def force(self, wrench: Array) -> float:
         """The length of the force (N) beyond that at the start."""
@@ -191,6 +191,20 @@ def _towards(pose: Array, goal: Array, share: float) -> Array:
     moved = pose + share * (np.append(goal[:3], quaternion) - pose)
     moved[3:] /= np.linalg.norm(moved[3:])
     return moved
+
+
+def _turn(data: mujoco.MjData) -> Array:
+    """The sensor's quaternion, wxyz; scipy's conversion takes as long as several steps of physics."""
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, data.site_xmat[0])
+    return quaternion
+
+
+def _away(data: mujoco.MjData, pose: Array) -> Array:
+    """From the sensor to a pose (7,): translation and rotation vector (6,) along the world's axes."""
+    turn = np.zeros(3)
+    mujoco.mju_subQuat(turn, pose[3:], _turn(data))
+    return np.append(pose[:3] - data.site_xpos[0], data.site_xmat[0].reshape(3, 3) @ turn)
 
 
 def _contact(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
@@ -226,12 +240,10 @@ def _model(part: Part, peg: Part, truth: Array, mechanics: Mechanics) -> mujoco.
 
 def _stand(model: mujoco.MjModel, data: mujoco.MjData, pose: Array) -> None:
     """Set the joints so that the sensor is at a pose, by damped least squares."""
-    wanted = Rotation.from_quat(pose[3:], scalar_first=True)
     jacobian = np.zeros((6, model.nv))
     for _ in range(200):
         mujoco.mj_forward(model, data)
-        turn = Rotation.from_matrix(data.site_xmat[0].reshape(3, 3))
-        away = np.append(pose[:3] - data.site_xpos[0], (wanted * turn.inv()).as_rotvec())
+        away = _away(data, pose)
         mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], 0)
         damped = jacobian @ jacobian.T + 1e-6 * np.eye(6)
         data.qpos += np.clip(jacobian.T @ np.linalg.solve(damped, away), -0.2, 0.2)

@@ -78,7 +78,7 @@ def test_six_taps_of_40_to_60_ms_push_the_peg_out_of_the_part(scene, log):
 
 def test_truth_is_within_the_guess_and_measurements_have_no_problem(recording):
     assert problems(recording) == []
-    for seed in range(4):
+    for seed in range(3):
         scene = world.scene_of(seed)
         guess = scene.guess
         assert (np.abs(scene.truth[:3] - guess.world_from_part[:3]) <= guess.translation).all()
@@ -115,15 +115,17 @@ def test_faulty_recordings_have_no_problem_that_a_check_of_the_file_reports(reco
 
 
 def test_a_moved_part_is_touched_where_it_was_moved_to(recording):
-    moved = faults.part_moved(faults.resampled(recording, 100), 0.02, 0.7)
+    slow = faults.resampled(recording, 50)
+    moved = faults.part_moved(slow, 0.02, 0.7)
     shift = 0.02 * np.array([np.cos(0.7), np.sin(0.7), 0.0])
-    away = joined(moved, "world_from_peg") - joined(faults.resampled(recording, 100), "world_from_peg")
+    away = joined(moved, "world_from_peg") - joined(slow, "world_from_peg")
     np.testing.assert_allclose(away[-1, :3], shift, atol=1e-12)
     np.testing.assert_array_equal(away[0], 0.0)
     later = replace(moved, truth=moved.truth + np.append(shift, np.zeros(4)))
     before, after = check.gaps_of(moved), check.gaps_of(later)
     second = np.linalg.norm(away[:, :3], axis=1) > 0.01
     contact = before.contact
+    assert (contact & second).sum() >= 3 and (contact & ~second).sum() >= 3
     assert np.abs(before.gap[contact & ~second]).max() < 2.5e-4
     assert np.abs(after.gap[contact & second]).max() < 2.5e-4
     assert np.abs(before.gap[contact & second]).max() > 1e-3
