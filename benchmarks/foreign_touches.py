@@ -37,7 +37,7 @@ MASSES = (0.5, 0.9)
 REGIONS = {"translation": translation_deviation, "rotation": rotation_deviation}
 HELD = tuple(itertools.product(REGIONS, MASSES))
 GOALS = {"taps": 0.5, "presses": 0.2}  # mm, of the median ADD
-FAR = 2.0  # mm: a belief this far off is wrong
+FAR = 2.0  # mm: a belief this far off is wrong where its 90 % region of the translation misses the truth
 CUTS = tuple(itertools.product((500, 100, 50), (0.5, 6.0, 0.1, 0.01)))  # Hz, and s of a window
 QUANTILES = {"median": 0.5, "90 %": 0.9, "99 %": 0.99, "worst": 1.0}
 
@@ -81,6 +81,11 @@ class Result(NamedTuple):
     warned: bool
     seconds: float
     error: str = ""
+
+    @property
+    def silent(self) -> bool:
+        """Whether the belief is wrong, sure, and without a warning."""
+        return self.add > FAR and not self.warned and not self.held[HELD.index(("translation", 0.9))]
 
 
 def inferred(case: Case, particles: int, folder: Path | None) -> Result:
@@ -142,7 +147,7 @@ def line(name: str, several: Sequence[Result], vision: bool = False) -> list[Any
         *[f"{100 * share:.0f}" for share in held.mean(axis=0)],
         "" if vision else quantile([one.distance for one in several], 0.5),
         "" if vision else sum(one.warned for one in several),
-        "" if vision else sum(add > FAR and not one.warned for add, one in zip(adds, several, strict=True)),
+        "" if vision else sum(one.silent for one in several),
         "" if vision else float(np.nanmedian([one.seconds for one in several])),
     ]
 
@@ -199,9 +204,9 @@ def rows_of(results: Sequence[Result]) -> list[Row]:
         for k, (region, mass) in enumerate(HELD):
             share = 100 * float(np.mean([one.held[k] for one in several]))
             rows.append(Row(f"{name}: {100 * mass:.0f} % region of the {region} holds the truth", share, "%"))
-        silent = sum(one.add > FAR and not one.warned for one in several)
+        silent = sum(one.silent for one in several)
         goal = 0.0 if not several[0].case.change else None
-        rows.append(Row(f"{name}: over {FAR:g} mm off without a warning", silent, "runs", goal))
+        rows.append(Row(f"{name}: over {FAR:g} mm off and sure, without a warning", silent, "runs", goal))
         rows.append(Row(f"{name}: with a warning", sum(one.warned for one in several), "runs"))
     return [row._replace(value=math.nan) if math.isinf(row.value) else row for row in rows]
 
