@@ -34,7 +34,9 @@ def belief(program: Any, args: tuple[Any, ...], observed: dict[str, Tensor], cou
     return Population(*generate(program, args, observed, count))
 
 
-def looked_at(bench: BenchParameters | None = None, seed: int = 0) -> tuple[BenchScene, Any]:
+def looked_at(
+    bench: BenchParameters | None = None, seed: int = 0, temperature: float = 2.0
+) -> tuple[BenchScene, Any]:
     """A scene, and a program by which its first camera that may be hidden sees the part where it is."""
     scene = bench_scene(seed, bench)
     renderer, view = RayCaster(scene.part), 0 if scene.hidden_view is None else scene.hidden_view
@@ -45,7 +47,13 @@ def looked_at(bench: BenchParameters | None = None, seed: int = 0) -> tuple[Benc
         part = pyro.sample("part", NormalPose(torch.from_numpy(scene.truth), spread))
         part = torch.cat([part[:, :3] + shift, part[:, 3:]], dim=1)
         site = RobustDepth(
-            renderer, camera, part, SCALE, outlier=0.1, temperature=2.0, bias=float(scene.range_bias[view])
+            renderer,
+            camera,
+            part,
+            SCALE,
+            outlier=0.1,
+            temperature=temperature,
+            bias=float(scene.range_bias[view]),
         )
         pyro.sample("depth", site)
 
@@ -61,7 +69,7 @@ def of_view(scene: BenchScene) -> Tensor:
 
 def test_draws_of_the_model_are_seldom_surprising_and_a_wrong_noise_is() -> None:
     """Images drawn at other draws of the belief: p values spread over the whole of 0 to 1."""
-    _, program = looked_at()
+    _, program = looked_at(temperature=1.0)
     still = torch.zeros(3, dtype=torch.float64)
     torch.manual_seed(0)
     drawn = simulate(program, (still,), 24)
@@ -197,11 +205,39 @@ def test_a_series_is_left_out_and_no_particles_are_refused() -> None:
 
 
 def test_a_mutant_that_draws_over_missing_pixels_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the mask replicas have more pixels than the image: nothing would ever surprise."""
-    scene, program = looked_at(BenchParameters(occluder=True))
-    image = of_view(scene)
-    image[torch.rand_like(image) < 0.6] = math.nan
-    population = belief(program, (torch.zeros(3).double(),), {"depth": image})
-    assert surprise(population)["depth"].surprising
+    """Without the mask replicas have more pixels than the image: every image with gaps would surprise."""
+    for hidden in (True, False):
+        scene, program = looked_at(BenchParameters(occluder=hidden))
+        image = of_view(scene)
+        image[torch.rand_like(image) < 0.6] = math.nan
+        population = belief(program, (torch.zeros(3).double(),), {"depth": image})
+        assert surprise(population)["depth"].surprising == hidden
     monkeypatch.setattr(DepthDistribution, "_replicated", lambda site, image, many: many.sample())
-    assert not surprise(population)["depth"].surprising
+    assert surprise(population)["depth"].surprising
+
+
+def test_pixels_off_the_part_do_not_surprise_and_a_power_widens_the_spread() -> None:
+    """A background that is off by 20 mm says nothing of the part; a power of 1 / 4 halves the excess."""
+    scene, still = bench_scene(0), torch.zeros(3, dtype=torch.float64)
+    renderer, camera = RayCaster(scene.part), scene.cameras[0]
+    truth = torch.from_numpy(scene.truth)
+    rendered = torch.from_numpy(renderer.images(camera, truth[None])[0])
+    torch.manual_seed(3)
+    behind = torch.where(torch.isinf(rendered), 1.0, rendered)
+    seen = behind + SCALE * torch.distributions.Laplace(0.0, 1.0).sample(behind.shape)
+    off = torch.where(torch.isinf(rendered), 1.02, seen)
+    background = torch.ones_like(seen)
+
+    def placed(shift: Tensor, power: float) -> None:
+        spread = torch.tensor([1e-5] * 3 + [1e-4] * 3, dtype=torch.float64)
+        part = pyro.sample("part", NormalPose(truth, spread))
+        part = torch.cat([part[:, :3] + shift, part[:, 3:]], dim=1)
+        site = RobustDepth(renderer, camera, part, SCALE, background, temperature=power)
+        pyro.sample("depth", site)
+
+    assert not surprise(belief(placed, (still, 1.0), {"depth": off}))["depth"].surprising
+    moved = still.index_fill(0, torch.tensor([0]), 0.02)
+    whole, quarter = (
+        surprise(belief(placed, (moved, power), {"depth": seen}))["depth"].excess for power in (1.0, 4.0)
+    )
+    assert whole > 10.0 and quarter == pytest.approx(0.5 * whole, rel=0.05)

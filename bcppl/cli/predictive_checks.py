@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import math
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from bcppl.inference.hypotheses import Edge, alternatives, edges, likeliest
 from bcppl.inference.population import Population
 from bcppl.inference.predictive import THRESHOLD, Check, surprise
 
 MARK = "!"
 NAMED = 6  # measurements that a warning names
 MEANING = {
-    "image": "an unmodelled object may occlude the view, or the camera is not where it is stated to be",
+    "image": "an unmodelled object may occlude the view, the camera may not be where it is stated to be, or "
+    "the part may have another shape or have moved",
+    "through": "the part is seen through where it is believed to be, so that it may have moved or have another "
+    "shape",
     "normal": "a camera, or another latent value, may be farther off than its prior allows",
-    "contacts": "the peg may have touched something else, slipped in the hand or bent",
+    "contacts": "the peg may have touched something else, slipped in the hand or bent, or the part may have "
+    "moved or have another shape",
 }
 
 
@@ -38,16 +44,27 @@ class PredictiveChecks:
         probability = together(checks.values())
         return f"<{THRESHOLD:g}{MARK}" if probability < THRESHOLD else f"{probability:.3f}"
 
-    def warning(self, step: Any) -> str | None:
-        """One sentence on the measurements that do not fit the belief of the last step; None where all do."""
+    def warnings(self, step: Any, address: str) -> list[str]:
+        """One sentence on each reason to doubt the belief of the last step; empty where there is none.
+
+        `address` is that of the sought pose.
+        """
         population = getattr(step, "population", None)
         if not isinstance(population, Population):
-            return None
+            return []
         by_label: dict[str, dict[str, Check]] = {}
-        for address, check in surprise(population, list(self.labels)).items():
-            by_label.setdefault(self.labels[address], {})[address] = check
+        for at, check in surprise(population, list(self.labels)).items():
+            by_label.setdefault(self.labels[at], {})[at] = check
         off = {label: checks for label, checks in by_label.items() if together(checks.values()) < THRESHOLD}
-        return sentence(off) if off else None
+        reasons = [sentence(off, list(by_label))] if off else []
+        reasons += [edge_sentence(edge) for edge in edges(population, address) if edge.decisive or off]
+        others = alternatives(population)
+        if others:
+            reasons.append(
+                f"the images fit a part that is {likeliest(others)} better by {others[0].gain:.0f} nats: "
+                "check the mesh's axes and handedness, and how the part was put down."
+            )
+        return reasons
 
 
 def together(checks: Collection[Check]) -> float:
@@ -55,16 +72,38 @@ def together(checks: Collection[Check]) -> float:
     return min(1.0, len(checks) * min(check.probability for check in checks))
 
 
-def sentence(off: Mapping[str, Mapping[str, Check]]) -> str:
-    """The warning for measurements that fail their check, by measurement and address."""
+def edge_sentence(edge: Edge) -> str:
+    """The warning for a belief that is piled up at the edge of the guess."""
+    unit, scale = ("mm", 1e3) if edge.axis in "xyz" else ("°", math.degrees(1.0))
+    better = ""
+    if edge.decisive:
+        beyond = f"{scale * edge.beyond:.2g} {unit} beyond it"
+        better = f", and the measurements fit better by {edge.gain:.0f} nats {beyond}"
+    return (
+        f"{100 * edge.mass:.0f} % of the posterior is at the edge of the guess, {edge.axis} "
+        f"{scale * edge.limit:+.3g} {unit} from its centre{better}: the part may be outside; widen the guess."
+    )
+
+
+def sentence(off: Mapping[str, Mapping[str, Check]], checked: Sequence[str] = ()) -> str:
+    """The warning for measurements that fail their check, by measurement and address.
+
+    `checked` are the labels of all measurements that were checked, in their order.
+    """
     labels = list(off)
     more = f" and {len(labels) - NAMED} more" if len(labels) > NAMED else ""
     kinds = dict.fromkeys(
         min(checks.values(), key=lambda check: check.probability).kind for checks in off.values()
     )
     verb = "does" if len(labels) == 1 else "do"
+    count = len(labels)
+    first = list(checked[:count]) == labels
+    moved = ""
+    if 1 < count < len(checked) and (first or list(checked[-count:]) == labels):
+        where = f"up to {labels[-1]}" if first else f"from {labels[0]} on"
+        moved = f"all {where}, as if the part had moved: "
     return (
         f"posterior predictive check: {', '.join(labels[:NAMED])}{more} {verb} not fit the final belief "
-        f"(p value below {THRESHOLD:g}): {', or '.join(MEANING[kind] for kind in kinds)}, or the belief is "
-        "wrong; look at the measurement, and try more particles or another seed."
+        f"(p value below {THRESHOLD:g}): {moved}{', or '.join(MEANING[kind] for kind in kinds)}, or the belief "
+        "is wrong; look at the measurement, and try more particles or another seed."
     )

@@ -14,6 +14,7 @@ from bcppl.beliefs import Belief, average_distance, average_nearest_distance, av
 from bcppl.cli import latent_sites
 from bcppl.cli.predictive_checks import PredictiveChecks
 from bcppl.recordings import Recording
+from bcppl.recordings.check import piece_errors
 from bcppl.traces import Model
 
 WIDTHS = {
@@ -96,8 +97,7 @@ class Report:
                 f"the particles missed the truth, which scores {gap:.0f} nats better than the best of them: "
                 "try more particles or another seed."
             )
-        warning = self._checks.warning(last)
-        if warning is not None:
+        for warning in [*self._checks.warnings(last, self.model.pose), *piece_errors(self.recording)]:
             self._warn(warning)
         self._note(self._effort())
         self.console.print(result(last.belief, self.recording), markup=False)

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.ndimage import binary_erosion
+from scipy.special import betainc
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
+from bcppl.distributions.checks import Check
 from bcppl.distributions.depth.camera_image import CameraImage
 from bcppl.distributions.depth.noise import RobustDepth
 from bcppl.distributions.depth.observed import Observed
 from bcppl.distributions.depth.rendering import Array, Mask
 from bcppl.distributions.depth.scanlines import Chain, Line, Lines, draw, gains, scan
 from bcppl.distributions.parameters import COUNT, POSITIVE, PROBABILITY, within
+
+_BEHIND = 3.0  # scales: farther behind the part, a pixel sees through it
 
 
 class _Scanned(NamedTuple):
@@ -69,7 +75,8 @@ class ClutteredDepth(CameraImage):
         pose: (N, 7) `world_from_part`.
         scale: of the Laplace error of a pixel that shows the part, metres.
         lines: every so many rows and columns are evaluated; neighbouring ones are nearly copies.
-        temperature: the divisor of the log-likelihood.
+        temperature: the divisor of the log-likelihood; None for the integrated autocorrelation of the errors
+            from one evaluated line to the next, of which so many are worth one that is independent.
         correlation: of the error from one pixel of the part to the next, from 0 up to below 1.
         rough: the probability that the error is independent of the one before.
         step: of the depth of clutter from pixel to pixel, metres.
@@ -85,7 +92,7 @@ class ClutteredDepth(CameraImage):
     scale: float = field(metadata=POSITIVE)
     _: KW_ONLY
     lines: int = field(default=4, metadata=COUNT)
-    temperature: float = field(default=1.0, metadata=POSITIVE)
+    temperature: float | None = field(default=1.0, metadata=within(above=0.0, optional=True))
     correlation: float = field(default=0.85, metadata=within(least=0.0, below=1.0))
     rough: float = field(default=0.1, metadata=PROBABILITY)
     step: float = field(default=0.004, metadata=POSITIVE)
@@ -107,7 +114,10 @@ class ClutteredDepth(CameraImage):
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-probability (N,) of a depth image (H, W), or of one for each particle (N, H, W)."""
         rows, columns = self._of_lines(value)
-        return 0.5 * (rows + columns) / self.temperature
+        temperature = self.temperature
+        if temperature is None:
+            temperature = integrated_autocorrelation(self.correlation**self.lines)
+        return 0.5 * (rows + columns) / temperature
 
     def observed(self, value: Tensor) -> Observed:
         """The valid pixels of an image (H, W), or of one for each particle, where the lines cross.
@@ -118,6 +128,35 @@ class ClutteredDepth(CameraImage):
         crossings[self.lines // 2 :: self.lines, self.lines // 2 :: self.lines] = True
         alone = RobustDepth(self.renderer, self.camera, self.pose, self.scale, outlier=0.05, region=crossings)
         return alone.observed(value)
+
+    def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check:
+        """The check of an image (H, W) at P particles (`bcppl.distributions.checks.Checked`).
+
+        Things may stand before a part, but none explains that it is seen through. The discrepancy is the
+        number of pixels inside its outline that read farther than it by three scales. Its distribution is
+        binomial, of the share `through` and the errors' tail, over as many independent pixels as the
+        correlation of the errors leaves along both directions.
+        """
+        hits = self.renderer.hits(self.camera, self.pose.detach())
+        depth = value.detach().numpy().reshape(-1).astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            valid = (depth > 0.0) & (depth >= self.camera.near) & (depth <= self.camera.far)
+        rate = self.through + 0.5 * math.exp(-_BEHIND)
+        probability, excess = np.ones(len(self.pose)), np.zeros(len(self.pose))
+        for k in range(len(self.pose)):
+            own = hits.particle == k
+            rendered = np.full(depth.shape, np.inf)
+            rendered[hits.pixel[own]] = hits.depth[own]
+            solid = np.isfinite(rendered).reshape(tuple(self.event_shape))
+            inside = valid & binary_erosion(solid, iterations=max(self.rim, 1)).reshape(-1)
+            behind = depth[inside] - rendered[inside] > _BEHIND * self.scale
+            count = len(behind) / integrated_autocorrelation(self.correlation) ** 2
+            if behind.any():
+                # The incomplete beta function is the binomial's tail, also between whole numbers.
+                seen = float(behind.mean()) * count
+                probability[k] = betainc(seen, count - seen + 1.0, rate)
+                excess[k] = (seen - count * rate) / math.sqrt(count * rate * (1.0 - rate))
+        return Check(float(probability.mean()), "through", float(excess.mean()))
 
     def _of_lines(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """Log-densities (N,) of the rows and of the columns.
@@ -180,6 +219,14 @@ class ClutteredDepth(CameraImage):
         scanned = _Scanned(copy, self.chain, self.lines, depth, valid, rows, columns, of_rows, of_columns)
         CACHE[value] = scanned
         return scanned
+
+
+def integrated_autocorrelation(correlation: float) -> float:
+    """The number of members of a first-order autoregression that are worth one independent number.
+
+    Sokal, Monte Carlo methods in statistical mechanics: foundations and new algorithms, 1989, section 2.
+    """
+    return (1.0 + correlation) / (1.0 - correlation)
 
 
 # Every run of a program builds new distributions, at other poses: the cache belongs to the image.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -191,16 +191,29 @@ class DepthDistribution(CameraImage):
     def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check:
         """The check of an image (H, W) at P particles (`bcppl.distributions.checks.Checked`).
 
-        The discrepancy is -log p(y | theta), which is a sum over pixels and so nearly normal. Replicated
+        The discrepancy is -log p(y | theta) over the pixels at which one of the particles has the part: it is
+        a sum over pixels and so nearly normal. Pixels off the part do not inform its pose, and a background
+        that is off by the error of the camera's pose is no reason to doubt it. A power below 1 states that
+        only so large a share of the pixels is independent, so the spread is larger by its root. Replicated
         images are missing where the observed one is.
         """
-        many, observed = replicas(), -self.log_prob(value)
+        every = np.ones(self.camera.height * self.camera.width, dtype=bool)
+        shown = np.zeros_like(every)
+        shown[self._hits(every).pixel] = True
+        if self.region is not None:
+            shown &= np.asarray(self.region, dtype=bool).reshape(-1)
+        if not shown.any():
+            return Check(1.0, "image", 0.0)
+        power = float(self.observed(value).power.mean())
+        # The image is copied, for the densities of all its pixels are cached with it.
+        region, image = shown.reshape(self.camera.height, self.camera.width), value.clone()
+        many, observed = replace(replicas(), region=region), -replace(self, region=region).log_prob(image)
         replicated = -many.log_prob(self._replicated(value, many)).reshape(len(observed), -1)
         # One spread for all: that of a sum over pixels hardly depends on the pose.
         spread = float(replicated.var(dim=1).mean().sqrt())
-        if not spread > 0.0:  # no pixel of the image counts
+        if not spread > 0.0:  # no pixel of the part counts
             return Check(1.0, "image", 0.0)
-        excess = (observed - replicated.mean(dim=1)) / spread
+        excess = math.sqrt(power) * (observed - replicated.mean(dim=1)) / spread
         return Check(float(ndtr(-excess.numpy()).mean()), "image", float(excess.mean()))
 
     def _replicated(self, value: Tensor, many: Any) -> Tensor:

@@ -1,0 +1,201 @@
+"""Other hypotheses than a belief's, compared by evidence: outside the guess, a mirrored or turned part.
+
+    for edge in edges(population, "part"):
+        print(edge.axis, edge.mass, edge.beyond)
+
+A truth outside the prior's box, or a part that is mirrored or was put down turned, leaves a belief that is
+narrow and wrong. These functions do not search: they move the particles that there are, and compare the
+measurements' likelihood there with that of the belief.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.arrays import Array
+from bcppl.distributions.checks import THRESHOLD
+from bcppl.distributions.depth import ClutteredDepth, DepthDistribution
+from bcppl.distributions.poses import SwingTwistPose, UniformPose
+from bcppl.distributions.poses.uniform import tilt_and_yaw
+from bcppl.inference.population import Population
+from bcppl.inference.resampling import systematic
+from bcppl.rendering.ray_casting import RayCaster
+from bcppl.traces import Trace
+from bcppl.traces.series import SeriesTrace
+
+DECISIVE = -math.log(THRESHOLD)  # nats: a gain worth a warning
+EDGE = 0.05  # of a limit: so near to it a particle counts as at the edge
+PILED = 0.3  # of the weight at one edge; of a uniform distribution there are 0.025 to 0.14
+PARTICLES = 4
+# Distances beyond the limit that are tried, in limits: from a quarter of a millimetre in a box of 20 mm.
+BEYOND = tuple(0.0125 * 1.35**k for k in range(15))
+
+
+class Edge(NamedTuple):
+    """A limit of the prior against which a belief is piled up.
+
+    Attributes:
+        axis: "x", "y" or "z" of the world, "tilt", "yaw" or "angle".
+        limit: metres or radians from the prior's centre, signed.
+        mass: the share of the weight within 5 % of the limit.
+        beyond: the distance beyond the limit at which the measurements fit best, metres or radians.
+        gain: the log-likelihood ratio of the best place beyond to the best particle, nats.
+    """
+
+    axis: str
+    limit: float
+    mass: float
+    beyond: float
+    gain: float
+
+    @property
+    def decisive(self) -> bool:
+        """Whether the measurements fit decisively better beyond the limit."""
+        return self.gain > DECISIVE
+
+
+def edges(population: Population, address: str) -> list[Edge]:
+    """The limits of a uniform prior at which a belief has 30 % of its weight; empty for any other prior.
+
+    The particles there are moved outwards, by steps up to the whole width, and all that depends on the pose
+    is evaluated again. Other latent values keep theirs.
+    """
+    trace = population.trace
+    prior = None if isinstance(trace, SeriesTrace) else trace.distributions.get(address)
+    if not isinstance(prior, UniformPose | SwingTwistPose):
+        return []
+    weights, pose = torch.softmax(population.log_weights, dim=0), trace[address]
+    piled: list[Edge] = []
+    best = None
+    for axis, limit, place, outwards in _limits(prior, pose):
+        for sign in (1.0, -1.0):
+            near = sign * place > (1.0 - EDGE) * limit
+            mass = float(weights[near].sum())
+            if mass < PILED:
+                continue
+            best = float(_of_others(trace, address).max()) if best is None else best
+            beyond, gain = _beyond(population, address, near, sign * limit * outwards, limit, best)
+            piled.append(Edge(axis, sign * limit, mass, beyond, gain))
+    return piled
+
+
+def _limits(prior: Any, pose: Tensor) -> Iterator[tuple[str, float, Tensor, Tensor]]:
+    """Each limited coordinate: name, limit, values (N,), and the tangent (N, 6) that increases it by 1."""
+    tangent = poses.local(prior.center, pose)
+    eye = torch.eye(6, dtype=torch.float64)
+    for k, axis in enumerate("xyz"):
+        if float(prior.widths[k]) > 0.0:
+            yield axis, float(prior.widths[k]), tangent[:, k], eye[k].expand(len(pose), 6)
+    if isinstance(prior, UniformPose):
+        if 0.0 < prior.angle < math.pi:
+            angle = tangent[:, 3:].norm(dim=1)
+            turn = tangent[:, 3:] / angle.clamp_min(1e-9)[:, None]
+            yield "angle", prior.angle, angle, torch.cat([torch.zeros_like(turn), turn], dim=1)
+        return
+    tilt, yaw = tilt_and_yaw(prior.center, pose)
+    if 0.0 < prior.tilt < math.pi:
+        swing = tangent[:, 3:5] / tangent[:, 3:5].norm(dim=1).clamp_min(1e-9)[:, None]
+        still = torch.zeros(len(pose), 3, dtype=torch.float64)
+        yield "tilt", prior.tilt, tilt, torch.cat([still, swing, still[:, :1]], dim=1)
+    if 0.0 < prior.yaw < math.pi:
+        yield "yaw", prior.yaw, yaw, eye[5].expand(len(pose), 6)
+
+
+def _of_others(trace: Trace, address: str) -> Tensor:
+    """The log-probability (N,) of all sites but that of the pose itself."""
+    return trace.log_prob(*(a for a in trace.addresses if a != address))
+
+
+def _beyond(
+    population: Population, address: str, near: Tensor, step: Tensor, limit: float, best: float
+) -> tuple[float, float]:
+    """The best distance beyond a limit, and its log-likelihood ratio to the best particle."""
+    chosen = systematic(torch.where(near, population.log_weights, -torch.inf), PARTICLES)
+    few = population.trace.chosen(chosen.repeat_interleave(len(BEYOND)))
+    share = torch.tensor(BEYOND, dtype=torch.float64).repeat(PARTICLES)
+    start = step[chosen].repeat_interleave(len(BEYOND), dim=0)
+    moved = few.at({address: _moved(few[address], share[:, None] * start)})
+    reached = _of_others(moved, address)
+    highest = int(reached.nan_to_num(nan=-torch.inf).argmax())
+    return float(share[highest]) * limit, float(reached[highest]) - best
+
+
+def _moved(pose: Tensor, tangent: Tensor) -> Tensor:
+    """Poses (N, 7) after a translation in the world and a rotation in the part's frame."""
+    return poses.retract(pose, tangent)
+
+
+class Alternative(NamedTuple):
+    """Another part, or another orientation, under which images are more probable.
+
+    Attributes:
+        name: such as "mirrored along x" or "turned by 180° about its z", of the part's axes.
+        gain: the log-likelihood ratio to the belief, nats.
+    """
+
+    name: str
+    gain: float
+
+
+def alternatives(population: Population, particles: int = PARTICLES) -> list[Alternative]:
+    """Mirrored or turned parts under which the depth images are decisively more probable, the best first.
+
+    The part is mirrored, or turned by a half or a quarter, about the middle of its bounding box, where it is
+    believed to be; nothing is searched. A part that is symmetric has the same likelihood so, and is not
+    named.
+    """
+    trace = population.trace
+    if isinstance(trace, SeriesTrace):
+        return []
+    few = trace.chosen(systematic(population.log_weights, particles))
+    images = [
+        (site, few[address])
+        for address, site in few.distributions.items()
+        if isinstance(site, DepthDistribution | ClutteredDepth) and type(site.renderer) is RayCaster
+    ]
+    if not images:
+        return []
+    believed = sum(site.log_prob(image) for site, image in images)
+    part = images[0][0].renderer.part
+    if any(site.renderer.part is not part for site, _ in images):
+        return []
+    middle = 0.5 * (part.vertices.min(axis=0) + part.vertices.max(axis=0))
+    results = []
+    for name, other, turn in _hypotheses(part, middle):
+        renderer = None if other is None else RayCaster(other)
+        log_likelihood: Any = 0.0
+        for site, image in images:
+            pose = poses.compose(site.pose, turn)
+            there = replace(site, pose=pose, renderer=site.renderer if renderer is None else renderer)
+            log_likelihood = log_likelihood + there.log_prob(image)
+        results.append(Alternative(name, float(log_likelihood.max() - believed.max())))
+    return sorted((r for r in results if r.gain > DECISIVE), key=lambda each: -each.gain)
+
+
+def _hypotheses(part: Any, middle: Array) -> Iterator[tuple[str, Any, Tensor]]:
+    """Each hypothesis: its name, the other part (None for the same), its turn (7,) in the part's frame."""
+    for k, axis in enumerate("xyz"):
+        sign = np.ones(3)
+        sign[k] = -1.0
+        vertices = np.ascontiguousarray(middle + sign * (part.vertices - middle))
+        mirrored = replace(part, vertices=vertices, faces=part.faces[:, ::-1].copy(), pieces=())
+        yield f"mirrored along {axis}", mirrored, poses.identity()
+    center = torch.tensor([*middle, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    for axis, degrees in (("x", 180), ("y", 180), ("z", 180), ("z", 90), ("z", -90)):
+        turn = torch.zeros(6, dtype=torch.float64)
+        turn[3 + "xyz".index(axis)] = math.radians(degrees)
+        about = poses.compose(poses.retract(center, turn), poses.inverse(center))
+        yield f"turned by {degrees}° about its {axis}", None, about
+
+
+def likeliest(others: Sequence[Alternative]) -> str:
+    """The names of the alternatives that are as probable as the first, within what is decisive."""
+    return " or ".join(each.name for each in others if each.gain > others[0].gain - DECISIVE)
