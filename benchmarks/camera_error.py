@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +23,8 @@ from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models import camera_error, part_in_view
 from bcppl.models.worlds.two_cameras import simulate_recording
 
-MODELS = {"latent errors": camera_error.model, "none": part_in_view.model}
+NONE = replace(part_in_view.model, prepare=partial(part_in_view.prepare, shift=0.0), proposals=())
+MODELS = {"latent errors": camera_error.model, "none": NONE}
 MASS = 0.9
 
 

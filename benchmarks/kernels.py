@@ -35,7 +35,9 @@ OBJECT = 5
 PARTICLES = 75
 COUNTS = (75, 1000, 10_000)
 # Moves that align a part to depth read likelihoods of independent pixels.
-IN_VIEW = replace(part_in_view.model, prepare=partial(part_in_view.prepare, clutter=False))
+IN_VIEW = replace(
+    part_in_view.model, prepare=partial(part_in_view.prepare, clutter=False, shift=0.0), proposals=()
+)
 
 
 class Posed(NamedTuple):

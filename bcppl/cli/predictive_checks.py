@@ -16,8 +16,8 @@ NAMED = 6  # measurements that a warning names
 MEANING = {
     "image": "an unmodelled object may occlude the view, the camera may not be where it is stated to be, or "
     "the part may have another shape or have moved",
-    "through": "the part is seen through where it is believed to be, so that it may have moved or have another "
-    "shape",
+    "through": "the part is seen through where it is believed to be, so that it may have moved or have "
+    "another shape",
     "normal": "a camera, or another latent value, may be farther off than its prior allows",
     "contacts": "the peg may have touched something else, slipped in the hand or bent, or the part may have "
     "moved or have another shape",
@@ -102,8 +102,9 @@ def sentence(off: Mapping[str, Mapping[str, Check]], checked: Sequence[str] = ()
     if 1 < count < len(checked) and (first or list(checked[-count:]) == labels):
         where = f"up to {labels[-1]}" if first else f"from {labels[0]} on"
         moved = f"all {where}, as if the part had moved: "
+    meant = ", or ".join(MEANING[kind] for kind in kinds)
     return (
         f"posterior predictive check: {', '.join(labels[:NAMED])}{more} {verb} not fit the final belief "
-        f"(p value below {THRESHOLD:g}): {moved}{', or '.join(MEANING[kind] for kind in kinds)}, or the belief "
-        "is wrong; look at the measurement, and try more particles or another seed."
+        f"(p value below {THRESHOLD:g}): {moved}{meant}, or the belief is wrong; "
+        "look at the measurement, and try more particles or another seed."
     )

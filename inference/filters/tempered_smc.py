@@ -25,7 +25,7 @@ from typing import Any
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.distributions.support import support_of
+from bcppl.distributions.support import freedom_of, support_of
 from bcppl.errors import InputError
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.step import Observed, Stepped
@@ -43,7 +43,13 @@ from bcppl.traces import Model, Series, Trace, generate
 PHYSICS = 2  # the cost of a site that simulates contact (`bcppl.distributions.lazy`)
 
 
-def kernel(pose: str, proposals: Sequence[Program] = (), modes: Modes | None = None) -> Kernel:
+def kernel(
+    pose: str,
+    proposals: Sequence[Program] = (),
+    modes: Modes | None = None,
+    along: Sequence[str] = (),
+    conditional: Program | None = None,
+) -> Kernel:
     """Random walks of a pose at two scales, and independent moves fitted to the other particles.
 
     Discrete values (which of several holes it is) are redrawn from the program. Other continuous latent
@@ -53,10 +59,12 @@ def kernel(pose: str, proposals: Sequence[Program] = (), modes: Modes | None = N
         pose: its address.
         proposals: the model's own (`bcppl.traces.Model`); each is used once.
         modes: if given, a third of the moves of the pose are jumps to one of them.
+        along: addresses that jump with the pose (`bcppl.inference.proposals.climbing.jumps`).
+        conditional: a proposal of the pose given these.
     """
     # A fifth of the draws are three times as wide as the particles: few particles may have missed a mode.
     redrawn = independent(pose, 1, inflation=1.2, wide=(0.2, 3.0))
-    far = [] if modes is None else [metropolis_hastings(jumps(pose, modes))]
+    far = [] if modes is None else [metropolis_hastings(jumps(pose, modes, along, conditional))]
     alone = mixture([metropolis_hastings(drift(pose, (0.2, 2.0))), metropolis_hastings(redrawn), *far])
 
     def moved(population: Population) -> Move:
@@ -92,6 +100,7 @@ def infer(
     sweeps: tuple[int | Until, int | Until] | None = None,
     share: tuple[float, float] = (0.8, 0.6),
     climbs: int = 0,
+    conditional: Program | None = None,
     scene: Any = None,
     start: Step | None = None,
 ) -> Iterator[Step]:
@@ -110,6 +119,8 @@ def infer(
             one, as shares of N: without, and with physics.
         climbs: number of draws of the prior that climb before a measurement is tempered, to find the modes
             between which particles jump (`bcppl.inference.proposals.climbing`; it needs depth images).
+        conditional: where depth images depend on other latent poses than the sought one (those at which
+            cameras that err see the part), a proposal of the sought pose given these, which jump.
         scene: `model.prepare(recording)` unless given.
         start: a step to resume from, as for `bcppl.inference.smc`.
 
@@ -132,13 +143,16 @@ def infer(
         return adaptive(systematic, share[by_physics(population.trace)])(population)
 
     def step(population: Population, observed: Observed) -> Stepped:
-        centres = None
+        centres, along = None, []
         if climbing:
             known = {**population.trace.observations, **observed.observations}
             climbers, _ = generate(model.program, observed.args, known, climbing)
-            centres = modes(climbers, model.pose)
+            if conditional is not None:
+                sites, pose = climbers.distributions, model.pose
+                along = [a for a in climbers.choices if a != pose and freedom_of(sites[a]) is not None]
+            centres = modes(climbers, model.pose, along)
         return tempered(
-            kernel(model.pose, model.proposals, centres),
+            kernel(model.pose, model.proposals, centres, along, conditional),
             sweeps=lambda trace: moves[by_physics(trace)],
             resample=resample,
             share=lambda trace: share[by_physics(trace)],

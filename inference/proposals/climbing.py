@@ -9,6 +9,7 @@ and Hastings: the posterior weighs the modes, and no answer depends on how they 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import pyro
@@ -48,7 +49,7 @@ class Modes(NamedTuple):
     scale: Tensor  # (d,) standard deviations of where the climbs began
 
 
-def modes(start: Trace, address: str) -> Modes:
+def modes(start: Trace, address: str, along: Sequence[str] = ()) -> Modes:
     """The modes that climbs from a trace's particles lead to.
 
     Every climber is aligned with the depth images, several times, and goes back to the best of these places.
@@ -62,6 +63,8 @@ def modes(start: Trace, address: str) -> Modes:
         start: of a program with all its observations, its latent values drawn from the prior. The more
             particles, the narrower a mode may be that is reached.
         address: of the pose that is moved; other latent values stay as they are.
+        along: addresses of poses that are set to the same pose, such as those at which cameras that err see
+            the part: the errors are climbed without.
 
     Raises:
         InputError: no pose is at the address, or no depth image is at an address `depth_*`.
@@ -69,34 +72,42 @@ def modes(start: Trace, address: str) -> Modes:
     if address not in start.choices or start[address].shape != (start.particles, 7):
         raise InputError(f"climbs are to move {address!r}, where the program samples no pose; name one.")
     known = PoseCoordinates(freedom_of(start.distributions[address]) or FREE)
+    start = _at(start, start[address], address, *along)
     equal = torch.full((start.particles,), 1.0 / start.particles, dtype=torch.float64)
     steps = known.steps(known.mean(start[address], equal), start[address])
     scale = steps.std(dim=0, correction=0).clamp_min(1e-9)
     damping = torch.diag((REACH * scale) ** -2)
     trace, density, pose = start, start.log_prob(), start[address]
     for _ in range(ALIGNMENTS):
-        trace = trace.at({address: depth_aligned(trace, address, damping, steps=2).pose})
+        trace = _at(trace, depth_aligned(trace, address, damping, steps=2).pose, address, *along)
         reached = trace.log_prob()
         # An alignment may lead out of the prior, or from a good place to a worse one.
         pose = torch.where((reached > density)[:, None], trace[address], pose)
         density = torch.maximum(reached, density)
-    trace = trace.at({address: pose})
+    trace = _at(trace, pose, address, *along)
     kept = highest(known, trace[address], density, scale, WALKERS, APART[0])
     trace, density = trace.chosen(kept), density[kept]
     size = torch.full_like(density, FIRST)
     for _ in range(STEPS):
         step = size[:, None] * scale * torch.randn(len(kept), known.dimension, dtype=torch.float64)
-        tried = trace.at({address: known.stepped(trace[address], step)})
+        tried = _at(trace, known.stepped(trace[address], step), address, *along)
         reached = tried.log_prob()
         higher = reached > density
         pose = torch.where(higher[:, None], tried[address], trace[address])
-        trace, density = trace.at({address: pose}), torch.maximum(density, reached)
+        trace, density = _at(trace, pose, address, *along), torch.maximum(density, reached)
         size = torch.where(higher, LONGER * size, SHORTER * size).clamp(SMALLEST, LARGEST)
     ends = highest(known, trace[address], density, scale, MODES, APART[1])
-    return fitted(trace.chosen(ends), address, known, scale)
+    return fitted(trace.chosen(ends), address, known, scale, along)
 
 
-def fitted(trace: Trace, address: str, known: PoseCoordinates, scale: Tensor) -> Modes:
+def _at(trace: Trace, pose: Tensor, *addresses: str) -> Trace:
+    """The trace with the same pose (N, 7) at several addresses."""
+    return trace.at(dict.fromkeys(addresses, pose))
+
+
+def fitted(
+    trace: Trace, address: str, known: PoseCoordinates, scale: Tensor, along: Sequence[str] = ()
+) -> Modes:
     """A normal for the mode at each of K particles; `scale` (d,) is that of where climbs began."""
     centers, count = trace[address], trace.particles
     many = trace.chosen(torch.arange(count).repeat_interleave(DRAWS))
@@ -106,7 +117,7 @@ def fitted(trace: Trace, address: str, known: PoseCoordinates, scale: Tensor) ->
     for k in range(ROUNDS):
         around = NormalPose(centers[:, None], covariance[:, None], known.freedom).expand((count, DRAWS))
         drawn = around.sample()
-        density = many.at({address: drawn.reshape(-1, 7)}).log_prob().reshape(count, DRAWS)
+        density = _at(many, drawn.reshape(-1, 7), address, *along).log_prob().reshape(count, DRAWS)
         factor = density - around.log_prob(drawn)
         log_mass = torch.logsumexp(factor, dim=1) - math.log(DRAWS)
         if k == ROUNDS - 1:
@@ -122,8 +133,13 @@ def fitted(trace: Trace, address: str, known: PoseCoordinates, scale: Tensor) ->
     return Modes(centers, covariance, log_mass, scale)
 
 
-def jumps(address: str, ends: Modes) -> Program:
+def jumps(
+    address: str, ends: Modes, along: Sequence[str] = (), conditional: Program | None = None
+) -> Program:
     """A pose near one of several modes, wherever the particle was: an independent proposal.
+
+    Where the modes are those of other poses `along`, these jump, and `conditional`, a proposal of the pose
+    given them, follows.
 
     Half of the jumps go to all modes alike, half by their mass. Some are wider than the prior: particles
     where no mode was reached could not leave otherwise, for nothing would lead back.
@@ -141,7 +157,10 @@ def jumps(address: str, ends: Modes) -> Program:
 
     def jump(trace: Trace) -> None:
         freedom = freedom_of(trace.distributions[address]) or FREE
-        pyro.sample(address, MixturePose(chance.log(), centers, around, freedom))
+        mixture = MixturePose(chance.log(), centers, around, freedom)
+        moved = {each: pyro.sample(each, mixture) for each in along or (address,)}
+        if conditional is not None and along:
+            conditional(trace.at(moved))
 
     return jump
 

@@ -95,7 +95,8 @@ def _equations(trace: Trace, address: str, image: str, pose: Tensor) -> tuple[Eq
             f"depth_alignment is given the site {image!r}, which is a {type(site).__name__} and no depth "
             "image; give those that are as `sites`."
         )
-    check_pose("depth_alignment", address, image, torch.equal(site.pose, trace[address]))
+    same = torch.allclose(site.pose, trace[address], rtol=0.0, atol=1e-9)
+    check_pose("depth_alignment", address, image, same)
     seen, camera = site.observed(trace[image]), site.camera
     hits = renderer.hits(camera, pose, counted=np.asarray(seen.valid.any(axis=0)), faces=True)
     hits, multiplicity = _thinned(hits, len(pose))

@@ -75,8 +75,7 @@ class ClutteredDepth(CameraImage):
         pose: (N, 7) `world_from_part`.
         scale: of the Laplace error of a pixel that shows the part, metres.
         lines: every so many rows and columns are evaluated; neighbouring ones are nearly copies.
-        temperature: the divisor of the log-likelihood; None for the integrated autocorrelation of the errors
-            from one evaluated line to the next, of which so many are worth one that is independent.
+        temperature: the divisor of the log-likelihood.
         correlation: of the error from one pixel of the part to the next, from 0 up to below 1.
         rough: the probability that the error is independent of the one before.
         step: of the depth of clutter from pixel to pixel, metres.
@@ -92,7 +91,7 @@ class ClutteredDepth(CameraImage):
     scale: float = field(metadata=POSITIVE)
     _: KW_ONLY
     lines: int = field(default=4, metadata=COUNT)
-    temperature: float | None = field(default=1.0, metadata=within(above=0.0, optional=True))
+    temperature: float = field(default=1.0, metadata=POSITIVE)
     correlation: float = field(default=0.85, metadata=within(least=0.0, below=1.0))
     rough: float = field(default=0.1, metadata=PROBABILITY)
     step: float = field(default=0.004, metadata=POSITIVE)
@@ -114,10 +113,7 @@ class ClutteredDepth(CameraImage):
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-probability (N,) of a depth image (H, W), or of one for each particle (N, H, W)."""
         rows, columns = self._of_lines(value)
-        temperature = self.temperature
-        if temperature is None:
-            temperature = integrated_autocorrelation(self.correlation**self.lines)
-        return 0.5 * (rows + columns) / temperature
+        return 0.5 * (rows + columns) / self.temperature
 
     def observed(self, value: Tensor) -> Observed:
         """The valid pixels of an image (H, W), or of one for each particle, where the lines cross.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -13,13 +13,17 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.depth import ClutteredDepth, RobustDepth
+from bcppl.distributions.pose_normals import PoseFactor
+from bcppl.distributions.poses import NormalPose
 from bcppl.effort import Effort
 from bcppl.geometry.camera import Camera
+from bcppl.rendering.extrinsics_error import apparent_pose, line_of_sight
 from bcppl.rendering.part_renderer import PartRenderer
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors.depth import View
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Numbered
+from bcppl.traces.carried import once
 
 
 class CalibratedCamera:
@@ -57,6 +61,10 @@ class CalibratedCamera:
 class ClutteredCamera(CalibratedCamera):
     """The same of a part among things that nobody has modelled (`ClutteredDepth`).
 
+    A mesh is not quite the part, images are registered to a pixel or two, and ranges are biased: all pixels
+    of a part share these errors. Where an instrument's first image sees the part, `seen_by_*`, is therefore
+    another pose than where it is, and normal about it.
+
     Args:
         recording: its part and the backgrounds of its cameras; where a background was measured, pixels off
             the part are independent, as for `CalibratedCamera`.
@@ -64,6 +72,10 @@ class ClutteredCamera(CalibratedCamera):
         stride: every so many rows and columns are used; of an image with a background every so many pixels
             in each direction.
         temperature: the divisor of the log-likelihood.
+        clutter: whether unknown surfaces continue from pixel to pixel.
+        shift, turn: standard deviations of where an image sees the part, along and about each axis, metres
+            and radians; a shift of 0 for images that see it where it is.
+        bias: the same along the ray, metres, in addition.
         noise: further arguments of `RobustDepth`.
     """
 
@@ -75,13 +87,49 @@ class ClutteredCamera(CalibratedCamera):
         stride: int,
         temperature: float,
         clutter: bool,
+        shift: float,
+        turn: float,
+        bias: float,
         **noise: Any,
     ) -> None:
         super().__init__(recording, renderer, **noise)
         self.stride, self.temperature, self.clutter = stride, temperature, clutter
+        self.shift, self.turn, self.bias = shift, turn, bias
+
+    def observe(self, number: int, action: View, world_from_part: Tensor) -> None:
+        """Sample `depth_*`, and with an instrument's first image its `seen_by_*`."""
+        camera, seen = action.camera, world_from_part
+        if self.shift:
+            name = f"instrument {self.instrument(action)}"
+            first, seen = once(name, partial(self._seen, camera, world_from_part))
+            if first.name != camera.name:
+                seen = apparent_pose(first, camera, world_from_part, seen)
+        pyro.sample(f"depth_{number}", self.image(camera, seen))
+
+    def _seen(self, camera: Camera, part: Tensor) -> tuple[Camera, Tensor]:
+        """The camera, and where its image sees the part (N, 7)."""
+        around = NormalPose(part, self._covariance(camera, part))
+        return camera, pyro.sample(f"seen_by_{camera.instrument}", around)
+
+    def _covariance(self, camera: Camera, part: Tensor) -> Tensor:
+        """Covariances (N, 6, 6) of where an image sees parts at poses (N, 7), in their tangent space."""
+        ray = self.bias * line_of_sight(camera, part)
+        variance = part.new_tensor([self.shift**2] * 3 + [self.turn**2] * 3)
+        covariance = torch.diag(variance).expand(*part.shape[:-1], 6, 6).clone()
+        covariance[..., :3, :3] += ray[..., :, None] * ray[..., None, :]
+        return covariance
+
+    def instrument(self, action: View) -> str:
+        """The name of the instrument, which has one error for all its images."""
+        return action.camera.instrument
+
+    def factor(self, action: View, values: Mapping[str, Tensor]) -> PoseFactor:
+        """The Gaussian over the part's pose, given where its camera sees it (N, 7)."""
+        seen = values[f"seen_by_{self.instrument(action)}"]
+        return PoseFactor(seen, partial(self._covariance, action.camera))
 
     def image(self, camera: Camera, part: Tensor) -> Any:
-        """The likelihood of an image of a part at poses (N, 7)."""
+        """The likelihood of an image of a part that is seen at poses (N, 7)."""
         if self.clutter and self.background.get(camera.name) is None:
             scale, stride, temperature = self.noise["scale"], self.stride, self.temperature
             return ClutteredDepth(self.renderer, camera, part, scale, lines=stride, temperature=temperature)
