@@ -237,7 +237,7 @@ def judge(found: Probed, steps: Sequence[Step], scene: BenchScene) -> None:
             found.holds[name] = regions_of(step.belief, scene)
     checks = PredictiveChecks()
     marked = [checks.cell(step).endswith(MARK) for step in steps]
-    found.warned = any(marked) or checks.warning(steps[-1]) is not None
+    found.warned = any(marked) or bool(checks.warnings(steps[-1], model.pose))
     found.memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
         1e6 if sys.platform != "darwin" else 1e9
     )

@@ -32,8 +32,8 @@ from bcppl.traces import Trace
 from bcppl.traces.series import SeriesTrace
 
 DECISIVE = -math.log(THRESHOLD)  # nats: a gain worth a warning
-EDGE = 0.05  # of a limit: so near to it a particle counts as at the edge
-PILED = 0.3  # of the weight at one edge; of a uniform distribution there are 0.025 to 0.14
+EDGE = 0.1  # of a limit: so near to it a particle counts as at the edge
+PILED = 0.2  # of the weight at one edge; of a uniform distribution there are 0.05 to 0.27
 PARTICLES = 4
 # Distances beyond the limit that are tried, in limits: from a quarter of a millimetre in a box of 20 mm.
 BEYOND = tuple(0.0125 * 1.35**k for k in range(15))
@@ -45,7 +45,7 @@ class Edge(NamedTuple):
     Attributes:
         axis: "x", "y" or "z" of the world, "tilt", "yaw" or "angle".
         limit: metres or radians from the prior's centre, signed.
-        mass: the share of the weight within 5 % of the limit.
+        mass: the share of the weight within 10 % of the limit.
         beyond: the distance beyond the limit at which the measurements fit best, metres or radians.
         gain: the log-likelihood ratio of the best place beyond to the best particle, nats.
     """
@@ -63,7 +63,7 @@ class Edge(NamedTuple):
 
 
 def edges(population: Population, address: str) -> list[Edge]:
-    """The limits of a uniform prior at which a belief has 30 % of its weight; empty for any other prior.
+    """The limits of a uniform prior at which a belief has a fifth of its weight; empty for any other prior.
 
     The particles there are moved outwards, by steps up to the whole width, and all that depends on the pose
     is evaluated again. Other latent values keep theirs.

@@ -14,7 +14,7 @@ from typing import Any
 
 import pyro
 
-from bcppl.arguments import whole_number
+from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.geometry.parts import Part
 from bcppl.models.camera_error import conditional_proposal
@@ -61,7 +61,9 @@ class Settings:
     bias: float = 0.005
 
     def __post_init__(self) -> None:
-        require_positive(self, "scale")
+        require_positive(self, "scale", "turn")
+        for name in ("shift", "bias"):
+            number_within(f"part_in_view is given {name} {{}}", getattr(self, name), least=0.0)
         whole_number("part_in_view is given stride {}", self.stride)
 
 

@@ -1,0 +1,113 @@
+"""Other hypotheses than a belief's: outside the guess, mirrored, turned; and silence where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pyro
+import pytest
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.cli.predictive_checks import edge_sentence
+from bcppl.distributions.depth import RobustDepth
+from bcppl.distributions.poses import NormalPose, SwingTwistPose, UniformPose
+from bcppl.geometry.parts import Part
+from bcppl.inference import hypotheses
+from bcppl.inference.hypotheses import alternatives, edges, likeliest
+from bcppl.inference.population import Population
+from bcppl.models.worlds.bench import bench_scene
+from bcppl.rendering.ray_casting import RayCaster
+from bcppl.traces import generate
+from tests.made_recordings import assert_one_sentence
+
+COUNT = 12
+SCENE = bench_scene(0)
+TRUTH = torch.from_numpy(SCENE.truth)
+
+
+def moved(*tangent: float) -> Tensor:
+    """The truth moved by a tangent, of which numbers left out are 0."""
+    whole = torch.zeros(6, dtype=torch.float64)
+    whole[: len(tangent)] = torch.tensor(tangent, dtype=torch.float64)
+    return poses.retract(TRUTH, whole)
+
+
+def seen(part: Part = SCENE.part) -> Tensor:
+    """An image of a part at the truth, with errors of 2 mm."""
+    rendered = RayCaster(part).images(SCENE.cameras[0], TRUTH[None])[0]
+    noise = np.random.default_rng(0).laplace(scale=0.002, size=rendered.shape)
+    return torch.from_numpy(np.where(np.isfinite(rendered), rendered + noise, np.nan))
+
+
+def belief(prior: Any, middle: Tensor, part: Part = SCENE.part) -> Population:
+    """Particles within tenths of a millimetre of a pose, clamped to nothing: all have the same weight."""
+
+    def program() -> None:
+        pose = pyro.sample("part", prior)
+        site = RobustDepth(RayCaster(part), SCENE.cameras[0], pose, 0.002, effective_pixels=300.0)
+        pyro.sample("depth", site)
+
+    torch.manual_seed(0)
+    trace, _ = generate(program, (), {"depth": seen()}, COUNT)
+    spread = torch.tensor([1e-4] * 3 + [1e-3] * 3, dtype=torch.float64)
+    drawn = NormalPose(middle, spread).expand((COUNT,)).sample()
+    return Population(trace.at({"part": drawn}), torch.zeros(COUNT, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_truth_outside_the_box_is_named_with_its_axis(axis: int, side: float) -> None:
+    """The truth is 8 mm outside a box of 20 mm: particles at its edge, and nothing to be seen of them."""
+    unit = np.eye(3)[axis] * side
+    population = belief(UniformPose(moved(*-0.028 * unit), 0.02, 0.3), moved(*-0.0083 * unit))
+    (found,) = edges(population, "part")
+    assert found.axis == "xyz"[axis] and found.limit == pytest.approx(0.02 * side)
+    assert found.mass > 0.9 and found.decisive and found.beyond == pytest.approx(0.008, abs=0.003)
+    sentence = edge_sentence(found)
+    assert_one_sentence(sentence)
+    assert f"{'xyz'[axis]} {20 * side:+.3g} mm" in sentence and "widen the guess" in sentence
+
+
+def test_a_truth_beyond_the_yaw_and_one_beyond_an_angle_are_named() -> None:
+    turned = moved(0.0, 0.0, 0.0, 0.0, 0.0, -0.14)
+    upright = SwingTwistPose(moved(0.0, 0.0, 0.0, 0.0, 0.0, -0.35), 0.02, 0.2, 0.2)
+    (found,) = edges(belief(upright, turned), "part")
+    assert found.axis == "yaw" and found.decisive and found.beyond == pytest.approx(0.15, abs=0.07)
+    within = UniformPose(moved(0.0, 0.0, 0.0, 0.0, 0.0, -0.35), 0.02, 0.22)
+    (found,) = edges(belief(within, turned), "part")
+    assert found.axis == "angle" and found.decisive
+
+
+def test_a_truth_just_inside_is_reported_and_not_decisive_and_one_far_inside_is_not() -> None:
+    (found,) = edges(belief(UniformPose(moved(-0.0195, 0.0, 0.0), 0.02, 0.3), TRUTH), "part")
+    assert found.axis == "x" and not found.decisive
+    assert edges(belief(UniformPose(TRUTH, 0.02, 0.3), TRUTH), "part") == []
+    assert edges(belief(NormalPose(TRUTH, torch.full((6,), 0.01).double()), TRUTH), "part") == []
+
+
+def test_a_mutant_that_compares_nothing_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hypotheses, "_of_others", lambda trace, address: torch.zeros(len(trace)).double())
+    population = belief(UniformPose(moved(-0.028, 0.0, 0.0), 0.02, 0.3), moved(-0.0083, 0.0, 0.0))
+    assert not any(edge.decisive for edge in edges(population, "part"))
+
+
+def other(linear: np.ndarray) -> Part:
+    """The scene's part under a map (3, 3) about the middle of its box."""
+    vertices = SCENE.part.vertices
+    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    faces = SCENE.part.faces if np.linalg.det(linear) > 0.0 else SCENE.part.faces[:, ::-1].copy()
+    mapped = np.ascontiguousarray((vertices - middle) @ linear.T + middle)
+    return replace(SCENE.part, vertices=mapped, faces=faces, pieces=())
+
+
+def test_a_mirrored_part_and_a_turned_one_are_named_and_the_right_one_is_not() -> None:
+    prior = UniformPose(TRUTH, 0.02, 0.3)
+    assert alternatives(belief(prior, TRUTH)) == []
+    mirrored = alternatives(belief(prior, TRUTH, other(np.diag([-1.0, 1.0, 1.0]))))
+    assert "mirrored along x" in likeliest(mirrored) and mirrored[0].gain > 20.0
+    turned = alternatives(belief(prior, TRUTH, other(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]))))
+    assert "turned by -90° about its z" in likeliest(turned) and turned[0].gain > 20.0
