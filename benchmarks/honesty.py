@@ -20,7 +20,7 @@ from report import Row, finish, options, show
 from scenes import PARTICLES, followed
 
 from bcppl import poses
-from bcppl.cli.predictive_checks import PredictiveChecks
+from bcppl.cli.predictive_checks import PredictiveChecks, piece_errors
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.parts import Piece
@@ -28,7 +28,6 @@ from bcppl.inference.filters.default import infer
 from bcppl.models import load_recording, look_and_touch, part_in_view, point_probe
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.recordings import Recording
-from bcppl.recordings.check import piece_errors
 from bcppl.traces import Model
 
 SYMMETRIC = 0.001  # m: a mesh that is so near to the part's is the part's

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from bcppl.cli.predictive_checks import MEANING, NAMED, sentence, together
+from bcppl.cli.predictive_checks import MEANING, NAMED, piece_errors, sentence, together
+from bcppl.geometry.parts import Piece
 from bcppl.inference.predictive import Check
 from bcppl.models.worlds.bench import BenchParameters, bench_scene
 from bcppl.recordings import save
@@ -67,3 +69,22 @@ def test_sites_that_came_together_are_counted() -> None:
     three = [Check(p, "normal", 0.0) for p in (0.2, 0.01, 0.9)]
     assert together(three) == pytest.approx(0.03)
     assert together(three[:1]) == 0.2 and together([three[2]] * 2) == 1.0
+
+
+def test_measurements_from_one_on_or_up_to_one_are_called_a_part_that_moved() -> None:
+    every = [f"view {k}" for k in range(1, 7)]
+    late = sentence({label: of("through") for label in every[3:]}, every)
+    assert "all from view 4 on, as if the part had moved" in late and MEANING["through"] in late
+    assert "all up to view 3, as" in sentence({label: of("through") for label in every[:3]}, every)
+    for labels in ([], every[2:3], every[1:4], every):
+        assert "as if" not in sentence({label: of("through") for label in labels or every[-1:]}, every)
+
+
+def test_pieces_that_are_not_the_mesh_are_named_and_those_that_are_are_not() -> None:
+    recording = bench_scene(0).look()
+    assert piece_errors(recording) == []
+    for factor in (1.1, 0.9):
+        pieces = tuple(Piece(p.kind, factor * p.size, factor * p.center) for p in recording.part.pieces)
+        (warning,) = piece_errors(replace(recording, part=replace(recording.part, pieces=pieces)))
+        assert recording.part.name in warning and "convex pieces" in warning
+        assert_one_sentence(warning)

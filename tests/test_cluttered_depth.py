@@ -13,6 +13,7 @@ import trimesh
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.distributions.checks import Check
 from bcppl.distributions.depth import ClutteredDepth, RobustDepth
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
@@ -140,6 +141,28 @@ def test_an_image_for_each_particle_an_image_written_to_and_a_temperature() -> N
     written = site.log_prob(image)
     assert not torch.equal(written, together)
     torch.testing.assert_close(written, site.log_prob(image.clone()), rtol=0.0, atol=0.0)
+
+
+def test_a_part_that_is_seen_through_surprises_and_one_that_is_hidden_or_right_does_not() -> None:
+    """A box that is where it is believed to be, behind a tool, and 20 mm beside."""
+    lens = camera(240, 180, 600.0)
+    rng = np.random.default_rng(0)
+
+    def image(*shift: float, tool: bool = False) -> Tensor:
+        depth = np.minimum(RENDERER.images(lens, at(shift or (0.0, 0.0, 0.0)))[0], 0.43)  # type: ignore[arg-type]
+        if tool:
+            depth[:, 108:] = 0.3
+        return torch.from_numpy(depth + rng.laplace(size=depth.shape) * 1e-3)
+
+    def check(seen: Tensor) -> Check:
+        site = ClutteredDepth(RENDERER, lens, at((0.0, 0.0, 0.0), (0.0005, 0.0, 0.0)), SCALE)
+        return site.predictive_check(seen, lambda: None)
+
+    assert check(image()).probability > 0.5 and check(image(tool=True)).probability > 0.5
+    assert check(torch.full((180, 240), math.nan)).probability == 1.0
+    for shift in ((0.02, 0.0, 0.0), (0.0, -0.02, 0.0), (0.014, 0.014, 0.0)):
+        moved = check(image(*shift))
+        assert moved.kind == "through" and moved.surprising and moved.excess > 4.0
 
 
 def test_turned_images_say_the_same() -> None:

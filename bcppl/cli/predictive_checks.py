@@ -7,12 +7,15 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from bcppl.geometry.hausdorff import hausdorff_error
 from bcppl.inference.hypotheses import Edge, alternatives, edges, likeliest
 from bcppl.inference.population import Population
 from bcppl.inference.predictive import THRESHOLD, Check, surprise
+from bcppl.recordings import Recording
 
 MARK = "!"
 NAMED = 6  # measurements that a warning names
+PIECES = 0.01  # of a part's diameter: convex pieces that are so far off its mesh are warned of
 MEANING = {
     "image": "an unmodelled object may occlude the view, the camera may not be where it is stated to be, or "
     "the part may have another shape or have moved",
@@ -65,6 +68,22 @@ class PredictiveChecks:
                 "check the mesh's axes and handedness, and how the part was put down."
             )
         return reasons
+
+
+def piece_errors(recording: Recording) -> list[str]:
+    """One sentence on each solid of a recording whose convex pieces are not its mesh."""
+    wrong = []
+    for solid in (recording.part, recording.peg):
+        if solid is None or not solid.pieces or not solid.is_closed:
+            continue
+        error = hausdorff_error(solid, count=1000)
+        if error.largest > PIECES * solid.diameter:
+            wrong.append(
+                f"the convex pieces of part {solid.name!r} extend {1e3 * error.added:.2g} mm beyond its mesh "
+                f"and lack up to {1e3 * error.lost:.2g} mm of it: it is touched as another shape than it is "
+                "seen as; decompose it again (bcppl.geometry.decomposition)."
+            )
+    return wrong
 
 
 def together(checks: Collection[Check]) -> float:

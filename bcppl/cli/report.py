@@ -12,9 +12,8 @@ from rich.table import Table
 from bcppl import poses
 from bcppl.beliefs import Belief, average_distance, average_nearest_distance, average_point_distance
 from bcppl.cli import latent_sites
-from bcppl.cli.predictive_checks import PredictiveChecks
+from bcppl.cli.predictive_checks import PredictiveChecks, piece_errors
 from bcppl.recordings import Recording
-from bcppl.recordings.check import piece_errors
 from bcppl.traces import Model
 
 WIDTHS = {

@@ -13,8 +13,6 @@ from bcppl.sensors import checks
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.protocol import by_sensor, sensor_for, sensors
 
-PIECES = 0.01  # of a part's diameter: pieces that are so far off its mesh are worth a remark
-
 
 def problems(recording: Recording) -> list[str]:
     """Everything that is wrong with a recording, one sentence each; empty where nothing is."""
@@ -35,27 +33,8 @@ def notes(recording: Recording) -> list[str]:
     """Remarks on a recording that do not stop inference, one sentence each."""
     part = recording.part
     if _touched(recording) or list(checks.part(part, closed=False)) or part.is_closed:
-        return piece_errors(recording)
+        return []
     return [f"part {part.name!r} has an open mesh: it can be looked at, as here, but not touched."]
-
-
-def piece_errors(recording: Recording) -> list[str]:
-    """One sentence on each solid whose convex pieces are not its mesh; empty where they fit."""
-    solids = [solid for solid in (recording.part, recording.peg) if solid is not None and solid.pieces]
-    wrong = []
-    for solid in solids:
-        if list(checks.part(solid, closed=True)):
-            continue
-        from bcppl.geometry.hausdorff import hausdorff_error  # trimesh takes long to import
-
-        error = hausdorff_error(solid, count=1000)
-        if error.largest > PIECES * solid.diameter:
-            wrong.append(
-                f"the convex pieces of part {solid.name!r} extend {1e3 * error.added:.2g} mm beyond its mesh "
-                f"and lack up to {1e3 * error.lost:.2g} mm of it: it is touched as another shape than it is "
-                "seen as; decompose it again (bcppl.geometry.decomposition)."
-            )
-    return wrong
 
 
 def _touched(recording: Recording) -> bool:
