@@ -156,17 +156,16 @@ def alternatives(population: Population, particles: int = PARTICLES) -> list[Alt
     if isinstance(trace, SeriesTrace):
         return []
     few = trace.chosen(systematic(population.log_weights, particles))
-    images = [
+    images: list[tuple[Any, Tensor]] = [
         (site, few[address])
         for address, site in few.distributions.items()
         if isinstance(site, DepthDistribution | ClutteredDepth) and type(site.renderer) is RayCaster
     ]
-    if not images:
+    parts = {id(site.renderer.part): site.renderer.part for site, _ in images}
+    if len(parts) != 1:
         return []
-    believed = sum(site.log_prob(image) for site, image in images)
-    part = images[0][0].renderer.part
-    if any(site.renderer.part is not part for site, _ in images):
-        return []
+    believed = torch.stack([site.log_prob(image) for site, image in images]).sum(dim=0)
+    (part,) = parts.values()
     middle = 0.5 * (part.vertices.min(axis=0) + part.vertices.max(axis=0))
     results = []
     for name, other, turn in _hypotheses(part, middle):
