@@ -109,7 +109,7 @@ def inferred(case: Case, particles: int, folder: Path | None) -> Result:
     seconds = time.perf_counter() - begun
     checks = PredictiveChecks()
     marked = [checks.cell(step).endswith(MARK) for step in steps]
-    warned = any(marked) or checks.warning(steps[-1]) is not None
+    warned = any(marked) or bool(checks.warnings(steps[-1], bcppl.models.look_and_touch.model.pose))
     warned |= any(issubclass(warning.category, RuntimeWarning) for warning in given)
     views = [step for step in steps if step.info.label.startswith("view")]
     seen, end = views[-1].belief, steps[-1].belief
