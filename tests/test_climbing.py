@@ -14,7 +14,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.beliefs import average_distance
 from bcppl.distributions.depth import ClutteredDepth
-from bcppl.distributions.poses import UniformPose
+from bcppl.distributions.poses import NormalPose, UniformPose
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
@@ -23,7 +23,7 @@ from bcppl.inference.kernels import metropolis_hastings, moved_by
 from bcppl.inference.proposals.climbing import Modes, jumps, modes
 from bcppl.inference.targets import POSTERIOR
 from bcppl.rendering.ray_casting import RayCaster
-from bcppl.traces import generate
+from bcppl.traces import Trace, generate
 
 BOX = trimesh.creation.box((0.06, 0.04, 0.03))
 RENDERER = RayCaster(Part("box", np.asarray(BOX.vertices), np.asarray(BOX.faces, dtype=np.int64)))
@@ -54,11 +54,20 @@ def test_climbs_find_what_an_image_shows() -> None:
         modes(start, "depth_0")
 
 
-def test_jumps_leave_the_prior_as_it_is() -> None:
+@pytest.mark.parametrize("seen", [False, True])
+def test_jumps_leave_the_prior_as_it_is(seen: bool) -> None:
     """Modes that are none: particles drawn from the prior stay draws of the prior."""
 
+    error = torch.tensor([0.01] * 3 + [0.1] * 3, dtype=torch.float64)
+
     def prior() -> None:
-        pyro.sample("part", UniformPose(poses.identity(), 0.03, 0.3))
+        part = pyro.sample("part", UniformPose(poses.identity(), 0.03, 0.3))
+        if seen:
+            pyro.sample("seen", NormalPose(part, error))
+
+    def conditional(trace: Trace) -> None:
+        """The part given where it is seen, but for the prior's edges, and a little wider."""
+        pyro.sample("part", NormalPose(trace["seen"], 1.2 * error))
 
     torch.manual_seed(1)
     count = 4000
@@ -71,10 +80,15 @@ def test_jumps_leave_the_prior_as_it_is() -> None:
         torch.tensor([0.0, -1.0], dtype=torch.float64),
         scale,
     )
-    moved = moved_by(population, metropolis_hastings(jumps("part", wrong)), POSTERIOR, 10)
+    jump = jumps("part", wrong, ["seen"], conditional) if seen else jumps("part", wrong)
+    moved = moved_by(population, metropolis_hastings(jump), POSTERIOR, 10)
     place = moved.population["part"]
     assert 0.02 < moved.acceptance < 0.9
     assert bool((place[:, :3].abs() <= 0.03).all())
     deviation = 0.03 / math.sqrt(3.0 * count)
     assert float(place[:, :3].mean(dim=0).abs().max()) < 5.0 * deviation
     assert float(place[:, :3].std(dim=0).max()) == pytest.approx(0.03 / math.sqrt(3.0), rel=0.05)
+    if seen:
+        off = poses.local(place, moved.population["seen"]) / error
+        assert float(off.mean(dim=0).abs().max()) < 5.0 / math.sqrt(count)
+        assert float((off.std(dim=0) - 1.0).abs().max()) < 0.06
