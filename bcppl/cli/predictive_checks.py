@@ -14,6 +14,7 @@ NAMED = 6  # measurements that a warning names
 MEANING = {
     "image": "an unmodelled object may occlude the view, or the camera is not where it is stated to be",
     "normal": "a camera, or another latent value, may be farther off than its prior allows",
+    "touch": "the part may have moved between touches, or the finger may have touched something else",
     "contacts": "the peg may have touched something else, slipped in the hand or bent",
 }
 

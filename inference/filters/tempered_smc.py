@@ -20,6 +20,7 @@ are moved until they are displaced from where they were resampled. Copy this fil
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -27,6 +28,7 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.support import support_of
 from bcppl.errors import InputError
+from bcppl.inference.filters.searching import Searching
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.step import Observed, Stepped
 from bcppl.inference.filters.tempering import tempered
@@ -92,6 +94,8 @@ def infer(
     sweeps: tuple[int | Until, int | Until] | None = None,
     share: tuple[float, float] = (0.8, 0.6),
     climbs: int = 0,
+    search: int = 120,
+    always_search: bool = False,
     scene: Any = None,
     start: Step | None = None,
 ) -> Iterator[Step]:
@@ -110,6 +114,9 @@ def infer(
             one, as shares of N: without, and with physics.
         climbs: number of draws of the prior that climb before a measurement is tempered, to find the modes
             between which particles jump (`bcppl.inference.proposals.climbing`; it needs depth images).
+        search: number of draws of the prior that climb where a measurement surprises all particles
+            (`bcppl.inference.filters.searching`); 0 for no search.
+        always_search: search at every measurement; with onsets of touches it costs less than tempering.
         scene: `model.prepare(recording)` unless given.
         start: a step to resume from, as for `bcppl.inference.smc`.
 
@@ -144,4 +151,8 @@ def infer(
             share=lambda trace: share[by_physics(trace)],
         )(population, observed)
 
+    if whole_number("{} climbs are to search", search, least=0) and not isinstance(model.program, Series):
+        near = partial(kernel, model.pose, model.proposals)
+        apart = until(distinct=max(1, round(0.8 * particles)), most=12)
+        step = Searching(step, model.program, model.pose, near, search, apart, always_search)
     return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)

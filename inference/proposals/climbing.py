@@ -9,6 +9,8 @@ and Hastings: the posterior weighs the modes, and no answer depends on how they 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from fnmatch import fnmatchcase
 from typing import NamedTuple
 
 import pyro
@@ -21,6 +23,8 @@ from bcppl.errors import InputError
 from bcppl.inference.exponents import next_exponent
 from bcppl.inference.proposals.coordinates import PoseCoordinates
 from bcppl.inference.proposals.depth_points import depth_aligned
+from bcppl.inference.proposals.least_squares import Alignment
+from bcppl.inference.proposals.onset_points import onsets, onsets_aligned
 from bcppl.inference.proposals.proposal import Program
 from bcppl.inference.proposals.spread import conditioned
 from bcppl.inference.summaries import weighted_covariance
@@ -51,7 +55,8 @@ class Modes(NamedTuple):
 def modes(start: Trace, address: str) -> Modes:
     """The modes that climbs from a trace's particles lead to.
 
-    Every climber is aligned with the depth images, several times, and goes back to the best of these places.
+    Every climber is aligned with the depth images or the onsets of touches that there are, several times, and
+    goes back to the best of these places.
     Those of the highest density, no two of them close together, try small steps, and go where the density is
     higher (the (1+1) evolution strategy of Rechenberg, Evolutionsstrategie, 1973). Those that end near
     a higher one count as one mode.
@@ -64,7 +69,7 @@ def modes(start: Trace, address: str) -> Modes:
         address: of the pose that is moved; other latent values stay as they are.
 
     Raises:
-        InputError: no pose is at the address, or no depth image is at an address `depth_*`.
+        InputError: no pose is at the address.
     """
     if address not in start.choices or start[address].shape != (start.particles, 7):
         raise InputError(f"climbs are to move {address!r}, where the program samples no pose; name one.")
@@ -74,8 +79,9 @@ def modes(start: Trace, address: str) -> Modes:
     scale = steps.std(dim=0, correction=0).clamp_min(1e-9)
     damping = torch.diag((REACH * scale) ** -2)
     trace, density, pose = start, start.log_prob(), start[address]
-    for _ in range(ALIGNMENTS):
-        trace = trace.at({address: depth_aligned(trace, address, damping, steps=2).pose})
+    alignments = _alignments(start, address)
+    for align in ALIGNMENTS * alignments:
+        trace = trace.at({address: align(trace, address, damping, steps=2).pose})
         reached = trace.log_prob()
         # An alignment may lead out of the prior, or from a good place to a worse one.
         pose = torch.where((reached > density)[:, None], trace[address], pose)
@@ -83,8 +89,9 @@ def modes(start: Trace, address: str) -> Modes:
     trace = trace.at({address: pose})
     kept = highest(known, trace[address], density, scale, WALKERS, APART[0])
     trace, density = trace.chosen(kept), density[kept]
+    # Where onsets are all that is aligned, climbers end at the optimum: small steps gained no evidence.
     size = torch.full_like(density, FIRST)
-    for _ in range(STEPS):
+    for _ in range(0 if alignments == [onsets_aligned] else STEPS):
         step = size[:, None] * scale * torch.randn(len(kept), known.dimension, dtype=torch.float64)
         tried = trace.at({address: known.stepped(trace[address], step)})
         reached = tried.log_prob()
@@ -94,6 +101,12 @@ def modes(start: Trace, address: str) -> Modes:
         size = torch.where(higher, LONGER * size, SHORTER * size).clamp(SMALLEST, LARGEST)
     ends = highest(known, trace[address], density, scale, MODES, APART[1])
     return fitted(trace.chosen(ends), address, known, scale)
+
+
+def _alignments(trace: Trace, address: str) -> list[Callable[..., Alignment]]:
+    """The alignments for which a trace has sites."""
+    images = any(fnmatchcase(a, "depth_*") for a in trace.observations)
+    return [depth_aligned] * images + [onsets_aligned] * bool(onsets(trace, address))
 
 
 def fitted(trace: Trace, address: str, known: PoseCoordinates, scale: Tensor) -> Modes:
