@@ -25,17 +25,18 @@ from bcppl.inference.kernels import Kernel, Until, moved_by
 from bcppl.inference.kernels.kernel import scattered
 from bcppl.inference.kernels.rejuvenation import Moved
 from bcppl.inference.population import Population
-from bcppl.inference.predictive import surprise
 from bcppl.inference.proposals.climbing import Modes, jumps, modes
-from bcppl.inference.resampling import systematic
+from bcppl.inference.resampling import seeded, systematic
 from bcppl.inference.targets import POSTERIOR, cost_of
 from bcppl.inference.verbs import update
-from bcppl.traces import generate
+from bcppl.traces import Trace, generate
 
-# Standard deviations of a discrepancy above its mean: those of a normal value 2.6 standard deviations off. Of
-# good measurements one in a hundred begins a search, whatever share of outliers the model expects.
-EXCESS = 4.0
-CHECKED = 20  # particles at which a measurement is checked
+# How far the discrepancy -log p(y | particle) of a measurement lies above the median of replicated ones, in
+# standard deviations that are taken from their quartiles: outliers among the replicas do not hide an outlier.
+# One good measurement in fifty to a hundred is farther off (a normal value by 2.2 to 3 standard deviations).
+EXCESS = 5.0
+QUARTILES = 1.349  # of a normal, in standard deviations
+LEAST = 0.45  # their distance in standard deviations so taken, for the discrepancy of one normal value
 FRESH = 8  # fresh particles for each old one: a large batch costs little more than a small one
 ENOUGH = 0.15  # effective fresh particles for each old one, with which tempering adds nothing
 
@@ -44,7 +45,7 @@ ENOUGH = 0.15  # effective fresh particles for each old one, with which temperin
 class Searching:
     """A step that searches for modes where a measurement surprises, or `always`.
 
-    Only sites that cost arithmetic are checked for surprise.
+    Only programs without a simulator are searched because of a surprise.
 
     Attributes:
         step: assimilates a measurement where no search does.
@@ -73,7 +74,7 @@ class Searching:
             done = _reweighed(population, observed) if enough else self.step(population, observed)
         else:
             done = self.step(population, observed)
-            if not _surprises(done.population, population):
+            if not excess(self.program, observed.args, done.population, population.trace) > EXCESS:
                 return done
             observations = done.population.trace.observations
             ends, fresh = self._search(Observed(observed.args, observations), len(population))
@@ -91,11 +92,27 @@ class Searching:
         )
 
 
-def _surprises(later: Population, before: Population) -> bool:
-    trace = later.trace
-    new = [a for a in trace.since(before.trace) if a in trace.observations]
-    cheap = [a for a in new if cost_of(trace.distributions[a]) == 0]
-    return any(check.excess > EXCESS for check in surprise(later, cheap, particles=CHECKED).values())
+def excess(program: Callable[..., Any], args: tuple[Any, ...], later: Population, before: Trace) -> float:
+    """How far a measurement's discrepancy exceeds that of replicas at the particles that assimilated it.
+
+    Discrepancies are those of Gelman, Meng and Stern (Statistica Sinica 6, 1996). -inf where the program has
+    sites that cost more than arithmetic, for then replicas and a search would take a simulator.
+
+    Args:
+        program: of the model.
+        args: its arguments up to and including the measurement.
+        later: the particles afterwards.
+        before: the trace without the measurement.
+    """
+    new = [a for a in later.trace.since(before) if a in later.trace.observations]
+    if not new or any(cost_of(site) > 0 for site in later.trace.distributions.values()):
+        return -math.inf
+    with seeded(0):
+        few = later.trace.chosen(systematic(later.log_weights))
+        again, _ = generate(program, args, before.observations, len(later), few.choices)
+    replicas = -again.log_prob(*new)
+    low, middle, high = replicas.quantile(torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)).tolist()
+    return float(-few.log_prob(*new).mean() - middle) / max((high - low) / QUARTILES, LEAST)
 
 
 def _reweighed(population: Population, observed: Observed) -> Stepped:

@@ -143,7 +143,7 @@ def smc(
     Warns:
         RuntimeWarning: the recording has a problem (`bcppl.recordings.problems`, checked where no scene is
             given): two cameras of one name, lengths in millimetres, times that decrease. The run continues;
-                `bcppl run` refuses such a recording. Or a measurement repeats an earlier one, number by number:
+            `bcppl run` refuses such a recording. Or a measurement repeats an earlier one, number by number:
             it is counted once.
     """
     whole_number("SMC is to run {} particles", particles)
