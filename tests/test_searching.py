@@ -120,18 +120,20 @@ def test_populations_are_joined_by_evidence() -> None:
 
 
 def test_good_readings_seldom_begin_a_search_and_outliers_do() -> None:
+    """At draws of the model, of 100 readings; and where all particles have a reading as an outlier."""
     torch.manual_seed(0)
-    started = []
-    for _ in range(20):
-        x = 1.6 * float(torch.rand(())) - 0.8
-        near = [abs(x) + NOISE * float(torch.randn(())), x + COARSE * float(torch.randn(()))]
-        near.append(x + NOISE * float(torch.randn(())))
-        steps = list(tempered_smc.infer(model, recording(*near), particles=40, search=0, sweeps=(2, 2)))
-        args = None, [None] * 3
-        started.append(excess(line, args, steps[-1].population, steps[-2].population.trace))
-    assert sum(value > EXCESS for value in started) <= 2
-    far, _ = generate(line, args, {**readings(recording(*near).measurements), "reading_2": number(2.5)}, 40)
-    assert excess(line, args, Population(far, torch.zeros(40)), steps[-2].population.trace) > EXCESS
+    args, known = (None, [None] * 3), readings(recording(0.4, 0.4).measurements)
+    truth = poses.identity(75)
+    truth[:, 0] = 0.4
+    before, _ = generate(line, (None, [None] * 2), known, 75, {"part": truth})
+
+    def exceeds(value: float) -> float:
+        trace, _ = generate(line, args, {**known, "reading_2": number(value)}, 75, {"part": truth})
+        return excess(line, args, Population(trace, torch.zeros(75)), before)
+
+    good = [exceeds(float(value)) for value in 0.4 + NOISE * torch.randn(100, dtype=torch.float64)]
+    assert 0 < sum(value > EXCESS for value in good) <= 6
+    assert exceeds(0.7) > EXCESS
 
 
 # ---- real pushes

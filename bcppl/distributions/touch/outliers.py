@@ -11,6 +11,7 @@ from torch import Tensor
 from bcppl.distributions.checks import Check
 
 KIND = "touch"
+FAR = 0.05  # a touch with a larger tail is as it should be, whatever the others are
 # The tail beyond four standard deviations: farther off, one touch is as much an outlier as another.
 FARTHEST = 6.3e-5
 
@@ -33,6 +34,7 @@ def touch_check(tail: Tensor, outlier: float, others: Tensor | None = None) -> C
     if others is not None:
         count = 1 + (others <= tail[:, None]).sum(dim=1)
         total = 1 + others.shape[1]
-        probability = torch.as_tensor(bdtrc(count.numpy() - 1, total, own.numpy()))
+        together = torch.as_tensor(bdtrc(count.numpy() - 1, total, own.numpy()))
+        probability = torch.where(tail < FAR, together, own)
     squared = torch.from_numpy(ndtri(0.5 * tail.clamp(min=FARTHEST).numpy())).square()
     return Check(float(probability.mean()), KIND, float((squared.mean() - 1.0) / math.sqrt(2.0)))
