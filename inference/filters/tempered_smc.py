@@ -126,7 +126,9 @@ def infer(
     particles = whole_number("SMC is to run {} particles", particles)
     for kept in share:
         number_within("a share of {} of the particles is to be kept", kept, least=0.0, below=1.0)
-    enough = until(displacement=0.5, distinct=max(1, round(0.8 * particles)), most=60)
+    # A run that is resumed has the particles that it was begun with.
+    most = max(1, round(0.8 * (particles if start is None else len(start.population))))
+    enough = until(displacement=0.5, distinct=most, most=60)
     climbing = whole_number("{} climbs are to find modes", climbs, least=0)
     if climbing and isinstance(model.program, Series):
         raise InputError("climbs find modes of one pose, and the model's is a series; give climbs=0.")
@@ -153,6 +155,6 @@ def infer(
 
     if whole_number("{} climbs are to search", search, least=0) and not isinstance(model.program, Series):
         near = partial(kernel, model.pose, model.proposals)
-        apart = until(distinct=max(1, round(0.8 * particles)), most=12)
+        apart = until(distinct=most, most=12)
         step = Searching(step, model.program, model.pose, near, search, apart, always_search)
     return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)
