@@ -76,8 +76,8 @@ class Searching:
             done = self.step(population, observed)
             if not excess(self.program, observed.args, done.population, population.trace) > EXCESS:
                 return done
-            observations = done.population.trace.observations
-            ends, fresh = self._search(Observed(observed.args, observations), len(population))
+            every = Observed(observed.args, done.population.trace.observations)
+            ends, fresh = self._search(every, len(population))
         both, chosen = joined(done.population, fresh)
         moved = moved_by(both, self.kernel(ends), POSTERIOR, self.sweeps)
         return Stepped(moved.population, _record(done, population, moved, chosen))
