@@ -109,7 +109,7 @@ def test_a_part_that_moves_between_touches_is_named_and_one_that_stays_is_not() 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(5))
 def test_a_belief_of_a_part_that_moved_is_named_or_has_both_places(seed: int) -> None:
-    """Where half of the particles explain either half of the touches no single touch is off to all of them."""
+    """Where particles explain either half of the touches, no single touch is off to all of them."""
     recording = model.simulate_recording(seed, pushes=10)
     halves = [m if k < 5 else _moved(m, 0.02) for k, m in enumerate(recording.measurements)]
     *_, step = infer(model, replace(recording, measurements=halves), seed=seed)
