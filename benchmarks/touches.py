@@ -24,8 +24,8 @@ from bcppl.beliefs import Belief, average_distance
 from bcppl.beliefs.regions import Measure, average_point_distance, rotation_angle, translation_deviation
 from bcppl.contact.touch import Touch
 from bcppl.geometry.distance import SignedDistance
+from bcppl.inference import infer
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.filters.tempered_smc import infer
 from bcppl.models.point_probe import estimate_settings, model
 from bcppl.recordings.importers.point_probe import command
 from bcppl.sensors import Push, Recording

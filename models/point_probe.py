@@ -60,6 +60,7 @@ model = Model(
     observe=Scene.observed,
     pose="part",
     simulate_recording=simulated_in("point_probe"),
+    inference=("tempered_smc", {"always_search": True}),
 )
 
 

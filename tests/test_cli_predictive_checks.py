@@ -42,9 +42,29 @@ def test_a_hidden_view_is_marked_and_named_and_a_clean_one_is_not(
         assert not marked and not warnings
 
 
+UNCHECKED = """
+import pyro
+import pyro.distributions as dist
+import torch
+from bcppl.models.point_probe import prepare
+from bcppl.traces import Model
+
+def program(scene, actions):
+    part = pyro.sample("part", scene.prior)
+    for k in range(len(actions)):
+        pyro.sample(f"x_{k}", dist.Laplace(part[..., 0], 0.1))
+
+def observe(scene, measurements):
+    return {f"x_{k}": torch.tensor(0.0).double() for k in range(len(measurements))}
+
+model = Model(program, prepare, observe, "part")
+"""
+
+
 def test_a_model_without_a_check_has_no_p_values(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(1), tmp_path / "short.h5")
-    ran = bcppl("run", "short.h5", "--particles", 4)
+    (tmp_path / "unchecked.py").write_text(UNCHECKED)
+    ran = bcppl("run", "short.h5", "--particles", 4, "--model", "unchecked.py")
     assert ran.code == 0 and "predictive check" not in ran.out
     rows = json.loads((tmp_path / "runs/short/run.json").read_text())["rows"]
     assert [row["p value"] for row in rows] == ["", ""]

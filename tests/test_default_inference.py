@@ -30,7 +30,7 @@ def test_infer_runs_it_and_settings_given_win() -> None:
     recording = short(1)
     (*_, one), (*_, other) = (
         bcppl.infer(point_probe.model, recording, particles=5, seed=2),
-        tempered_smc.infer(point_probe.model, recording, particles=5, seed=2),
+        tempered_smc.infer(point_probe.model, recording, particles=5, seed=2, always_search=True),
     )
     assert torch.equal(one.belief.world_from_part, other.belief.world_from_part)
     with pytest.raises(InputError, match="-1 climbs"):

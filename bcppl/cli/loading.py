@@ -20,7 +20,7 @@ import bcppl.models
 from bcppl.errors import InputError
 from bcppl.inference.filters.default import Infer, default_inference
 from bcppl.models.shipped import load_recording
-from bcppl.recordings import Recording, validate
+from bcppl.recordings import Recording, once_each, validate
 from bcppl.traces import Model
 
 MODEL, INFERENCE = "model", "inference program"
@@ -32,10 +32,10 @@ HOMES: dict[str, tuple[ModuleType, str, str]] = {
 
 
 def recording(name: str) -> Recording:
-    """The recording in a file, or a shipped one by name, checked."""
+    """The recording in a file, or a shipped one by name, checked, every measurement once."""
     loaded = load_recording(name)
     validate(loaded)
-    return loaded
+    return once_each(loaded)
 
 
 def model(given: str | None, named: str = "", by: str = "the recording") -> Model:

@@ -22,6 +22,7 @@ MEANING = {
     "through": "the part is seen through where it is believed to be, so that it may have moved or have "
     "another shape",
     "normal": "a camera, or another latent value, may be farther off than its prior allows",
+    "touch": "the part may have moved between touches, or the finger may have touched something else",
     "contacts": "the peg may have touched something else, slipped in the hand or bent, or the part may have "
     "moved or have another shape",
 }

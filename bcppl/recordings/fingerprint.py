@@ -32,7 +32,7 @@ def fingerprint(recording: Recording, count: int) -> str:
         sensor = sensor_of(measurement.action)
         action = sensor.action.stored(measurement.action)
         content.append([sensor.kind, action, sensor.observation.stored(measurement.observation)])
-    _add(digest, content)
+    add(digest, content)
     return PREFIX + digest.hexdigest()
 
 
@@ -48,14 +48,14 @@ def is_of(stored: str, recording: Recording, count: int) -> bool:
     return stored == _first_version(recording, count)
 
 
-def _add(digest: Any, value: Any) -> None:
+def add(digest: Any, value: Any) -> None:
     """Hash a value with its type and length, so that no two values have the same bytes."""
     if isinstance(value, Mapping):
-        _add(digest, [[key, each] for key, each in value.items()])
+        add(digest, [[key, each] for key, each in value.items()])
     elif isinstance(value, list):
         digest.update(f"list {len(value)} ".encode())
         for each in value:
-            _add(digest, each)
+            add(digest, each)
     elif isinstance(value, np.ndarray):
         digest.update(f"array {value.dtype.str} {value.shape} ".encode())
         digest.update(np.ascontiguousarray(value).tobytes())

@@ -24,7 +24,7 @@ from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.verbs import initialize, observations_of
-from bcppl.recordings import Recording, problems
+from bcppl.recordings import Recording, once_each, problems
 from bcppl.traces import Model, Series, Trace, extend, generate
 
 
@@ -143,10 +143,12 @@ def smc(
     Warns:
         RuntimeWarning: the recording has a problem (`bcppl.recordings.problems`, checked where no scene is
             given): two cameras of one name, lengths in millimetres, times that decrease. The run continues;
-            `bcppl run` refuses such a recording.
+            `bcppl run` refuses such a recording. Or a measurement repeats an earlier one, number by number:
+            it is counted once.
     """
     whole_number("SMC is to run {} particles", particles)
     seed_number(seed)
+    recording = once_each(recording) if isinstance(recording, Recording) else recording
     steps = _steps(model, recording, step, particles, seed, scene, start)
     left = len(recording.measurements) + (1 if start is None else -start.taken)
     return watched(steps, total=left, describe=lambda each: each.info.label, progress=progress)

@@ -20,6 +20,7 @@ are moved until they are displaced from where they were resampled. Copy this fil
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -27,6 +28,7 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.support import freedom_of, support_of
 from bcppl.errors import InputError
+from bcppl.inference.filters.searching import Searching
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.step import Observed, Stepped
 from bcppl.inference.filters.tempering import tempered
@@ -101,6 +103,8 @@ def infer(
     share: tuple[float, float] = (0.8, 0.6),
     climbs: int = 0,
     conditional: Program | None = None,
+    search: int = 120,
+    always_search: bool = False,
     scene: Any = None,
     start: Step | None = None,
 ) -> Iterator[Step]:
@@ -121,6 +125,9 @@ def infer(
             between which particles jump (`bcppl.inference.proposals.climbing`; it needs depth images).
         conditional: where depth images depend on other latent poses than the sought one (those at which
             cameras that err see the part), a proposal of the sought pose given these, which jump.
+        search: number of draws of the prior that climb where a measurement surprises all particles
+            (`bcppl.inference.filters.searching`); 0 for no search.
+        always_search: search at every measurement; with onsets of touches it costs less than tempering.
         scene: `model.prepare(recording)` unless given.
         start: a step to resume from, as for `bcppl.inference.smc`.
 
@@ -130,7 +137,9 @@ def infer(
     particles = whole_number("SMC is to run {} particles", particles)
     for kept in share:
         number_within("a share of {} of the particles is to be kept", kept, least=0.0, below=1.0)
-    enough = until(displacement=0.5, distinct=max(1, round(0.8 * particles)), most=60)
+    # A run that is resumed has the particles that it was begun with.
+    most = max(1, round(0.8 * (particles if start is None else len(start.population))))
+    enough = until(displacement=0.5, distinct=most, most=60)
     climbing = whole_number("{} climbs are to find modes", climbs, least=0)
     if climbing and isinstance(model.program, Series):
         raise InputError("climbs find modes of one pose, and the model's is a series; give climbs=0.")
@@ -158,4 +167,8 @@ def infer(
             share=lambda trace: share[by_physics(trace)],
         )(population, observed)
 
+    if whole_number("{} climbs are to search", search, least=0) and not isinstance(model.program, Series):
+        near = partial(kernel, model.pose, model.proposals)
+        apart = until(distinct=most, most=12)
+        step = Searching(step, model.program, model.pose, near, search, apart, always_search)
     return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)

@@ -9,7 +9,8 @@ and Hastings: the posterior weighs the modes, and no answer depends on how they 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from fnmatch import fnmatchcase
 from typing import NamedTuple
 
 import pyro
@@ -22,6 +23,8 @@ from bcppl.errors import InputError
 from bcppl.inference.exponents import next_exponent
 from bcppl.inference.proposals.coordinates import PoseCoordinates
 from bcppl.inference.proposals.depth_points import depth_aligned
+from bcppl.inference.proposals.least_squares import Alignment
+from bcppl.inference.proposals.onset_points import onsets, onsets_aligned
 from bcppl.inference.proposals.proposal import Program
 from bcppl.inference.proposals.spread import conditioned
 from bcppl.inference.summaries import weighted_covariance
@@ -52,7 +55,8 @@ class Modes(NamedTuple):
 def modes(start: Trace, address: str, along: Sequence[str] = ()) -> Modes:
     """The modes that climbs from a trace's particles lead to.
 
-    Every climber is aligned with the depth images, several times, and goes back to the best of these places.
+    Every climber is aligned with the depth images or the onsets of touches that there are, several times, and
+    goes back to the best of these places.
     Those of the highest density, no two of them close together, try small steps, and go where the density is
     higher (the (1+1) evolution strategy of Rechenberg, Evolutionsstrategie, 1973). Those that end near
     a higher one count as one mode.
@@ -67,7 +71,7 @@ def modes(start: Trace, address: str, along: Sequence[str] = ()) -> Modes:
             the part: the errors are climbed without.
 
     Raises:
-        InputError: no pose is at the address, or no depth image is at an address `depth_*`.
+        InputError: no pose is at the address.
     """
     if address not in start.choices or start[address].shape != (start.particles, 7):
         raise InputError(f"climbs are to move {address!r}, where the program samples no pose; name one.")
@@ -78,8 +82,9 @@ def modes(start: Trace, address: str, along: Sequence[str] = ()) -> Modes:
     scale = steps.std(dim=0, correction=0).clamp_min(1e-9)
     damping = torch.diag((REACH * scale) ** -2)
     trace, density, pose = start, start.log_prob(), start[address]
-    for _ in range(ALIGNMENTS):
-        trace = _at(trace, depth_aligned(trace, address, damping, steps=2).pose, address, *along)
+    alignments = _alignments(start, address)
+    for align in ALIGNMENTS * alignments:
+        trace = _at(trace, align(trace, address, damping, steps=2).pose, address, *along)
         reached = trace.log_prob()
         # An alignment may lead out of the prior, or from a good place to a worse one.
         pose = torch.where((reached > density)[:, None], trace[address], pose)
@@ -87,8 +92,9 @@ def modes(start: Trace, address: str, along: Sequence[str] = ()) -> Modes:
     trace = _at(trace, pose, address, *along)
     kept = highest(known, trace[address], density, scale, WALKERS, APART[0])
     trace, density = trace.chosen(kept), density[kept]
+    # Where onsets are all that is aligned, climbers end at the optimum: small steps gained no evidence.
     size = torch.full_like(density, FIRST)
-    for _ in range(STEPS):
+    for _ in range(0 if alignments == [onsets_aligned] else STEPS):
         step = size[:, None] * scale * torch.randn(len(kept), known.dimension, dtype=torch.float64)
         tried = _at(trace, known.stepped(trace[address], step), address, *along)
         reached = tried.log_prob()
@@ -103,6 +109,12 @@ def modes(start: Trace, address: str, along: Sequence[str] = ()) -> Modes:
 def _at(trace: Trace, pose: Tensor, *addresses: str) -> Trace:
     """The trace with the same pose (N, 7) at several addresses."""
     return trace.at(dict.fromkeys(addresses, pose))
+
+
+def _alignments(trace: Trace, address: str) -> list[Callable[..., Alignment]]:
+    """The alignments for which a trace has sites."""
+    images = any(fnmatchcase(a, "depth_*") for a in trace.observations)
+    return [depth_aligned] * images + [onsets_aligned] * bool(onsets(trace, address))
 
 
 def fitted(

@@ -76,7 +76,7 @@ def _equations(trace: Trace, address: str, measured: str) -> tuple[Equations, Te
         gap = near.distance + torch.as_tensor(site.offset, dtype=torch.float64).reshape(-1, 1)
         spread = torch.as_tensor(site.spread, dtype=torch.float64).reshape(-1, 1)
         precision = torch.where(known, 1.0 / spread**2, 0.0)
-        return _robust(pose, near.closest, near.normal, gap, precision)
+        return robust_equations(pose, near.closest, near.normal, gap, precision)
     if not isinstance(site, ChamferContacts | ContactsInTime | PegPose):
         raise InputError(
             f"contact_alignment is given the site {measured!r}, which is a {type(site).__name__}; "
@@ -105,7 +105,7 @@ def _equations(trace: Trace, address: str, measured: str) -> tuple[Equations, Te
     part_from_world = poses.inverse(pose)
     point = poses.transform(part_from_world, here)
     normal = push @ poses.rotation_matrix(part_from_world).mT
-    return _robust(
+    return robust_equations(
         pose, point, normal, ((there - here) * push).sum(dim=-1), torch.where(known, precision, 0.0)
     )
 
@@ -115,7 +115,7 @@ def _moved(world_from_peg: Tensor, points: Tensor) -> Tensor:
     return poses.transform(world_from_peg, points[..., None, :])[..., 0, :]
 
 
-def _robust(
+def robust_equations(
     pose: Tensor, point: Tensor, normal: Tensor, gap: Tensor, precision: Tensor
 ) -> tuple[Equations, Tensor]:
     """The equations of T points (N, T, 3) of each particle, large residuals downweighted.

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from bcppl.distributions.checks import Check
 from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.touch.outliers import touch_check
 from bcppl.distributions.touch.placed import LATENT_POSITIVE, OUTLIER, Distance, Placed, Scale, distance_at
 
 # A normal with less than this in the world's xy plane has no direction there.
@@ -79,6 +82,14 @@ class ForceDirection(LazyDistribution):
         given = ~torch.isnan(value)
         without = torch.where(given, -torch.inf, 0.0)
         return torch.where(touched, torch.where(given, density, -torch.inf), without)
+
+    def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check | None:
+        """The check of an observed angle against its normal and the share of outliers; None without one."""
+        expected, sided, touched = self._expected()
+        if not bool((touched & ~torch.isnan(value)).all()):
+            return None
+        tail = 2.0 * torch.special.ndtr(-_wrapped(value - expected).abs() / self.spread)
+        return touch_check(torch.where(sided, tail, 1.0), self.outlier)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """An angle for each particle (N,), radians in (-pi, pi]; NaN without contact."""

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.special import log_ndtr
+from torch.special import log_ndtr, ndtr
 
+from bcppl.distributions.checks import Check
 from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.touch.outliers import touch_check
 from bcppl.distributions.touch.path import Path
 from bcppl.distributions.touch.placed import (
     LATENT_POSITIVE,
@@ -102,6 +105,28 @@ class OnsetLocation(LazyDistribution):
         density = torch.where(travelled == 0.0, inlier + log_ndtr(-score), density)
         density = torch.where(located.off <= OFF_PATH, density, -torch.inf)
         return torch.where(touched, density, inlier + log_ndtr((lowest + offset) / spread))
+
+    def tail(self, value: Tensor) -> Tensor:
+        """The probability (N,), given no outlier, of an onset no likelier than this one, (3,) or (N, 3).
+
+        Of a threshold farther from its mean; 0 for an onset that only an outlier explains.
+        """
+        offset, width = self.threshold()
+        travelled = _travelled(self.path, value)
+        touched = torch.isfinite(travelled)
+        place = value if bool(touched.all()) else torch.where(touched[..., None], value, self.path.points[0])
+        here, normal = distance_at(self.distance, self.pose, place)
+        lowest = _lowest(self.distance, self.pose, self.path, travelled)
+        approach = -(normal * self.path.locate(place).direction).sum(dim=-1)
+        score = (here + offset) / width
+        passage = torch.where((here < lowest) & (approach > 0.0), 2.0 * ndtr(-score.abs()), 0.0)
+        at_once = (2.0 * ndtr(-score)).clamp(max=1.0)
+        never = (2.0 * ndtr((lowest + offset) / width)).clamp(max=1.0)
+        return torch.where(touched, torch.where(travelled == 0.0, at_once, passage), never)
+
+    def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check:
+        """The check of an observed onset against the threshold's normal and the share of outliers."""
+        return touch_check(self.tail(value), self.outlier)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Locations of first contact (N, 3), interpolated between the path's points; NaN for never."""

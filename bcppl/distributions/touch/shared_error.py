@@ -9,11 +9,16 @@ Cholesky factor of their covariance contains the conditionals): no latent value 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.distributions.checks import Check
 from bcppl.distributions.touch.onset import OnsetLocation
+from bcppl.distributions.touch.outliers import touch_check
 from bcppl.distributions.touch.path import Path
 from bcppl.distributions.touch.placed import Placed, distance_at
 
@@ -115,18 +120,28 @@ class SharedOnset(OnsetLocation):
     """`OnsetLocation` of one touch of a session with a shared error.
 
     Args:
-        shared: the error; this touch is the last that was added to it.
+        shared: the error.
         outlier: probability of an onset that is independent of the part.
+        which: number of the touch; the last that was added unless given.
     """
 
     __caches__ = ("shared",)
 
-    def __init__(self, shared: SharedError, outlier: float) -> None:
-        self.shared, self.which = shared, len(shared.paths) - 1
+    def __init__(self, shared: SharedError, outlier: float, which: int | None = None) -> None:
+        self.shared, self.which = shared, len(shared.paths) - 1 if which is None else which
         # Later touches of the session do not change it.
         self.given = shared.center, shared.scale, tuple(shared.paths), tuple(shared.places)
-        placed, path = shared.placed, shared.paths[-1]
+        placed, path = shared.placed, shared.paths[self.which]
         super().__init__(placed, placed.pose, path, shared.offset, shared.spread, outlier)
+
+    def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check:
+        """The check of an onset beside the session's others: how many are as far off."""
+        others = [
+            SharedOnset(self.shared, self.outlier, k).tail(place)
+            for k, place in enumerate(self.shared.places)
+            if k != self.which
+        ]
+        return touch_check(self.tail(value), self.outlier, torch.stack(others, 1) if others else None)
 
     def threshold(self) -> tuple[Tensor, Tensor]:
         """Offset and spread (N,) of this touch, given the places of those before it, metres."""
