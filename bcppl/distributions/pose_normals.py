@@ -128,13 +128,18 @@ def _root(matrix: Tensor) -> Tensor:
 
 def normal_like(prior: Any) -> NormalPose:
     """A Gaussian with about the spread of a prior that is uniform within limits."""
+    return NormalPose(prior.center, 0.6 * _limits(prior).clamp(min=1e-4))
+
+
+def allowed(prior: Any, there: Tensor, margin: Tensor) -> Tensor:
+    """Whether poses (M, 7) lie in a prior's support, its limits widened by `margin` (6,), m and radians."""
+    limits = _limits(prior)
+    inwards = limits / (limits + margin) * poses.local(prior.center, there)
+    return prior.log_prob(poses.retract(prior.center, inwards)) > -torch.inf
+
+
+def _limits(prior: Any) -> Tensor:
+    """The largest deviations (6,) of a prior along and about its axes, metres and radians."""
     angle = getattr(prior, "angle", None)
     turns = [angle] * 3 if angle is not None else [prior.tilt, prior.tilt, prior.yaw]
-    widths = torch.cat([torch.as_tensor(prior.widths), torch.tensor(turns, dtype=torch.float64)])
-    return NormalPose(prior.center, 0.6 * widths.clamp(min=1e-4))
-
-
-def allowed(prior: Any, there: Tensor) -> Tensor:
-    """Whether poses (M, 7) lie in the prior's support, its limits widened by a third."""
-    inwards = poses.retract(prior.center, 0.75 * poses.local(prior.center, there))
-    return prior.log_prob(inwards) > -torch.inf
+    return torch.cat([torch.as_tensor(prior.widths), torch.tensor(turns, dtype=torch.float64)])

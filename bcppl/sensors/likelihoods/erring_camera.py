@@ -34,6 +34,8 @@ from bcppl.traces.carried import once
 
 # The Gaussian fit of an image is no sharper than this: metres, radians, metres of bias.
 SHARPEST = torch.tensor([5e-5] * 3 + [1e-3] * 3 + [1e-4], dtype=torch.float64)
+# An apparent pose is this many standard deviations of the camera's errors outside the prior's support at most.
+_OUTSIDE = 4.0
 _WIDER = 1.3  # standard deviations of a proposed bias, in those of the fit
 
 
@@ -198,17 +200,25 @@ class ErringCamera:
     def fit(self, number: int, action: View, observations: Mapping[str, Tensor]) -> FittedNormal:
         """A Gaussian (7,) over the apparent pose, in the tangent space of the prior's mean, and the bias."""
         camera, prior, image = self.camera(action), self.prior, observations[f"depth_{number}"]
+        errors = self._errors(camera)
 
         def log_density(point: Tensor) -> Tensor:
             seen, bias = poses.retract(prior.center, point[:, :6]), point[:, 6]
             image_here = self.image(camera, without_bias(camera, seen, bias), bias).log_prob(image)
-            return torch.where(allowed(prior, seen), image_here, -torch.inf)
+            return torch.where(allowed(prior, seen, _OUTSIDE * errors), image_here, -torch.inf)
 
-        spread = normal_like(prior).covariance.diagonal().sqrt()
+        spread = torch.hypot(normal_like(prior).covariance.diagonal().sqrt(), errors)
         bias = torch.tensor([self.settings.bias], dtype=torch.float64)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)  # a fit depends on the image alone
             return fitted_normal(log_density, torch.cat([spread, bias]), SHARPEST)
+
+    def _errors(self, camera: Camera) -> Tensor:
+        """Standard deviations (6,) of the apparent pose of a part at the prior's mean."""
+        center, settings = self.prior.center, self.settings
+        error = apparent_covariance(camera, center, settings.camera_shift, settings.camera_turn).diagonal()
+        along = settings.bias * line_of_sight(camera, center)
+        return (error + torch.cat([along, torch.zeros_like(along)]).square()).sqrt()
 
     def factor(self, action: View, values: Mapping[str, Tensor]) -> PoseFactor:
         """The Gaussian over the part's pose, given where its camera measures it (N, 7) and its bias (N,)."""
