@@ -21,6 +21,7 @@ from bcppl.distributions.pose_normals import (
     GaussianMixture,
     PoseFactor,
     matched,
+    moments_within,
     normal_like,
     product_of_factors,
     truncated,
@@ -146,7 +147,7 @@ class GaussianApproximation:
         prior, sensor = self.scene.prior, self.scene.sensor
         factors = [sensor(f.action).marginal_factor(f.action, f.fit) for f in self.fits.values()]
         if factors:
-            normal = product_of_factors(prior, factors)
+            normal = moments_within(prior, product_of_factors(prior, factors))
             return Normal(normal.center, torch.linalg.inv(normal.covariance))
         normal = normal_like(prior)
         return Normal(normal.center[None], torch.linalg.inv(normal.covariance)[None])
@@ -178,6 +179,7 @@ class GaussianApproximation:
             center = expected.center.expand(trace.particles, 7)
             precision = torch.linalg.inv(expected.covariance).expand(trace.particles, 6, 6)
         else:
+            given = moments_within(prior, given)
             center, precision = given.center, torch.linalg.inv(given.covariance)
         return widened_mixture(self.quadratic.posterior(center, precision))
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.special import log_ndtr
 
 from bcppl import poses
 from bcppl.distributions.poses import BoxedNormal, MixturePose, NormalPose
@@ -14,6 +16,9 @@ from bcppl.distributions.poses import BoxedNormal, MixturePose, NormalPose
 # Proposals are mixtures of scaled copies: their scales, in standard deviations, and their probabilities.
 WIDTHS = torch.tensor([1.1, 3.0], dtype=torch.float64)
 SHARES = torch.tensor([0.85, 0.15], dtype=torch.float64)
+
+_SWEEPS = 3  # of expectation propagation over the axes
+_NARROWEST = 1e-3  # share of a variance that a truncation leaves, at least: beyond, rounding dominates
 
 
 class GaussianMixture(NamedTuple):
@@ -97,6 +102,53 @@ def truncated(prior: Any, normal: NormalPose) -> NormalPose | BoxedNormal:
         return normal
     low, high = prior.center[:3] - prior.widths, prior.center[:3] + prior.widths
     return BoxedNormal(normal.center, normal.covariance, low, high)
+
+
+def moments_within(prior: Any, normal: NormalPose) -> NormalPose:
+    """The Gaussian with about the moments of a Gaussian (N,) truncated to a prior's box.
+
+    Expectation propagation with a factor for each axis (Cunningham, Hennig and Lacoste-Julien, Gaussian
+    probabilities and expectation propagation, arXiv 1111.6832).
+    """
+    if not bool((prior.widths > 0.0).all()):
+        return normal
+    covariance, center = normal.covariance.clone(), normal.center
+    off = center[..., :3] - prior.center[:3]
+    mean = torch.zeros_like(covariance[..., 0])
+    precision, pull = torch.zeros_like(off), torch.zeros_like(off)
+    for axis in list(range(3)) * _SWEEPS:
+        column = covariance[..., axis].clone()
+        own, here = column[..., axis].clone(), mean[..., axis]
+        # The marginal without the factor's own share, truncated, gives the share anew.
+        free = 1.0 / (1.0 / own - precision[..., axis])
+        middle = free * (here / own - pull[..., axis])
+        limits = prior.widths[axis] - off[..., axis], -prior.widths[axis] - off[..., axis]
+        inside, spread = _truncated_moments(middle, free, limits[1], limits[0])
+        change = 1.0 / spread - 1.0 / free - precision[..., axis]
+        pulled = inside / spread - middle / free - pull[..., axis]
+        precision[..., axis] += change
+        pull[..., axis] += pulled
+        gain = column / (1.0 + change * own)[..., None]
+        mean = mean + (pulled - change * here)[..., None] * gain
+        covariance = covariance - change[..., None, None] * gain[..., :, None] * column[..., None, :]
+    symmetric = 0.5 * (covariance + covariance.transpose(-1, -2))
+    return NormalPose(poses.retract(center, mean), symmetric, normal.freedom)
+
+
+def _truncated_moments(mean: Tensor, variance: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and variance of a normal truncated to an interval (Johnson, Kotz and Balakrishnan, 1994, 13.10)."""
+    deviation = variance.sqrt()
+    first, last = (low - mean) / deviation, (high - mean) / deviation
+    flip = first + last > 0.0  # as in a right tail, where the distribution function would round to 1
+    first, last = torch.where(flip, -last, first), torch.where(flip, -first, last)
+    upper, lower = log_ndtr(last), log_ndtr(first)
+    log_mass = upper + torch.log1p(-torch.exp(lower - upper))
+    at_first, at_last = (
+        torch.exp(-0.5 * x**2 - 0.5 * math.log(2.0 * math.pi) - log_mass) for x in (first, last)
+    )
+    away = at_first - at_last
+    share = 1.0 + first * at_first - last * at_last - away**2
+    return mean + deviation * torch.where(flip, -away, away), variance * share.clamp(_NARROWEST, 1.0)
 
 
 def product(first: NormalPose, second: NormalPose) -> NormalPose:
