@@ -8,6 +8,7 @@ a run that is resumed, branched or repeated gives the same bits.
 
 from __future__ import annotations
 
+import math
 from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -17,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bcppl import poses
 from bcppl.distributions.pose_normals import (
     GaussianMixture,
     PoseFactor,
@@ -160,6 +162,29 @@ class GaussianApproximation:
             alone = torch.zeros(1, dtype=torch.float64)
             return GaussianMixture(center[None], torch.linalg.inv(precision)[None], alone)
         return self.quadratic.posterior(center, precision)
+
+    def shortfall(self, trace: Any) -> float:
+        """By how many nats the best mode explains all measurements better than the best particle does.
+
+        Where the population is spread over the posterior it is about 1 or less, and -inf without contacts.
+        """
+        if self.quadratic is None:
+            return -math.inf
+        sites = [
+            self.scene.sensor(c.action).address(c.number) for c in self.contacts if self.relevant[c.number]
+        ]
+        center, precision = self.prior
+
+        def log_prior(pose: Tensor) -> Tensor:
+            away = poses.local(center, pose)
+            within = torch.where(self.scene.prior.log_prob(pose) > -torch.inf, 0.0, -torch.inf)
+            return within - 0.5 * ((away @ precision[0]) * away).sum(dim=-1)
+
+        best = self.quadratic.log_likelihood + log_prior(self.quadratic.around)
+        reached = log_prior(trace[self.pose])
+        if sites:
+            reached = reached + trace.log_prob(*sites)
+        return float(best.max() - reached.max())
 
     def conditional(self, trace: Any, values: Mapping[str, Tensor] | None = None) -> Any:
         """The approximate conditional distribution of the pose, given each particle's nuisance parameters.

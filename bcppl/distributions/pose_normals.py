@@ -119,7 +119,7 @@ def moments_within(prior: Any, normal: NormalPose) -> NormalPose:
     for axis in list(range(3)) * _SWEEPS:
         column = covariance[..., axis].clone()
         own, here = column[..., axis].clone(), mean[..., axis]
-        # The marginal without the factor's own share, truncated, gives the share anew.
+        # The marginal without the factor's own share, truncated, gives the share.
         free = 1.0 / (1.0 / own - precision[..., axis])
         middle = free * (here / own - pull[..., axis])
         limits = prior.widths[axis] - off[..., axis], -prior.widths[axis] - off[..., axis]
@@ -136,7 +136,7 @@ def moments_within(prior: Any, normal: NormalPose) -> NormalPose:
 
 
 def _truncated_moments(mean: Tensor, variance: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and variance of a normal truncated to an interval (Johnson, Kotz and Balakrishnan, 1994, 13.10)."""
+    """Mean and variance of a normal truncated to an interval."""
     deviation = variance.sqrt()
     first, last = (low - mean) / deviation, (high - mean) / deviation
     flip = first + last > 0.0  # as in a right tail, where the distribution function would round to 1

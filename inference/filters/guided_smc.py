@@ -27,6 +27,7 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import NoWeightError
 from bcppl.inference.approximation import GaussianApproximation
+from bcppl.inference.filters.second_search import searched
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair, moved as moved_by_pair
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
@@ -39,6 +40,7 @@ from bcppl.inference.proposals.approximated import (
     backward_kernel,
     conditional_proposal,
     forward_kernel,
+    independent_proposal,
     joint_random_walk,
 )
 from bcppl.inference.proposals.coordinates import continuous_addresses
@@ -114,6 +116,7 @@ def guided(
     *,
     sweeps: int = 1,
     share: float = 0.5,
+    search: Callable[[Population], Population] | None = None,
 ) -> StepFunction:
     """A step that assimilates a measurement by SMCP3, resamples when needed, and moves the particles.
 
@@ -123,6 +126,7 @@ def guided(
         moves: of every particle after each step.
         sweeps: how many of them.
         share: particles are resampled below this effective sample size, as a share of N.
+        search: given the population after each step, returns it or another that takes its place.
     """
     resample = adaptive(systematic, share)
     rejuvenation = resample_move(moves, sweeps, resample, always_move=True)
@@ -143,9 +147,21 @@ def guided(
         population = population.with_approximation(after)
         assimilated = assimilate(population, observed, programs.pair(before, after, action))
         if assimilated is None:
-            return by_tempering(population, observed)
+            return settled(by_tempering(population, observed))
         moved, ancestors, acceptance, _ = rejuvenation(assimilated.population, POSTERIOR)
-        return Stepped(moved, _info(population, moved, assimilated, acceptance, ancestors))
+        return settled(Stepped(moved, _info(population, moved, assimilated, acceptance, ancestors)))
+
+    def settled(stepped: Stepped) -> Stepped:
+        population, info = stepped
+        other = population if search is None else search(population)
+        if other is population:
+            return stepped
+        gained = other.log_evidence - population.log_evidence
+        other = rejuvenation(other, POSTERIOR).population
+        size = other.effective_sample_size
+        return Stepped(
+            other, info._replace(log_evidence=info.log_evidence + gained, effective_sample_size=size)
+        )
 
     return step
 
@@ -262,5 +278,9 @@ def infer(
         return GaussianApproximation(model.pose, scene)
 
     moves = kernel(model.pose, programs.proposals)
-    step = guided(gaussian, programs, moves, sweeps=sweeps, share=share)
+
+    def search(population: Population) -> Population:
+        return searched(population, independent_proposal)
+
+    step = guided(gaussian, programs, moves, sweeps=sweeps, share=share, search=search)
     return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)

@@ -34,8 +34,7 @@ from bcppl.traces.carried import once
 
 # The Gaussian fit of an image is no sharper than this: metres, radians, metres of bias.
 SHARPEST = torch.tensor([5e-5] * 3 + [1e-3] * 3 + [1e-4], dtype=torch.float64)
-# An apparent pose is this many standard deviations of the camera's errors outside the prior's support at most.
-_OUTSIDE = 4.0
+_OUTSIDE = 4.0  # standard deviations of a camera's errors: an apparent pose is so far off the prior at most
 _WIDER = 1.3  # standard deviations of a proposed bias, in those of the fit
 
 
