@@ -54,7 +54,7 @@ STAGES = (VISION, "planning", "touch")
 
 
 def all_scenes(seeds: Sequence[tuple[int, int | None]], particles: int, jobs: int) -> list[Probed]:
-    """Every scene and seed of inference in order; each is reported as it comes, also of an interrupted run."""
+    """All scenes and seeds in order, reported as they come; an interrupted run keeps what it has."""
     found: list[Probed] = []
     try:
         for one in every(partial(probed_from, particles=particles), seeds, jobs, lost):

@@ -30,10 +30,20 @@ class GaussianMixture(NamedTuple):
 
     def component(self, pose: Tensor) -> Tensor:
         """The most probable component of each of the poses (N, 7), (N,) int64."""
-        if len(self.centers) == 1:
+        if self.log_weights.shape[-1] == 1:
             return torch.zeros(len(pose), dtype=torch.int64)
         log_prob = NormalPose(self.centers, self.covariances).log_prob(pose[:, None])
         return (self.log_weights + log_prob).argmax(dim=1)
+
+    def times(self, factor: NormalPose) -> GaussianMixture:
+        """The mixture that approximates its product with a Gaussian (...,)."""
+        other = NormalPose(factor.center[..., None, :], factor.covariance[..., None, :, :])
+        whole = product(NormalPose(self.centers, self.covariances), other)
+        both = self.covariances + other.covariance
+        away = poses.local(self.centers, other.center)
+        squared = (away * torch.linalg.solve(both, away[..., None])[..., 0]).sum(dim=-1)
+        overlap = -0.5 * (squared + torch.linalg.slogdet(both)[1])
+        return GaussianMixture(whole.center, whole.covariance, self.log_weights + overlap)
 
 
 class PoseFactor(NamedTuple):
@@ -62,6 +72,24 @@ def product_of_factors(prior: Any, factors: Sequence[PoseFactor]) -> NormalPose:
         covariance = torch.linalg.inv(precision)
         center = poses.retract(center, free.embed((covariance @ pull)[..., 0]))
     return NormalPose(center, 0.5 * (covariance + covariance.transpose(-1, -2)), free)
+
+
+def log_overlap(product: NormalPose, factors: Sequence[PoseFactor]) -> Tensor:
+    """The log of the integral (N,) of factors' product, given the Gaussian that it is, but for a constant."""
+    log_mass = 0.5 * torch.linalg.slogdet(product.covariance)[1]
+    for pose, covariance_at in factors:
+        own = covariance_at(product.center)
+        away = poses.local(product.center, pose)
+        squared = (away * torch.linalg.solve(own, away[..., None])[..., 0]).sum(dim=-1)
+        log_mass = log_mass - 0.5 * (squared + torch.linalg.slogdet(own)[1])
+    return log_mass
+
+
+def mixture_of(mixture: GaussianMixture) -> NormalPose | MixturePose:
+    """A mixture of M Gaussians for each of N particles; the Gaussian where M is 1."""
+    if mixture.log_weights.shape[-1] == 1:
+        return NormalPose(mixture.centers[..., 0, :], mixture.covariances[..., 0, :, :])
+    return MixturePose(mixture.log_weights, mixture.centers, mixture.covariances)
 
 
 def widened(center: Tensor, covariance: Tensor) -> MixturePose:

@@ -44,7 +44,7 @@ from bcppl.inference.proposals.approximated import (
     joint_random_walk,
 )
 from bcppl.inference.proposals.coordinates import continuous_addresses
-from bcppl.inference.resampling import adaptive, systematic
+from bcppl.inference.resampling import systematic
 from bcppl.inference.sizing import replicate
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Model, Trace, extend
@@ -128,7 +128,13 @@ def guided(
         share: particles are resampled below this effective sample size, as a share of N.
         search: given the population after each step, returns it or another that takes its place.
     """
-    resample = adaptive(systematic, share)
+
+    def resample(population: Population) -> tuple[Population, Tensor | None]:
+        if population.effective_sample_size >= share * len(population):
+            return population, None
+        ancestors = by_mode(population, len(population))
+        return population.selected(ancestors), ancestors
+
     rejuvenation = resample_move(moves, sweeps, resample, always_move=True)
     by_tempering = tempered(moves, sweeps=2 * sweeps, resample=resample)
 
@@ -197,8 +203,17 @@ def assimilate(population: Population, observed: Observed, pair: Pair) -> Assimi
     effective = reached.effective_sample_size
     if times == 1:
         return Assimilated(reached, effective, None)
-    chosen = systematic(reached.log_weights, count)
+    chosen = by_mode(reached, count)
     return Assimilated(reached.selected(chosen), effective, chosen // times)
+
+
+def by_mode(population: Population, count: int) -> Tensor:
+    """Systematic ancestors (count,), so that each mode keeps its share but for one particle."""
+    stratum = getattr(population.approximation, "stratum", None)
+    if stratum is None:
+        return systematic(population.log_weights, count)
+    order = stratum(population.trace).argsort(stable=True)
+    return order[systematic(population.log_weights[order], count)].sort().values
 
 
 def _given_all(approximation: Any, trace: Trace, actions: Sequence[Any]) -> Any:
