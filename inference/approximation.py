@@ -186,6 +186,11 @@ class GaussianApproximation:
         )
         return GaussianMixture(centers, covariances, log_weights + prior.log_weights[own])
 
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether the instruments leave several modes."""
+        return len(self.prior.log_weights) > 1
+
     def stratum(self, trace: Any) -> Tensor:
         """The mode of each particle (N,), int64."""
         return self.mixture.component(trace[self.pose])

@@ -30,8 +30,8 @@ def box_turns(part: Part) -> Tensor:
             Rotation.from_rotvec(about).as_quat(canonical=True),
         ]
     )
-    other = np.unique(every.round(9), axis=0)
-    other = torch.from_numpy(other[other[:, 3] < 1.0 - 1e-9])
+    _, first = np.unique(every.round(6), axis=0, return_index=True)
+    other = torch.from_numpy(every[first][every[first, 3] < 1.0 - 1e-9])
     middle = torch.as_tensor(0.5 * (part.vertices.min(axis=0) + part.vertices.max(axis=0)))
     turned = poses.from_translation_quaternion_xyzw(torch.zeros(len(other), 3).double(), other)
     there = torch.cat([middle, poses.identity()[3:]])

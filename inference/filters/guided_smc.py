@@ -56,6 +56,8 @@ FEW = 0.2  # the effective sample size that SMCP3 is to leave, as a share of N
 # Where it does not, it is run again with more copies of each particle, as many as seem needed and at most so
 # many of each and in all: memory and time grow with them. N of all are kept.
 MOST, ROOM = 40, 40_000
+# Where images leave several modes: of 75 particles 20 stay effective, too few for the modes' shares.
+SEVERAL = 8
 LEAST = 0.03  # of N: where even with so many copies less would be left, the measurement is tempered
 
 
@@ -151,7 +153,8 @@ def guided(
         before = before.updated()
         after = before.including(scene, len(actions) - 1, action, values)
         population = population.with_approximation(after)
-        assimilated = assimilate(population, observed, programs.pair(before, after, action))
+        least = SEVERAL if getattr(after, "is_ambiguous", False) else 1
+        assimilated = assimilate(population, observed, programs.pair(before, after, action), least)
         if assimilated is None:
             return settled(by_tempering(population, observed))
         moved, ancestors, acceptance, _ = rejuvenation(assimilated.population, POSTERIOR)
@@ -180,8 +183,11 @@ class Assimilated(NamedTuple):
     origin: Tensor | None  # (N,) the particle that each copy was made of; None where each is its own
 
 
-def assimilate(population: Population, observed: Observed, pair: Pair) -> Assimilated | None:
-    """The particles moved and weighted by a pair of kernels; None where too few keep weight."""
+def assimilate(population: Population, observed: Observed, pair: Pair, least: int = 1) -> Assimilated | None:
+    """The particles moved and weighted by a pair of kernels; None where too few keep weight.
+
+    `least` is how many copies of each are made at least.
+    """
     count = len(population)
 
     def weighted(population: Population) -> Population | None:
@@ -190,9 +196,9 @@ def assimilate(population: Population, observed: Observed, pair: Pair) -> Assimi
         except NoWeightError:
             return None
 
-    times, goal = 1, FEW * count
-    allowed = max(1, min(MOST, ROOM // count))
-    reached = weighted(population)
+    goal, allowed = FEW * count, max(1, min(MOST, ROOM // count))
+    times = min(least, allowed)
+    reached = weighted(population if times == 1 else replicate(population, times))
     while times < allowed and (reached is None or reached.effective_sample_size < goal):
         each = 0.0 if reached is None else reached.effective_sample_size / times
         # The estimate is often too large: ask for more copies than would just do.
