@@ -122,7 +122,7 @@ class GaussianApproximation:
 
         known, everywhere = self.prior, ambiguous and self._is_unsure()
         before = None if self.quadratic is None else self.quadratic.around
-        own = None if before is None else known.component(before)
+        own = torch.zeros(0) if before is None else known.component(before)
         heading = next((heading for heading in headings if heading is not None), None)
         each = []
         for k, (center, covariance) in enumerate(zip(known.centers, known.covariances, strict=True)):
