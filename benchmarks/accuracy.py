@@ -31,6 +31,7 @@ from scenes import (
     by,
     every,
     probed,
+    probed_from,
     quantile,
 )
 
@@ -52,21 +53,21 @@ UNITS = dict.fromkeys(Moment._fields[:5], "mm") | dict.fromkeys(Moment._fields[5
 STAGES = (VISION, "planning", "touch")
 
 
-def all_scenes(seeds: Sequence[int], particles: int, jobs: int) -> list[Probed]:
-    """Every scene in order; each is reported as it comes, and an interrupted run keeps what is there."""
+def all_scenes(seeds: Sequence[tuple[int, int | None]], particles: int, jobs: int) -> list[Probed]:
+    """All scenes and seeds in order, reported as they come; an interrupted run keeps what it has."""
     found: list[Probed] = []
     try:
-        for one in every(partial(probed, particles=particles), seeds, jobs, lost):
+        for one in every(partial(probed_from, particles=particles), seeds, jobs, lost):
             found.append(one)
             report(one)
     except KeyboardInterrupt:
         print(f"interrupted: what follows is of {len(found)} scenes of {len(seeds)}.", flush=True)
-    return sorted(found, key=lambda one: one.seed)
+    return sorted(found, key=lambda one: (one.seed, one.inference_seed or 0))
 
 
-def lost(seed: int, why: str) -> Probed:
+def lost(seeds: tuple[int, int | None], why: str) -> Probed:
     """A scene whose process died."""
-    return Probed(seed, missed=why)
+    return Probed(seeds[0], missed=why, inference_seed=seeds[1])
 
 
 def report(one: Probed) -> None:
@@ -227,6 +228,13 @@ def asked() -> argparse.Namespace:
     parser.add_argument(
         "--jobs", type=int, default=2, help="scenes at a time; with more than one, times mean little"
     )
+    parser.add_argument(
+        "--inference-seeds",
+        type=int,
+        default=1,
+        metavar="K",
+        help="run every scene with K seeds of inference: its own, then 1 to K - 1",
+    )
     parser.add_argument("--figure", type=Path, metavar="FILE", help="ADD over time of all scenes")
     ways = parser.add_mutually_exclusive_group()
     ways.add_argument(
@@ -256,7 +264,8 @@ def main() -> None:
     if given.ablations:
         finish(ablations.rows_of(seeds, given.particles, jobs), given.json)
         return
-    found = all_scenes(seeds, given.particles, jobs)
+    others = [None, *range(1, given.inference_seeds)]
+    found = all_scenes([(seed, other) for seed in seeds for other in others], given.particles, jobs)
     if not found:
         print("no scene was run; give --scenes a number from 1.")
         return

@@ -91,7 +91,7 @@ class Probed:
     """What came of one scene.
 
     Attributes:
-        seed: of the scene and of inference.
+        seed: of the scene.
         part, clearance: which; millimetres.
         missed: in one line why the scene was not brought to its end; empty where it was.
         moments: by name of the moment, how far off the belief was.
@@ -102,6 +102,7 @@ class Probed:
         tempered: how many measurements were tempered.
         warned: whether a run would have warned of a measurement (`bcppl.cli.predictive_checks`).
         memory: most that the process ever held, GB.
+        inference_seed: of inference; the scene's unless given.
     """
 
     seed: int
@@ -116,11 +117,13 @@ class Probed:
     tempered: int = 0
     warned: bool = False
     memory: float = math.nan
+    inference_seed: int | None = None
 
     @property
     def name(self) -> str:
         """The scene in words."""
-        return f"{self.seed}: {self.part}, {self.clearance:g} mm"
+        seeds = f"{self.seed}" if self.inference_seed is None else f"{self.seed}/{self.inference_seed}"
+        return f"{seeds}: {self.part}, {self.clearance:g} mm"
 
     @property
     def wall(self) -> float:
@@ -187,28 +190,42 @@ def default_run(
     return infer(model, recording, particles=particles, seed=seed, scene=scene, start=start)
 
 
-def probed(seed: int, particles: int = PARTICLES, bench: BenchParameters | None = None) -> Probed:
+def probed(
+    seed: int,
+    particles: int = PARTICLES,
+    bench: BenchParameters | None = None,
+    inference_seed: int | None = None,
+) -> Probed:
     """One scene, whatever happens: an exception makes it a miss, and what was reached before it is kept."""
-    return followed(seed, particles, bench)[0]
+    return followed(seed, particles, bench, inference_seed)[0]
+
+
+def probed_from(seeds: tuple[int, int | None], particles: int = PARTICLES) -> Probed:
+    """As `probed`, of a scene's seed and one of inference, which is the scene's where it is None."""
+    return probed(seeds[0], particles, inference_seed=seeds[1])
 
 
 def followed(
-    seed: int, particles: int = PARTICLES, bench: BenchParameters | None = None
+    seed: int,
+    particles: int = PARTICLES,
+    bench: BenchParameters | None = None,
+    inference_seed: int | None = None,
 ) -> tuple[Probed, list[Step], Recording | None]:
     """As `probed`, with all steps and the recording of the probe, None where it was not reached."""
-    found, steps, recording = Probed(seed), list[Step](), None
+    found, steps, recording = Probed(seed, inference_seed=inference_seed), list[Step](), None
+    chosen = seed if inference_seed is None else inference_seed
     try:
         scene = bench_scene(seed, bench)
         found.part, found.clearance = scene.kind.name, round(1e3 * scene.clearance, 6)
         look = scene.look()
         with timed(found.seconds, "vision"):
-            for step in default_run(look, particles, seed):
+            for step in default_run(look, particles, chosen):
                 steps.append(step)
         with timed(found.seconds, "planning"):
             plan = three_two_one(steps[-1].belief, scene.part, scene.peg)
         recording = scene.probe(plan)
         with timed(found.seconds, "touch"):
-            for step in default_run(recording, particles, seed, start=steps[-1]):
+            for step in default_run(recording, particles, chosen, start=steps[-1]):
                 steps.append(step)
     except Exception as error:
         found.missed = one_line(error)

@@ -8,6 +8,7 @@ a run that is resumed, branched or repeated gives the same bits.
 
 from __future__ import annotations
 
+import math
 from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -20,7 +21,10 @@ from torch import Tensor
 from bcppl.distributions.pose_normals import (
     GaussianMixture,
     PoseFactor,
+    log_overlap,
     matched,
+    mixture_of,
+    moments_within,
     normal_like,
     product_of_factors,
     truncated,
@@ -29,9 +33,10 @@ from bcppl.distributions.pose_normals import (
 from bcppl.distributions.poses import MixturePose
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
-from bcppl.inference.laplace import Normal, QuadraticApproximation, quadratic_approximation
+from bcppl.inference.laplace import Normal, QuadraticApproximation, quadratic_approximation, together
 from bcppl.sensors.capabilities import Approximated, Contacts, FitsPose, Linearised
 
+_MODES, _FAINT = 8, 10.0  # that views leave: at most so many, within so many nats of the most probable
 UNSURE = 0.0005  # m: beyond this standard deviation the contact may be with another place of the part
 
 
@@ -102,7 +107,7 @@ class GaussianApproximation:
             sensor = self.scene.sensor(contact.action)
             if contact.number not in relevant:
                 relevant[contact.number] = not isinstance(sensor, Contacts) or sensor.is_informative(
-                    contact.action, contact.value, self.prior.center
+                    contact.action, contact.value, self.prior.centers
                 )
         informative = tuple(c for c in self.contacts if relevant[c.number])
         by_sensor = list(self._by_sensor(informative))
@@ -115,13 +120,16 @@ class GaussianApproximation:
             for sensor, own in by_sensor:
                 yield from sensor.sites(own, pose, blur)
 
-        quadratic = quadratic_approximation(
-            sites,
-            self.prior,
-            None if self.quadratic is None else self.quadratic.around,
-            next((heading for heading in headings if heading is not None), None),
-            ambiguous and self._is_unsure(),
-        )
+        known, everywhere = self.prior, ambiguous and self._is_unsure()
+        before = None if self.quadratic is None else self.quadratic.around
+        own = torch.zeros(0) if before is None else known.component(before)
+        heading = next((heading for heading in headings if heading is not None), None)
+        each = []
+        for k, (center, covariance) in enumerate(zip(known.centers, known.covariances, strict=True)):
+            mine = None if before is None or not bool((own == k).any()) else before[own == k]
+            normal = Normal(center[None], torch.linalg.inv(covariance)[None])
+            each.append(quadratic_approximation(sites, normal, mine, heading, everywhere))
+        quadratic = each[0] if len(each) == 1 else together(each, known)
         return replace(self, quadratic=quadratic, relevant=relevant, stale=False)
 
     def _by_sensor(self, contacts: tuple[Approximated, ...]) -> Iterator[tuple[Any, list[Approximated]]]:
@@ -133,32 +141,82 @@ class GaussianApproximation:
 
     def _is_unsure(self) -> bool:
         """Whether the part may be at several places so far, or at one that is not known well."""
-        if self.quadratic is None:
-            covariances = torch.linalg.inv(self.prior.precision)
-        else:
-            covariances = self.quadratic.posterior(self.prior.center[0], self.prior.precision[0]).covariances
+        covariances = self.mixture.covariances
         wide = torch.linalg.eigvalsh(covariances[:, :3, :3])[:, -1].sqrt()
         return len(wide) > 1 or bool((wide > UNSURE).any())
 
     @cached_property
-    def prior(self) -> Normal:
-        """The Gaussian given the instruments' fits; the model's prior where there is none."""
-        prior, sensor = self.scene.prior, self.scene.sensor
-        factors = [sensor(f.action).marginal_factor(f.action, f.fit) for f in self.fits.values()]
-        if factors:
-            normal = product_of_factors(prior, factors)
-            return Normal(normal.center, torch.linalg.inv(normal.covariance))
-        normal = normal_like(prior)
-        return Normal(normal.center[None], torch.linalg.inv(normal.covariance)[None])
+    def prior(self) -> GaussianMixture:
+        """The pose given the instruments' fits; the model's prior where there is none."""
+        prior, fits = self.scene.prior, list(self.fits.values())
+        if not fits:
+            normal = normal_like(prior)
+            alone = torch.zeros(1, dtype=torch.float64)
+            return GaussianMixture(normal.center[None], normal.covariance[None], alone)
+        # One component for each combination of the instruments' own, as far as they agree.
+        each = torch.cartesian_prod(*(torch.arange(len(f.fit.log_weights)) for f in fits)).reshape(
+            -1, len(fits)
+        )
+        chosen = [f.fit.chosen(index) for f, index in zip(fits, each.T, strict=True)]
+        factors = [
+            self.scene.sensor(f.action).marginal_factor(f.action, fit)
+            for f, fit in zip(fits, chosen, strict=True)
+        ]
+        normal = product_of_factors(prior, factors)
+        log_weights = torch.stack([fit.log_weights for fit in chosen]).sum(dim=0)
+        kept = torch.zeros(1, dtype=torch.int64)
+        if len(each) > 1:
+            log_weights = log_weights + log_overlap(normal, factors)
+            order = log_weights.argsort(descending=True)[:_MODES]
+            kept = order[log_weights[order] > log_weights[order[0]] - _FAINT]
+        whole = moments_within(prior, normal)
+        return GaussianMixture(
+            whole.center[kept], whole.covariance[kept], log_weights[kept].log_softmax(dim=0)
+        )
 
     @cached_property
     def mixture(self) -> GaussianMixture:
         """The posterior of the part's pose, the nuisance parameters integrated out."""
-        center, precision = self.prior.center[0], self.prior.precision[0]
+        prior, quadratic = self.prior, self.quadratic
+        if quadratic is None:
+            return prior
+        own = prior.component(quadratic.around)
+        centers, covariances, log_weights = quadratic.posterior_each(
+            prior.centers[own], torch.linalg.inv(prior.covariances[own])
+        )
+        return GaussianMixture(centers, covariances, log_weights + prior.log_weights[own])
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether the instruments leave several modes."""
+        return len(self.prior.log_weights) > 1
+
+    def stratum(self, trace: Any) -> Tensor:
+        """The mode of each particle (N,), int64."""
+        return self.mixture.component(trace[self.pose])
+
+    def shortfall(self, trace: Any) -> float:
+        """By how many nats the best mode explains all measurements better than the best particle does.
+
+        Where the population is spread over the posterior it is about 1 or less; -inf without contacts.
+        """
         if self.quadratic is None:
-            alone = torch.zeros(1, dtype=torch.float64)
-            return GaussianMixture(center[None], torch.linalg.inv(precision)[None], alone)
-        return self.quadratic.posterior(center, precision)
+            return -math.inf
+        sites = [
+            self.scene.sensor(c.action).address(c.number)
+            for c in self.contacts
+            if self.relevant.get(c.number)
+        ]
+
+        def log_prior(pose: Tensor) -> Tensor:
+            within = self.scene.prior.log_prob(pose) > -torch.inf
+            return torch.where(within, mixture_of(self.prior).log_prob(pose), -torch.inf)
+
+        best = self.quadratic.log_likelihood + log_prior(self.quadratic.around)
+        reached = log_prior(trace[self.pose])
+        if sites:
+            reached = reached + trace.log_prob(*sites)
+        return float(best.max() - reached.max())
 
     def conditional(self, trace: Any, values: Mapping[str, Tensor] | None = None) -> Any:
         """The approximate conditional distribution of the pose, given each particle's nuisance parameters.
@@ -178,6 +236,7 @@ class GaussianApproximation:
             center = expected.center.expand(trace.particles, 7)
             precision = torch.linalg.inv(expected.covariance).expand(trace.particles, 6, 6)
         else:
+            given = moments_within(prior, given)
             center, precision = given.center, torch.linalg.inv(given.covariance)
         return widened_mixture(self.quadratic.posterior(center, precision))
 

@@ -24,6 +24,7 @@ _PLACES = torch.randn(32, 6, generator=torch.Generator().manual_seed(1), dtype=t
 # Modes that are kept: at most so many, of weights within so many nats of the largest, and at least so many
 # squared standard deviations apart.
 _MODES, _FAINT, _SAME = 4, 6.0, 12.0
+_REFUTED = 10.0  # nats by which a mode that started at another component of the prior is less probable
 _LEFT = 12  # starts from many places that are followed to the end
 
 # The sites of the likelihood at poses (S, 7), errors `blur` metres wider, each with its observed value.
@@ -47,13 +48,17 @@ class QuadraticApproximation(NamedTuple):
 
     def posterior(self, center: Tensor, precision: Tensor) -> GaussianMixture:
         """The posterior, M components, under Gaussian priors: means (..., 7), precisions (..., 6, 6)."""
-        away = poses.local(self.around, center[..., None, :])
-        pull = (precision[..., None, :, :] @ away[..., None])[..., 0]
-        covariance = torch.linalg.inv(precision[..., None, :, :] + self.information)
+        return self.posterior_each(center[..., None, :], precision[..., None, :, :])
+
+    def posterior_each(self, center: Tensor, precision: Tensor) -> GaussianMixture:
+        """The posterior under a prior for each mode: means (..., M, 7), precisions (..., M, 6, 6)."""
+        away = poses.local(self.around, center)
+        pull = (precision @ away[..., None])[..., 0]
+        covariance = torch.linalg.inv(precision + self.information)
         step = (covariance @ (pull - self.gradient)[..., None])[..., 0]
         # The integral of prior times likelihood over all poses, by completing the square.
         squares = (step * (pull - self.gradient)).sum(dim=-1) - (away * pull).sum(dim=-1)
-        sizes = torch.linalg.slogdet(covariance)[1] + torch.linalg.slogdet(precision)[1][..., None]
+        sizes = torch.linalg.slogdet(covariance)[1] + torch.linalg.slogdet(precision)[1]
         return GaussianMixture(
             poses.retract(self.around, step),
             0.5 * (covariance + covariance.transpose(-1, -2)),
@@ -101,6 +106,17 @@ def quadratic_approximation(
         each, _ = gauss_newton(sites, torch.cat(others), prior, FINE, _LEFT)
         best = torch.cat([best, each])
     return _distinct(_quadratic(sites, best), prior)
+
+
+def together(each: Sequence[QuadraticApproximation], prior: GaussianMixture) -> QuadraticApproximation:
+    """The modes reached from each of a prior's components, without those that hardly weigh beside others."""
+    modes = QuadraticApproximation(*(torch.cat(values) for values in zip(*each, strict=True)))
+    own = torch.arange(len(each)).repeat_interleave(torch.tensor([len(one.around) for one in each]))
+    weight = modes.posterior_each(prior.centers[own], torch.linalg.inv(prior.covariances[own])).log_weights
+    weight = weight + prior.log_weights[own]
+    order = weight.argsort(descending=True)
+    kept = order[weight[order] > weight[order[0]] - _REFUTED]
+    return QuadraticApproximation(*(values[kept] for values in modes))
 
 
 def gauss_newton(

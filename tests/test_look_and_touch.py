@@ -45,9 +45,11 @@ def test_images_of_a_small_part_do_not_place_it_surer_than_they_can(seed: int) -
     *_, last = infer(model, scene.look(), particles=10, seed=0)
     known = last.population.approximation.prior
     assert all(isinstance(action, View) for action in last.population.trace.args[1])
-    off = poses.local(known.center[0], torch.as_tensor(scene.truth))
-    assert float(off @ known.precision[0] @ off) < 22.5  # chi-square with six degrees of freedom, 0.1 %
-    spread = torch.linalg.inv(known.precision[0]).diagonal().sqrt()
+    off = poses.local(known.centers[0], torch.as_tensor(scene.truth))
+    assert (
+        float(off @ torch.linalg.solve(known.covariances[0], off)) < 22.5
+    )  # chi-square with six degrees of freedom, 0.1 %
+    spread = known.covariances[0].diagonal().sqrt()
     assert 0.01 < float(spread[5]) < 0.2 and 0.0005 < float(spread[:3].max()) < 0.01
     # Both sides of a tray are slid along, so touches do inform its yaw.
     plan = three_two_one(last.belief, scene.part, scene.peg)

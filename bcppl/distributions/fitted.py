@@ -1,8 +1,9 @@
-"""A normal that resembles a density which can only be evaluated."""
+"""Normals, and mixtures of them, that resemble a density which can only be evaluated."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -15,6 +16,10 @@ _LEAST = 0.15  # of the draws: their effective number, which bounds how sharp th
 _ROUNDS = 30  # at most
 _FASTER = 1.1  # by how much sharper it becomes at least
 _ENOUGH = 0.3  # of the draws: so many effective, and the fit is good
+# Of the images of a fit under near symmetries: nats within which one is followed further, and nats within
+# which the weight of a mode is kept; squared standard deviations within which two modes are one.
+_NEAR, _FAINT, _SAME = 30.0, 10.0, 12.0
+_LOCAL = 0.5  # exponent from which an image is followed: with smaller ones its fit would leave the mode
 
 
 class FittedNormal(NamedTuple):
@@ -31,6 +36,78 @@ class FittedNormal(NamedTuple):
         """
         columns = torch.linalg.cholesky(self.covariance).T
         return torch.cat([self.mean[None], self.mean + columns, self.mean - columns])
+
+
+class FittedMixture(NamedTuple):
+    """A mixture of M normals: means (M, d), covariances (M, d, d), log-weights (M,), the largest first."""
+
+    means: Tensor
+    covariances: Tensor
+    log_weights: Tensor
+
+    @classmethod
+    def of(cls, normals: Sequence[FittedNormal], log_weights: Tensor) -> FittedMixture:
+        """The mixture of normals with unnormalised log-weights (M,)."""
+        order = log_weights.argsort(descending=True)
+        return cls(
+            torch.stack([normals[k].mean for k in order]),
+            torch.stack([normals[k].covariance for k in order]),
+            log_weights[order].log_softmax(dim=0),
+        )
+
+    @property
+    def components(self) -> list[FittedNormal]:
+        """The normals."""
+        return [FittedNormal(*each) for each in zip(self.means, self.covariances, strict=True)]
+
+    def chosen(self, index: Tensor) -> FittedMixture:
+        """The components at an index (C,), with their weights as they are."""
+        return FittedMixture(*(each[index] for each in self))
+
+
+def fitted_mixture(
+    log_density: Callable[[Tensor], Tensor],
+    start: Tensor,
+    least: Tensor,
+    alike: Callable[[Tensor], Tensor],
+) -> FittedMixture:
+    """`fitted_normal`, and the other modes that are its images under near symmetries of the density.
+
+    Each image is followed by a fit of its own where one of its sigma points is nearly as probable as here.
+    Weights are estimates of each mode's mass by importance sampling.
+
+    Args:
+        log_density: as for `fitted_normal`, as are the next two.
+        start: (d,).
+        least: (d,).
+        alike: of points (P, d), their images (K, P, d) under K transformations; K may be 0.
+    """
+    prior = _Prior(start)
+    normal, mass = _population_monte_carlo(log_density, prior, prior.draws(400), least, 200)
+    normals, masses = [normal], [mass]
+    tried = normal.sigma_points()
+    images = alike(tried)
+    if len(images):
+        best = torch.stack([log_density(image).max() for image in images])
+        for k in best.argsort(descending=True).tolist():
+            if not best[k] > log_density(tried).max() - _NEAR:
+                break
+            away = images[k][1:] - images[k][0]
+            there = FittedNormal(images[k][0], 0.5 * away.T @ away)
+            if _is_among(there, normals):
+                continue
+            other, mass = _population_monte_carlo(log_density, prior, _drawn(there, 200), least, 200, _LOCAL)
+            if not _is_among(other, normals):
+                normals.append(other)
+                masses.append(mass)
+    weights = torch.tensor(masses, dtype=torch.float64)
+    kept = (weights > weights.max() - _FAINT).nonzero()[:, 0]
+    return FittedMixture.of([normals[k] for k in kept], weights[kept])
+
+
+def _is_among(normal: FittedNormal, others: Sequence[FittedNormal]) -> bool:
+    away = [(normal.mean - other.mean, other.covariance) for other in others]
+    return any(float(off @ torch.linalg.solve(covariance, off)) < _SAME for off, covariance in away)
 
 
 def fitted_normal(
@@ -55,20 +132,42 @@ def fitted_normal(
         draws: points in each round.
         first: points in the first.
     """
-    prior = MultivariateNormal(torch.zeros_like(start), torch.diag(start**2), validate_args=False)
-    fit = FittedNormal(torch.zeros_like(start), torch.diag(start**2))
-    point = prior.sample((first,))
-    log_proposal = prior.log_prob(point)
-    exponent = 0.0
+    prior = _Prior(start)
+    return _population_monte_carlo(log_density, prior, prior.draws(first), least, draws)[0]
+
+
+class _Prior:
+    """A normal about zero with standard deviations (d,)."""
+
+    def __init__(self, start: Tensor) -> None:
+        zero = torch.zeros_like(start)
+        self.normal = MultivariateNormal(zero, torch.diag(start**2), validate_args=False)
+
+    def draws(self, count: int) -> tuple[Tensor, Tensor]:
+        """Points (count, d) and their log-density."""
+        point = self.normal.sample((count,))
+        return point, self.normal.log_prob(point)
+
+
+def _population_monte_carlo(
+    log_density: Callable[[Tensor], Tensor],
+    prior: _Prior,
+    first: tuple[Tensor, Tensor],
+    least: Tensor,
+    draws: int,
+    exponent: float = 0.0,
+) -> tuple[FittedNormal, float]:
+    """The fit from the first draws and their log-density on, and the log of the mass that it covers."""
+    point, log_proposal = first
     for _ in range(_ROUNDS):
-        target, correction = log_density(point), prior.log_prob(point) - log_proposal
+        target, correction = log_density(point), prior.normal.log_prob(point) - log_proposal
         exponent = _exponent(target, correction, exponent)
         log_weights = exponent * target + correction
         fit = _moments(point, torch.softmax(log_weights, dim=0), least)
         if exponent == 1.0 and _effective(log_weights) >= _ENOUGH * len(point):
             break
         point, log_proposal = _drawn(fit, draws)
-    return fit
+    return fit, float(torch.logsumexp(target + correction, dim=0)) - math.log(len(target))
 
 
 def _drawn(fit: FittedNormal, draws: int) -> tuple[Tensor, Tensor]:

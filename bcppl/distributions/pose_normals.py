@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.special import log_ndtr
 
 from bcppl import poses
 from bcppl.distributions.poses import BoxedNormal, MixturePose, NormalPose
@@ -14,6 +16,9 @@ from bcppl.distributions.poses import BoxedNormal, MixturePose, NormalPose
 # Proposals are mixtures of scaled copies: their scales, in standard deviations, and their probabilities.
 WIDTHS = torch.tensor([1.1, 3.0], dtype=torch.float64)
 SHARES = torch.tensor([0.85, 0.15], dtype=torch.float64)
+
+_SWEEPS = 3  # of expectation propagation over the axes
+_NARROWEST = 1e-3  # share of a variance that a truncation leaves, at least: beyond, rounding dominates
 
 
 class GaussianMixture(NamedTuple):
@@ -25,10 +30,20 @@ class GaussianMixture(NamedTuple):
 
     def component(self, pose: Tensor) -> Tensor:
         """The most probable component of each of the poses (N, 7), (N,) int64."""
-        if len(self.centers) == 1:
+        if self.log_weights.shape[-1] == 1:
             return torch.zeros(len(pose), dtype=torch.int64)
         log_prob = NormalPose(self.centers, self.covariances).log_prob(pose[:, None])
         return (self.log_weights + log_prob).argmax(dim=1)
+
+    def times(self, factor: NormalPose) -> GaussianMixture:
+        """The mixture that approximates its product with a Gaussian (...,)."""
+        other = NormalPose(factor.center[..., None, :], factor.covariance[..., None, :, :])
+        whole = product(NormalPose(self.centers, self.covariances), other)
+        both = self.covariances + other.covariance
+        away = poses.local(self.centers, other.center)
+        squared = (away * torch.linalg.solve(both, away[..., None])[..., 0]).sum(dim=-1)
+        overlap = -0.5 * (squared + torch.linalg.slogdet(both)[1])
+        return GaussianMixture(whole.center, whole.covariance, self.log_weights + overlap)
 
 
 class PoseFactor(NamedTuple):
@@ -57,6 +72,24 @@ def product_of_factors(prior: Any, factors: Sequence[PoseFactor]) -> NormalPose:
         covariance = torch.linalg.inv(precision)
         center = poses.retract(center, free.embed((covariance @ pull)[..., 0]))
     return NormalPose(center, 0.5 * (covariance + covariance.transpose(-1, -2)), free)
+
+
+def log_overlap(product: NormalPose, factors: Sequence[PoseFactor]) -> Tensor:
+    """The log of the integral (N,) of factors' product, given the Gaussian that it is, but for a constant."""
+    log_mass = 0.5 * torch.linalg.slogdet(product.covariance)[1]
+    for pose, covariance_at in factors:
+        own = covariance_at(product.center)
+        away = poses.local(product.center, pose)
+        squared = (away * torch.linalg.solve(own, away[..., None])[..., 0]).sum(dim=-1)
+        log_mass = log_mass - 0.5 * (squared + torch.linalg.slogdet(own)[1])
+    return log_mass
+
+
+def mixture_of(mixture: GaussianMixture) -> NormalPose | MixturePose:
+    """A mixture of M Gaussians for each of N particles; the Gaussian where M is 1."""
+    if mixture.log_weights.shape[-1] == 1:
+        return NormalPose(mixture.centers[..., 0, :], mixture.covariances[..., 0, :, :])
+    return MixturePose(mixture.log_weights, mixture.centers, mixture.covariances)
 
 
 def widened(center: Tensor, covariance: Tensor) -> MixturePose:
@@ -99,6 +132,53 @@ def truncated(prior: Any, normal: NormalPose) -> NormalPose | BoxedNormal:
     return BoxedNormal(normal.center, normal.covariance, low, high)
 
 
+def moments_within(prior: Any, normal: NormalPose) -> NormalPose:
+    """The Gaussian with about the moments of a Gaussian (N,) truncated to a prior's box.
+
+    Expectation propagation with a factor for each axis (Cunningham, Hennig and Lacoste-Julien, Gaussian
+    probabilities and expectation propagation, arXiv 1111.6832).
+    """
+    if not bool((prior.widths > 0.0).all()):
+        return normal
+    covariance, center = normal.covariance.clone(), normal.center
+    off = center[..., :3] - prior.center[:3]
+    mean = torch.zeros_like(covariance[..., 0])
+    precision, pull = torch.zeros_like(off), torch.zeros_like(off)
+    for axis in list(range(3)) * _SWEEPS:
+        column = covariance[..., axis].clone()
+        own, here = column[..., axis].clone(), mean[..., axis]
+        # The marginal without the factor's own share, truncated, gives the share.
+        free = 1.0 / (1.0 / own - precision[..., axis])
+        middle = free * (here / own - pull[..., axis])
+        limits = prior.widths[axis] - off[..., axis], -prior.widths[axis] - off[..., axis]
+        inside, spread = _truncated_moments(middle, free, limits[1], limits[0])
+        change = 1.0 / spread - 1.0 / free - precision[..., axis]
+        pulled = inside / spread - middle / free - pull[..., axis]
+        precision[..., axis] += change
+        pull[..., axis] += pulled
+        gain = column / (1.0 + change * own)[..., None]
+        mean = mean + (pulled - change * here)[..., None] * gain
+        covariance = covariance - change[..., None, None] * gain[..., :, None] * column[..., None, :]
+    symmetric = 0.5 * (covariance + covariance.transpose(-1, -2))
+    return NormalPose(poses.retract(center, mean), symmetric, normal.freedom)
+
+
+def _truncated_moments(mean: Tensor, variance: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and variance of a normal truncated to an interval."""
+    deviation = variance.sqrt()
+    first, last = (low - mean) / deviation, (high - mean) / deviation
+    flip = first + last > 0.0  # as in a right tail, where the distribution function would round to 1
+    first, last = torch.where(flip, -last, first), torch.where(flip, -first, last)
+    upper, lower = log_ndtr(last), log_ndtr(first)
+    log_mass = upper + torch.log1p(-torch.exp(lower - upper))
+    at_first, at_last = (
+        torch.exp(-0.5 * x**2 - 0.5 * math.log(2.0 * math.pi) - log_mass) for x in (first, last)
+    )
+    away = at_first - at_last
+    share = 1.0 + first * at_first - last * at_last - away**2
+    return mean + deviation * torch.where(flip, -away, away), variance * share.clamp(_NARROWEST, 1.0)
+
+
 def product(first: NormalPose, second: NormalPose) -> NormalPose:
     """The Gaussian that approximates the product of two."""
     own, other = torch.linalg.inv(first.covariance), torch.linalg.inv(second.covariance)
@@ -128,13 +208,18 @@ def _root(matrix: Tensor) -> Tensor:
 
 def normal_like(prior: Any) -> NormalPose:
     """A Gaussian with about the spread of a prior that is uniform within limits."""
+    return NormalPose(prior.center, 0.6 * _limits(prior).clamp(min=1e-4))
+
+
+def allowed(prior: Any, there: Tensor, margin: Tensor) -> Tensor:
+    """Whether poses (M, 7) lie in a prior's support, its limits widened by `margin` (6,), m and radians."""
+    limits = _limits(prior)
+    inwards = limits / (limits + margin) * poses.local(prior.center, there)
+    return prior.log_prob(poses.retract(prior.center, inwards)) > -torch.inf
+
+
+def _limits(prior: Any) -> Tensor:
+    """The largest deviations (6,) of a prior along and about its axes, metres and radians."""
     angle = getattr(prior, "angle", None)
     turns = [angle] * 3 if angle is not None else [prior.tilt, prior.tilt, prior.yaw]
-    widths = torch.cat([torch.as_tensor(prior.widths), torch.tensor(turns, dtype=torch.float64)])
-    return NormalPose(prior.center, 0.6 * widths.clamp(min=1e-4))
-
-
-def allowed(prior: Any, there: Tensor) -> Tensor:
-    """Whether poses (M, 7) lie in the prior's support, its limits widened by a third."""
-    inwards = poses.retract(prior.center, 0.75 * poses.local(prior.center, there))
-    return prior.log_prob(inwards) > -torch.inf
+    return torch.cat([torch.as_tensor(prior.widths), torch.tensor(turns, dtype=torch.float64)])

@@ -27,6 +27,7 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import NoWeightError
 from bcppl.inference.approximation import GaussianApproximation
+from bcppl.inference.filters.second_search import searched
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair, moved as moved_by_pair
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
@@ -39,10 +40,11 @@ from bcppl.inference.proposals.approximated import (
     backward_kernel,
     conditional_proposal,
     forward_kernel,
+    independent_proposal,
     joint_random_walk,
 )
 from bcppl.inference.proposals.coordinates import continuous_addresses
-from bcppl.inference.resampling import adaptive, systematic
+from bcppl.inference.resampling import systematic
 from bcppl.inference.sizing import replicate
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Model, Trace, extend
@@ -54,6 +56,8 @@ FEW = 0.2  # the effective sample size that SMCP3 is to leave, as a share of N
 # Where it does not, it is run again with more copies of each particle, as many as seem needed and at most so
 # many of each and in all: memory and time grow with them. N of all are kept.
 MOST, ROOM = 40, 40_000
+# Where images leave several modes: of 75 particles 20 stay effective, too few for the modes' shares.
+SEVERAL = 8
 LEAST = 0.03  # of N: where even with so many copies less would be left, the measurement is tempered
 
 
@@ -114,6 +118,7 @@ def guided(
     *,
     sweeps: int = 1,
     share: float = 0.5,
+    search: Callable[[Population], Population] | None = None,
 ) -> StepFunction:
     """A step that assimilates a measurement by SMCP3, resamples when needed, and moves the particles.
 
@@ -123,8 +128,15 @@ def guided(
         moves: of every particle after each step.
         sweeps: how many of them.
         share: particles are resampled below this effective sample size, as a share of N.
+        search: given the population after each step, returns it or another that takes its place.
     """
-    resample = adaptive(systematic, share)
+
+    def resample(population: Population) -> tuple[Population, Tensor | None]:
+        if population.effective_sample_size >= share * len(population):
+            return population, None
+        ancestors = by_mode(population, len(population))
+        return population.selected(ancestors), ancestors
+
     rejuvenation = resample_move(moves, sweeps, resample, always_move=True)
     by_tempering = tempered(moves, sweeps=2 * sweeps, resample=resample)
 
@@ -141,11 +153,24 @@ def guided(
         before = before.updated()
         after = before.including(scene, len(actions) - 1, action, values)
         population = population.with_approximation(after)
-        assimilated = assimilate(population, observed, programs.pair(before, after, action))
+        least = SEVERAL if getattr(after, "is_ambiguous", False) else 1
+        assimilated = assimilate(population, observed, programs.pair(before, after, action), least)
         if assimilated is None:
-            return by_tempering(population, observed)
+            return settled(by_tempering(population, observed))
         moved, ancestors, acceptance, _ = rejuvenation(assimilated.population, POSTERIOR)
-        return Stepped(moved, _info(population, moved, assimilated, acceptance, ancestors))
+        return settled(Stepped(moved, _info(population, moved, assimilated, acceptance, ancestors)))
+
+    def settled(stepped: Stepped) -> Stepped:
+        population, info = stepped
+        other = population if search is None else search(population)
+        if other is population:
+            return stepped
+        gained = other.log_evidence - population.log_evidence
+        other = rejuvenation(other, POSTERIOR).population
+        size = other.effective_sample_size
+        return Stepped(
+            other, info._replace(log_evidence=info.log_evidence + gained, effective_sample_size=size)
+        )
 
     return step
 
@@ -158,8 +183,11 @@ class Assimilated(NamedTuple):
     origin: Tensor | None  # (N,) the particle that each copy was made of; None where each is its own
 
 
-def assimilate(population: Population, observed: Observed, pair: Pair) -> Assimilated | None:
-    """The particles moved and weighted by a pair of kernels; None where too few keep weight."""
+def assimilate(population: Population, observed: Observed, pair: Pair, least: int = 1) -> Assimilated | None:
+    """The particles moved and weighted by a pair of kernels; None where too few keep weight.
+
+    `least` is how many copies of each are made at least.
+    """
     count = len(population)
 
     def weighted(population: Population) -> Population | None:
@@ -168,9 +196,9 @@ def assimilate(population: Population, observed: Observed, pair: Pair) -> Assimi
         except NoWeightError:
             return None
 
-    times, goal = 1, FEW * count
-    allowed = max(1, min(MOST, ROOM // count))
-    reached = weighted(population)
+    goal, allowed = FEW * count, max(1, min(MOST, ROOM // count))
+    times = min(least, allowed)
+    reached = weighted(population if times == 1 else replicate(population, times))
     while times < allowed and (reached is None or reached.effective_sample_size < goal):
         each = 0.0 if reached is None else reached.effective_sample_size / times
         # The estimate is often too large: ask for more copies than would just do.
@@ -181,8 +209,17 @@ def assimilate(population: Population, observed: Observed, pair: Pair) -> Assimi
     effective = reached.effective_sample_size
     if times == 1:
         return Assimilated(reached, effective, None)
-    chosen = systematic(reached.log_weights, count)
+    chosen = by_mode(reached, count)
     return Assimilated(reached.selected(chosen), effective, chosen // times)
+
+
+def by_mode(population: Population, count: int) -> Tensor:
+    """Systematic ancestors (count,), so that each mode keeps its share but for one particle."""
+    stratum = getattr(population.approximation, "stratum", None)
+    if stratum is None:
+        return systematic(population.log_weights, count)
+    order = stratum(population.trace).argsort(stable=True)
+    return order[systematic(population.log_weights[order], count)].sort().values
 
 
 def _given_all(approximation: Any, trace: Trace, actions: Sequence[Any]) -> Any:
@@ -262,5 +299,9 @@ def infer(
         return GaussianApproximation(model.pose, scene)
 
     moves = kernel(model.pose, programs.proposals)
-    step = guided(gaussian, programs, moves, sweeps=sweeps, share=share)
+
+    def search(population: Population) -> Population:
+        return searched(population, independent_proposal)
+
+    step = guided(gaussian, programs, moves, sweeps=sweeps, share=share, search=search)
     return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)

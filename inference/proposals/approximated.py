@@ -7,6 +7,7 @@ conditional, and a random walk of the part together with the nuisance parameters
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pyro
@@ -27,6 +28,7 @@ from bcppl.traces import Trace
 MOVED, ASSIMILATING, WALKING = 0.9, 0.98, 0.9
 SCALES = torch.tensor([0.1, 1.5], dtype=torch.float64).log()  # of a random walk
 _SAME = 25.0  # squared standard deviations: components that are nearer are the same before and after
+_KNOWN = 1e-14  # variance (m^2, rad^2) of a pose that is given
 _STAYING = 0.8  # probability that a particle stays with the same component
 
 
@@ -55,6 +57,18 @@ def backward_kernel(before: GaussianApproximation, after: GaussianApproximation,
             pyro.sample(before.pose, before.conditional(trace))
         else:
             _follow(trace, before, _transported(trace, after, before), ASSIMILATING)
+
+    return program
+
+
+def independent_proposal(approximation: GaussianApproximation) -> Callable[..., None]:
+    """A program that draws the part's pose and its instruments' nuisance parameters, whatever they were."""
+
+    def program(*args: Any) -> None:
+        part = pyro.sample(approximation.pose, widened_mixture(approximation.mixture))
+        known = NormalPose(part, part.new_zeros(6, 6) + _KNOWN * torch.eye(6, dtype=torch.float64))
+        for each in approximation.fits.values():
+            approximation.scene.sensor(each.action).propose(each.action, each.fit, known)
 
     return program
 

@@ -17,12 +17,20 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.arguments import whole_number
 from bcppl.distributions.depth import RobustDepth
-from bcppl.distributions.fitted import FittedNormal, fitted_normal
-from bcppl.distributions.pose_normals import PoseFactor, allowed, normal_like, product, widened
+from bcppl.distributions.fitted import FittedMixture, fitted_mixture
+from bcppl.distributions.pose_normals import (
+    GaussianMixture,
+    PoseFactor,
+    allowed,
+    mixture_of,
+    normal_like,
+    widened_mixture,
+)
 from bcppl.distributions.poses import NormalPose
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, bin_depth
+from bcppl.geometry.turns import box_turns
 from bcppl.rendering.extrinsics_error import apparent_covariance, apparent_pose, line_of_sight
 from bcppl.rendering.information import pixel_information
 from bcppl.rendering.ray_casting import RayCaster
@@ -34,6 +42,7 @@ from bcppl.traces.carried import once
 
 # The Gaussian fit of an image is no sharper than this: metres, radians, metres of bias.
 SHARPEST = torch.tensor([5e-5] * 3 + [1e-3] * 3 + [1e-4], dtype=torch.float64)
+_OUTSIDE = 4.0  # standard deviations of a camera's errors: an apparent pose is so far off the prior at most
 _WIDER = 1.3  # standard deviations of a proposed bias, in those of the fit
 
 
@@ -195,20 +204,43 @@ class ErringCamera:
         """The name of the instrument, which has one error for all its measurements."""
         return action.camera.instrument
 
-    def fit(self, number: int, action: View, observations: Mapping[str, Tensor]) -> FittedNormal:
-        """A Gaussian (7,) over the apparent pose, in the tangent space of the prior's mean, and the bias."""
+    def fit(self, number: int, action: View, observations: Mapping[str, Tensor]) -> FittedMixture:
+        """Gaussians (7,) over the apparent pose, in the tangent space of the prior's mean, and the bias.
+
+        There is one for each mode that turns about the middle of the part lead to (`box_turns`).
+        """
         camera, prior, image = self.camera(action), self.prior, observations[f"depth_{number}"]
+        errors = self._errors(camera)
 
         def log_density(point: Tensor) -> Tensor:
             seen, bias = poses.retract(prior.center, point[:, :6]), point[:, 6]
             image_here = self.image(camera, without_bias(camera, seen, bias), bias).log_prob(image)
-            return torch.where(allowed(prior, seen), image_here, -torch.inf)
+            return torch.where(allowed(prior, seen, _OUTSIDE * errors), image_here, -torch.inf)
 
-        spread = normal_like(prior).covariance.diagonal().sqrt()
+        def alike(point: Tensor) -> Tensor:
+            seen = poses.compose(poses.retract(prior.center, point[:, :6]), turns[:, None])
+            images = torch.cat(
+                [poses.local(prior.center, seen), point[:, 6:].expand(len(turns), -1, 1)], dim=2
+            )
+            return images[allowed(prior, seen[:, 0], _OUTSIDE * errors)]
+
+        turns = box_turns(self.renderer.part)
+        spread = torch.hypot(normal_like(prior).covariance.diagonal().sqrt(), errors)
         bias = torch.tensor([self.settings.bias], dtype=torch.float64)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)  # a fit depends on the image alone
-            return fitted_normal(log_density, torch.cat([spread, bias]), SHARPEST)
+            fit = fitted_mixture(log_density, torch.cat([spread, bias]), SHARPEST, alike)
+        # Weights are of the likelihood alone, in the poses' base measure.
+        own = 0.5 * (fit.means[:, :6] / spread).square().sum(dim=1)
+        own = own + poses.FREE.log_base_density(fit.means[:, 3:6].norm(dim=1))
+        return FittedMixture.of(fit.components, fit.log_weights + own)
+
+    def _errors(self, camera: Camera) -> Tensor:
+        """Standard deviations (6,) of the apparent pose of a part at the prior's mean."""
+        center, settings = self.prior.center, self.settings
+        error = apparent_covariance(camera, center, settings.camera_shift, settings.camera_turn).diagonal()
+        along = settings.bias * line_of_sight(camera, center)
+        return (error + torch.cat([along, torch.zeros_like(along)]).square()).sqrt()
 
     def factor(self, action: View, values: Mapping[str, Tensor]) -> PoseFactor:
         """The Gaussian over the part's pose, given where its camera measures it (N, 7) and its bias (N,)."""
@@ -216,14 +248,14 @@ class ErringCamera:
         there = without_bias(camera, values[f"seen_by_{name}"], values[f"bias_{name}"])
         return PoseFactor(there, self._covariance(camera))
 
-    def marginal_factor(self, action: View, fit: FittedNormal) -> PoseFactor:
-        """The Gaussian over the part's pose (1, 7), given a fit of an image."""
-        camera, points = self.camera(action), fit.sigma_points()
-        seen, bias = poses.retract(self.prior.center, points[:, :6]), points[:, 6]
+    def marginal_factor(self, action: View, fit: FittedMixture) -> PoseFactor:
+        """The Gaussian over the part's pose (M, 7), given each component of a fit of an image."""
+        camera, points = self.camera(action), torch.stack([each.sigma_points() for each in fit.components])
+        seen, bias = poses.retract(self.prior.center, points[..., :6]), points[..., 6]
         # Where the image leaves the part's pose open, so does the approximation.
         parts = without_bias(camera, seen, bias)
-        away = poses.local(parts[:1], parts[1:])
-        return PoseFactor(parts[:1], self._covariance(camera, 0.5 * away.T @ away))
+        away = poses.local(parts[:, :1], parts[:, 1:])
+        return PoseFactor(parts[:, 0], self._covariance(camera, 0.5 * away.transpose(1, 2) @ away))
 
     def _covariance(self, camera: Camera, more: Tensor | float = 0.0) -> Any:
         settings = self.settings
@@ -269,25 +301,22 @@ class ErringCamera:
         """Whether this is the first image of its instrument."""
         return f"seen_by_{action.camera.instrument}" not in trace
 
-    def propose(self, action: View, fit: FittedNormal, part: NormalPose | None) -> Mapping[str, Tensor]:
+    def propose(self, action: View, fit: FittedMixture, part: NormalPose | None) -> Mapping[str, Tensor]:
         """Sample the nuisance parameters from their approximate conditional, given their first image's fit.
 
         `part` is the part's pose (N, 7) given all measurements before; None where there are none.
         """
         name, camera = action.camera.instrument, self.camera(action)
-        bias = pyro.sample(f"bias_{name}", dist.Normal(fit.mean[6], _WIDER * fit.covariance[6, 6].sqrt()))
+        bias = pyro.sample(f"bias_{name}", self._bias(fit))
         around = self._given_bias(fit, bias)
         if part is not None:
             seen = self._apparent(camera, part.center, bias)
-            around = product(around, NormalPose(seen.center, part.covariance + seen.covariance))
-        covariance = around.covariance.expand(len(bias), 6, 6)
-        return {
-            f"bias_{name}": bias,
-            f"seen_by_{name}": pyro.sample(f"seen_by_{name}", widened(around.center, covariance)),
-        }
+            around = around.times(NormalPose(seen.center, part.covariance + seen.covariance))
+        seen_by = pyro.sample(f"seen_by_{name}", widened_mixture(around))
+        return {f"bias_{name}": bias, f"seen_by_{name}": seen_by}
 
     def accompany(
-        self, action: View, fit: FittedNormal, trace: Any, old: Tensor, new: Tensor, correlation: float
+        self, action: View, fit: FittedMixture, trace: Any, old: Tensor, new: Tensor, correlation: float
     ) -> None:
         """Sample the apparent pose for a part that moves, at the same quantile of its conditional.
 
@@ -297,17 +326,32 @@ class ErringCamera:
         name, camera = action.camera.instrument, self.camera(action)
         bias = trace[f"bias_{name}"]
         seen = self._given_bias(fit, bias)
-        before, after = (product(seen, self._apparent(camera, part, bias)) for part in (old, new))
-        away = poses.local(before.center, trace[f"seen_by_{name}"])
-        center = poses.retract(after.center, correlation * away)
-        pyro.sample(f"seen_by_{name}", NormalPose(center, (1.0 - correlation**2) * after.covariance))
+        before, after = (seen.times(self._apparent(camera, part, bias)) for part in (old, new))
+        # The deviation is from the component that it most probably came of, and is kept in all others.
+        at, own = trace[f"seen_by_{name}"], torch.arange(len(old))
+        away = poses.local(before.centers[own, before.component(at)], at)
+        centers = poses.retract(after.centers, correlation * away[:, None])
+        covariances = (1.0 - correlation**2) * after.covariances
+        pyro.sample(f"seen_by_{name}", mixture_of(GaussianMixture(centers, covariances, after.log_weights)))
 
-    def _given_bias(self, fit: FittedNormal, bias: Tensor) -> NormalPose:
-        """The apparent pose, given an image and the bias (N,)."""
-        own, both = fit.covariance[6, 6], fit.covariance[:6, 6]
-        off = fit.mean[:6] + (bias - fit.mean[6])[:, None] * both / own
-        covariance = fit.covariance[:6, :6] - torch.outer(both, both) / own
-        return NormalPose(poses.retract(self.prior.center, off), covariance)
+    def _bias(self, fit: FittedMixture) -> Any:
+        """The bias given an image, wider."""
+        each = dist.Normal(fit.means[:, 6], _WIDER * fit.covariances[:, 6, 6].sqrt())
+        if len(fit.means) == 1:
+            return dist.Normal(each.mean[0], each.stddev[0])
+        return dist.MixtureSameFamily(dist.Categorical(logits=fit.log_weights), each)
+
+    def _given_bias(self, fit: FittedMixture, bias: Tensor) -> GaussianMixture:
+        """The apparent pose, given an image and the bias (N,): M components for each."""
+        own, both = fit.covariances[:, 6, 6], fit.covariances[:, :6, 6]
+        away = bias[:, None] - fit.means[:, 6]
+        off = fit.means[:, :6] + away[..., None] * both / own[:, None]
+        covariances = fit.covariances[:, :6, :6] - both[:, :, None] * both[:, None] / own[:, None, None]
+        return GaussianMixture(
+            poses.retract(self.prior.center, off),
+            covariances.expand(len(bias), -1, 6, 6),
+            fit.log_weights - 0.5 * (away.square() / own + own.log()),
+        )
 
 
 def with_bias(camera: Camera, part: Tensor, bias: Tensor) -> Tensor:
