@@ -51,16 +51,16 @@ def held(seen: Recording, **settings: float) -> tuple[bool, float]:
     own = replace(
         model, prepare=partial(part_in_view.prepare, **settings), proposals=() if exact else model.proposals
     )
-    *_, last = infer(own, seen, particles=30, sweeps=(6, 6))
+    *_, last = infer(own, seen, particles=40, sweeps=(6, 6))
     region = last.belief.credible_region(0.9, translation_deviation)
     return bool(region.contains(TRUTH)), float((last.belief.mean[:3] - TRUTH[:3]).norm())
 
 
 def test_the_region_holds_a_truth_that_an_erring_image_misses_and_without_latent_errors_does_not() -> None:
-    displaced = recording((0.003, -0.002, 0.006))
+    displaced = recording((0.003, -0.002, 0.008))
     holds, off = held(displaced, **ERRORS)
-    assert holds and off < 0.011
-    assert held(displaced, shift=0.0) == (False, pytest.approx(0.007, abs=0.0025))
+    assert holds and off < 0.012
+    assert held(displaced, shift=0.0) == (False, pytest.approx(0.0085, abs=0.003))
 
 
 @pytest.mark.long
