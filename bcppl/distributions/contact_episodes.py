@@ -169,8 +169,9 @@ class ContactEpisodes(ContactManifold):
         whole, count = Check(1.0, "contacts", 0.0), int((contact & new).sum())
         if count:
             every = self._blocks(rows, contact)
-            inlier, _ = self._inliers(every, every.residual(distance))
-            weights = (self._log_weights()[:, None] + inlier.sum(dim=1)).softmax(dim=0)
+            inlier, stray = self._inliers(every, every.residual(distance))
+            either = torch.logaddexp(inlier, stray[:, None].expand_as(inlier))
+            weights = (self._log_weights()[:, None] + either.sum(dim=1)).softmax(dim=0)
             squared = every.whitened(every.residual(distance)).square().sum(dim=(1, 2))
             if bool((contact & ~new).any()):
                 old = self._blocks(rows, contact & ~new)
@@ -231,11 +232,13 @@ class ContactEpisodes(ContactManifold):
     ) -> Quadratic:
         blocks = self._blocks(rows, used)
         error = blocks.residual(distance)
-        inlier, _ = self._inliers(blocks, error)
-        weights = (self._log_weights()[:, None] + inlier.sum(dim=1)).softmax(dim=0)
+        inlier, stray = self._inliers(blocks, error)
+        either = torch.logaddexp(inlier, stray[:, None].expand_as(inlier))
+        weights = (self._log_weights()[:, None] + either.sum(dim=1)).softmax(dim=0)
         variance = torch.diagonal(blocks.factor @ blocks.factor.transpose(-1, -2), dim1=-2, dim2=-1)
         # What is far off, seen as wide as the errors are taken to be, hardly pulls.
-        trust = (1.0 / (1.0 + error**2 / (_FAR**2 * variance[..., None]))).sqrt()
+        sure = (inlier - either).exp()[:, :, None]
+        trust = (sure / (1.0 + error**2 / (_FAR**2 * variance[..., None]))).sqrt()
         slope = torch.where(blocks.used[..., None], gradient[:, blocks.rows], 0.0).permute(1, 2, 3, 0)
         nodes, episodes, most, count = error.shape
         whitened = blocks.whitened(trust * error)

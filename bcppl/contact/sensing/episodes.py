@@ -17,11 +17,15 @@ from bcppl.contact.sensing.contact_detection import ContactDetector
 CELL = 0.5  # s: rows are complete at the end of each cell of a probe, or at its own
 SHORTEST, LONGEST = 0.01, 0.05  # s of contact in one row
 _GROWTH = 0.3  # of the time since the onset: rows are short where the force rises
-_TRAVEL = 0.001  # m that a peg moves within a row of contact, and between rows without one
-_FORCE = 1.5  # N by which the force changes within a row
+_TRAVEL = 0.0025  # m that a peg moves within a row of contact, and
+_MOVED = 0.001  # m between rows without one
+_FORCE, _SHARE = 1.5, 0.3  # N, and of the force, by which it changes within a row
+_RESTING, _SLIDING = 0.01, 0.02  # m/s: below the one a peg rests, above the other it slides
+_FRICTION = 0.5  # a peg that slides moves across its force by so much more than along it
 _SMOOTH = 0.01  # s to either side of a stamp, over which velocity and acceleration are estimated
-_BREAK = 0.05  # s without contact that end an episode, and
-_LASTING = 1.0  # s after which a new one begins, so that one outlier does not take a long slide with it
+# s without contact that end an episode. Where a peg comes to rest or begins to slide another begins, and in
+# each cell: an episode is an outlier as a whole.
+_BREAK = 0.05
 
 
 class Rows(NamedTuple):
@@ -31,10 +35,10 @@ class Rows(NamedTuple):
         world_from_peg: (R, 7).
         felt: (R,) 1 for contact and 0 for none.
         count: (R,) stamps.
-        speed: (R,) m/s, in contact along the force.
+        speed: (R,) m/s, in contact along its normal, at least.
         force: (R,) N.
         time: (R,) s.
-        episode: (R,) the number of the uninterrupted contact; -1 without contact.
+        episode: (R,) the number of the contact, at rest or sliding, within a cell; -1 without contact.
     """
 
     world_from_peg: Array
@@ -52,6 +56,16 @@ def cell_ends(stamps: Array) -> Indices:
     return np.append(np.flatnonzero(np.diff(cell)) + 1, len(stamps))
 
 
+class _Stamps(NamedTuple):
+    """All stamps so far: `force` is its size (N), `pace` the peg's speed (m/s)."""
+
+    time: Array
+    pose: Array
+    felt: Array
+    force: Array
+    pace: Array
+
+
 @dataclass
 class EpisodeExtractor:
     """Rows of one probe, cell by cell; they depend on no later stamp, and not on how the probe is cut.
@@ -67,6 +81,7 @@ class EpisodeExtractor:
     _episode: int = -1
     _onset: float = -math.inf
     _last_contact: float = -math.inf
+    _moving: bool = False
     _last_free: tuple[float, Array] | None = None
 
     @property
@@ -90,15 +105,16 @@ class EpisodeExtractor:
             last: whether the probe ends here.
         """
         until = math.inf if last or not len(time) else time[-1] - self._lag + 1e-6
-        felt, speed = self._decided(time, pose, force, acceleration)
+        felt, speed, pace = self._decided(time, pose, force, acceleration)
         size = np.linalg.norm(force, axis=1)
+        seen = _Stamps(time, pose, felt, size, pace)
         groups: list[tuple[slice, float, int]] = []
         begin = int(np.searchsorted(time, self._done, side="right"))
         end = int(np.searchsorted(time, until, side="right"))
         k = begin
         while k < end:
             if felt[k] == 1.0:
-                stop = self._contact_row(k, end, time, pose, felt, size)
+                stop = self._contact_row(k, end, seen)
                 groups.append((slice(k, stop), 1.0, self._episode))
                 k = stop
                 continue
@@ -107,27 +123,29 @@ class EpisodeExtractor:
                 self._last_free = time[k], pose[k, :3]
             k += 1
         self._done = float(time[end - 1]) if end > begin else self._done
+        self._last_contact = -math.inf
         return _rows(groups, time, pose, size, speed)
 
-    def _contact_row(self, first: int, end: int, time: Array, pose: Array, felt: Array, size: Array) -> int:
-        """The index after a row's last stamp."""
-        now = time[first]
-        between = (time > self._last_contact) & (time < now)
-        if (
-            now - self._last_contact > max(_BREAK, 1.5 * self.step)
-            or now - self._onset > _LASTING
-            or (felt[between] == 0.0).any()
-        ):
-            self._episode, self._onset = self._episode + 1, now
+    def _contact_row(self, first: int, end: int, seen: _Stamps) -> int:
+        """The index after a row's last stamp; the row's episode is `_episode`."""
+        now = seen.time[first]
+        between = (seen.time > self._last_contact) & (seen.time < now)
+        broken = now - self._last_contact > max(_BREAK, 1.5 * self.step) or (seen.felt[between] == 0.0).any()
+        if broken:
+            self._onset = now
         longest = min(LONGEST, max(SHORTEST, _GROWTH * (now - self._onset)))
         stop = first + 1
-        while stop < end and felt[stop] == 1.0 and time[stop] - now < longest - 1e-6:
-            moved = np.linalg.norm(pose[stop, :3] - pose[first, :3])
-            changed = moved > _TRAVEL or abs(size[stop] - size[first]) > _FORCE
-            if changed and time[stop] - now > SHORTEST - 1e-6:
+        while stop < end and seen.felt[stop] == 1.0 and seen.time[stop] - now < longest - 1e-6:
+            moved = np.linalg.norm(seen.pose[stop, :3] - seen.pose[first, :3])
+            force = abs(seen.force[stop] - seen.force[first])
+            changed = moved > _TRAVEL or force > max(_FORCE, _SHARE * seen.force[first])
+            if changed and seen.time[stop] - now > SHORTEST - 1e-6:
                 break
             stop += 1
-        self._last_contact = time[stop - 1]
+        moving = seen.pace[first:stop].mean() > (_RESTING if self._moving else _SLIDING)
+        if broken or moving != self._moving:
+            self._episode += 1
+        self._moving, self._last_contact = moving, seen.time[stop - 1]
         return stop
 
     def _is_new(self, k: int, time: Array, pose: Array, felt: Array) -> bool:
@@ -137,13 +155,15 @@ class EpisodeExtractor:
         if self._last_free is None:
             return True
         then, place = self._last_free
-        return time[k] - then > LONGEST - 1e-6 and bool(np.linalg.norm(pose[k, :3] - place) > _TRAVEL)
+        return time[k] - then > LONGEST - 1e-6 and bool(np.linalg.norm(pose[k, :3] - place) > _MOVED)
 
-    def _decided(self, time: Array, pose: Array, force: Array, acceleration: Array) -> tuple[Array, Array]:
-        """1, 0 or NaN (T,) for contact, none and undecided, and the speed (T,)."""
-        felt, speed = np.full(len(time), np.nan), np.zeros(len(time))
+    def _decided(
+        self, time: Array, pose: Array, force: Array, acceleration: Array
+    ) -> tuple[Array, Array, Array]:
+        """1, 0 or NaN (T,) for contact, none and undecided; the speed of `Rows`, and the whole one."""
+        felt, speed, pace = np.full(len(time), np.nan), np.zeros(len(time)), np.zeros(len(time))
         if not len(time):
-            return felt, speed
+            return felt, speed, pace
         breaks = np.flatnonzero(np.diff(time) > 1.5 * self.step) + 1
         for part in np.split(np.arange(len(time)), breaks):
             velocity, measured = self._derivatives(pose[part, :3])
@@ -152,9 +172,11 @@ class EpisodeExtractor:
             felt[part] = self.detector(*given, self.step).numpy()
             world = Rotation.from_quat(pose[part][:, [4, 5, 6, 3]]).apply(np.nan_to_num(force[part]))
             size = np.linalg.norm(world, axis=1)
+            pace[part] = whole = np.linalg.norm(velocity, axis=1)
             along = np.abs(np.einsum("ij,ij->i", velocity, world)) / np.maximum(size, 1e-9)
-            speed[part] = np.where(felt[part] == 1.0, along, np.linalg.norm(velocity, axis=1))
-        return felt, speed
+            across = np.sqrt(np.maximum(whole**2 - along**2, 0.0))
+            speed[part] = np.where(felt[part] == 1.0, np.maximum(along - _FRICTION * across, 0.0), whole)
+        return felt, speed, pace
 
     def _derivatives(self, place: Array) -> tuple[Array, Array]:
         """Velocity and acceleration (T, 3) of a peg at (T, 3), by parabolas."""

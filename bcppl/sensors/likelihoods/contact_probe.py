@@ -16,7 +16,7 @@ from bcppl.arguments import number_within
 from bcppl.contact.quasi_static import QuasiStaticMotion, WindowMotion
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.location import ContactSensing
-from bcppl.distributions.contact_episodes import EPISODE, FELT, GIVEN, ContactEpisodes
+from bcppl.distributions.contact_episodes import FELT, ContactEpisodes
 from bcppl.distributions.manifold import Gaps, MeasuresGap
 from bcppl.effort import Effort
 from bcppl.errors import InputError
@@ -201,12 +201,15 @@ class ContactProbe:
 
     def new_contact(self, measurements: Sequence[Approximated], newest: bool) -> bool:
         """Whether contact begins in one of the windows, or in the newest of them."""
-        for _, _, value in measurements[-1:] if newest else measurements:
-            contact = value[value[:, FELT] == 1.0]
-            given = contact[:, GIVEN] == 1.0
-            if not set(contact[~given, EPISODE].tolist()) <= set(contact[given, EPISODE].tolist()):
-                return True
-        return False
+        if not measurements:
+            return False
+        felt = torch.cat(
+            [torch.zeros(1, dtype=torch.bool), *(new_rows(v)[:, FELT] == 1.0 for _, _, v in measurements)]
+        )
+        onsets = felt[1:] & ~felt[:-1]
+        return bool(
+            (onsets[len(onsets) - len(new_rows(measurements[-1].value)) :] if newest else onsets).any()
+        )
 
     def heading(self, measurements: Sequence[Approximated]) -> Tensor | None:
         """The direction (3,) in which the peg moved when contact last began; None without contact."""
