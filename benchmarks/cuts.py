@@ -1,4 +1,4 @@
-"""One probe, cut into windows of 10 ms to all of it and read at 50 to 500 Hz: the same belief in the same time.
+"""One probe, in windows of 10 ms to all of it, read at 50 to 500 Hz: the same belief in the same time.
 
 A scene of `foreign_world` is tapped and pressed. Each recording is assimilated after the same two views, with
 the same seeds. Two beliefs differ by chance where the distance of their means is small against the spread.

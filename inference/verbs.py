@@ -83,9 +83,12 @@ def observations_of(
             yield Observed((scene, [each.action for each in once]), {})
             continue
         once.append(newest)
+        if not alone and _is_deferred(scene, newest):
+            yield Observed((scene, [each.action for each in once]), {})
+            continue
         given = [newest] if alone else once
         new = {a: value for a, value in model.observe(scene, given).items() if a not in known}
-        if not (new or alone or _is_deferred(scene, newest)):
+        if not (new or alone):
             raise InputError(
                 f"measurement {count - 1} gives no observation, so it would leave the belief as it is; "
                 "let the model's `observe` name its addresses, or leave the measurement out."

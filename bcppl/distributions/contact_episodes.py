@@ -25,6 +25,7 @@ _LOG_TWO_PI = math.log(2.0 * math.pi)
 # Nodes of the compliance, in decades from its median: they are closer than `varying` is wide.
 _DECADES = torch.linspace(-1.25, 1.25, 11, dtype=torch.float64)
 _RIDGE = 1.0  # 1/m^2 and 1/rad^2: far less than any touch informs
+_LEAST = 0.1  # of a contact's information that an unknown compliance leaves
 
 
 class _Errors(NamedTuple):
@@ -250,10 +251,15 @@ class ContactEpisodes(ContactManifold):
         away = pulls - pull[:, None]
         inside = (shares[..., None, None] * within).sum(dim=1)
         between = (shares[..., None] * away).transpose(-1, -2) @ away
-        # To first order `inside` minus `between`, the Hessian of a mixture; this one is never negative.
+        # The Hessian of a mixture is `inside` minus `between`; what is left of it is bounded from below.
         ridge = _RIDGE * torch.eye(6, dtype=torch.float64)
-        information = inside @ torch.linalg.solve(inside + between + ridge, inside)
-        return Quadratic(pull, 0.5 * (information + information.transpose(-1, -2)))
+        factor = torch.linalg.cholesky(inside + ridge)
+        left = torch.linalg.solve_triangular(factor, between, upper=False)
+        lost = torch.linalg.solve_triangular(factor, left.transpose(-1, -2), upper=False)
+        shares_lost, axes = torch.linalg.eigh(0.5 * (lost + lost.transpose(-1, -2)))
+        root = factor @ (axes * (1.0 - shares_lost).clamp(min=_LEAST).sqrt()[..., None, :])
+        information = root @ root.transpose(-1, -2)
+        return Quadratic(pull, information)
 
 
 @lru_cache(maxsize=128)

@@ -11,7 +11,7 @@ import numpy as np
 
 from bcppl.arrays import Array
 from bcppl.contact.touch import Touch
-from bcppl.traces.dependence import alike, equal
+from bcppl.traces.dependence.equality import alike, equal
 
 _LEAST = 30  # numbers: fewer, rounded by their sensor, may be equal by chance
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within
-from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.robot.motion import Probe
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ class ContactDetector:
     contact: float = 1.5
     free: float = 0.8
     mass: float = 0.3
-    agreement: float = 0.01
+    agreement: float = 0.005
 
     def __post_init__(self) -> None:
         number_within("a contact detector has contact {} N", self.contact, above=0.0)
@@ -60,7 +57,7 @@ class ContactDetector:
             return torch.empty(0, dtype=torch.float64)
         size = force.norm(dim=1)
         known = ~torch.isnan(size)
-        neighbours = round(self.agreement / step + 1e-6)
+        neighbours = int(self.agreement / step + 1e-6)
         contact = _unanimous(known & (size > self.contact + self.mass * acceleration), neighbours)
         free = _unanimous(known & (size < self.free), neighbours)
         return torch.where(contact, 1.0, torch.where(free, 0.0, torch.nan)).to(torch.float64)
@@ -69,12 +66,3 @@ class ContactDetector:
 def _unanimous(flags: Tensor, neighbours: int) -> Tensor:
     padded = torch.nn.functional.pad(flags, (neighbours, neighbours), value=True)
     return padded.unfold(0, 2 * neighbours + 1, 1).all(dim=1)
-
-
-def commanded_acceleration(probe: Probe) -> Array:
-    """The maximum commanded acceleration (T,), m/s^2, within 50 ms of a probe's stamps."""
-    stamps = probe.stamps
-    near = stamps[:, None] + np.arange(-0.05, 0.051, 0.01)
-    place = np.stack([np.interp(near, probe.command_times, probe.command[:, axis]) for axis in range(3)])
-    speed = np.diff(place, axis=-1) / 0.01
-    return np.asarray(np.linalg.norm(np.diff(speed, axis=-1) / 0.01, axis=0).max(axis=-1))

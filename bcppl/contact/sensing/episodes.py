@@ -94,18 +94,17 @@ class EpisodeExtractor:
         """Seconds after which a stamp and the one after it are decided: what comes later changes nothing."""
         return self.step * (1 + max(self._half, round(self.detector.agreement / self.step)))
 
-    def rows(self, time: Array, pose: Array, force: Array, acceleration: Array, last: bool) -> Rows:
+    def rows(self, time: Array, pose: Array, force: Array, last: bool) -> Rows:
         """The rows that are complete, of all stamps so far.
 
         Args:
             time: (T,) s.
             pose: (T, 7) world_from_peg.
             force: (T, 3) tared, in the peg's frame, N; NaN while taring.
-            acceleration: (T,) commanded, m/s^2.
             last: whether the probe ends here.
         """
         until = math.inf if last or not len(time) else time[-1] - self._lag + 1e-6
-        felt, speed, pace = self._decided(time, pose, force, acceleration)
+        felt, speed, pace = self._decided(time, pose, force)
         size = np.linalg.norm(force, axis=1)
         seen = _Stamps(time, pose, felt, size, pace)
         groups: list[tuple[slice, float, int]] = []
@@ -157,18 +156,15 @@ class EpisodeExtractor:
         then, place = self._last_free
         return time[k] - then > LONGEST - 1e-6 and bool(np.linalg.norm(pose[k, :3] - place) > _MOVED)
 
-    def _decided(
-        self, time: Array, pose: Array, force: Array, acceleration: Array
-    ) -> tuple[Array, Array, Array]:
+    def _decided(self, time: Array, pose: Array, force: Array) -> tuple[Array, Array, Array]:
         """1, 0 or NaN (T,) for contact, none and undecided; the speed of `Rows`, and the whole one."""
         felt, speed, pace = np.full(len(time), np.nan), np.zeros(len(time)), np.zeros(len(time))
         if not len(time):
             return felt, speed, pace
         breaks = np.flatnonzero(np.diff(time) > 1.5 * self.step) + 1
         for part in np.split(np.arange(len(time)), breaks):
-            velocity, measured = self._derivatives(pose[part, :3])
-            most = np.maximum(acceleration[part], np.linalg.norm(measured, axis=1))
-            given = torch.from_numpy(force[part]), torch.from_numpy(most)
+            velocity, acceleration = self._derivatives(pose[part, :3])
+            given = torch.from_numpy(force[part]), torch.from_numpy(np.linalg.norm(acceleration, axis=1))
             felt[part] = self.detector(*given, self.step).numpy()
             world = Rotation.from_quat(pose[part][:, [4, 5, 6, 3]]).apply(np.nan_to_num(force[part]))
             size = np.linalg.norm(world, axis=1)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bcppl.arrays import Indices
-from bcppl.contact.sensing.contact_detection import ContactDetector, commanded_acceleration
+from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, cell_ends
 from bcppl.contact.sensing.location import ContactSensing
 from bcppl.distributions.contact_episodes import COLUMNS, FELT, GIVEN, padded
@@ -112,7 +112,6 @@ class ProbeRows:
         self.probe, self.sensing, self.settings = probe, sensing, settings
         self._state = sensing.start(1)
         self._extractor = EpisodeExtractor(settings.contact_detector, step_of(probe))
-        self._commanded = commanded_acceleration(probe)
         self._number = np.empty(0, dtype=np.int64)
         self._pose, self._force = np.empty((0, 7)), np.empty((0, 3))
         self._given = torch.empty(0, COLUMNS, dtype=torch.float64)
@@ -151,7 +150,6 @@ class ProbeRows:
             self.probe.stamps[number],
             self._pose[so_far],
             self._force[so_far],
-            self._commanded[number],
             end == len(self.probe.stamps),
         )
         noise = np.hypot(settings.gap_noise / np.sqrt(rows.count), settings.delay * rows.speed)
