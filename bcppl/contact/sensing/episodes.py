@@ -34,7 +34,7 @@ class Rows(NamedTuple):
     Attributes:
         world_from_peg: (R, 7).
         felt: (R,) 1 for contact and 0 for none.
-        count: (R,) stamps.
+        stamps: (R,) how many.
         speed: (R,) m/s, in contact along its normal, at least.
         force: (R,) N.
         time: (R,) s.
@@ -43,7 +43,7 @@ class Rows(NamedTuple):
 
     world_from_peg: Array
     felt: Array
-    count: Array
+    stamps: Array
     speed: Array
     force: Array
     time: Array

@@ -152,7 +152,7 @@ class ProbeRows:
             self._force[so_far],
             end == len(self.probe.stamps),
         )
-        noise = np.hypot(settings.gap_noise / np.sqrt(rows.count), settings.delay * rows.speed)
+        noise = np.hypot(settings.gap_noise / np.sqrt(rows.stamps), settings.delay * rows.speed)
         columns = [rows.felt, noise, rows.force, rows.time, rows.episode, np.zeros(len(noise))]
         every = torch.from_numpy(np.column_stack([rows.world_from_peg, *columns]))
         return every if settings.free_space else every[every[:, FELT] == 1.0]
