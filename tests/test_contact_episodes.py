@@ -33,7 +33,7 @@ from bcppl.sensors.likelihoods.probe_rows import new_rows
 from bcppl.sensors.repeats import repeated
 from tests.test_manifold import around, differences, ledge
 
-NOISE, SHARED, DRIFT, LASTING, COMPLIANCE, VARYING, ROUGH = 6e-5, 1e-5, 2e-5, 0.1, 5e-6, 0.4, 0.2
+NOISE, SHARED, DRIFT, LASTING, COMPLIANCE, VARYING, ROUGH = 6e-5, 1e-5, 2e-5, 0.1, 5e-6, 0.6, 0.2
 OUTLIER = 1e-3
 
 

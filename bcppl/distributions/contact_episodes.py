@@ -97,7 +97,7 @@ class ContactEpisodes(ContactManifold):
     lasting: float = field(default=0.1, metadata=POSITIVE)
     compliance: float = field(default=0.000005, metadata=POSITIVE)
     uncertain: float = field(default=0.5, metadata=POSITIVE)
-    varying: float = field(default=0.4, metadata=NONNEGATIVE)
+    varying: float = field(default=0.6, metadata=NONNEGATIVE)
     rough: float = field(default=0.2, metadata=NONNEGATIVE)
     blur: float = field(default=0.0, metadata=NONNEGATIVE)
 

@@ -60,7 +60,7 @@ class TouchSettings:
     """
 
     gap_noise: float = 0.00006
-    gap_drift: float = 0.00002
+    gap_drift: float = 0.000015
     gap_shared: float = 0.00001
     lasting: float = 0.1
     compliance: float = 0.000005
