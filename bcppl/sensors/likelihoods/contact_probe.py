@@ -47,7 +47,8 @@ class TouchSettings:
     """Noise of the peg's measured pose in contact, and how contact is detected.
 
     Attributes:
-        gap_noise: standard deviation of the peg's surface position at one stamp, m.
+        gap_noise: standard deviation of the peg's surface position at one stamp, m; less where the measured
+            poses scatter less.
         gap_drift: standard deviation of its errors that last for `lasting` seconds, m.
         gap_shared: standard deviation of the error that all stamps of a contact share, m.
         lasting: s.

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bcppl.arrays import Indices
+from bcppl import poses
+from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, cell_ends
 from bcppl.contact.sensing.location import ContactSensing
@@ -60,6 +61,16 @@ def capacity(window: ProbeWindow) -> int:
 def new_rows(value: Tensor) -> Tensor:
     """The rows (R, 13) of a value that no earlier window has used."""
     return value[~torch.isnan(value[:, FELT]) & (value[:, GIVEN] != 1.0)]
+
+
+def _noise_of(place: Array) -> float:
+    """The noise (m) of positions (T, 3) along an axis, by the median of their second differences.
+
+    A motion that is not smooth over three stamps adds to it.
+    """
+    if len(place) < 10:
+        return float("inf")
+    return float(np.median(np.abs(np.diff(place, n=2, axis=0)))) / (0.6745 * 6.0**0.5)
 
 
 class RememberedGaps:
@@ -142,6 +153,12 @@ class ProbeRows:
         contact[:, GIVEN] = 1.0
         self._given = torch.cat([self._given, contact])[-_REMEMBERED:]
 
+    def _tip(self, pose: Array) -> Array:
+        """Positions (T, 3) of the peg's farthest vertex."""
+        corners = self.sensing.peg.vertices
+        tip = torch.from_numpy(corners[np.linalg.norm(corners, axis=1).argmax()])
+        return np.asarray(poses.transform(torch.from_numpy(pose), tip[None])[:, 0].numpy())
+
     def _rows(self, end: int) -> Tensor:
         """The rows (R, 13) that are complete at the end of a cell."""
         settings, so_far = self.settings, self._number < end
@@ -152,7 +169,10 @@ class ProbeRows:
             self._force[so_far],
             end == len(self.probe.stamps),
         )
-        noise = np.hypot(settings.gap_noise / np.sqrt(rows.stamps), settings.delay * rows.speed)
+        stamp = float(
+            np.clip(_noise_of(self._tip(self._pose[so_far])), 0.3 * settings.gap_noise, settings.gap_noise)
+        )
+        noise = np.hypot(stamp / np.sqrt(rows.stamps), settings.delay * rows.speed)
         columns = [rows.felt, noise, rows.force, rows.time, rows.episode, np.zeros(len(noise))]
         every = torch.from_numpy(np.column_stack([rows.world_from_peg, *columns]))
         return every if settings.free_space else every[every[:, FELT] == 1.0]
