@@ -23,6 +23,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
+from bcppl.distributions.contact_episodes import padded
 from bcppl.inference.design import Ranking, expected_information_gain, linearised_information_gain
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.planning.candidate_layout import plan_candidates
@@ -32,6 +33,8 @@ from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.robot.plan import Plan, probe_of
 from bcppl.sensors.candidates import action_of
+from bcppl.sensors.likelihoods.contact_probe import PREDICTED
+from bcppl.sensors.likelihoods.probe_rows import capacity, step_of
 from bcppl.sensors.scene import Scene
 from bcppl.traces import Trace
 
@@ -81,7 +84,8 @@ def after_vision(seed: int, particles: int) -> tuple[Setting, list[Plan]]:
 
 def rolled_out(setting: Setting, plan: Plan, part: Tensor) -> Tensor:
     """What physics makes of a plan for poses (N, 7) of the part: (N, T, 8), without the sensors' noise."""
-    probe, every = probe_of(plan), setting.touches.settings.every
+    probe = probe_of(plan)
+    every = max(1, round(PREDICTED / step_of(probe)))
     rollout = setting.physics.start(part, probe).advance(len(probe.stamps))
     felt = np.linalg.norm(rollout.wrench[..., :3], axis=-1, keepdims=True) > FELT
     return torch.from_numpy(np.concatenate([rollout.world_from_peg, felt], axis=-1)[:, ::every])
@@ -104,7 +108,8 @@ class Physics:
         rows = self.rows[id(plan)][which].clone()
         sensor = self.setting.touches
         noise = sensor.settings.gap_noise * torch.randn(*rows.shape[:2], 3, dtype=torch.float64)
-        return torch.cat([rows[..., :3] + noise, rows[..., 3:]], dim=-1)
+        whole = torch.cat([rows[..., :3] + noise, rows[..., 3:]], dim=-1)
+        return padded(whole, capacity(action_of(plan)))
 
     def predict(self, plan: Plan, trace: Trace) -> dict[str, Tensor]:
         """What would be observed, for `expected_information_gain`."""

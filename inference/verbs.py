@@ -15,6 +15,7 @@ and resuming. GenParticleFilters.jl has the same verbs (`pf_initialize`, `pf_upd
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -26,6 +27,8 @@ from bcppl.inference.kernels import Kernel, Until, moved_by
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import POSTERIOR, Target
+from bcppl.sensors.capabilities import Defers
+from bcppl.sensors.repeats import repeated
 from bcppl.traces import Model, Series, extend
 
 
@@ -58,12 +61,32 @@ def observations_of(
 
     Raises:
         InputError: a measurement gives no observation at a new address.
+
+    Warns:
+        RuntimeWarning: a measurement repeats an earlier one to the bit. It adds nothing, as one whose
+            observations come with a later one (`bcppl.sensors.capabilities.Defers`) adds nothing yet.
     """
     # A step of a series is given the newest measurement alone, under its own addresses, and may have none.
     alone = isinstance(model.program, Series)
-    known = set(model.observe(scene, measurements[:start])) if start and not alone else set()
+    repeats = {} if alone else repeated(measurements)
+    once = [each for number, each in enumerate(measurements[:start]) if number not in repeats]
+    known = set(model.observe(scene, once)) if once and not alone else set()
     for count in range(start + 1, len(measurements) + 1):
-        given = measurements[count - 1 if alone else 0 : count]
+        newest = measurements[count - 1]
+        if count - 1 in repeats:
+            warnings.warn(
+                f"measurement {count - 1} repeats measurement {repeats[count - 1]} to the bit; "
+                "it counts once.",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            yield Observed((scene, [each.action for each in once]), {})
+            continue
+        once.append(newest)
+        if not alone and _is_deferred(scene, newest):
+            yield Observed((scene, [each.action for each in once]), {})
+            continue
+        given = [newest] if alone else once
         new = {a: value for a, value in model.observe(scene, given).items() if a not in known}
         if not (new or alone):
             raise InputError(
@@ -73,6 +96,11 @@ def observations_of(
         if not alone:
             known |= new.keys()
         yield Observed((scene, [each.action for each in given]), new)
+
+
+def _is_deferred(scene: Any, measurement: Any) -> bool:
+    sensor = scene.sensor(measurement.action) if hasattr(scene, "sensor") else None
+    return isinstance(sensor, Defers) and sensor.is_deferred(measurement.action)
 
 
 def update(population: Population, observed: Observed, pair: Pair | None = None) -> Population:

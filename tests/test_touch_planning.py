@@ -157,7 +157,7 @@ def forces(*sizes: float) -> torch.Tensor:
 
 
 def test_contact_is_detected_above_one_force_and_excluded_below_another() -> None:
-    at_once = ContactDetector(contact=1.5, free=0.8, mass=0.3, neighbours=0)
+    at_once = ContactDetector(contact=1.5, free=0.8, mass=0.3, agreement=0.0)
     detected = at_once(forces(0.0, 0.79, 0.81, 1.49, 1.51, 40.0, NAN))
     np.testing.assert_array_equal(detected.numpy(), [0, 0, NAN, NAN, 1, 1, NAN])
     # Accelerating the tool takes force: 4 m/s^2 hide 1.2 N.
@@ -168,16 +168,17 @@ def test_contact_is_detected_above_one_force_and_excluded_below_another() -> Non
 
 def test_neighbours_must_agree_either_way_in_time() -> None:
     sizes = [0.1] * 6 + [1.0] + [3.0] * 7 + [0.1] * 5 + [9.0] + [0.1] * 4
-    detected = ContactDetector(neighbours=2)(forces(*sizes)).numpy()
+    detected = ContactDetector(agreement=0.02)(forces(*sizes), step=0.01).numpy()
     expected = [0] * 4 + [NAN] * 5 + [1] * 3 + [NAN] * 4 + [0] * 1 + [NAN] * 5 + [0] * 2
     np.testing.assert_array_equal(detected, expected)
-    np.testing.assert_array_equal(ContactDetector(neighbours=2)(forces(*sizes[::-1])).numpy(), detected[::-1])
+    backwards = ContactDetector(agreement=0.02)(forces(*sizes[::-1]), step=0.01).numpy()
+    np.testing.assert_array_equal(backwards, detected[::-1])
 
 
 def test_forces_and_numbers_that_make_no_sense_are_refused() -> None:
     with pytest.raises(InputError, match=r"shape \(5, 6\); give \(T, 3\)"):
         ContactDetector()(torch.zeros(5, 6))
-    for numbers in ({"free": 2.0}, {"contact": 0.0}, {"mass": -1.0}, {"neighbours": -1}):
+    for numbers in ({"free": 2.0}, {"contact": 0.0}, {"mass": -1.0}, {"agreement": -1.0}):
         with pytest.raises(InputError):
             ContactDetector(**numbers)
 

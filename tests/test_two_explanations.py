@@ -174,12 +174,14 @@ def test_particles_mostly_stay_in_their_mode_and_may_go_to_any() -> None:
 def test_a_contact_is_new_where_the_peg_did_not_touch_before() -> None:
     sensor, (_, action, _) = window_of(touched())
 
-    def window(flags: str) -> Approximated:
-        value = torch.zeros(len(flags), 8, dtype=torch.float64)
-        value[:, 7] = torch.tensor([{"#": 1.0, ".": 0.0, "?": torch.nan}[each] for each in flags])
-        return Approximated(0, action, value)
+    def windows(*flags: str) -> list[Approximated]:
+        """Windows of one probe, a character for each 50 ms."""
+        rows = torch.zeros(sum(map(len, flags)), 13, dtype=torch.float64)
+        rows[:, 7] = torch.tensor([{"#": 1.0, ".": 0.0, "?": torch.nan}[each] for each in "".join(flags)])
+        rows[:, 10] = 0.05 * torch.arange(len(rows))
+        return [Approximated(0, action, value) for value in rows.split([len(each) for each in flags])]
 
-    for newest, windows, new in (
+    for newest, given, new in (
         (True, ["..?##"], True),
         (True, ["..###", "#####"], False),
         (False, ["..###", "#####"], True),
@@ -188,7 +190,7 @@ def test_a_contact_is_new_where_the_peg_did_not_touch_before() -> None:
         (False, ["....", "??"], False),
         (True, [], False),
     ):
-        assert sensor.new_contact([window(each) for each in windows], newest) is new, (newest, windows)
+        assert sensor.new_contact(windows(*given), newest) is new, (newest, given)
 
 
 def test_the_contact_may_be_elsewhere_where_the_part_is_not_known_to_half_a_millimetre() -> None:

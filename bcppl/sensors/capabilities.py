@@ -81,6 +81,14 @@ class Contacts(Protocol):
 
 
 @runtime_checkable
+class Defers(Protocol):
+    """Measurements that may have no site of their own: a later one brings what they inform."""
+
+    def is_deferred(self, action: Any) -> bool:
+        """Whether a measurement's observations come with a later one."""
+
+
+@runtime_checkable
 class Grasping(Protocol):
     """A likelihood of what a held peg touches, which may sit off in the hand."""
 

@@ -47,6 +47,7 @@ from bcppl.inference.proposals.coordinates import continuous_addresses
 from bcppl.inference.resampling import systematic
 from bcppl.inference.sizing import replicate
 from bcppl.inference.targets import POSTERIOR
+from bcppl.sensors.capabilities import Defers
 from bcppl.traces import Model, Trace, extend
 
 WALK = (0.2, 2.0)  # scales of the random walks
@@ -225,7 +226,9 @@ def by_mode(population: Population, count: int) -> Tensor:
 def _given_all(approximation: Any, trace: Trace, actions: Sequence[Any]) -> Any:
     """The approximation given the measurements that a trace already holds."""
     for number, action in enumerate(actions):
-        approximation = approximation.including(trace.args[0], number, action, trace.observations)
+        sensor = trace.args[0].sensor(action)
+        if not (isinstance(sensor, Defers) and sensor.is_deferred(action)):
+            approximation = approximation.including(trace.args[0], number, action, trace.observations)
     return approximation
 
 

@@ -203,6 +203,10 @@ def _steps(
     ):
         measurement = measurements[count - 1]
         label = f"{measurement.kind} {count}"
+        if not (observed.observations or isinstance(model.program, Series)):
+            start = _unchanged(start, label, _time(measurement), population, state[0], count)
+            yield start
+            continue
         begun, before = time.perf_counter(), _effort(scene)
         try:
             with own_state(state, particles):
@@ -216,7 +220,17 @@ def _steps(
         gap = truth.gap(population)
         evidence, distinct = population.log_evidence, belief.distinct
         info = Info(label, _time(measurement), evidence, distinct, gap, elapsed, spent, happened)
-        yield Step(belief, info, population, state[0], count)
+        start = Step(belief, info, population, state[0], count)
+        yield start
+
+
+def _unchanged(
+    before: Step, label: str, time: float, population: Population, random_state: Tensor, count: int
+) -> Step:
+    """The step of a measurement that adds nothing: the same particles."""
+    happened = StepInfo(exponents=(), effective_sample_size=before.info.effective_sample_size)
+    info = before.info._replace(label=label, time=time, seconds=0.0, effort={}, step=happened)
+    return Step(before.belief, info, population, random_state, count)
 
 
 def _prior(model: Model, population: Population, random_state: Tensor) -> Step:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from bcppl.arguments import number_within, whole_number
+from bcppl.arguments import number_within
 from bcppl.errors import InputError
-from bcppl.robot.motion import ProbeWindow
 
 
 @dataclass(frozen=True)
@@ -25,7 +23,7 @@ class ContactDetector:
             inertial force.
         free: N; there is none below this.
         mass: kg; `contact` grows by this for each m/s^2 of the tool's acceleration.
-        neighbours: samples to either side that must agree.
+        agreement: s to either side within which all samples must agree.
 
     Raises:
         InputError: a number is out of range.
@@ -34,20 +32,21 @@ class ContactDetector:
     contact: float = 1.5
     free: float = 0.8
     mass: float = 0.3
-    neighbours: int = 2
+    agreement: float = 0.005
 
     def __post_init__(self) -> None:
         number_within("a contact detector has contact {} N", self.contact, above=0.0)
         number_within("a contact detector has free {} N", self.free, above=0.0, most=self.contact)
         number_within("a contact detector has mass {} kg", self.mass, least=0.0)
-        whole_number("a contact detector has neighbours {}", self.neighbours, least=0)
+        number_within("a contact detector has agreement {} s", self.agreement, least=0.0)
 
-    def __call__(self, force: Tensor, acceleration: Tensor | float = 0.0) -> Tensor:
+    def __call__(self, force: Tensor, acceleration: Tensor | float = 0.0, step: float = math.inf) -> Tensor:
         """1 for contact, 0 for none and NaN for undecided, (T,).
 
         Args:
             force: (T, 3) tared, newtons; one that is NaN, as while taring, is undecided.
-            acceleration: (T,) commanded acceleration of the tool, m/s^2.
+            acceleration: (T,) of the tool, m/s^2.
+            step: s between samples.
 
         Raises:
             InputError: forces are not (T, 3).
@@ -58,20 +57,12 @@ class ContactDetector:
             return torch.empty(0, dtype=torch.float64)
         size = force.norm(dim=1)
         known = ~torch.isnan(size)
-        contact = self._unanimous(known & (size > self.contact + self.mass * acceleration))
-        free = self._unanimous(known & (size < self.free))
+        neighbours = int(self.agreement / step + 1e-6)
+        contact = _unanimous(known & (size > self.contact + self.mass * acceleration), neighbours)
+        free = _unanimous(known & (size < self.free), neighbours)
         return torch.where(contact, 1.0, torch.where(free, 0.0, torch.nan)).to(torch.float64)
 
-    def _unanimous(self, flags: Tensor) -> Tensor:
-        padded = torch.nn.functional.pad(flags, (self.neighbours, self.neighbours), value=True)
-        return padded.unfold(0, 2 * self.neighbours + 1, 1).all(dim=1)
 
-
-def commanded_acceleration(windows: Sequence[ProbeWindow]) -> Tensor:
-    """The maximum commanded acceleration (T,), m/s^2, within 50 ms of the stamps of a probe's windows."""
-    probe = windows[0].probe
-    stamps = np.concatenate([probe.stamps[window.first : window.last] for window in windows])
-    near = stamps[:, None] + np.arange(-0.05, 0.051, 0.01)
-    place = np.stack([np.interp(near, probe.command_times, probe.command[:, axis]) for axis in range(3)])
-    speed = np.diff(place, axis=-1) / 0.01
-    return torch.from_numpy(np.linalg.norm(np.diff(speed, axis=-1) / 0.01, axis=0).max(axis=-1))
+def _unanimous(flags: Tensor, neighbours: int) -> Tensor:
+    padded = torch.nn.functional.pad(flags, (neighbours, neighbours), value=True)
+    return padded.unfold(0, 2 * neighbours + 1, 1).all(dim=1)

@@ -260,27 +260,43 @@ class ContactSensing:
         unfiltered = replace(self, cutoff=None)
         return [torch.from_numpy(cleaned) for cleaned in unfiltered._cleaned(touches, finite=False)]
 
+    def next_tared(self, touch: Touch, state: SensingState, name: str) -> tuple[Array, SensingState]:
+        """The same (T, 6) of one more window, and the state for the window after it.
+
+        `state` is from `start(1)`, or from the window before; `name` is the window's, for messages.
+
+        Raises:
+            InputError: as of `tared`.
+        """
+        return replace(self, cutoff=None)._next_cleaned(touch, state, name, finite=False)
+
     def _cleaned(self, touches: Sequence[Touch], finite: bool) -> Iterator[Array]:
         """Cleaned wrenches (T, 6) of consecutive windows; they must be finite, or only those of the tare."""
         state = self.start(1)
         for k, touch in enumerate(touches):
-            count, pose = len(touch.times), touch.world_from_peg
-            if touch.wrench.shape != (count, 6) or pose.shape != (count, 7):
+            cleaned, state = self._next_cleaned(touch, state, f"window {k}", finite)
+            yield cleaned
+
+    def _next_cleaned(
+        self, touch: Touch, state: SensingState, name: str, finite: bool
+    ) -> tuple[Array, SensingState]:
+        count, pose = len(touch.times), touch.world_from_peg
+        if touch.wrench.shape != (count, 6) or pose.shape != (count, 7):
+            raise InputError(
+                f"{name} has {count} times, wrenches {touch.wrench.shape} and peg poses "
+                f"{pose.shape}; give (T,), (T, 6) and (T, 7)."
+            )
+        self.check_rate(touch.times, name)
+        wrench = touch.wrench.astype(np.float64)
+        needed = count if finite else self.tare - state.tare.shape[1]
+        for what, rows in (("peg pose", pose), ("wrench", wrench[:needed])):
+            missing = ~np.isfinite(rows).all(axis=1)
+            if missing.any():
                 raise InputError(
-                    f"window {k} has {count} times, wrenches {touch.wrench.shape} and peg poses "
-                    f"{pose.shape}; give (T,), (T, 6) and (T, 7)."
+                    f"{name} has a {what} that is not finite at row {int(missing.argmax())}; fill it "
+                    "by interpolation, or cut the recording there."
                 )
-            self.check_rate(touch.times, f"window {k}")
-            wrench = touch.wrench.astype(np.float64)
-            needed = count if finite else self.tare - state.tare.shape[1]
-            for name, rows in (("peg pose", pose), ("wrench", wrench[:needed])):
-                missing = ~np.isfinite(rows).all(axis=1)
-                if missing.any():
-                    raise InputError(
-                        f"window {k} has a {name} that is not finite at row {int(missing.argmax())}; fill it "
-                        "by interpolation, or cut the recording there."
-                    )
-            if self.load is not None:
-                wrench = wrench - self.load.weight(pose)
-            cleaned, state = self.clean(wrench[None], state)
-            yield cleaned[0]
+        if self.load is not None:
+            wrench = wrench - self.load.weight(pose)
+        cleaned, state = self.clean(wrench[None], state)
+        return cleaned[0], state

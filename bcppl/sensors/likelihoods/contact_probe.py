@@ -5,28 +5,39 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
-import numpy as np
 import pyro
 import torch
 from torch import Tensor
 
-from bcppl.arguments import number_within, whole_number
+from bcppl.arguments import number_within
 from bcppl.contact.quasi_static import QuasiStaticMotion, WindowMotion
-from bcppl.contact.sensing.contact_detection import ContactDetector, commanded_acceleration
+from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.location import ContactSensing
-from bcppl.distributions.manifold import ContactManifold, Gaps, MeasuresGap
+from bcppl.distributions.contact_episodes import FELT, ContactEpisodes
+from bcppl.distributions.manifold import Gaps, MeasuresGap
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.parts import Part
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.capabilities import Approximated
+from bcppl.sensors.likelihoods.probe_rows import (
+    ProbeRows,
+    RememberedGaps,
+    capacity,
+    cells_of,
+    new_rows,
+    step_of,
+)
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Numbered, by_probe
+from bcppl.traces.carried import once
 
+PREDICTED = 0.05  # s between the rows of a probe that is not yet carried out
+PRESSED = 4.0  # N: of such a probe's contacts
 _NEAR = 0.02  # m: a window in which the peg stays farther away carries no information
 _MOVED = 0.001  # m: a shorter displacement has no direction
 
@@ -36,26 +47,33 @@ class TouchSettings:
     """Noise of the peg's measured pose in contact, and how contact is detected.
 
     Attributes:
-        gap_noise: standard deviation of the peg's surface position at one stamp, m.
-        gap_shared: standard deviation of the error that all contacts of a window share, m.
-        sink: penetration at the forces of a probe, m.
-        gap_outlier: probability that a stamp, or all contacts of a window, are outliers.
-        every: stride of the stamps that are used.
+        gap_noise: standard deviation of the peg's surface position at one stamp, m; less where the measured
+            poses scatter less.
+        gap_drift: standard deviation of its errors that last for `lasting` seconds, m.
+        gap_shared: standard deviation of the error that all stamps of a contact share, m.
+        lasting: s.
+        compliance: of part and peg where they touch, m/N: the median of what it may be.
+        compliance_decades: standard deviation of its decimal logarithm.
+        delay: standard deviation of the time between the wrench's stamps and the pose's, s.
+        gap_outlier: probability that a stamp without contact, or a contact, is an outlier.
         contact_detector: force thresholds of contact and of free motion.
         free_space: whether stamps without contact count, which exclude the part from where the peg moved.
     """
 
     gap_noise: float = 0.00006
+    gap_drift: float = 0.000015
     gap_shared: float = 0.00001
-    sink: float = 0.00002
+    lasting: float = 0.1
+    compliance: float = 0.000005
+    compliance_decades: float = 0.5
+    delay: float = 0.002
     gap_outlier: float = 0.001
-    every: int = 5
     contact_detector: ContactDetector = field(default_factory=ContactDetector)
     free_space: bool = True
 
     def __post_init__(self) -> None:
-        number_within("a contact probe is given gap_noise {}", self.gap_noise, above=0.0)
-        whole_number("a contact probe is given every {}", self.every)
+        for name in ("gap_noise", "lasting", "compliance", "compliance_decades"):
+            number_within(f"a contact probe is given {name} {{}}", getattr(self, name), above=0.0)
 
 
 @lru_cache(maxsize=4)
@@ -68,8 +86,9 @@ def _solids(part: Part, peg: Part) -> tuple[PegGap, QuasiStaticMotion]:
 class ContactProbe:
     """Windows of a probe, by the distance between the measured peg and the part.
 
-    Where contact is felt that distance is zero, elsewhere it is positive (`ContactManifold`). Each window has
-    one site, `touch_*`, observed as (T, 8): the peg's pose, then 1 with contact, 0 without, NaN if undecided.
+    Where contact is felt that distance is zero, elsewhere it is positive (`ContactEpisodes`). The rows of a
+    cell of 0.5 s (`EpisodeExtractor`) are observed where the cell ends: a window in which one does has a
+    site, `touch_*`; the others are deferred.
 
     Args:
         recording: its part, peg and probes.
@@ -79,17 +98,14 @@ class ContactProbe:
         InputError: the recording has no peg.
     """
 
+    __caches__ = ("_streams",)
+
     def __init__(self, recording: Recording, settings: TouchSettings) -> None:
         if recording.peg is None:
             raise InputError("the recording has probe windows but no peg; add the peg that was held.")
-        self.settings = settings
+        self.settings, self.peg = settings, recording.peg
         self.gap, self.quasi_static = _solids(recording.part, recording.peg)
-        windows = [m.action for m in recording.measurements if isinstance(m.action, ProbeWindow)]
-        self.sensing = (
-            ContactSensing(recording.peg, rate=1.0 / float(np.median(np.diff(windows[0].probe.stamps))))
-            if windows
-            else None
-        )
+        self._streams: dict[str, ProbeRows] = {}
 
     @classmethod
     def prepare(cls, recording: Recording, settings: TouchSettings) -> ContactProbe | None:
@@ -104,42 +120,58 @@ class ContactProbe:
 
     # ---- the program's sites
 
+    def is_deferred(self, action: ProbeWindow) -> bool:
+        """Whether no cell ends in a window, so that a later one brings its rows."""
+        return not len(cells_of(action))
+
     def observe(self, number: int, action: ProbeWindow, world_from_part: Tensor) -> None:
-        """Sample `touch_*`."""
-        pyro.sample(f"touch_{number}", self.site(action, world_from_part))
+        """Sample `touch_*`, unless the window is deferred."""
+        if not self.is_deferred(action):
+            gaps = once(f"gaps of {action.probe.name}", partial(RememberedGaps, self.gap, world_from_part))
+            shared = gaps if gaps.part is world_from_part else None
+            pyro.sample(f"touch_{number}", self.site(action, world_from_part, gap=shared))
 
     def site(
         self, window: ProbeWindow, part: Tensor, blur: float = 0.0, gap: MeasuresGap | None = None
-    ) -> ContactManifold:
+    ) -> ContactEpisodes:
         """The likelihood of a window for parts at poses (N, 7), its errors `blur` metres wider."""
         settings = self.settings
-        return ContactManifold(
+        stride = max(1, round(PREDICTED / step_of(window.probe)))
+        return ContactEpisodes(
             self.gap if gap is None else gap,
             part,
-            len(range(window.first, window.last, settings.every)),
+            capacity(window),
             math.hypot(settings.gap_noise, blur),
             math.hypot(settings.gap_shared, blur),
-            settings.sink,
+            settings.compliance * PRESSED,
             settings.gap_outlier,
-            WindowMotion(self.quasi_static, window, settings.every),
+            WindowMotion(self.quasi_static, window, stride),
+            drift=settings.gap_drift,
+            lasting=settings.lasting,
+            compliance=settings.compliance,
+            uncertain=settings.compliance_decades,
+            blur=blur,
         )
 
     def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
-        """The peg's poses, and whether contact is felt, by address; each probe's wrench is tared whole."""
-        return {a: v for windows in by_probe(measurements) for a, v in self._of_probe(windows)}
+        """The rows by address; each probe's wrench is tared whole."""
+        return {
+            f"touch_{windows[k].number}": value
+            for windows in by_probe(measurements)
+            for k, value in self._of_probe(windows).items()
+        }
 
-    def _of_probe(self, windows: Sequence[Numbered]) -> Iterator[tuple[str, Tensor]]:
-        assert self.sensing is not None
-        touches = [measurement.observation for _, measurement in windows]
-        tared = self.sensing.tared(touches)
-        commanded = commanded_acceleration([measurement.action for _, measurement in windows])
-        flags = self.settings.contact_detector(torch.cat(tared)[:, :3], commanded)
-        if not self.settings.free_space:
-            flags = torch.where(flags == 0.0, torch.nan, flags)
-        each = flags[:, None].split([len(wrench) for wrench in tared])
-        for (number, _), touch, own in zip(windows, touches, each, strict=True):
-            rows = torch.cat([torch.from_numpy(np.array(touch.world_from_peg)), own], dim=1)
-            yield f"touch_{number}", rows[:: self.settings.every]
+    def _of_probe(self, windows: Sequence[Numbered]) -> Mapping[int, Tensor]:
+        """The values of a probe's windows, by their number among these."""
+        seen = [measurement for _, measurement in windows]
+        probe = seen[0].action.probe
+        stream = self._streams.get(probe.name)
+        if stream is None or not stream.begins(seen):
+            sensing = ContactSensing(self.peg, rate=1.0 / step_of(probe), cutoff=None)
+            stream = self._streams[probe.name] = ProbeRows(probe, sensing, self.settings)
+        for measurement in seen[len(stream.windows) :]:
+            stream.add(measurement)
+        return {k: value for k, value in stream.values.items() if k < len(seen)}
 
     # ---- a quadratic approximation of the likelihood (`bcppl.sensors.capabilities.Linearised`)
 
@@ -149,31 +181,41 @@ class ContactProbe:
 
     def is_informative(self, action: ProbeWindow, value: Tensor, part: Tensor) -> bool:
         """Whether the peg came within 20 mm of parts at poses (M, 7)."""
-        return bool((self.gap(part, value[:, :7]).distance < _NEAR).any())
+        rows = new_rows(value)
+        return bool(len(rows)) and bool((self.gap(part, rows[:, :7]).distance < _NEAR).any())
 
     def sites(
         self, measurements: Sequence[Approximated], part: Tensor, blur: float
-    ) -> Iterator[tuple[ContactManifold, Tensor]]:
-        """Each window's likelihood at poses (S, 7), all distances computed in one batch, and its value."""
-        gaps = self.gap(part, torch.cat([value[:, :7] for _, _, value in measurements]))
+    ) -> Iterator[tuple[ContactEpisodes, Tensor]]:
+        """Each probe's likelihood at poses (S, 7), all distances computed in one batch, and its rows."""
+        probes: dict[str, list[Approximated]] = {}
+        for each in measurements:
+            probes.setdefault(each.action.probe.name, []).append(each)
+        rows = [torch.cat([new_rows(value) for _, _, value in own]) for own in probes.values()]
+        gaps = self.gap(part, torch.cat(rows)[:, :7])
         gradients, begin = gaps.gradient(part), 0
-        for _, action, value in measurements:
-            used = begin + torch.nonzero(~torch.isnan(value[:, 7]))[:, 0]
+        for own, value in zip(probes.values(), rows, strict=True):
+            used = slice(begin, begin + len(value))
             begin += len(value)
-            yield self.site(action, part, blur, _Measured(gaps.distance[:, used], gradients[:, used])), value
+            measured = _Measured(gaps.distance[:, used], gradients[:, used])
+            yield self.site(own[-1].action, part, blur, measured), value
 
     def new_contact(self, measurements: Sequence[Approximated], newest: bool) -> bool:
         """Whether contact begins in one of the windows, or in the newest of them."""
         if not measurements:
             return False
-        felt = torch.cat([torch.zeros(1, dtype=torch.bool), *(v[:, 7] == 1.0 for _, _, v in measurements)])
+        felt = torch.cat(
+            [torch.zeros(1, dtype=torch.bool), *(new_rows(v)[:, FELT] == 1.0 for _, _, v in measurements)]
+        )
         onsets = felt[1:] & ~felt[:-1]
-        return bool((onsets[-len(measurements[-1].value) :] if newest else onsets).any())
+        return bool(
+            (onsets[len(onsets) - len(new_rows(measurements[-1].value)) :] if newest else onsets).any()
+        )
 
     def heading(self, measurements: Sequence[Approximated]) -> Tensor | None:
         """The direction (3,) in which the peg moved when contact last began; None without contact."""
-        rows = torch.cat([value for _, _, value in measurements])
-        felt = rows[:, 7] == 1.0
+        rows = torch.cat([new_rows(value) for _, _, value in measurements])
+        felt = rows[:, FELT] == 1.0
         onsets = torch.nonzero(felt[1:] & ~felt[:-1])[:, 0]
         if len(onsets) == 0:
             return None

@@ -1,0 +1,209 @@
+"""What a probe's stamps say of contact, in few rows: chosen by what they inform, at any rate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation
+
+from bcppl.arrays import Array, Indices
+from bcppl.contact.sensing.contact_detection import ContactDetector
+
+CELL = 0.5  # s: rows are complete at the end of each cell of a probe, or at its own
+SHORTEST, LONGEST = 0.01, 0.05  # s of contact in one row
+_GROWTH = 0.3  # of the time since the onset: rows are short where the force rises
+_TRAVEL = 0.0025  # m that a peg moves within a row of contact, and
+_MOVED = 0.001  # m between rows without one
+_FORCE, _SHARE = 1.5, 0.3  # N, and of the force, by which it changes within a row
+_RESTING, _SLIDING = 0.01, 0.02  # m/s: below the one a peg rests, above the other it slides
+_FRICTION = 0.5  # a peg that slides moves across its force by so much more than along it
+_SMOOTH = 0.01  # s to either side of a stamp, over which velocity and acceleration are estimated
+# s without contact that end an episode. Where a peg comes to rest or begins to slide another begins, and in
+# each cell: an episode is an outlier as a whole.
+_BREAK = 0.05
+
+
+class Rows(NamedTuple):
+    """R rows: single stamps, or means of consecutive ones that hardly differ.
+
+    Attributes:
+        world_from_peg: (R, 7).
+        felt: (R,) 1 for contact and 0 for none.
+        stamps: (R,) how many.
+        speed: (R,) m/s, in contact along its normal, at least.
+        force: (R,) N.
+        time: (R,) s.
+        episode: (R,) the number of the contact, at rest or sliding, within a cell; -1 without contact.
+    """
+
+    world_from_peg: Array
+    felt: Array
+    stamps: Array
+    speed: Array
+    force: Array
+    time: Array
+    episode: Array
+
+
+def cell_ends(stamps: Array) -> Indices:
+    """The number of stamps (C,) up to the end of each cell of a probe that has stamps (T,)."""
+    cell = np.floor((stamps - stamps[0]) / CELL + 1e-6)
+    return np.append(np.flatnonzero(np.diff(cell)) + 1, len(stamps))
+
+
+class _Stamps(NamedTuple):
+    """All stamps so far: `force` is its size (N), `pace` the peg's speed (m/s)."""
+
+    time: Array
+    pose: Array
+    felt: Array
+    force: Array
+    pace: Array
+
+
+@dataclass
+class EpisodeExtractor:
+    """Rows of one probe, cell by cell; they depend on no later stamp, and not on how the probe is cut.
+
+    Attributes:
+        detector: force thresholds.
+        step: s between stamps.
+    """
+
+    detector: ContactDetector
+    step: float
+    _done: float = -math.inf  # s: rows of stamps up to here are returned
+    _episode: int = -1
+    _onset: float = -math.inf
+    _last_contact: float = -math.inf
+    _moving: bool = False
+    _last_free: tuple[float, Array] | None = None
+
+    @property
+    def _half(self) -> int:
+        """Stamps to either side of one over which velocity and acceleration are estimated."""
+        return max(1, round(_SMOOTH / self.step))
+
+    @property
+    def _lag(self) -> float:
+        """Seconds after which a stamp and the one after it are decided: what comes later changes nothing."""
+        return self.step * (1 + max(self._half, round(self.detector.agreement / self.step)))
+
+    def rows(self, time: Array, pose: Array, force: Array, last: bool) -> Rows:
+        """The rows that are complete, of all stamps so far.
+
+        Args:
+            time: (T,) s.
+            pose: (T, 7) world_from_peg.
+            force: (T, 3) tared, in the peg's frame, N; NaN while taring.
+            last: whether the probe ends here.
+        """
+        until = math.inf if last or not len(time) else time[-1] - self._lag + 1e-6
+        felt, speed, pace = self._decided(time, pose, force)
+        size = np.linalg.norm(force, axis=1)
+        seen = _Stamps(time, pose, felt, size, pace)
+        groups: list[tuple[slice, float, int]] = []
+        begin = int(np.searchsorted(time, self._done, side="right"))
+        end = int(np.searchsorted(time, until, side="right"))
+        k = begin
+        while k < end:
+            if felt[k] == 1.0:
+                stop = self._contact_row(k, end, seen)
+                groups.append((slice(k, stop), 1.0, self._episode))
+                k = stop
+                continue
+            if felt[k] == 0.0 and self._is_new(k, time, pose, felt):
+                groups.append((slice(k, k + 1), 0.0, -1))
+                self._last_free = time[k], pose[k, :3]
+            k += 1
+        self._done = float(time[end - 1]) if end > begin else self._done
+        self._last_contact = -math.inf
+        return _rows(groups, time, pose, size, speed)
+
+    def _contact_row(self, first: int, end: int, seen: _Stamps) -> int:
+        """The index after a row's last stamp; the row's episode is `_episode`."""
+        now = seen.time[first]
+        between = (seen.time > self._last_contact) & (seen.time < now)
+        broken = now - self._last_contact > max(_BREAK, 1.5 * self.step) or (seen.felt[between] == 0.0).any()
+        if broken:
+            self._onset = now
+        longest = min(LONGEST, max(SHORTEST, _GROWTH * (now - self._onset)))
+        stop = first + 1
+        while stop < end and seen.felt[stop] == 1.0 and seen.time[stop] - now < longest - 1e-6:
+            moved = np.linalg.norm(seen.pose[stop, :3] - seen.pose[first, :3])
+            force = abs(seen.force[stop] - seen.force[first])
+            changed = moved > _TRAVEL or force > max(_FORCE, _SHARE * seen.force[first])
+            if changed and seen.time[stop] - now > SHORTEST - 1e-6:
+                break
+            stop += 1
+        moving = seen.pace[first:stop].mean() > (_RESTING if self._moving else _SLIDING)
+        if broken or moving != self._moving:
+            self._episode += 1
+        self._moving, self._last_contact = moving, seen.time[stop - 1]
+        return stop
+
+    def _is_new(self, k: int, time: Array, pose: Array, felt: Array) -> bool:
+        """Whether a stamp without contact informs: the peg has moved on, or contact comes next."""
+        if k + 1 < len(time) and felt[k + 1] != 0.0:
+            return True
+        if self._last_free is None:
+            return True
+        then, place = self._last_free
+        return time[k] - then > LONGEST - 1e-6 and bool(np.linalg.norm(pose[k, :3] - place) > _MOVED)
+
+    def _decided(self, time: Array, pose: Array, force: Array) -> tuple[Array, Array, Array]:
+        """1, 0 or NaN (T,) for contact, none and undecided; the speed of `Rows`, and the whole one."""
+        felt, speed, pace = np.full(len(time), np.nan), np.zeros(len(time)), np.zeros(len(time))
+        if not len(time):
+            return felt, speed, pace
+        breaks = np.flatnonzero(np.diff(time) > 1.5 * self.step) + 1
+        for part in np.split(np.arange(len(time)), breaks):
+            velocity, acceleration = self._derivatives(pose[part, :3])
+            given = torch.from_numpy(force[part]), torch.from_numpy(np.linalg.norm(acceleration, axis=1))
+            felt[part] = self.detector(*given, self.step).numpy()
+            world = Rotation.from_quat(pose[part][:, [4, 5, 6, 3]]).apply(np.nan_to_num(force[part]))
+            size = np.linalg.norm(world, axis=1)
+            pace[part] = whole = np.linalg.norm(velocity, axis=1)
+            along = np.abs(np.einsum("ij,ij->i", velocity, world)) / np.maximum(size, 1e-9)
+            across = np.sqrt(np.maximum(whole**2 - along**2, 0.0))
+            speed[part] = np.where(felt[part] == 1.0, np.maximum(along - _FRICTION * across, 0.0), whole)
+        return felt, speed, pace
+
+    def _derivatives(self, place: Array) -> tuple[Array, Array]:
+        """Velocity and acceleration (T, 3) of a peg at (T, 3), by parabolas."""
+        width = 2 * self._half + 1
+        if len(place) < width:
+            return np.zeros_like(place), np.zeros_like(place)
+        velocity, acceleration = (
+            savgol_filter(place, width, 2, deriv=order, delta=self.step, axis=0) for order in (1, 2)
+        )
+        return velocity, acceleration
+
+
+def _rows(
+    groups: list[tuple[slice, float, int]], time: Array, pose: Array, size: Array, speed: Array
+) -> Rows:
+    mean = np.empty((len(groups), 7))
+    for row, (own, _, _) in enumerate(groups):
+        quaternion = pose[own, 3:] * np.sign(pose[own, 3:] @ pose[own.start, 3:])[:, None]
+        mean[row, :3], mean[row, 3:] = pose[own, :3].mean(axis=0), quaternion.mean(axis=0)
+    mean[:, 3:] /= np.linalg.norm(mean[:, 3:], axis=1, keepdims=True)
+    slices = [own for own, _, _ in groups]
+
+    def averaged(values: Array) -> Array:
+        return np.array([values[own].mean() for own in slices])
+
+    return Rows(
+        mean,
+        np.array([felt for _, felt, _ in groups]),
+        np.array([own.stop - own.start for own in slices], dtype=np.float64),
+        averaged(speed),
+        averaged(size),
+        averaged(time),
+        np.array([episode for *_, episode in groups], dtype=np.float64),
+    )

@@ -1,0 +1,178 @@
+"""The rows of a probe, window by window: what each brings, and what earlier ones have used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.arrays import Array, Indices
+from bcppl.contact.sensing.contact_detection import ContactDetector
+from bcppl.contact.sensing.episodes import EpisodeExtractor, cell_ends
+from bcppl.contact.sensing.location import ContactSensing
+from bcppl.distributions.contact_episodes import COLUMNS, FELT, GIVEN, padded
+from bcppl.distributions.manifold import Gaps, MeasuresGap
+from bcppl.robot.motion import Probe, ProbeWindow
+from bcppl.sensors.measurements import Measurement
+
+_ROWS = 60  # of a cell at most: those of contact last 10 ms at least
+_REMEMBERED = 120  # rows of contact that are given to a window at most, the newest
+
+
+class RowSettings(Protocol):
+    """Those of `contact_probe.TouchSettings` on which the rows depend."""
+
+    @property
+    def gap_noise(self) -> float: ...  # noqa: D102
+    @property
+    def delay(self) -> float: ...  # noqa: D102
+    @property
+    def free_space(self) -> bool: ...  # noqa: D102
+    @property
+    def contact_detector(self) -> ContactDetector: ...  # noqa: D102
+
+
+@lru_cache(maxsize=64)
+def _ends(probe: Probe) -> Indices:
+    return cell_ends(probe.stamps)
+
+
+def step_of(probe: Probe) -> float:
+    """Seconds between a probe's stamps; of one with a single stamp, one."""
+    return float(np.median(np.diff(probe.stamps))) if len(probe.stamps) > 1 else 1.0
+
+
+def cells_of(window: ProbeWindow) -> Indices:
+    """The ends of cells (C,), in stamps, that lie in a window."""
+    ends = _ends(window.probe)
+    return ends[(ends > window.first) & (ends <= window.last)]
+
+
+def capacity(window: ProbeWindow) -> int:
+    """T, the rows that a window's value has room for."""
+    return min(window.last, _ROWS * max(1, len(cells_of(window))) + _REMEMBERED)
+
+
+def new_rows(value: Tensor) -> Tensor:
+    """The rows (R, 13) of a value that no earlier window has used."""
+    return value[~torch.isnan(value[:, FELT]) & (value[:, GIVEN] != 1.0)]
+
+
+def _noise_of(place: Array) -> float:
+    """The noise (m) of positions (T, 3) along an axis, by the median of their second differences.
+
+    A motion that is not smooth over three stamps adds to it.
+    """
+    if len(place) < 10:
+        return float("inf")
+    return float(np.median(np.abs(np.diff(place, n=2, axis=0)))) / (0.6745 * 6.0**0.5)
+
+
+class RememberedGaps:
+    """The gaps at one set of poses of the part, each place of the peg measured once.
+
+    The windows of a probe ask for those of earlier ones again.
+    """
+
+    __caches__ = ("_number", "_distance")
+
+    def __init__(self, gap: MeasuresGap, part: Tensor) -> None:
+        self.gap, self.part = gap, part
+        self._number: dict[bytes, int] = {}
+        self._distance = part.new_zeros(len(part), 0)
+
+    def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gaps:
+        """Gaps at poses (N, 7), those of `part`, and (T, 7) or (N, T, 7)."""
+        if world_from_part is not self.part or world_from_peg.ndim != 2:
+            return self.gap(world_from_part, world_from_peg)
+        keys = [row.tobytes() for row in world_from_peg.numpy()]
+        new = [k for k, key in enumerate(keys) if key not in self._number]
+        if new:
+            measured = self.gap(self.part, world_from_peg[new]).distance
+            for place, k in enumerate(new, self._distance.shape[1]):
+                self._number[keys[k]] = place
+            self._distance = torch.cat([self._distance, measured], dim=1)
+        return _Distances(self._distance[:, [self._number[key] for key in keys]], self, world_from_peg)
+
+
+class _Distances(NamedTuple):
+    distance: Tensor
+    gaps: RememberedGaps
+    world_from_peg: Tensor
+
+    def gradient(self, world_from_part: Tensor) -> Tensor:
+        return self.gaps.gap(world_from_part, self.world_from_peg).gradient(world_from_part)
+
+
+class ProbeRows:
+    """One probe, as far as it is measured.
+
+    Attributes:
+        windows: so far.
+        values: (T, 13) by number of the window, of those in which a cell ends.
+    """
+
+    def __init__(self, probe: Probe, sensing: ContactSensing, settings: RowSettings) -> None:
+        self.windows: list[Measurement] = []
+        self.values: dict[int, Tensor] = {}
+        self.probe, self.sensing, self.settings = probe, sensing, settings
+        self._state = sensing.start(1)
+        self._extractor = EpisodeExtractor(settings.contact_detector, step_of(probe))
+        self._number = np.empty(0, dtype=np.int64)
+        self._pose, self._force = np.empty((0, 7)), np.empty((0, 3))
+        self._given = torch.empty(0, COLUMNS, dtype=torch.float64)
+
+    def begins(self, windows: Sequence[Measurement]) -> bool:
+        """Whether the windows so far are the first of these, or these the first of them."""
+        return all(mine is given for mine, given in zip(self.windows, windows, strict=False))
+
+    def add(self, measurement: Measurement) -> None:
+        """One more window; stamps that were measured before are left out."""
+        window, touch = measurement.action, measurement.observation
+        name = f"window {len(self.windows)}"
+        wrench, self._state = self.sensing.next_tared(touch, self._state, name)
+        number = np.arange(window.first, window.last)
+        fresh = number > (self._number[-1] if len(self._number) else -1)
+        self._number = np.append(self._number, number[fresh])
+        self._pose = np.concatenate([self._pose, touch.world_from_peg[fresh]])
+        self._force = np.concatenate([self._force, wrench[fresh, :3]])
+        self.windows.append(measurement)
+        ends = cells_of(window)
+        if not len(ends):
+            return
+        new = torch.cat([self._rows(int(end)) for end in ends])
+        room = capacity(window)
+        given = self._given[max(0, len(self._given) - max(0, room - len(new))) :]
+        self.values[len(self.windows) - 1] = padded(torch.cat([given, new]), room)
+        contact = new[new[:, FELT] == 1.0]
+        contact[:, GIVEN] = 1.0
+        self._given = torch.cat([self._given, contact])[-_REMEMBERED:]
+
+    def _tip(self, pose: Array) -> Array:
+        """Positions (T, 3) of the peg's farthest vertex."""
+        corners = self.sensing.peg.vertices
+        tip = torch.from_numpy(corners[np.linalg.norm(corners, axis=1).argmax()])
+        return np.asarray(poses.transform(torch.from_numpy(pose), tip[None])[:, 0].numpy())
+
+    def _rows(self, end: int) -> Tensor:
+        """The rows (R, 13) that are complete at the end of a cell."""
+        settings, so_far = self.settings, self._number < end
+        number = self._number[so_far]
+        rows = self._extractor.rows(
+            self.probe.stamps[number],
+            self._pose[so_far],
+            self._force[so_far],
+            end == len(self.probe.stamps),
+        )
+        stamp = float(
+            np.clip(_noise_of(self._tip(self._pose[so_far])), 0.3 * settings.gap_noise, settings.gap_noise)
+        )
+        noise = np.hypot(stamp / np.sqrt(rows.stamps), settings.delay * rows.speed)
+        columns = [rows.felt, noise, rows.force, rows.time, rows.episode, np.zeros(len(noise))]
+        every = torch.from_numpy(np.column_stack([rows.world_from_peg, *columns]))
+        return every if settings.free_space else every[every[:, FELT] == 1.0]
