@@ -15,7 +15,6 @@ and resuming. GenParticleFilters.jl has the same verbs (`pf_initialize`, `pf_upd
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -28,7 +27,6 @@ from bcppl.inference.population import Population
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.sensors.capabilities import Defers
-from bcppl.sensors.repeats import repeated
 from bcppl.traces import Model, Series, extend
 
 
@@ -61,32 +59,15 @@ def observations_of(
 
     Raises:
         InputError: a measurement gives no observation at a new address.
-
-    Warns:
-        RuntimeWarning: a measurement repeats an earlier one to the bit. It adds nothing, as one whose
-            observations come with a later one (`bcppl.sensors.capabilities.Defers`) adds nothing yet.
     """
     # A step of a series is given the newest measurement alone, under its own addresses, and may have none.
     alone = isinstance(model.program, Series)
-    repeats = {} if alone else repeated(measurements)
-    once = [each for number, each in enumerate(measurements[:start]) if number not in repeats]
-    known = set(model.observe(scene, once)) if once and not alone else set()
+    known = set(model.observe(scene, measurements[:start])) if start and not alone else set()
     for count in range(start + 1, len(measurements) + 1):
-        newest = measurements[count - 1]
-        if count - 1 in repeats:
-            warnings.warn(
-                f"measurement {count - 1} repeats measurement {repeats[count - 1]} to the bit; "
-                "it counts once.",
-                RuntimeWarning,
-                stacklevel=2,
-            )
-            yield Observed((scene, [each.action for each in once]), {})
+        given = measurements[count - 1 if alone else 0 : count]
+        if not alone and _is_deferred(scene, given[-1]):
+            yield Observed((scene, [each.action for each in given]), {})
             continue
-        once.append(newest)
-        if not alone and _is_deferred(scene, newest):
-            yield Observed((scene, [each.action for each in once]), {})
-            continue
-        given = [newest] if alone else once
         new = {a: value for a, value in model.observe(scene, given).items() if a not in known}
         if not (new or alone):
             raise InputError(

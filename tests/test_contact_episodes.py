@@ -27,10 +27,10 @@ from bcppl.geometry.parts import Guess
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.verbs import observations_of
 from bcppl.models import look_and_touch
+from bcppl.recordings import repeated
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors import Measurement, Recording
 from bcppl.sensors.likelihoods.probe_rows import new_rows
-from bcppl.sensors.repeats import repeated
 from tests.test_manifold import around, differences, ledge
 
 NOISE, SHARED, DRIFT, LASTING, COMPLIANCE, VARYING, ROUGH = 6e-5, 1e-5, 2e-5, 0.1, 5e-6, 0.6, 0.2
@@ -280,11 +280,11 @@ def test_fine_windows_give_the_belief_of_coarse_ones_to_the_bit_and_steps_for_al
 def test_a_window_given_twice_counts_once_and_is_named() -> None:
     once = cut(probed(100), 50)
     twice = replace(once, measurements=[*once.measurements[:3], *once.measurements[2:]])
-    assert repeated(twice.measurements) == {3: 2}
+    assert repeated(twice) == {3: 2}
     with pytest.warns(RuntimeWarning, match="measurement 3 repeats measurement 2"):
         *_, last = infer(look_and_touch.model, twice, particles=6, seed=2)
     *_, other = infer(look_and_touch.model, once, particles=6, seed=2)
-    assert last.taken == 7 and torch.equal(last.belief.world_from_part, other.belief.world_from_part)
+    assert last.taken == 6 and torch.equal(last.belief.world_from_part, other.belief.world_from_part)
     # Windows that overlap are no repeats; stamps that were measured before are left out.
     action, touch = probed(100).measurements[0].action, probed(100).measurements[0].observation
 
@@ -297,13 +297,3 @@ def test_a_window_given_twice_counts_once_and_is_named() -> None:
     torch.testing.assert_close(
         log_likelihood(overlapping, pose), log_likelihood(once, pose), rtol=1e-9, atol=1e-6
     )
-
-
-def test_measurements_that_differ_in_a_bit_or_hold_few_numbers_are_no_repeats() -> None:
-    first = cut(probed(100), 50).measurements[2]
-    touch = first.observation
-    wrench: Array = touch.wrench.copy()
-    wrench[7, 2] += 1e-12
-    other = Measurement(first.action, Touch(touch.times, wrench, touch.world_from_peg))
-    short = Measurement(first.action, Touch(touch.times[:2], touch.wrench[:2], touch.world_from_peg[:2]))
-    assert repeated([first, other, first, short, short]) == {2: 0}

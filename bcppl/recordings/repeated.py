@@ -7,6 +7,7 @@ import warnings
 from contextlib import suppress
 from dataclasses import replace
 
+from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.recordings.fingerprint import add
 from bcppl.sensors.measurements import Measurement, Recording
@@ -18,7 +19,8 @@ NAMED = 4  # measurements that a warning names
 def repeated(recording: Recording) -> dict[int, int]:
     """The first measurement with the same numbers, for every measurement that repeats one, by their places.
 
-    A sensor's noise never has the same bits twice. Action and observation both have to be equal.
+    A sensor's noise never has the same bits twice. Action and observation both have to be equal; of
+    touches that hold the measured motion, the observation alone, whatever their probe is named.
     """
     first: dict[bytes, int] = {}
     again: dict[int, int] = {}
@@ -51,6 +53,9 @@ def once_each(recording: Recording) -> Recording:
 
 def _digest(measurement: Measurement) -> bytes:
     sensor, digest = sensor_of(measurement.action), hashlib.sha256()
-    stored = sensor.action.stored(measurement.action), sensor.observation.stored(measurement.observation)
-    add(digest, [sensor.kind, *stored])
+    stored = [sensor.kind, sensor.observation.stored(measurement.observation)]
+    touch = measurement.observation
+    if not (isinstance(touch, Touch) and touch.world_from_peg.size):
+        stored.append(sensor.action.stored(measurement.action))
+    add(digest, stored)
     return digest.digest()
