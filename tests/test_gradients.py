@@ -23,11 +23,11 @@ from bcppl.traces import (
     extend,
     generate,
     gradients,
-    graph,
     propose,
     simulate,
     update,
 )
+from bcppl.traces.differentiation import graph
 from tests.invariance import number
 
 Program = Callable[..., None]

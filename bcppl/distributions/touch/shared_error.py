@@ -120,24 +120,25 @@ class SharedOnset(OnsetLocation):
     """`OnsetLocation` of one touch of a session with a shared error.
 
     Args:
-        shared: the error.
+        shared: the error; this touch is the last that was added to it.
         outlier: probability of an onset that is independent of the part.
-        which: number of the touch; the last that was added unless given.
     """
 
     __caches__ = ("shared",)
 
-    def __init__(self, shared: SharedError, outlier: float, which: int | None = None) -> None:
-        self.shared, self.which = shared, len(shared.paths) - 1 if which is None else which
+    def __init__(self, shared: SharedError, outlier: float) -> None:
+        self.shared, self.which = shared, len(shared.paths) - 1
         # Later touches of the session do not change it.
         self.given = shared.center, shared.scale, tuple(shared.paths), tuple(shared.places)
-        placed, path = shared.placed, shared.paths[self.which]
+        placed, path = shared.placed, shared.paths[-1]
         super().__init__(placed, placed.pose, path, shared.offset, shared.spread, outlier)
 
     def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check:
         """The check of an onset beside the session's others: how many are as far off."""
         others = [
-            SharedOnset(self.shared, self.outlier, k).tail(place)
+            OnsetLocation(
+                self.distance, self.pose, self.shared.paths[k], *self.shared.threshold(k), self.outlier
+            ).tail(place)
             for k, place in enumerate(self.shared.places)
             if k != self.which
         ]
