@@ -227,7 +227,7 @@ def asked() -> argparse.Namespace:
     parser.add_argument("--contacts", nargs="+", choices=CONTACTS, default=list(CONTACTS))
     parser.add_argument("--rates", nargs="+", type=int, choices=RATES, default=list(RATES))
     parser.add_argument(
-        "--keep", type=Path, metavar="FOLDER", help="recordings are kept in, and taken from, it"
+        "--keep", type=Path, metavar="FOLDER", help="recordings are kept in it, and read from it"
     )
     parser.add_argument("--faults", action="store_true", help="good recordings beside faulty ones")
     parser.add_argument("--cuts", action="store_true", help="the same probes in other windows and rates")

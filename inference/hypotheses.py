@@ -122,15 +122,10 @@ def _beyond(
     few = population.trace.chosen(chosen.repeat_interleave(len(BEYOND)))
     share = torch.tensor(BEYOND, dtype=torch.float64).repeat(PARTICLES)
     start = step[chosen].repeat_interleave(len(BEYOND), dim=0)
-    moved = few.at({address: _moved(few[address], share[:, None] * start)})
+    moved = few.at({address: poses.retract(few[address], share[:, None] * start)})
     reached = _of_others(moved, address)
     highest = int(reached.nan_to_num(nan=-torch.inf).argmax())
     return float(share[highest]) * limit, float(reached[highest]) - best
-
-
-def _moved(pose: Tensor, tangent: Tensor) -> Tensor:
-    """Poses (N, 7) after a translation in the world and a rotation in the part's frame."""
-    return poses.retract(pose, tangent)
 
 
 class Alternative(NamedTuple):
