@@ -8,7 +8,8 @@ mean over the axes, and the mean ratio of estimated to exact variance.
 A bias is explained where it is within two standard errors of minus half the variance of log Z; for other
 kernels that are known to be biased `REASONS` states why. All kernels of a problem have the same seeds, so
 their errors are correlated: a bias common to all of them is one draw, not fourteen. With --file cells are
-written as they are done, and a later call adds those that are missing.
+written as they are done, and a later call adds those that are missing. With --limit a cell is left out, and
+its row says so, where a run with fewer particles took longer than that.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import math
 import time
 from collections.abc import Callable
 from functools import cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -168,19 +170,40 @@ def summary(outcome: Outcome) -> Summary:
     )
 
 
-def recorded(file: Path | None, cell: Cell) -> Outcome:
-    """A cell's outcome, read from the file if it is there, else measured and added to it."""
+def recorded(file: Path | None, cell: Cell) -> Outcome | None:
+    """A cell's outcome, if it is in the file."""
     key = [cell.problem, cell.kernel, cell.particles, list(cell.seeds)]
     if file is not None and file.exists():
         for line in file.read_text(encoding="utf-8").splitlines():
             known, outcome = json.loads(line)
             if known == key:
                 return Outcome(*outcome)
+    return None
+
+
+def added(file: Path | None, cell: Cell) -> Outcome:
+    """A cell's outcome, measured and added to the file."""
     outcome = measured(cell)
     if file is not None:
+        key = [cell.problem, cell.kernel, cell.particles, list(cell.seeds)]
         with file.open("a", encoding="utf-8") as lines:
             lines.write(json.dumps([key, list(outcome)]) + "\n")
     return outcome
+
+
+def with_more(file: Path | None, limit: float, cells: list[Cell]) -> list[Outcome | float]:
+    """The outcomes with more and more particles; instead of it the seconds of a run that took too long."""
+    outcomes: list[Outcome | float] = []
+    longest = 0.0
+    for cell in cells:
+        outcome = recorded(file, cell)
+        if outcome is None and longest > limit:
+            outcomes.append(longest)
+            continue
+        outcome = outcome or added(file, cell)
+        longest = max(longest, outcome.seconds / len(cell.seeds))
+        outcomes.append(outcome)
+    return outcomes
 
 
 def main() -> None:
@@ -190,6 +213,9 @@ def main() -> None:
     parser.add_argument("--counts", nargs="+", type=int, default=list(COUNTS), metavar="N")
     parser.add_argument("--runs", type=int, default=30)
     parser.add_argument("--jobs", type=int, default=1, help="cells at a time")
+    parser.add_argument(
+        "--limit", type=float, default=math.inf, help="seconds that a run with fewer particles may take"
+    )
     parser.add_argument("--file", type=Path, help="where the outcome of each cell is kept")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -199,13 +225,16 @@ def main() -> None:
         else (arguments.problems, arguments.kernels, arguments.counts, arguments.runs)
     )
     seeds = tuple(range(arguments.seed, arguments.seed + runs))
-    cells = [Cell(p, k, n, seeds) for n in counts for p in problems for k in kernels]
-    outcomes = each(partial(recorded, arguments.file), cells, arguments.jobs)
+    kernels_on = [[Cell(p, k, n, seeds) for n in sorted(counts)] for p in problems for k in kernels]
+    outcomes = each(partial(with_more, arguments.file, arguments.limit), kernels_on, arguments.jobs)
+    done = dict(zip(chain(*kernels_on), chain(*outcomes), strict=True))
     rows: list[Row] = []
     for problem in problems:
         lines = []
-        for cell, outcome in zip(cells, outcomes, strict=True):
-            if cell.problem != problem:
+        for cell in (Cell(problem, k, n, seeds) for n in sorted(counts) for k in kernels):
+            outcome = done[cell]
+            if isinstance(outcome, float):
+                lines.append([cell.kernel, cell.particles, *"-----", f"> {outcome:.1f}", "not run"])
                 continue
             figures = summary(outcome)
             name = f"{problem}, {cell.kernel}, N = {cell.particles}"
