@@ -14,6 +14,7 @@ from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised
 from bcppl.distributions.support import freedom_of, refuse_several_poses
 from bcppl.errors import InferenceError, InputError
+from bcppl.inference.ancestry import inherited
 from bcppl.poses import FREE
 from bcppl.traces import Trace
 from bcppl.traces.indexing import Index, particles_at
@@ -39,7 +40,7 @@ class Population:
         log_pairs: sum over the first population and every resampling since of log M / (M - 1), M the
             particles that were then drawn independently of one another.
         families: (N,) int64, the family of each particle: those that descend from one since the population
-            was last split into halves (`bcppl.inference.kernels.halving`); empty before.
+            was last split into halves (`bcppl.inference.ancestry`); empty before.
         sides: (N,) bool, the half to which each particle's family belongs; empty before.
         approximation: the filter's approximation of the posterior, an immutable value that guides proposals
             and that the target never depends on (`bcppl.inference.approximation`); None where there is none.
@@ -147,7 +148,7 @@ class Population:
             log_weights=torch.zeros(count, dtype=torch.float64),
             founders=founders,
             log_pairs=self.log_pairs + log_pair(count),
-            **self._halves(ancestors),
+            **(inherited(ancestors, **self._split()) if len(self.sides) else {}),
         )
         drawn.__dict__["log_total"] = math.log(count)
         return drawn
@@ -171,14 +172,12 @@ class Population:
             trace=self.trace.chosen(particles),
             log_weights=self.log_weights[particles],
             founders=self.founders[particles],
-            **self._halves(particles),
+            **{name: of[particles] for name, of in self._split().items()},
         )
 
-    def _halves(self, particles: Tensor) -> dict[str, Tensor]:
-        """The halves to which some particles belong, once the population was split."""
-        if len(self.sides) == 0:
-            return {}
-        return {"families": self.families[particles], "sides": self.sides[particles]}
+    def _split(self) -> dict[str, Tensor]:
+        """Families and sides, once the population was split into halves."""
+        return {"families": self.families, "sides": self.sides} if len(self.sides) else {}
 
     def _with(self, **changed: Any) -> Population:
         """The same population with other fields, which are known to be right: a step makes several."""

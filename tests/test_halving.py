@@ -18,6 +18,7 @@ from bcppl.inference.filters.smcp3 import Pair, moved
 from bcppl.inference.filters.waste_free import waste_free_moves
 from bcppl.inference.kernels import Kernel, halved, halves, metropolis_hastings, moved_by
 from bcppl.inference.proposals import Fitted, drift, independent
+from bcppl.inference.resampling import systematic
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, simulate
 from tests.invariance import equal_weights
@@ -50,7 +51,7 @@ def test_copies_are_of_one_half() -> None:
 
 def test_descendants_are_on_their_ancestors_side() -> None:
     torch.manual_seed(0)
-    start = halved(with_copies(40, 1).reweighed(torch.randn(40, dtype=torch.float64)))
+    start = halved(with_copies(40, 1).reweighed(0.5 * torch.randn(40, dtype=torch.float64)))
     side = dict(zip(start["x"][:, 0].tolist(), start.sides.tolist(), strict=True))
     for later in (resample(start), resize(start, 90), replicate(start, 3), start[torch.tensor([3, 3, 7])]):
         assert later.sides.tolist() == [side[x] for x in later["x"][:, 0].tolist()]
@@ -61,17 +62,43 @@ def test_descendants_are_on_their_ancestors_side() -> None:
     assert torch.equal(whole.sides, start.sides[whole.founders])
 
 
+def shifted(population: Population) -> Population:
+    """Moved apart: values no longer show which particles are copies."""
+    x = population["x"]
+    return population.with_trace(population.trace.at({"x": x + 0.1 * torch.randn_like(x)}))
+
+
+def sides_of(labels: Tensor, sides: Tensor) -> list[set[int]]:
+    return [set(labels[side].tolist()) for side in (sides, ~sides)]
+
+
 def test_a_population_that_leans_to_one_side_is_split_by_families() -> None:
     torch.manual_seed(1)
     start = halved(with_copies(60, 1))
-    (many, few) = halves(start)
-    leaning = start[torch.cat([many.repeat(3), few[:2]])]
-    # Copies were moved apart: their values no longer show that they are of one family.
-    shifted = leaning.trace.at({"x": leaning["x"] + 0.1 * torch.randn_like(leaning["x"])})
-    again = halved(leaning.with_trace(shifted))
-    assert torch.equal(again.families, leaning.families)
-    assert not set(again.families[again.sides].tolist()) & set(again.families[~again.sides].tolist())
+    many, few = halves(start)
+    ancestors = torch.cat([many.repeat(3), few[:2]])
+    again = shifted(start).selected(ancestors)
+    assert torch.equal(again.families, start.families[ancestors])
+    assert not set.intersection(*sides_of(again.families, again.sides))
     assert 0.25 <= float(again.sides.double().mean()) <= 0.75
+
+
+def test_few_families_are_split_by_copies_and_only_as_they_are_resampled() -> None:
+    """Through many resamplings a half descends from several ancestors, and copies of one are never apart."""
+    torch.manual_seed(3)
+    population, split_again = halved(with_copies(75, 1)), 0
+    for _ in range(30):
+        before = population
+        weighed = population.reweighed(torch.randn(75, dtype=torch.float64))
+        ancestors = systematic(weighed.log_weights, 75)
+        population = weighed.selected(ancestors)
+        split_again += not torch.equal(population.sides, before.sides[ancestors])
+        assert not set.intersection(*sides_of(ancestors, population.sides))
+        assert min(len(families) for families in sides_of(population.families, population.sides)) >= 4
+        moved = halved(shifted(population))
+        assert torch.equal(moved.sides, population.sides)
+        population = moved
+    assert 3 <= split_again <= 27
 
 
 def test_a_single_family_is_split_by_values_and_equal_particles_are_not() -> None:

@@ -2,8 +2,8 @@
 
 A particle shapes its own proposal if its copies are among those that the proposal is fitted to, and then the
 moves do not leave the target invariant. So copies are of one half, and so are their descendants: a particle
-stays in its ancestor's half through moves and resampling. Where resampling has left less than a quarter of
-the particles in one half, the population is split again, by the ancestry since the last split.
+stays in its ancestor's half through moves and resampling. Where a resampling leaves too few particles or
+families in one half, it splits the population again (`bcppl.inference.ancestry`).
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from bcppl.inference.ancestry import split
 from bcppl.inference.population import Population
-
-LEAST = 0.25  # of the particles in either half
 
 
 def halved(population: Population) -> Population:
@@ -23,16 +22,11 @@ def halved(population: Population) -> Population:
 
     Particles that all descend from one, or are all equal, cannot be split: they are of one half.
     """
-    if len(population.sides):
-        if _smaller(population.sides) >= LEAST * len(population):
-            return population
-        sides = _split(population.families)
-        if _smaller(sides) >= LEAST * len(population):
-            return replace(population, sides=sides)
-        families = _copies(population, torch.arange(len(population)))
-    else:
-        families = _copies(population, population.founders)
-    return replace(population, families=families, sides=_split(families))
+    sides = population.sides
+    if len(sides) and not bool((sides == sides[0]).all()):
+        return population
+    families = _copies(population)
+    return replace(population, families=families, sides=split(families))
 
 
 def halves(population: Population) -> list[Tensor]:
@@ -41,29 +35,14 @@ def halves(population: Population) -> list[Tensor]:
     return [part for part in parts if len(part)]
 
 
-def _smaller(sides: Tensor) -> int:
-    count = int(sides.sum())
-    return min(count, len(sides) - count)
-
-
-def _copies(population: Population, otherwise: Tensor) -> Tensor:
+def _copies(population: Population) -> Tensor:
     """The number (N,) of each particle's group of copies: those with equal continuous values.
 
     Discrete values are equal by chance too. A side that depended on them would let a particle shape its own
-    proposal, so without a continuous value the groups are `otherwise`.
+    proposal, so without a continuous value the groups are those of the particles' founders.
     """
     values = [v for v in population.trace.choices.values() if v.is_floating_point()]
     if not values:
-        return otherwise
+        return population.founders
     rows = torch.cat([v.reshape(len(population), -1).double() for v in values], dim=1)
     return torch.unique(rows, dim=0, return_inverse=True)[1]
-
-
-def _split(families: Tensor) -> Tensor:
-    """Sides (N,) of families (N,) in random order, the first of them, up to half of the particles, on one."""
-    _, family, sizes = torch.unique(families, return_inverse=True, return_counts=True)
-    order = torch.randperm(len(sizes))
-    middle = sizes[order].cumsum(0) - 0.5 * sizes[order]
-    first = torch.empty(len(sizes), dtype=torch.bool)
-    first[order] = middle <= 0.5 * len(families)
-    return first[family]
