@@ -82,6 +82,7 @@ UNTIL = (
     "particles stop while they still correlate with where they began, by about 0.75, and all at a sweep that "
     "depends on them; repeat the moves, or ask for a larger displacement"
 )
+FEW = "exponents and resampling that depend on the particles leave a bias of order 1/N; give more particles"
 # Why a kernel may be biased here, by name.
 REASONS = {
     "drift until displaced": UNTIL,
@@ -279,9 +280,10 @@ def main() -> None:
             "",
         ]
         show(f"{problem}: {runs} runs of each kernel", columns, lines)
-        for kernel, *_, verdict in lines:
+        for kernel, particles, *_, verdict in lines:
             if verdict == "biased":
-                print(f"biased, {kernel}: {REASONS.get(kernel, 'unexplained')}")
+                otherwise = FEW if particles < 1000 else "unexplained"
+                print(f"biased, {kernel}, N = {particles}: {REASONS.get(kernel, otherwise)}")
     finish(rows, arguments.json)
 
 
