@@ -17,6 +17,7 @@ from bcppl.distributions.touch.placed import LATENT_POSITIVE, OUTLIER, Distance,
 
 # A normal with less than this in the world's xy plane has no direction there.
 UPRIGHT = 1e-6
+LOG_PEAK = math.log(2.0 / (math.pi * math.sqrt(3.0)))  # of the t with 3 degrees of freedom at 0
 
 
 @dataclass(eq=False, repr=False)
@@ -27,8 +28,15 @@ class ForceDirection(LazyDistribution):
     finger's motion, up to the friction cone's half angle a = atan(friction), where the finger slides. With m
     the angle from the inward normal to the motion, the force has the angle a tanh(m / a) from that normal:
     the motion's own direction while the finger sticks, the cone's edge while it slides, and (measured) a
-    smooth passage between them. About that it is normal (wrapped) with `spread`; with probability `outlier`
-    it is uniform. The base measure is Lebesgue on the circle, radians.
+    smooth passage between them. About that its error is Student's t (wrapped) with scale `spread` and three
+    degrees of freedom; with probability `outlier` it is uniform. The base measure is Lebesgue on the circle,
+    radians.
+
+    A t is a normal whose scale is uncertain: the scale is estimated in one session and holds in another. In
+    three logs of 50 pushes the errors' root mean squares are 0.042, 0.046 and 0.081 rad, so that a session's
+    log-scale differs from another's by 0.5 (standard deviation), which is that of a t with 3 degrees of
+    freedom. Given the first log's scale, the t is better than a normal by 17 nats on the third, and worse by
+    2 on the second.
 
     Where the surface faces straight up or down the angle is uniform. Without contact (tip NaN) the direction
     is NaN with probability one.
@@ -39,7 +47,7 @@ class ForceDirection(LazyDistribution):
         tip: (3,) or (N, 3) where the finger touches, in the world: the normal is taken there; NaN for never.
         motion: (3,) or (N, 3) the finger's direction of travel there, in the world.
         friction: coefficient of friction.
-        spread: radians.
+        spread: scale of the error, radians.
         outlier: probability of a direction that is independent of the part.
     """
 
@@ -75,7 +83,8 @@ class ForceDirection(LazyDistribution):
         spread = torch.as_tensor(self.spread, dtype=torch.float64)
         windings = 2.0 * math.pi * torch.arange(-1, 2, dtype=torch.float64)
         error = (_wrapped(value - expected)[:, None] + windings) / spread[..., None]
-        near = torch.logsumexp(-0.5 * error**2, dim=-1) - torch.log(spread) - 0.5 * math.log(2.0 * math.pi)
+        near = torch.logsumexp(LOG_PEAK - 2.0 * torch.log1p(error**2 / 3.0), dim=-1) - torch.log(spread)
+        near = near - torch.log1p(-_tail(3.0 * math.pi / spread))  # of more windings than these
         even = torch.full_like(expected, -math.log(2.0 * math.pi))
         stray = torch.tensor(self.outlier, dtype=torch.float64).log()
         density = torch.logaddexp(math.log1p(-self.outlier) + torch.where(sided, near, even), stray + even)
@@ -84,20 +93,28 @@ class ForceDirection(LazyDistribution):
         return torch.where(touched, torch.where(given, density, -torch.inf), without)
 
     def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check | None:
-        """The check of an observed angle against its normal and the share of outliers; None without one."""
+        """The check of an observed angle against its t and the share of outliers; None without one."""
         expected, sided, touched = self._expected()
         if not bool((touched & ~torch.isnan(value)).all()):
             return None
-        tail = 2.0 * torch.special.ndtr(-_wrapped(value - expected).abs() / self.spread)
-        return touch_check(torch.where(sided, tail, 1.0), self.outlier)
+        error = _wrapped(value - expected).abs() / self.spread
+        return touch_check(torch.where(sided, _tail(error), 1.0), self.outlier)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """An angle for each particle (N,), radians in (-pi, pi]; NaN without contact."""
         expected, sided, touched = self._expected()
-        angle = expected + self.spread * torch.randn(len(self.pose), dtype=torch.float64)
+        normal = torch.randn(len(self.pose), dtype=torch.float64)
+        inverse_scale = torch.randn(len(self.pose), 3, dtype=torch.float64).square().mean(dim=-1).sqrt()
+        angle = expected + self.spread * normal / inverse_scale
         even = 2.0 * math.pi * torch.rand(len(self.pose), dtype=torch.float64)
         stray = torch.rand(len(self.pose), dtype=torch.float64) < self.outlier
         return torch.where(touched, _wrapped(torch.where(stray | ~sided, even, angle)), torch.nan)
+
+
+def _tail(error: Tensor) -> Tensor:
+    """The probability of a t with 3 degrees of freedom outside +-error, exact and above 0 far off."""
+    share = error / math.sqrt(3.0)
+    return (2.0 / math.pi) * (torch.atan2(torch.ones_like(share), share) - share / (1.0 + share**2))
 
 
 def _wrapped(angle: Tensor) -> Tensor:
