@@ -14,7 +14,6 @@ its row says so, where a run with fewer particles took longer than that.
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable
@@ -27,6 +26,7 @@ import numpy as np
 import torch
 from exact_problems import PROBLEMS, Problem
 from jobs import each
+from kept import added, recorded
 from kernel_table import even, near, reflected, walk
 from report import Row, finish, options, show
 
@@ -171,37 +171,16 @@ def summary(outcome: Outcome) -> Summary:
     )
 
 
-def recorded(file: Path | None, cell: Cell) -> Outcome | None:
-    """A cell's outcome, if it is in the file."""
-    key = [cell.problem, cell.kernel, cell.particles, list(cell.seeds)]
-    if file is not None and file.exists():
-        for line in file.read_text(encoding="utf-8").splitlines():
-            known, outcome = json.loads(line)
-            if known == key:
-                return Outcome(*outcome)
-    return None
-
-
-def added(file: Path | None, cell: Cell) -> Outcome:
-    """A cell's outcome, measured and added to the file."""
-    outcome = measured(cell)
-    if file is not None:
-        key = [cell.problem, cell.kernel, cell.particles, list(cell.seeds)]
-        with file.open("a", encoding="utf-8") as lines:
-            lines.write(json.dumps([key, list(outcome)]) + "\n")
-    return outcome
-
-
 def with_more(file: Path | None, limit: float, cells: list[Cell]) -> list[Outcome | float]:
     """The outcomes with more and more particles; instead of it the seconds of a run that took too long."""
     outcomes: list[Outcome | float] = []
     longest = 0.0
     for cell in cells:
-        outcome = recorded(file, cell)
-        if outcome is None and longest > limit:
+        known = recorded(file, cell)
+        if known is None and longest > limit:
             outcomes.append(longest)
             continue
-        outcome = outcome or added(file, cell)
+        outcome = Outcome(*(known or added(file, cell, partial(measured, cell))))
         longest = max(longest, outcome.seconds / len(cell.seeds))
         outcomes.append(outcome)
     return outcomes
