@@ -11,6 +11,7 @@ from bcppl.geometry.hausdorff import hausdorff_error
 from bcppl.inference.hypotheses import Edge, alternatives, edges, likeliest
 from bcppl.inference.population import Population
 from bcppl.inference.predictive import THRESHOLD, Check, surprise
+from bcppl.inference.undetermined import Undetermined, undetermined
 from bcppl.recordings import Recording
 
 MARK = "!"
@@ -62,6 +63,9 @@ class PredictiveChecks:
         off = {label: checks for label, checks in by_label.items() if together(checks.values()) < THRESHOLD}
         reasons = [sentence(off, list(by_label))] if off else []
         reasons += [edge_sentence(edge) for edge in edges(population, address) if edge.decisive or off]
+        open_along = undetermined(population, address)
+        if open_along is not None:
+            reasons.append(open_sentence(open_along))
         others = alternatives(population)
         if others:
             reasons.append(
@@ -102,6 +106,16 @@ def edge_sentence(edge: Edge) -> str:
     return (
         f"{100 * edge.mass:.0f} % of the posterior is at the edge of the guess, {edge.axis} "
         f"{scale * edge.limit:+.3g} {unit} from its centre{better}: the part may be outside; widen the guess."
+    )
+
+
+def open_sentence(where: Undetermined) -> str:
+    """The warning for a direction in which the position is as open as the guess left it."""
+    direction = ", ".join(f"{0.0 + round(x, 2):g}" for x in where.direction.tolist())
+    return (
+        f"the measurements hardly determine the part's position along ({direction}) in the world: its "
+        f"standard deviation there is {1e3 * where.deviation:.2g} mm, and the guess's at most "
+        f"{1e3 * where.before:.2g} mm: touch a face across that direction, or look from another side."
     )
 
 
