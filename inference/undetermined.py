@@ -40,8 +40,8 @@ class Undetermined(NamedTuple):
 def undetermined(population: Population, address: str) -> Undetermined | None:
     """The direction of the largest standard deviation, where that is hardly less than the prior's largest.
 
-    They are compared as entropies of Gaussians. None where measurements determine the position better, without
-    measurements, and for a prior that is not uniform.
+    They are compared as entropies of Gaussians. None where measurements determine the position better,
+    without measurements, and for a prior that is not uniform.
     """
     trace = population.trace
     prior = None if isinstance(trace, SeriesTrace) else trace.distributions.get(address)

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.distributions.touch import Path
+from bcppl.distributions.touch.direction import scale_of
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.models.shipped import simulated_in
@@ -70,8 +71,9 @@ def estimate_settings(recording: Recording, **settings: Any) -> FingerSettings:
     The finger's position in the tip's xy plane and the registration are least-squares estimates from the
     signed distance at onset (three Gauss-Newton steps along the normals); the offset is the mean residual.
     The spread is that of the residuals without a registration: between logs the scatter differs by nearly a
-    factor of two, so a wide one is safer. The tolerance is the largest depth, and the friction has the least
-    squared error of the force's direction. With a given finger the registration is not estimated.
+    factor of two, so a wide one is safer. The tolerance is the largest depth, the friction has the least
+    squared error of the force's direction, and the direction's spread the maximum likelihood. With a given
+    finger the registration is not estimated.
 
     Args:
         recording: ten pushes or more, with the true pose.
@@ -146,7 +148,7 @@ def estimate_settings(recording: Recording, **settings: Any) -> FingerSettings:
         offset=float(depth.mean()),
         spread=spread,
         friction=math.tan(cone),
-        direction_spread=float(error(cone).square().mean().sqrt()),
+        direction_spread=scale_of(error(cone)),
         tolerance=float(depth.max()),
         free_spread=spread,
     )

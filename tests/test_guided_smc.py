@@ -23,7 +23,7 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError, NotANumberError
 from bcppl.geometry.parts import Guess
 from bcppl.inference.filters import tempered_smc
-from bcppl.inference.filters.guided_smc import guided, infer, kernel
+from bcppl.inference.filters.guided_smc import Approximation, guided, infer, kernel
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair, smcp3
 from bcppl.inference.planning.metrology import three_two_one
@@ -75,7 +75,7 @@ RECORDING: Any = SimpleNamespace(measurements=[Sight(k) for k in range(len(SEEN)
 
 
 @dataclass(frozen=True)
-class Exact:
+class Exact(Approximation):
     """The posterior given the first so many measurements, whose sum is (3,)."""
 
     count: int = 0

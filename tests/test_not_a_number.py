@@ -19,7 +19,7 @@ from bcppl.beliefs import normalised
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InferenceError
-from bcppl.inference.filters.guided_smc import guided, kernel
+from bcppl.inference.filters.guided_smc import Approximation, guided, kernel
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair
 from bcppl.inference.population import Population
@@ -76,7 +76,7 @@ def around(x: Sequence[float]) -> Program:
 
 
 @dataclass(frozen=True)
-class Counted:
+class Counted(Approximation):
     """An approximation that knows the number of measurements."""
 
     count: int = 0

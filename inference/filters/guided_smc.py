@@ -63,7 +63,10 @@ LEAST = 0.03  # of N: where even with so many copies less would be left, the mea
 
 
 class Approximation(Protocol):
-    """What guides the filter; `GaussianApproximation` is one. It is immutable."""
+    """What guides the filter; `GaussianApproximation` is one. It is immutable.
+
+    One that inherits from this class has a single mode unless it states otherwise.
+    """
 
     def including(self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]) -> Any:
         """The approximation given one more measurement."""
@@ -73,6 +76,15 @@ class Approximation(Protocol):
 
     def updated(self) -> Any:
         """The approximation with all that was deferred."""
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether it may have several modes before any contact; more copies are then made of a particle."""
+        return False
+
+    def stratum(self, trace: Trace) -> Tensor:
+        """The mode of each particle (N,), int64."""
+        return torch.zeros(len(trace), dtype=torch.int64)
 
 
 class Programs(Protocol):
@@ -154,7 +166,7 @@ def guided(
         before = before.updated()
         after = before.including(scene, len(actions) - 1, action, values)
         population = population.with_approximation(after)
-        least = SEVERAL if getattr(after, "is_ambiguous", False) else 1
+        least = SEVERAL if after.is_ambiguous else 1
         assimilated = assimilate(population, observed, programs.pair(before, after, action), least)
         if assimilated is None:
             return settled(by_tempering(population, observed))
@@ -216,10 +228,7 @@ def assimilate(population: Population, observed: Observed, pair: Pair, least: in
 
 def by_mode(population: Population, count: int) -> Tensor:
     """Systematic ancestors (count,), so that each mode keeps its share but for one particle."""
-    stratum = getattr(population.approximation, "stratum", None)
-    if stratum is None:
-        return systematic(population.log_weights, count)
-    order = stratum(population.trace).argsort(stable=True)
+    order = population.approximation.stratum(population.trace).argsort(stable=True)
     return order[systematic(population.log_weights[order], count)].sort().values
 
 

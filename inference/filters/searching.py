@@ -135,9 +135,14 @@ def _record(done: Stepped, before: Population, moved: Moved, chosen: Tensor) -> 
 
 
 def joined(old: Population, fresh: Population) -> tuple[Population, Tensor]:
-    """As many particles as `old` has, drawn from two populations by weight and evidence.
+    """As many particles as `old` has, drawn from two populations of one posterior by weight and evidence.
 
-    The evidence is the mean of the two estimates, which is unbiased if both are.
+    Each counts as its estimate of the evidence, as islands do (Verge, Dubarry, Del Moral and Moulines,
+    Statistics and Computing 25, 2015). The evidence is the mean of the two estimates, which is unbiased if
+    both are.
+
+    Raises:
+        NoWeightError: one has no particle with any weight.
 
     Returns:
         The population, and the particle (N,) from which each comes, those of `fresh` counted after the old.

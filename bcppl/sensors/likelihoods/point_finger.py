@@ -38,7 +38,7 @@ class FingerSettings:
         offset, spread: how far inside the part that place lies at onset, mean and standard deviation, metres.
         outlier: probability of an onset that has nothing to do with the part.
         friction: coefficient between finger and part.
-        direction_spread, direction_outlier: radians; probability of a direction unrelated to the part.
+        direction_spread, direction_outlier: scale, radians; probability of a direction unrelated to the part.
         tolerance, free_spread: depth at which one free path in two would be felt, and its spread, metres.
         spacing: the path's points are this far apart, metres.
         threshold: contact begins where the tared force exceeds it, N.
@@ -54,7 +54,7 @@ class FingerSettings:
     spread: float = 0.000403
     outlier: float = 0.01
     friction: float = 0.413
-    direction_spread: float = 0.0413
+    direction_spread: float = 0.0341
     direction_outlier: float = 0.01
     tolerance: float = 0.000794
     free_spread: float = 0.000403
