@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy import stats
 from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.touch import ForceDirection, FreePath, OnsetLocation, Path
+from bcppl.distributions.touch.direction import scale_of
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.parts import Part
@@ -196,6 +198,24 @@ def test_direction_samples_follow_the_density() -> None:
     density = direction(shifted(*[0.0] * 3200), t(1.0, 0.3, 0.0), outlier=0.2).log_prob(middle).exp()
     expected = density.reshape(32, 100).sum(dim=1) * 2 * math.pi / 3200
     assert float((torch.histogram(many, edges).hist / 20000 - expected).abs().max()) < 0.012
+
+
+def test_errors_of_a_direction_have_the_tails_of_a_t() -> None:
+    """Head on the expected angle is 0; 0.1 rad is one scale of the error."""
+    errors = t(0.0, 0.1, 0.3, 0.7)
+    density = direction(shifted(*[0.0] * 4), t(1.0, 0.0, 0.0), outlier=0.0).log_prob(errors).numpy()
+    np.testing.assert_allclose(density, stats.t.logpdf(errors.numpy(), 3, scale=0.1), atol=2e-3)
+    site = direction(shifted(0.0), t(1.0, 0.0, 0.0), outlier=0.0)
+    for error in (0.1, 0.7):
+        probability = site.predictive_check(t(error), lambda: site).probability
+        assert probability == pytest.approx(2.0 * stats.t.sf(error / 0.1, 3), rel=1e-6)
+
+
+def test_the_scale_of_directions_is_that_of_their_bulk() -> None:
+    errors = torch.from_numpy(stats.t.rvs(3, size=1000, scale=0.05, random_state=0))
+    assert scale_of(errors) == pytest.approx(0.05, rel=0.06)
+    errors[0] = 2.0  # one outlier doubles their root mean square
+    assert scale_of(errors) == pytest.approx(0.05, rel=0.06)
 
 
 def test_no_force_has_no_direction() -> None:
