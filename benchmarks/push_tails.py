@@ -92,8 +92,8 @@ def summary(runs: Sequence[Run]) -> list[float | int]:
     silent = [one for one in runs if one.position > WRONG and not (one.warned or one.holds)]
     quantiles = [float(np.quantile(position, q)) for q in (0.5, 0.9, 0.99, 1.0)]
     shares = [100.0 * float(np.mean([getattr(one, name) for one in runs])) for name in ("holds", "warned")]
-    # A mean that is near by chance is not good: the belief is as wide as the guess.
-    good = [one.warned for one in runs if max(one.position, one.spread) <= WRONG]
+    # A mean that is near by chance is not good where the belief is wide.
+    good = [one.warned for one in runs if one.position <= WRONG and one.spread <= 0.5 * WRONG]
     return [
         *quantiles,
         int((position > WRONG).sum()),
