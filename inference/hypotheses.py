@@ -45,7 +45,8 @@ class Edge(NamedTuple):
     Attributes:
         axis: "x", "y" or "z" of the world, "tilt", "yaw" or "angle".
         limit: metres or radians from the prior's centre, signed.
-        mass: the share of the weight within 10 % of the limit.
+        mass: the share of the weight within 10 % of the limit, or beyond it.
+        outside: the share of the weight beyond it.
         beyond: the distance beyond the limit at which the measurements fit best, metres or radians.
         gain: the log-likelihood ratio of the best place beyond to the best particle, nats.
     """
@@ -53,13 +54,14 @@ class Edge(NamedTuple):
     axis: str
     limit: float
     mass: float
+    outside: float
     beyond: float
     gain: float
 
     @property
     def decisive(self) -> bool:
-        """Whether the measurements fit decisively better beyond the limit."""
-        return self.gain > DECISIVE
+        """Whether the belief is beyond the limit, or the measurements fit decisively better there."""
+        return self.outside > 0.5 or self.gain > DECISIVE
 
 
 def edges(population: Population, address: str) -> list[Edge]:
@@ -83,7 +85,8 @@ def edges(population: Population, address: str) -> list[Edge]:
                 continue
             best = float(_of_others(trace, address).max()) if best is None else best
             beyond, gain = _beyond(population, address, near, sign * limit * outwards, limit, best)
-            piled.append(Edge(axis, sign * limit, mass, beyond, gain))
+            outside = float(weights[sign * place > limit].sum())
+            piled.append(Edge(axis, sign * limit, mass, outside, beyond, gain))
     return piled
 
 

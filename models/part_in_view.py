@@ -99,5 +99,5 @@ model = Model(
     observe=Scene.observed,
     pose="part",
     proposals=(conditional_proposal,),
-    inference=("tempered_smc", {"climbs": 240, "conditional": conditional_proposal}),
+    inference=("tempered_smc", {"climbs": 960, "conditional": conditional_proposal}),
 )

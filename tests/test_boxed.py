@@ -27,7 +27,7 @@ def test_its_density_is_that_of_its_draws(shift: float) -> None:
     center = poses.identity(count)
     center[:, 0] += shift
     center[:, 2] -= shift
-    boxed = BoxedNormal(center, covariance, -LIMIT, LIMIT)
+    boxed = BoxedNormal(center, covariance, torch.stack([-LIMIT, LIMIT]))
     drawn = boxed.sample()
     assert bool((drawn[:, :3].abs() <= LIMIT).all())
     share = torch.exp(boxed.normal.log_prob(drawn) - boxed.log_prob(drawn))
@@ -39,7 +39,7 @@ def test_its_density_is_that_of_its_draws(shift: float) -> None:
 
 
 def test_outside_it_has_no_density() -> None:
-    boxed = BoxedNormal(poses.identity(2), correlated(), -LIMIT, LIMIT)
+    boxed = BoxedNormal(poses.identity(2), correlated(), torch.stack([-LIMIT, LIMIT]))
     outside = poses.identity(2)
     outside[1, 1] = 0.011
     assert torch.isfinite(boxed.log_prob(outside)).tolist() == [True, False]

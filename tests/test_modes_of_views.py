@@ -18,7 +18,7 @@ from torch.distributions import MultivariateNormal
 from bcppl import poses
 from bcppl.distributions.fitted import FittedMixture, fitted_mixture
 from bcppl.distributions.pose_normals import moments_within
-from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.poses import NormalPose, UniformPose
 from bcppl.geometry.extrusion import extruded
 from bcppl.geometry.parts import Part
 from bcppl.geometry.turns import box_turns
@@ -167,7 +167,7 @@ def test_moments_of_a_gaussian_in_a_box_are_those_of_its_draws(beside: float) ->
     root, center = torch.randn(6, 6).double(), poses.identity(1)
     center[0, :2] = torch.tensor([beside, 0.015])
     covariance = 0.003**2 * (root @ root.T / 6.0 + 0.3 * torch.eye(6))
-    box = SimpleNamespace(widths=torch.full((3,), 0.02).double(), center=poses.identity())
+    box = UniformPose(poses.identity(), 0.02, 1.0)
     inside = moments_within(box, NormalPose(center, covariance[None]))
     draws = MultivariateNormal(torch.zeros(6).double(), covariance).sample((400_000,))
     kept = draws[((draws[:, :3] + center[:, :3]).abs() < box.widths).all(dim=1)]

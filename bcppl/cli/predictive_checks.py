@@ -99,6 +99,12 @@ def together(checks: Collection[Check]) -> float:
 def edge_sentence(edge: Edge) -> str:
     """The warning for a belief that is piled up at the edge of the guess."""
     unit, scale = ("mm", 1e3) if edge.axis in "xyz" else ("°", math.degrees(1.0))
+    if edge.outside > 0.5:
+        return (
+            f"{100 * edge.outside:.0f} % of the posterior is outside the guess, beyond {edge.axis} "
+            f"{scale * edge.limit:+.3g} {unit} from its centre: "
+            "widen the guess, or check the frame that it is stated in."
+        )
     better = ""
     if edge.decisive:
         beyond = f"{scale * edge.beyond:.2g} {unit} beyond it"

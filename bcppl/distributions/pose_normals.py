@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.special import log_ndtr
 
 from bcppl import poses
 from bcppl.distributions.poses import BoxedNormal, MixturePose, NormalPose
+from bcppl.distributions.poses.boxed import log_mass
 
 # Proposals are mixtures of scaled copies: their scales, in standard deviations, and their probabilities.
 WIDTHS = torch.tensor([1.1, 3.0], dtype=torch.float64)
@@ -125,15 +125,15 @@ def matched(mixture: MixturePose) -> NormalPose:
 
 
 def truncated(prior: Any, normal: NormalPose) -> NormalPose | BoxedNormal:
-    """A Gaussian (N,) truncated to a prior's box; near its border few draws would lie within."""
+    """A Gaussian (N,) times a prior's density along each axis; near its border few draws would lie within."""
     if not bool((prior.widths > 0.0).all()):
         return normal
-    low, high = prior.center[:3] - prior.widths, prior.center[:3] + prior.widths
-    return BoxedNormal(normal.center, normal.covariance, low, high)
+    limits, log_steps = prior.steps
+    return BoxedNormal(normal.center, normal.covariance, prior.center[:3] + limits, log_steps)
 
 
 def moments_within(prior: Any, normal: NormalPose) -> NormalPose:
-    """The Gaussian with about the moments of a Gaussian (N,) truncated to a prior's box.
+    """The Gaussian with about the moments of a Gaussian (N,) times a prior's density along each axis.
 
     Expectation propagation with a factor for each axis (Cunningham, Hennig and Lacoste-Julien, Gaussian
     probabilities and expectation propagation, arXiv 1111.6832).
@@ -143,6 +143,7 @@ def moments_within(prior: Any, normal: NormalPose) -> NormalPose:
     covariance, center = normal.covariance.clone(), normal.center
     off = center[..., :3] - prior.center[:3]
     mean = torch.zeros_like(covariance[..., 0])
+    steps, log_steps = prior.steps
     precision, pull = torch.zeros_like(off), torch.zeros_like(off)
     for axis in list(range(3)) * _SWEEPS:
         column = covariance[..., axis].clone()
@@ -150,8 +151,8 @@ def moments_within(prior: Any, normal: NormalPose) -> NormalPose:
         # The marginal without the factor's own share, truncated, gives the share.
         free = 1.0 / (1.0 / own - precision[..., axis])
         middle = free * (here / own - pull[..., axis])
-        limits = prior.widths[axis] - off[..., axis], -prior.widths[axis] - off[..., axis]
-        inside, spread = _truncated_moments(middle, free, limits[1], limits[0])
+        limits = steps[:, axis] - off[..., axis, None]
+        inside, spread = _stepped_moments(middle, free, limits, log_steps)
         change = 1.0 / spread - 1.0 / free - precision[..., axis]
         pulled = inside / spread - middle / free - pull[..., axis]
         precision[..., axis] += change
@@ -163,20 +164,28 @@ def moments_within(prior: Any, normal: NormalPose) -> NormalPose:
     return NormalPose(poses.retract(center, mean), symmetric, normal.freedom)
 
 
-def _truncated_moments(mean: Tensor, variance: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and variance of a normal truncated to an interval."""
+def _stepped_moments(
+    mean: Tensor, variance: Tensor, limits: Tensor, log_steps: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Mean and variance (N,) of a normal times a density that is constant between limits (N, K + 1)."""
     deviation = variance.sqrt()
-    first, last = (low - mean) / deviation, (high - mean) / deviation
+    ends = (limits - mean[..., None]) / deviation[..., None]
+    first, last = ends[..., :-1], ends[..., 1:]
     flip = first + last > 0.0  # as in a right tail, where the distribution function would round to 1
     first, last = torch.where(flip, -last, first), torch.where(flip, -first, last)
-    upper, lower = log_ndtr(last), log_ndtr(first)
-    log_mass = upper + torch.log1p(-torch.exp(lower - upper))
+    log_masses = log_mass(first, last)
     at_first, at_last = (
-        torch.exp(-0.5 * x**2 - 0.5 * math.log(2.0 * math.pi) - log_mass) for x in (first, last)
+        torch.exp(-0.5 * x**2 - 0.5 * math.log(2.0 * math.pi) - log_masses) for x in (first, last)
     )
     away = at_first - at_last
-    share = 1.0 + first * at_first - last * at_last - away**2
-    return mean + deviation * torch.where(flip, -away, away), variance * share.clamp(_NARROWEST, 1.0)
+    share = (1.0 + first * at_first - last * at_last - away**2).clamp(_NARROWEST, 1.0)
+    away = torch.where(flip, -away, away)
+    # An interval that is so far away that its mass is no number has none.
+    weight = (log_masses + log_steps).nan_to_num(nan=-torch.inf, neginf=-torch.inf).softmax(dim=-1)
+    away, share = (torch.where(weight > 0.0, each, 0.0) for each in (away, share))
+    middle = (weight * away).sum(dim=-1)
+    spread = (weight * (share + (away - middle[..., None]) ** 2)).sum(dim=-1)
+    return mean + deviation * middle, variance * spread.clamp(_NARROWEST, 1.0)
 
 
 def product(first: NormalPose, second: NormalPose) -> NormalPose:

@@ -17,12 +17,21 @@ from bcppl.errors import InputError
 from bcppl.poses import Freedom
 
 ANGLE = Range(least=0.0, most=math.pi)
+SHARE = Range(least=0.0, below=1.0)
+# A guess is a belief, not a fact. So much of each coordinate's mass lies in its tails, which reach so many
+# half widths from the centre: measurements that are worth 6 nats more outside move the belief there.
+TAIL, FARTHEST = 0.01, 3.0
 
 
 class _BoxPose(PoseDistribution):
-    """Uniform in a box, times Haar measure restricted to a set of rotations of a normalised `measure`."""
+    """Uniform in a box, times Haar measure restricted to a set of rotations of a normalised `measure`.
 
-    def __init__(self, center: Any, translation: Any, rotation: str, measure: float) -> None:
+    With a `tail`, that share of each coordinate's mass is spread evenly from there to `FARTHEST` half widths,
+    and the box is so much narrower that the density within remains that of the uniform.
+    """
+
+    def __init__(self, center: Any, translation: Any, rotation: str, measure: float, tail: float) -> None:
+        self.tail = SHARE.checked(f"{type(self).__name__} has a tail of mass {{}}", tail)
         what = f"{type(self).__name__} has a half width of {{}} m"
         each = np.broadcast_to(np.asarray(translation, dtype=object), 3)
         widths = [number_within(what, width, least=0.0) for width in each]
@@ -31,6 +40,39 @@ class _BoxPose(PoseDistribution):
         super().__init__(poses.as_pose(center, "the centre of a pose prior"), Freedom(free, rotation))
         volume = torch.log(2.0 * self.widths[self.widths > 0])
         self.log_density = -math.log(measure) - float(volume.sum())
+
+    @property
+    def steps(self) -> tuple[Tensor, Tensor]:
+        """The intervals of each coordinate from the centre over which the density is constant.
+
+        Returns:
+            Their limits (K + 1, 3), ascending, metres, and the log of the density there (K,), relative to
+            that at the centre.
+        """
+        if not self.tail:
+            return torch.stack([-self.widths, self.widths]), torch.zeros(1, dtype=torch.float64)
+        reach = torch.tensor([-FARTHEST, self.tail - 1.0, 1.0 - self.tail, FARTHEST], dtype=torch.float64)
+        lower = math.log(self.tail / (FARTHEST - 1.0 + self.tail))
+        return reach[:, None] * self.widths, torch.tensor([lower, 0.0, lower], dtype=torch.float64)
+
+    def _translations(self, uniform: Tensor) -> Tensor:
+        """The displacements (..., 3) at quantiles (..., 3)."""
+        share = 2.0 * uniform - 1.0
+        if self.tail:
+            beyond = (share.abs() - 1.0 + self.tail) / self.tail
+            far = 1.0 - self.tail + beyond * (FARTHEST - 1.0 + self.tail)
+            share = torch.where(beyond > 0.0, far.copysign(share), share)
+        return self.widths * share
+
+    def _log_density_at(self, shift: Tensor) -> Tensor:
+        """The log-density (...,) at displacements (..., 3) from the centre, for a rotation within its set."""
+        limits, log_steps = self.steps
+        inside = (shift.abs() <= limits[-1] + HELD).all(dim=-1)
+        density = shift.new_tensor(self.log_density)
+        if self.tail:
+            is_far = (shift.abs() > limits[-2] + HELD) & (self.widths > 0.0)
+            density = density + log_steps[0] * is_far.sum(dim=-1)
+        return torch.where(inside, density, -torch.inf)
 
     def _moved(self, shape: torch.Size, rotation: Tensor, translation: Tensor) -> Tensor:
         """The centre moved by translations (*shape, 3) and quaternions x y z w (*shape, 4)."""
@@ -49,22 +91,25 @@ class UniformPose(_BoxPose):
             0 holds an axis fixed.
         angle: the largest rotation angle away from the centre, radians, at most pi; 0 holds the orientation.
         rotation: "all", or one axis "x", "y", "z" of the frame the pose maps from.
+        tail: the share of the mass of each translation that lies in tails up to three half widths away.
 
     The Haar measure of a ball of rotation angle a is (a - sin a) / pi.
     """
 
-    def __init__(self, center: Any, translation: Any, angle: float, rotation: str = "all") -> None:
+    def __init__(
+        self, center: Any, translation: Any, angle: float, rotation: str = "all", *, tail: float = 0.0
+    ) -> None:
         self.angle = ANGLE.checked("UniformPose has angle = {} rad", angle)
         if self.angle == 0.0:
             rotation = "none"
         ball = (self.angle - math.sin(self.angle)) / math.pi
         measure = {"none": 1.0, "all": ball}.get(rotation, self.angle / math.pi)
-        super().__init__(center, translation, rotation, measure)
+        super().__init__(center, translation, rotation, measure, tail)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Poses (*sample_shape, *batch_shape, 7)."""
         shape = torch.Size(sample_shape) + self.batch_shape
-        translation = self.widths * (2.0 * torch.rand(*shape, 3, dtype=torch.float64) - 1.0)
+        translation = self._translations(torch.rand(*shape, 3, dtype=torch.float64))
         if self.freedom.rotation == "all":
             direction = torch.randn(*shape, 3, dtype=torch.float64)
             direction = direction / direction.norm(dim=-1, keepdim=True)
@@ -80,10 +125,9 @@ class UniformPose(_BoxPose):
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density (...,) with respect to the base measure; -inf outside the support."""
         tangent = poses.local(self.center, value)
-        inside = (tangent[..., :3].abs() <= self.widths + HELD).all(dim=-1)
-        inside &= tangent[..., 3:].norm(dim=-1) <= self.angle + HELD
+        inside = tangent[..., 3:].norm(dim=-1) <= self.angle + HELD
         inside &= (self.freedom.off_axis(tangent) <= HELD) & is_unit(value)
-        return torch.where(inside, value.new_tensor(self.log_density), -torch.inf)
+        return torch.where(inside, self._log_density_at(tangent[..., :3]), -torch.inf)
 
 
 def _haar_angle(shape: torch.Size, largest: float) -> Tensor:
@@ -108,12 +152,13 @@ class SwingTwistPose(_BoxPose):
         translation: half widths (3,) or one for all, metres; 0 holds an axis fixed.
         tilt: the largest tilt, radians; 0 leaves a turn about the part's z axis alone.
         yaw: the largest twist to either side, radians.
+        tail: the share of the mass of each translation that lies in tails up to three half widths away.
 
     Raises:
         InputError: a limit is out of range, or tilt is free while yaw is held (no Haar measure).
     """
 
-    def __init__(self, center: Any, translation: Any, tilt: float, yaw: float) -> None:
+    def __init__(self, center: Any, translation: Any, tilt: float, yaw: float, *, tail: float = 0.0) -> None:
         self.tilt = ANGLE.checked("SwingTwistPose has tilt = {} rad", tilt)
         self.yaw = ANGLE.checked("SwingTwistPose has yaw = {} rad", yaw)
         if self.tilt > 0 and self.yaw == 0:
@@ -123,13 +168,14 @@ class SwingTwistPose(_BoxPose):
             )
         rotation = "all" if self.tilt > 0 else "z" if self.yaw > 0 else "none"
         swing = 0.5 * (1.0 - math.cos(self.tilt)) if self.tilt > 0 else 1.0
-        super().__init__(center, translation, rotation, swing * (self.yaw / math.pi if self.yaw else 1.0))
+        twist = self.yaw / math.pi if self.yaw else 1.0
+        super().__init__(center, translation, rotation, swing * twist, tail)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Poses (*sample_shape, *batch_shape, 7)."""
         shape = torch.Size(sample_shape) + self.batch_shape
         uniform = torch.rand(*shape, 6, dtype=torch.float64)
-        translation = self.widths * (2.0 * uniform[..., :3] - 1.0)
+        translation = self._translations(uniform[..., :3])
         cosine = 1.0 - uniform[..., 3] * (1.0 - math.cos(self.tilt))
         heading = 2.0 * math.pi * uniform[..., 4]
         swing = torch.acos(cosine)[..., None] * torch.stack(
@@ -146,10 +192,9 @@ class SwingTwistPose(_BoxPose):
         """Log-density (...,) with respect to the base measure; -inf outside the support."""
         tilt, yaw = tilt_and_yaw(self.center, value)
         shift = value[..., :3] - self.center[..., :3]
-        inside = (shift.abs() <= self.widths + HELD).all(dim=-1)
         # The angle of a vanishing tilt is the square root of rounding in the quaternion.
-        inside &= (tilt <= self.tilt + 1e-7) & (yaw.abs() <= self.yaw + HELD) & is_unit(value)
-        return torch.where(inside, value.new_tensor(self.log_density), -torch.inf)
+        inside = (tilt <= self.tilt + 1e-7) & (yaw.abs() <= self.yaw + HELD) & is_unit(value)
+        return torch.where(inside, self._log_density_at(shift), -torch.inf)
 
 
 def tilt_and_yaw(center: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
@@ -164,7 +209,7 @@ def tilt_and_yaw(center: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def prior_from_guess(guess: Any) -> UniformPose | SwingTwistPose:
-    """The prior of a recording's guess: uniform within an angle, or within a tilt and a yaw."""
+    """The prior of a recording's guess, with tails: uniform within an angle, or within a tilt and a yaw."""
     if guess.angle is not None:
-        return UniformPose(guess.world_from_part, guess.translation, guess.angle)
-    return SwingTwistPose(guess.world_from_part, guess.translation, guess.tilt, guess.yaw)
+        return UniformPose(guess.world_from_part, guess.translation, guess.angle, tail=TAIL)
+    return SwingTwistPose(guess.world_from_part, guess.translation, guess.tilt, guess.yaw, tail=TAIL)
