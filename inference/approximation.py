@@ -60,6 +60,7 @@ class GaussianApproximation:
     # by number of the measurement, whether it is informative near the fits' estimate
     relevant: Mapping[int, bool] = field(default_factory=dict)
     stale: bool = False  # whether contacts were added after `quadratic` was computed
+    near: Tensor | None = None  # (K, 7) poses that fits of measurements follow too
 
     def __post_init__(self) -> None:
         if not hasattr(self.scene, "prior") or not hasattr(self.scene, "sensor"):
@@ -90,7 +91,7 @@ class GaussianApproximation:
             name = sensor.instrument(action)
             if name in self.fits:
                 return replace(self, scene=scene)
-            fits = {**self.fits, name: Fitted(action, sensor.fit(number, action, observations))}
+            fits = {**self.fits, name: Fitted(action, sensor.fit(number, action, observations, self.near))}
             # The estimate moves, so it is asked again which contacts are informative there.
             return replace(self, scene=scene, fits=fits, relevant={})
         if isinstance(sensor, Linearised):

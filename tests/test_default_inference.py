@@ -22,7 +22,7 @@ def test_the_model_names_the_program_and_its_settings() -> None:
     name, infer = default_inference(part_in_view.model)
     assert name == "tempered_smc" and isinstance(infer, partial)
     assert infer.func is tempered_smc.infer and infer.keywords == part_in_view.model.inference[1]
-    assert infer.keywords["climbs"] == 240
+    assert infer.keywords["climbs"] == 960
     assert default_inference(look_and_touch.model)[1].func is guided_smc.infer  # type: ignore[attr-defined]
 
 
@@ -40,7 +40,7 @@ def test_infer_runs_it_and_settings_given_win() -> None:
 def test_the_command_line_keeps_the_settings_of_the_models_own_program_only() -> None:
     for given in (None, "tempered_smc"):
         name, infer = loading.inference(given, part_in_view.model)
-        assert name == "tempered_smc" and infer.keywords["climbs"] == 240  # type: ignore[attr-defined]
+        assert name == "tempered_smc" and infer.keywords["climbs"] == 960  # type: ignore[attr-defined]
     assert loading.inference("bayes_contact", part_in_view.model) == ("bayes_contact", bayes_contact.infer)
 
 

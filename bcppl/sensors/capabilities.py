@@ -32,8 +32,13 @@ class FitsPose(Protocol):
     def instrument(self, action: Any) -> str:
         """The name of the instrument; all its measurements share its nuisance parameters."""
 
-    def fit(self, number: int, action: Any, observations: Mapping[str, Tensor]) -> Any:
-        """A Gaussian approximation of one measurement's likelihood."""
+    def fit(
+        self, number: int, action: Any, observations: Mapping[str, Tensor], near: Tensor | None = None
+    ) -> Any:
+        """A Gaussian approximation of one measurement's likelihood.
+
+        `near` are poses (K, 7) about which the part may be too, and which are followed as well.
+        """
 
     def factor(self, action: Any, values: Mapping[str, Tensor]) -> PoseFactor:
         """The Gaussian over the part's pose (N, 7), given the nuisance parameters' values by address."""

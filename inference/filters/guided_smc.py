@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -32,6 +33,7 @@ from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair, moved as moved_by_pair
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
 from bcppl.inference.filters.tempering import resample_move, tempered
+from bcppl.inference.filters.view_search import is_refuted, searched_anew
 from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence
 from bcppl.inference.kernels.kernel import Move
 from bcppl.inference.population import Population
@@ -47,7 +49,7 @@ from bcppl.inference.proposals.coordinates import continuous_addresses
 from bcppl.inference.resampling import systematic
 from bcppl.inference.sizing import replicate
 from bcppl.inference.targets import POSTERIOR
-from bcppl.sensors.capabilities import Defers
+from bcppl.sensors.capabilities import Defers, FitsPose
 from bcppl.traces import Model, Trace, extend
 
 WALK = (0.2, 2.0)  # scales of the random walks
@@ -131,7 +133,7 @@ def guided(
     *,
     sweeps: int = 1,
     share: float = 0.5,
-    search: Callable[[Population], Population] | None = None,
+    search: Callable[[Population, Trace], Population] | None = None,
 ) -> StepFunction:
     """A step that assimilates a measurement by SMCP3, resamples when needed, and moves the particles.
 
@@ -141,7 +143,8 @@ def guided(
         moves: of every particle after each step.
         sweeps: how many of them.
         share: particles are resampled below this effective sample size, as a share of N.
-        search: given the population after each step, returns it or another that takes its place.
+        search: given the population after each step and the trace before it, returns that population or
+            another that takes its place.
     """
 
     def resample(population: Population) -> tuple[Population, Tensor | None]:
@@ -169,13 +172,14 @@ def guided(
         least = SEVERAL if after.is_ambiguous else 1
         assimilated = assimilate(population, observed, programs.pair(before, after, action), least)
         if assimilated is None:
-            return settled(by_tempering(population, observed))
+            return settled(by_tempering(population, observed), population.trace)
         moved, ancestors, acceptance, _ = rejuvenation(assimilated.population, POSTERIOR)
-        return settled(Stepped(moved, _info(population, moved, assimilated, acceptance, ancestors)))
+        stepped = Stepped(moved, _info(population, moved, assimilated, acceptance, ancestors))
+        return settled(stepped, population.trace)
 
-    def settled(stepped: Stepped) -> Stepped:
+    def settled(stepped: Stepped, before: Trace) -> Stepped:
         population, info = stepped
-        other = population if search is None else search(population)
+        other = population if search is None else search(population, before)
         if other is population:
             return stepped
         gained = other.log_evidence - population.log_evidence
@@ -312,7 +316,17 @@ def infer(
 
     moves = kernel(model.pose, programs.proposals)
 
-    def search(population: Population) -> Population:
+    def refitted(trace: Trace, near: Tensor) -> GaussianApproximation:
+        scene, actions = trace.args
+        again: GaussianApproximation = _given_all(replace(gaussian(scene), near=near), trace, actions)
+        return replace(again, near=None)
+
+    def search(population: Population, before: Trace) -> Population:
+        scene, actions = population.trace.args
+        if isinstance(scene.sensor(actions[-1]), FitsPose):
+            new = population.trace.since(before)
+            if is_refuted(population, new):
+                return searched_anew(population, model.pose, refitted, independent_proposal)
         return searched(population, independent_proposal)
 
     step = guided(gaussian, programs, moves, sweeps=sweeps, share=share, search=search)

@@ -31,14 +31,28 @@ def searched(population: Population, proposal: Callable[[Any], Callable[..., Any
         population: weighted for all measurements of its trace. Its approximation has a method `shortfall`.
         proposal: of all latent values, given the approximation.
     """
-    approximation, trace = population.approximation, population.trace
-    if approximation.shortfall(trace) < MISSED:
+    approximation = population.approximation
+    if approximation.shortfall(population.trace) < MISSED:
         return population
-    count = COPIES * len(population)
+    return compared(population, approximation, proposal)
+
+
+def compared(
+    population: Population, approximation: Any, proposal: Callable[[Any], Callable[..., Any]]
+) -> Population:
+    """The population, joined with one drawn from an approximation by their evidence.
+
+    Args:
+        population: weighted for all measurements of its trace.
+        approximation: given them.
+        proposal: of all latent values, given the approximation.
+    """
+    trace, count = population.trace, COPIES * len(population)
     try:
         drawn = importance_sampling(
             trace.program, trace.args, trace.observations, count, proposal(approximation)
         )
-        return joined(population, drawn)[0]
+        both, chosen = joined(population, drawn)
     except NoWeightError:
         return population
+    return both.with_approximation(approximation) if bool((chosen >= len(population)).any()) else both

@@ -176,6 +176,11 @@ class DepthDistribution(CameraImage):
         gains = np.bincount(hits.particle, weights=gain, minlength=len(self.pose))
         return torch.from_numpy(seen.power * (total + gains))
 
+    def without_part(self, value: Tensor) -> Tensor:
+        """Log-probability (1 or N,) of an image (H, W), or of N, with no part in view, and no bias."""
+        seen = self.observed(value)
+        return torch.from_numpy(seen.power * seen.total_without_part)
+
     def _sample(self) -> Tensor:
         images = torch.from_numpy(self.renderer.images(self.camera, self.apparent_pose))
         bias = torch.zeros(1) if self._biases is None else torch.from_numpy(self._biases)

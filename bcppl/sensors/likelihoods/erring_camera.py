@@ -204,10 +204,13 @@ class ErringCamera:
         """The name of the instrument, which has one error for all its measurements."""
         return action.camera.instrument
 
-    def fit(self, number: int, action: View, observations: Mapping[str, Tensor]) -> FittedMixture:
+    def fit(
+        self, number: int, action: View, observations: Mapping[str, Tensor], near: Tensor | None = None
+    ) -> FittedMixture:
         """Gaussians (7,) over the apparent pose, in the tangent space of the prior's mean, and the bias.
 
-        There is one for each mode that turns about the middle of the part lead to (`box_turns`).
+        There is one for each mode that turns about the middle of the part lead to (`box_turns`), and that
+        poses `near` (K, 7) lead to.
         """
         camera, prior, image = self.camera(action), self.prior, observations[f"depth_{number}"]
         errors = self._errors(camera)
@@ -218,9 +221,13 @@ class ErringCamera:
             return torch.where(allowed(prior, seen, _OUTSIDE * errors), image_here, -torch.inf)
 
         def alike(point: Tensor) -> Tensor:
-            seen = poses.compose(poses.retract(prior.center, point[:, :6]), turns[:, None])
+            here = poses.retract(prior.center, point[:, :6])
+            seen = poses.compose(here, turns[:, None])
+            if near is not None:
+                off = poses.compose(poses.inverse(here[0]), here)
+                seen = torch.cat([seen, poses.compose(near[:, None], off)])
             images = torch.cat(
-                [poses.local(prior.center, seen), point[:, 6:].expand(len(turns), -1, 1)], dim=2
+                [poses.local(prior.center, seen), point[:, 6:].expand(len(seen), -1, 1)], dim=2
             )
             return images[allowed(prior, seen[:, 0], _OUTSIDE * errors)]
 
