@@ -15,6 +15,8 @@ import json
 import math
 import time
 from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -88,16 +90,35 @@ def run(asked: tuple[int, int, dict[str, Any]]) -> Result:
     )
 
 
+def recorded(file: Path | None, asked: tuple[int, int, dict[str, Any]]) -> Result:
+    """The result of a run, read from a file of runs where it is there, and added to it where it is not."""
+    kept = [] if file is None or not file.exists() else file.read_text(encoding="utf-8").splitlines()
+    for of_run, result in map(json.loads, kept):
+        if of_run == list(asked):
+            return Result(*result)
+    result = run(asked)
+    if file is not None:
+        with file.open("a", encoding="utf-8") as lines:
+            lines.write(json.dumps([asked, result]) + "\n")
+    return result
+
+
 def setting(text: str) -> tuple[str, float]:
     """A setting of the model, NAME=NUMBER."""
     name, _, value = text.partition("=")
     return name, int(value) if value.isdigit() else float(value)
 
 
-def rows_of(seeds: range, jobs: int, settings: dict[str, Any], objects: Sequence[int] = OBJECTS) -> list[Row]:
+def rows_of(
+    seeds: range,
+    jobs: int,
+    settings: dict[str, Any],
+    objects: Sequence[int] = OBJECTS,
+    file: Path | None = None,
+) -> list[Row]:
     """Looks for every object from the guess of every seed, and shows a line for each."""
     asked = [(object_id, seed, settings) for object_id in objects for seed in seeds]
-    results = each(run, asked, jobs)
+    results = each(partial(recorded, file), asked, jobs)
 
     honest, rows = 0, list[Row]()
     lines: list[list[Any]] = []
@@ -143,12 +164,14 @@ def main() -> None:
         "--set", type=setting, nargs="*", default=[], metavar="NAME=NUMBER", help="of the model"
     )
     parser.add_argument("--objects", type=int, nargs="*", choices=OBJECTS, default=OBJECTS)
+    parser.add_argument("--file", type=Path, help="results of runs are kept there, and not run again")
     arguments = parser.parse_args()
     if not SCENE.is_dir():
         print(f"skipped: the scene is not at {SCENE}.")
         return
     seeds = range(arguments.seed, arguments.seed + (1 if arguments.quick else 5))
-    finish(rows_of(seeds, arguments.jobs, dict(arguments.set), arguments.objects), arguments.json)
+    rows = rows_of(seeds, arguments.jobs, dict(arguments.set), arguments.objects, arguments.file)
+    finish(rows, arguments.json)
 
 
 if __name__ == "__main__":
