@@ -167,7 +167,10 @@ def _moved(piece: Piece, rotation: Array, shift: Array, name: str) -> Piece:
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """A prior's support: poses of the part within bounds of a guessed pose.
+    """A prior: poses of the part within bounds of a guessed pose.
+
+    A percent of each translation's mass lies in tails to three half widths (`prior_from_guess`), so that
+    measurements may move the belief out of the box. Bounds of the rotation are hard.
 
     Attributes:
         world_from_part: (7,) the guessed pose, the centre of the prior.
