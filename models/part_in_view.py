@@ -93,8 +93,8 @@ def prepare(
     return Scene(prior_from_guess(recording.guess), likelihoods, "part_in_view")
 
 
-# Of a part of LM-O of which a fifth is in view, at the edge of its guess, 240 climbs led to the place in 1 of 6
-# draws, 960 in 6 of 6, for a few seconds more; places that they lead to otherwise have 20 nats less evidence.
+# Of a part of LM-O of which a fifth is in view, at the edge of its guess, 240 climbs led to the place in one
+# of six draws, 960 in all six, for a few seconds more. Other places have 20 nats less evidence.
 CLIMBS = 960
 
 model = Model(
