@@ -33,7 +33,7 @@ from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair, moved as moved_by_pair
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
 from bcppl.inference.filters.tempering import resample_move, tempered
-from bcppl.inference.filters.view_search import is_refuted, searched_anew
+from bcppl.inference.filters.view_search import is_refuted, searched_by_climbing
 from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence
 from bcppl.inference.kernels.kernel import Move
 from bcppl.inference.population import Population
@@ -326,7 +326,7 @@ def infer(
         if isinstance(scene.sensor(actions[-1]), FitsPose):
             new = population.trace.since(before)
             if is_refuted(population, new):
-                return searched_anew(population, model.pose, refitted, independent_proposal)
+                return searched_by_climbing(population, model.pose, refitted, independent_proposal)
         return searched(population, independent_proposal)
 
     step = guided(gaussian, programs, moves, sweeps=sweeps, share=share, search=search)

@@ -46,7 +46,7 @@ def is_refuted(population: Population, addresses: Collection[str]) -> bool:
     return bool(checks) and len(checks) * min(c.probability for c in checks.values()) < THRESHOLD
 
 
-def searched_anew(
+def searched_by_climbing(
     population: Population,
     pose: str,
     approximated: Callable[[Trace, torch.Tensor], Any],
