@@ -43,7 +43,7 @@ class Population:
             was last split into halves (`bcppl.inference.ancestry`); empty before.
         sides: (N,) bool, the half to which each particle's family belongs; empty before.
         approximation: the filter's approximation of the posterior, an immutable value that guides proposals
-            and that the target never depends on (`bcppl.inference.approximation`); None where there is none.
+            and that the target never depends on (`bcppl.inference.approximations`); None where there is none.
     """
 
     trace: Trace

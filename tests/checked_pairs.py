@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from bcppl.inference.approximation import GaussianApproximation
+from bcppl.inference.approximations.gaussian import GaussianApproximation
 from bcppl.inference.filters.guided_smc import GaussianPrograms, guided, kernel
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair

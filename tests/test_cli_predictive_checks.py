@@ -11,7 +11,7 @@ import pytest
 
 from bcppl.cli.predictive_checks import MEANING, NAMED, piece_errors, sentence, together
 from bcppl.geometry.parts import Piece
-from bcppl.inference.predictive import Check
+from bcppl.inference.criticism.predictive import Check
 from bcppl.models.worlds.bench import BenchParameters, bench_scene
 from bcppl.recordings import save
 from tests.command_line import Ran, short

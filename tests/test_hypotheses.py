@@ -16,8 +16,8 @@ from bcppl.cli.predictive_checks import edge_sentence
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import NormalPose, SwingTwistPose, UniformPose
 from bcppl.geometry.parts import Part
-from bcppl.inference import hypotheses
-from bcppl.inference.hypotheses import alternatives, edges, likeliest
+from bcppl.inference.criticism import hypotheses
+from bcppl.inference.criticism.hypotheses import alternatives, edges, likeliest
 from bcppl.inference.population import Population
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.rendering.ray_casting import RayCaster

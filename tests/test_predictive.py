@@ -19,8 +19,8 @@ from bcppl.distributions.depth.image import DepthDistribution
 from bcppl.distributions.manifold import ContactManifold
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
+from bcppl.inference.criticism.predictive import THRESHOLD, Check, surprise
 from bcppl.inference.population import Population
-from bcppl.inference.predictive import THRESHOLD, Check, surprise
 from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
 from bcppl.recordings import DepthImage
 from bcppl.rendering.ray_casting import RayCaster

@@ -18,11 +18,11 @@ from bcppl import poses
 from bcppl.beliefs.regions import translation_deviation
 from bcppl.distributions.poses import UniformPose
 from bcppl.inference import importance_sampling, infer
+from bcppl.inference.criticism.undetermined import undetermined
 from bcppl.inference.filters import tempered_smc
 from bcppl.inference.filters.searching import EXCESS, excess, joined
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.population import Population
-from bcppl.inference.undetermined import undetermined
 from bcppl.models.point_probe import model as point_probe
 from bcppl.recordings.importers.point_probe import command
 from bcppl.traces import Model, generate

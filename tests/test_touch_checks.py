@@ -13,8 +13,8 @@ from bcppl import poses
 from bcppl.distributions.touch import ForceDirection, OnsetLocation, Path
 from bcppl.distributions.touch.outliers import touch_check
 from bcppl.inference import infer
+from bcppl.inference.criticism.predictive import THRESHOLD, surprise
 from bcppl.inference.population import Population
-from bcppl.inference.predictive import THRESHOLD, surprise
 from bcppl.models.point_probe import model
 from bcppl.sensors import Measurement
 from bcppl.traces import generate

@@ -19,9 +19,9 @@ from bcppl.distributions.pose_normals import GaussianMixture, matched, widened, 
 from bcppl.distributions.poses import UniformPose
 from bcppl.geometry.extrusion import box_peg
 from bcppl.geometry.parts import Guess, Part
-from bcppl.inference.approximation import GaussianApproximation
+from bcppl.inference.approximations.gaussian import GaussianApproximation
+from bcppl.inference.approximations.laplace import Normal, QuadraticApproximation, quadratic_approximation
 from bcppl.inference.filters.guided_smc import infer
-from bcppl.inference.laplace import Normal, QuadraticApproximation, quadratic_approximation
 from bcppl.inference.proposals.approximated import component_transitions
 from bcppl.models import look_and_touch
 from bcppl.recordings import problems

@@ -14,8 +14,8 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.cli.predictive_checks import open_sentence
 from bcppl.distributions.poses import NormalPose, UniformPose
+from bcppl.inference.criticism.undetermined import undetermined
 from bcppl.inference.population import Population
-from bcppl.inference.undetermined import undetermined
 from bcppl.traces import generate
 from tests.made_recordings import assert_one_sentence
 

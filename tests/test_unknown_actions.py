@@ -12,7 +12,7 @@ import pytest
 
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
-from bcppl.inference.approximation import GaussianApproximation
+from bcppl.inference.approximations.gaussian import GaussianApproximation
 from bcppl.inference.proposals.approximated import backward_kernel, forward_kernel
 from bcppl.models import look_and_touch, peg_in_hole
 from bcppl.recordings import Probe, ProbeWindow, Push, Recording, View, load

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bcppl.geometry.hausdorff import hausdorff_error
-from bcppl.inference.hypotheses import Edge, alternatives, edges, likeliest
+from bcppl.inference.criticism.hypotheses import Edge, alternatives, edges, likeliest
+from bcppl.inference.criticism.predictive import THRESHOLD, Check, surprise
+from bcppl.inference.criticism.undetermined import Undetermined, undetermined
 from bcppl.inference.population import Population
-from bcppl.inference.predictive import THRESHOLD, Check, surprise
-from bcppl.inference.undetermined import Undetermined, undetermined
 from bcppl.recordings import Recording
 
 MARK = "!"

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import NoWeightError
-from bcppl.inference.approximation import GaussianApproximation
+from bcppl.inference.approximations.gaussian import GaussianApproximation
 from bcppl.inference.filters.second_search import searched
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair, moved as moved_by_pair

@@ -8,8 +8,8 @@ all images together (`bcppl.inference.proposals.climbing`), lead to other modes;
 particles drawn from the new approximation are compared with the old by evidence
 (`bcppl.inference.filters.second_search`).
 
-The check renders `PARTICLES` times `REPLICAS` images (`bcppl.inference.predictive`), and draws from a
-generator of its own. A search costs about `CLIMBS` * 8 + 4,000 renderings of each image, and
+The check renders `PARTICLES` times `REPLICAS` images (`bcppl.inference.criticism.predictive`), and draws from
+a generator of its own. A search costs about `CLIMBS` * 8 + 4,000 renderings of each image, and
 `COPIES` for each particle: some ten times a view's own step.
 """
 
@@ -23,9 +23,9 @@ import torch
 from bcppl.distributions.depth import DepthDistribution
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import NoWeightError
+from bcppl.inference.criticism.predictive import THRESHOLD, surprise
 from bcppl.inference.filters.second_search import compared
 from bcppl.inference.population import Population
-from bcppl.inference.predictive import THRESHOLD, surprise
 from bcppl.inference.proposals.climbing import modes
 from bcppl.traces import Trace, generate
 

@@ -1,4 +1,4 @@
-"""Proposals guided by a Gaussian approximation of the posterior (`bcppl.inference.approximation`).
+"""Proposals guided by a Gaussian approximation of the posterior (`bcppl.inference.approximations.gaussian`).
 
 Forward and backward kernels of SMCP3 for a new measurement, an independence proposal from the approximate
 conditional, and a random walk of the part together with the nuisance parameters of its instruments.
@@ -18,7 +18,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.pose_normals import GaussianMixture, transport, widened_mixture
 from bcppl.distributions.poses import MixturePose, NormalPose
-from bcppl.inference.approximation import GaussianApproximation
+from bcppl.inference.approximations.gaussian import GaussianApproximation
 from bcppl.inference.proposals.proposal import Program
 from bcppl.sensors.capabilities import FitsPose
 from bcppl.traces import Trace

@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import Any
 
 from bcppl.errors import InputError
-from bcppl.inference.approximation import Fitted, GaussianApproximation
-from bcppl.inference.laplace import QuadraticApproximation
+from bcppl.inference.approximations.gaussian import Fitted, GaussianApproximation
+from bcppl.inference.approximations.laplace import QuadraticApproximation
 from bcppl.sensors.capabilities import Approximated, FitsPose
 from bcppl.traces import Trace
 

@@ -33,7 +33,12 @@ from bcppl.distributions.pose_normals import (
 from bcppl.distributions.poses import MixturePose
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
-from bcppl.inference.laplace import Normal, QuadraticApproximation, quadratic_approximation, together
+from bcppl.inference.approximations.laplace import (
+    Normal,
+    QuadraticApproximation,
+    quadratic_approximation,
+    together,
+)
 from bcppl.sensors.capabilities import Approximated, Contacts, FitsPose, Linearised
 
 _MODES, _FAINT = 8, 10.0  # that views leave: at most so many, within so many nats of the most probable

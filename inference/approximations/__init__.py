@@ -1,0 +1,1 @@
+"""Approximations of a pose's posterior that guide proposals: Gaussians of images, quadratics of touches."""
