@@ -31,8 +31,8 @@ def test_independent_moves_leave_a_circular_prior_invariant():
 
     torch.manual_seed(0)
     runs = []
-    for _ in range(3):
-        population = importance_sampling(program, (), {}, 200)
+    for _ in range(5):
+        population = importance_sampling(program, (), {}, 500)
         moved = rejuvenate(population, metropolis_hastings(independent("angle")), sweeps=10)
         runs.append(moved["angle"].cos().mean())
     cosines = torch.stack(runs)
