@@ -27,15 +27,8 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import latent_address, whole_number
-from bcppl.inference.kernels import (
-    Kernel,
-    fitted,
-    halved,
-    halves,
-    moved_by,
-    refuse_other,
-    scattered,
-)
+from bcppl.inference.kernels import Kernel, fitted, halved, halves, moved_by
+from bcppl.inference.kernels.kernel import refuse_other, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.resampling import Scheme, systematic

@@ -1,12 +1,17 @@
 """Small programs whose answer is known by enumeration, conjugacy, quadrature or a Kalman filter."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import numpy as np
 import pyro
 import pyro.distributions as dist
 import torch
 from scipy import special, stats
+from torch import Tensor
 
 from bcppl.inference import (
     Observed,
@@ -17,33 +22,41 @@ from bcppl.inference import (
     tempered,
     tempered_importance_sampling as tempered_sampling,
 )
-from bcppl.inference.kernels import metropolis_hastings, sequence
+from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence
 from bcppl.inference.proposals import drift, independent, joint_drift, prior
 from bcppl.inference.series import smooth
-from bcppl.inference.structures import Jump, generate_strata, jump, probabilities, resample_strata
+from bcppl.inference.structures import (
+    Jump,
+    StrataMove,
+    generate_strata,
+    jump,
+    probabilities,
+    resample_strata,
+)
 from bcppl.inference.summaries import mean
 from bcppl.inference.targets import POSTERIOR
-from bcppl.traces import Series, structural
+from bcppl.traces import Series, Trace, structural
 
 
-def real(x):
+def real(x: Any) -> Tensor:
     return torch.tensor(x, dtype=torch.float64)
 
 
-def agree(run, exact, seeds):
+def agree(run: Callable[[], Iterable[Any]], exact: Any, seeds: int) -> None:
+    """Means over seeds are within four standard errors of the exact values."""
     rows = []
     for seed in range(seeds):
         torch.manual_seed(1000 + seed)
         rows.append([float(x) for x in run()])
-    rows = np.array(rows)
-    error = rows.std(0, ddof=1) / math.sqrt(seeds)
-    assert (abs(rows.mean(0) - exact) < 4.0 * error + 1e-9).all(), (rows.mean(0), error, exact)
+    runs = np.array(rows)
+    error = runs.std(0, ddof=1) / math.sqrt(seeds)
+    assert (abs(runs.mean(0) - exact) < 4.0 * error + 1e-9).all(), (runs.mean(0), error, exact)
 
 
-def test_discrete_and_continuous_latent_values():
+def test_discrete_and_continuous_latent_values() -> None:
     places, widths, shares = [-2.0, 0.0, 3.0], [0.5, 1.0, 2.0], [0.5, 0.3, 0.2]
 
-    def program():
+    def program() -> None:
         kind = pyro.sample("kind", dist.Categorical(real(shares)))
         x = pyro.sample("x", dist.Normal(real(places)[kind], real(widths)[kind]))
         pyro.sample("y", dist.Normal(x, 0.5))
@@ -52,7 +65,7 @@ def test_discrete_and_continuous_latent_values():
     inner = (np.array(places) / np.square(widths) + 1.3 / 0.25) / (1.0 / np.square(widths) + 4.0)
     step = tempered(sequence(metropolis_hastings(prior("kind")), metropolis_hastings(drift("x"))))
 
-    def run():
+    def run() -> Iterable[Any]:
         population = tempered_sampling(program, (), {"y": np.float32(1.3)}, 200, step).population
         third = torch.softmax(population.log_weights, 0)[population["kind"] == 2].sum()
         return math.exp(population.log_evidence) / each.sum(), third, mean(population, "x")
@@ -60,10 +73,10 @@ def test_discrete_and_continuous_latent_values():
     agree(run, [1.0, each[2] / each.sum(), each @ inner / each.sum()], 10)
 
 
-def test_dirichlet_multinomial():
+def test_dirichlet_multinomial() -> None:
     prior_counts, counts = np.array([0.5, 1.0, 2.0, 3.0]), np.array([3.0, 0.0, 5.0, 1.0])
 
-    def program():
+    def program() -> None:
         shares = pyro.sample("shares", dist.Dirichlet(torch.tensor(prior_counts)))
         pyro.sample("counts", dist.Multinomial(9, shares, validate_args=False))
 
@@ -72,15 +85,15 @@ def test_dirichlet_multinomial():
     log_evidence += (gamma(prior_counts + counts) - gamma(prior_counts)).sum()
     step = tempered(metropolis_hastings(independent("shares")))
 
-    def run():
+    def run() -> Iterable[Any]:
         population = tempered_sampling(program, (), {"counts": counts}, 150, step).population
         return math.exp(population.log_evidence - log_evidence), *mean(population, "shares")
 
     agree(run, [1.0, *((prior_counts + counts) / 15.5)], 8)
 
 
-def test_support_that_depends_on_another_latent_value():
-    def program():
+def test_support_that_depends_on_another_latent_value() -> None:
+    def program() -> None:
         top = pyro.sample("top", dist.Uniform(real(0.0), real(1.0)))
         place = pyro.sample("place", dist.Uniform(torch.zeros_like(top), top))
         pyro.sample("y", dist.Normal(place, 0.2))
@@ -95,7 +108,7 @@ def test_support_that_depends_on_another_latent_value():
     ]
     for kernel in kernels:
 
-        def run(kernel=kernel):
+        def run(kernel: Kernel = kernel) -> Iterable[Any]:
             start = resample(importance_sampling(program, (), {"y": 0.5}, 500))
             moved = rejuvenate(start, kernel, sweeps=3)
             return moved["top"].mean(), moved["place"].mean()
@@ -103,10 +116,10 @@ def test_support_that_depends_on_another_latent_value():
         agree(run, exact, 6)
 
 
-def test_smoothing_with_missing_observations():
+def test_smoothing_with_missing_observations() -> None:
     along, noise, error, seen = 0.7, 0.8, 0.5, [0.5, None, None, 2.0, None]
 
-    def onward(x, observed):
+    def onward(x: Tensor, observed: bool) -> Tensor:
         x = pyro.sample("x", dist.Normal(along * x, noise))
         if observed:
             pyro.sample("y", dist.Normal(x, error))
@@ -129,7 +142,7 @@ def test_smoothing_with_missing_observations():
     gain = cov[:, where] @ np.linalg.inv(cov[np.ix_(where, where)] + error**2 * np.eye(2))
     shift = gain @ values
 
-    def run():
+    def run() -> Iterable[Any]:
         start = importance_sampling(series, (), {}, 300)
         observed = [Observed((y is not None,), {} if y is None else {"y": y}) for y in seen]
         filtered = [start, *(each.population for each in steps(tempered(share=0.0), start, observed))]
@@ -139,32 +152,38 @@ def test_smoothing_with_missing_observations():
     agree(run, [1.0, *shift], 12)
 
 
-def summed():
+def summed() -> None:
     count = structural("count", dist.Categorical(real([0.2, 0.3, 0.5]))) + 1
     terms = [pyro.sample(f"x{j}", dist.Normal(real(0.0), 1.0)) for j in range(count)]
     pyro.sample("y", dist.Normal(sum(terms), 0.5))
 
 
-def split(trace):
+def split(trace: Trace) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     last = len(trace.choices) - 2 if "count" in trace.choices else len(trace.choices) - 1
     apart, x = pyro.sample("apart", dist.Normal(real(0.0), 1.0)), trace[f"x{last}"]
     return {f"x{last}": x / 2 - apart, f"x{last + 1}": x / 2 + apart}, {}
 
 
-def join(trace):
+def join(trace: Trace) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     last = len(trace.choices) - 2 if "count" in trace.choices else len(trace.choices) - 1
     low, high = trace[f"x{last - 1}"], trace[f"x{last}"]
     return {f"x{last - 1}": low + high}, {"apart": (high - low) / 2}
 
 
-def test_reversible_jumps_leave_the_posterior_of_structures_invariant():
+def more(structure: Mapping[str, int]) -> Mapping[str, int] | None:
+    return {"count": structure["count"] + 1} if structure["count"] < 2 else None
+
+
+def fewer(structure: Mapping[str, int]) -> Mapping[str, int] | None:
+    return {"count": structure["count"] - 1} if structure["count"] > 0 else None
+
+
+def test_reversible_jumps_leave_the_posterior_of_structures_invariant() -> None:
     each = np.array([0.2, 0.3, 0.5]) * stats.norm.pdf(1.7, 0.0, np.sqrt(np.arange(3) + 1.25))
-    more = lambda s: {"count": s["count"] + 1} if s["count"] < 2 else None  # noqa: E731
-    fewer = lambda s: {"count": s["count"] - 1} if s["count"] > 0 else None  # noqa: E731
     for jumps in (Jump(more, fewer), Jump(more, fewer, split, join, check=True)):
         move = jump(jumps)
 
-        def run(move=move):
+        def run(move: StrataMove = move) -> Iterable[Any]:
             strata = resample_strata(generate_strata(summed, (), {"y": 1.7}, 2000), 300)
             for _ in range(3):
                 strata, _ = move(strata, POSTERIOR)
@@ -173,14 +192,14 @@ def test_reversible_jumps_leave_the_posterior_of_structures_invariant():
         agree(run, each / each.sum(), 12)
 
 
-def test_structural_choice_that_depends_on_a_latent_value():
-    def program():
+def test_structural_choice_that_depends_on_a_latent_value() -> None:
+    def program() -> None:
         chance = pyro.sample("chance", dist.Beta(real(1.0), real(1.0)))
         pyro.sample("y", dist.Normal(2.0 * structural("on", dist.Bernoulli(chance)), real(1.0)))
 
     off, on = stats.norm.pdf(1.7), stats.norm.pdf(-0.3)
 
-    def run():
+    def run() -> Iterable[Any]:
         strata = generate_strata(program, (), {"y": 1.7}, 300)
         return probabilities(strata, "on").probabilities[-1], math.exp(strata.log_evidence)
 

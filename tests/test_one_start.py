@@ -1,0 +1,130 @@
+"""Chains that all start from one point learn no scale from it, and take that of the prior."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.poses import NormalPose
+from bcppl.inference import adaptive_hmc, markov_chains, tempered, tempered_importance_sampling
+from bcppl.inference.kernels import Kernel, fitted, hmc, metropolis_hastings, moved_by
+from bcppl.inference.proposals import differential_evolution, drift, independent, joint_drift, spread_of
+from bcppl.inference.proposals.spread import weighted_places
+from bcppl.inference.targets import POSTERIOR
+from bcppl.traces import Series, extend, generate, simulate
+from tests.invariance import equal_weights, largest_z, number
+
+
+def shifted() -> None:
+    x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+    pyro.sample("y", dist.Normal(x, 1.0))
+
+
+def scaled() -> None:
+    """A rate and a position whose prior depends on it."""
+    scale = pyro.sample("scale", dist.Gamma(number(4.0), 2.0))
+    pyro.sample("x", dist.Normal(number(1.0), scale))
+
+
+KERNELS: dict[str, Kernel] = {
+    "drift": metropolis_hastings(drift("x")),
+    "independent": metropolis_hastings(independent("x")),
+    "a kernel density": metropolis_hastings(independent("x", None)),
+    "hmc": hmc("x"),
+    "adaptive hmc": adaptive_hmc("x"),
+}
+
+
+@pytest.mark.parametrize("particles", [1, 20])
+@pytest.mark.parametrize("name", KERNELS)
+def test_chains_from_one_point_reach_the_posterior(name: str, particles: int) -> None:
+    torch.manual_seed(3)
+    start, _ = generate(shifted, (), {"y": 0.0}, particles, {"x": number(0.1)})
+    chains = markov_chains(KERNELS[name], start, 300 if particles == 1 else 40, progress=False)
+    assert 0.55 < float(chains.draws["x"].std()) < 0.9  # exact: 0.707
+    assert 0.2 < float(chains.acceptance.mean()) < 0.999
+
+
+def test_a_tempered_particle_by_itself_moves() -> None:
+    torch.manual_seed(0)
+    step = tempered(metropolis_hastings(drift("x")), sweeps=15, always_move=True)
+    values = torch.cat(
+        [tempered_importance_sampling(shifted, (), {"y": 2.0}, 1, step).population["x"] for _ in range(60)]
+    )
+    assert abs(float(values.mean()) - 1.0) < 0.35 and 0.5 < float(values.std()) < 0.95
+
+
+@pytest.mark.parametrize(
+    "kernel",
+    [
+        metropolis_hastings(joint_drift("scale", "x")),
+        hmc("scale", "x", step_size=0.1),
+        metropolis_hastings(differential_evolution("x")),
+    ],
+    ids=["joint drift", "hmc", "differential evolution"],
+)
+def test_a_scale_taken_from_the_prior_leaves_the_target_invariant(kernel: Kernel) -> None:
+    """Each particle is fitted to itself, afresh for each move: its scale must not depend on where it is."""
+    torch.manual_seed(1)
+    before, after = [], []
+    for _ in range(400):
+        population = equal_weights(simulate(scaled, (), 1))
+        moved = moved_by(population, kernel, POSTERIOR, 2).population
+        for rows, each in ((before, population), (after, moved)):
+            scale, x = each["scale"], each["x"]
+            rows.append(torch.cat([scale, x, (x - 1.0) ** 2, scale.log()]))
+    assert largest_z(torch.stack(before), torch.stack(after)) < 4.0
+
+
+def test_the_scale_is_that_of_the_coordinates() -> None:
+    torch.manual_seed(0)
+    spread = torch.tensor([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]).double()
+
+    def program() -> None:
+        part = pyro.sample("part", NormalPose(poses.identity(), covariance=torch.diag(spread**2)))
+        pyro.sample("rate", dist.LogNormal(part[..., 0], 0.5))
+        pyro.sample("heavy", dist.Cauchy(number(0.0), 1.0))
+
+    trace = simulate(program, (), 1)[torch.zeros(30, dtype=torch.int64)]
+    population = equal_weights(trace)
+    root = spread_of("part")(population).diagonal().sqrt()
+    assert bool(((root / spread).log().abs() < 0.2).all())
+    log_rate = float(spread_of("rate")(population).sqrt())
+    assert abs(math.log(log_rate / math.hypot(0.5, 0.1))) < 0.2
+    assert 0.5 < float(spread_of("heavy")(population).sqrt()) < 5.0
+
+
+def test_where_particles_differ_nothing_is_drawn() -> None:
+    def along(first: Tensor) -> Tensor:
+        trace, _ = generate(plane, (), {}, 2, {"x": torch.stack([first, number(2.0).expand(2)], dim=1)})
+        return weighted_places(equal_weights(trace), "x").unlearned
+
+    def plane() -> None:
+        pyro.sample("x", dist.Normal(torch.zeros(2).double(), torch.tensor([1.0, 10.0])).to_event(1))
+
+    torch.manual_seed(0)
+    unlearned = along(torch.tensor([1.0, 1.0 + 1e-9]).double())
+    assert float(unlearned[0]) == 0.0 and 7.0 < float(unlearned[1].sqrt()) < 13.0
+    population, state = equal_weights(simulate(shifted, (), 3)), torch.get_rng_state()
+    fitted(hmc("x"), population)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_a_step_of_a_series_has_the_scale_of_that_step() -> None:
+    def onward(x: Tensor) -> Tensor:
+        return pyro.sample("x", dist.Normal(0.5 * x, 3.0))
+
+    series: Callable[[], Series] = lambda: Series(
+        lambda: pyro.sample("x", dist.Normal(number(0.0), 1.0)), onward
+    )
+    torch.manual_seed(0)
+    trace, _ = generate(series(), (), {}, 1)
+    longer, _ = extend(trace, (), {})
+    assert 2.4 < float(spread_of("x")(equal_weights(longer)).sqrt()) < 3.6
