@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pyro
 import pyro.distributions as dist
@@ -56,16 +55,16 @@ def test_a_tempered_particle_by_itself_moves() -> None:
     torch.manual_seed(0)
     step = tempered(metropolis_hastings(drift("x")), sweeps=15, always_move=True)
     values = torch.cat(
-        [tempered_importance_sampling(shifted, (), {"y": 2.0}, 1, step).population["x"] for _ in range(60)]
+        [tempered_importance_sampling(shifted, (), {"y": 2.0}, 1, step).population["x"] for _ in range(40)]
     )
-    assert abs(float(values.mean()) - 1.0) < 0.35 and 0.5 < float(values.std()) < 0.95
+    assert abs(float(values.mean()) - 1.0) < 0.4 and 0.45 < float(values.std()) < 0.95
 
 
 @pytest.mark.parametrize(
     "kernel",
     [
         metropolis_hastings(joint_drift("scale", "x")),
-        hmc("scale", "x", step_size=0.1),
+        hmc("scale", "x", step_size=0.2, steps=4),
         metropolis_hastings(differential_evolution("x")),
     ],
     ids=["joint drift", "hmc", "differential evolution"],
@@ -74,7 +73,7 @@ def test_a_scale_taken_from_the_prior_leaves_the_target_invariant(kernel: Kernel
     """Each particle is fitted to itself, afresh for each move: its scale must not depend on where it is."""
     torch.manual_seed(1)
     before, after = [], []
-    for _ in range(400):
+    for _ in range(100):
         population = equal_weights(simulate(scaled, (), 1))
         moved = moved_by(population, kernel, POSTERIOR, 2).population
         for rows, each in ((before, population), (after, moved)):
@@ -110,7 +109,7 @@ def test_where_particles_differ_nothing_is_drawn() -> None:
         pyro.sample("x", dist.Normal(torch.zeros(2).double(), torch.tensor([1.0, 10.0])).to_event(1))
 
     torch.manual_seed(0)
-    unlearned = along(torch.tensor([1.0, 1.0 + 1e-9]).double())
+    unlearned = along(torch.tensor([1.0, 1.0 + 1e-9], dtype=torch.float64))
     assert float(unlearned[0]) == 0.0 and 7.0 < float(unlearned[1].sqrt()) < 13.0
     population, state = equal_weights(simulate(shifted, (), 3)), torch.get_rng_state()
     fitted(hmc("x"), population)
@@ -121,10 +120,8 @@ def test_a_step_of_a_series_has_the_scale_of_that_step() -> None:
     def onward(x: Tensor) -> Tensor:
         return pyro.sample("x", dist.Normal(0.5 * x, 3.0))
 
-    series: Callable[[], Series] = lambda: Series(
-        lambda: pyro.sample("x", dist.Normal(number(0.0), 1.0)), onward
-    )
+    series = Series(lambda: pyro.sample("x", dist.Normal(number(0.0), 1.0)), onward)
     torch.manual_seed(0)
-    trace, _ = generate(series(), (), {}, 1)
+    trace, _ = generate(series, (), {}, 1)
     longer, _ = extend(trace, (), {})
     assert 2.4 < float(spread_of("x")(equal_weights(longer)).sqrt()) < 3.6

@@ -30,6 +30,7 @@ from bcppl.inference.proposals import (
     rotations,
     symmetry,
 )
+from bcppl.inference.proposals.spread import weighted_places
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, assess, propose, simulate
 from tests.exact_targets import (
