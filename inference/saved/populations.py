@@ -47,7 +47,7 @@ def save(population: Population | Sequence[Population], path: Location) -> None:
             there is no such folder, or something is no plain data: the state of a series without
             history, a field that a subclass adds, an approximation of another kind.
     """
-    several = list(population) if isinstance(population, list | tuple) else [population]
+    several: list[Any] = list(population) if isinstance(population, list | tuple) else [population]
     if hasattr(population, "populations"):
         raise InputError("save is given strata; save them by `save_strata` of bcppl.inference.structures.")
     for each in several:
