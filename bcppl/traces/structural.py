@@ -80,7 +80,7 @@ class UnchosenError(InputError):
         super().__init__(
             f"site {address!r} determines which sites the program visits, and has no value; observe it for a "
             f"trace of one structure (and to check that: check_program(..., {{{address!r}: 1}})); for all, "
-            "use generate_strata of bcppl.inference.structures, or extend_strata where new observations bring "
+            "use generate_strata of bcppl.inference.structures, or extend_strata where an observation brings "
             "it."
         )
         self.address, self.distribution, self.values = address, distribution, values
