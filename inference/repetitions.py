@@ -106,7 +106,7 @@ class Repeated:
         if not alive:
             raise NoWeightError(
                 f"no particle has any weight in any of {len(self)} runs: no particle explains the "
-                "measurements; widen the prior, or use more particles."
+                "observations; widen the prior, or use more particles."
             )
         return tuple(alive)
 
