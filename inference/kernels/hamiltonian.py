@@ -31,8 +31,9 @@ def hmc(
 
     Neal, MCMC using Hamiltonian dynamics, Handbook of Markov Chain Monte Carlo, 2011, section 5.3. The
     inverse mass matrix is the weighted covariance of the particles it learns from (not of those it moves;
-    along an axis on which these do not differ, that of the prior), so a step of 1 is about one standard deviation whatever the units. Constrained values (positive, in an
-    interval, on a simplex) move in unconstrained coordinates, the Jacobian included.
+    along an axis on which these do not differ, that of the prior), so a step of 1 is about one standard
+    deviation whatever the units. Constrained values (positive, in an interval, on a simplex) move in
+    unconstrained coordinates, the Jacobian included.
 
     Args:
         addresses: latent addresses, one by one or as a list, moved together; the other latent values stay.

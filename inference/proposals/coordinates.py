@@ -2,8 +2,8 @@
 
 A value whose support is bounded (positive numbers, an interval, a simplex) is transformed to an unbounded one
 by torch's bijection for its support, and densities include its Jacobian. An angle, whose density is periodic
-(von Mises), is one of the interval from -pi to pi, and a step does not cross its ends. A place is a value in the form that
-`normal` and `mixture` take as a centre: a pose (..., 7), or a vector (..., d).
+(von Mises), is one of the interval from -pi to pi, and a step does not cross its ends. A place is a value in
+the form that `normal` and `mixture` take as a centre: a pose (..., 7), or a vector (..., d).
 """
 
 from __future__ import annotations
