@@ -161,13 +161,13 @@ def check_alike(populations: Sequence[Population]) -> None:
         if set(trace.choices) != set(first.choices) or set(trace.observations) != set(first.observations):
             raise InputError(
                 f"populations 1 and {number} have different addresses ({', '.join(first.addresses)} and "
-                f"{', '.join(trace.addresses)}); give runs of one program on the same measurements."
+                f"{', '.join(trace.addresses)}); give runs of one program on the same observations."
             )
         for address, value in first.observations.items():
             if not torch.equal(torch.nan_to_num(value), torch.nan_to_num(trace.observations[address])):
                 raise InputError(
                     f"populations 1 and {number} have different observations at {address!r}; "
-                    "give runs on the same measurements."
+                    "give runs on the same observations."
                 )
 
 

@@ -27,15 +27,8 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import latent_address, whole_number
-from bcppl.inference.kernels import (
-    Kernel,
-    fitted,
-    halved,
-    halves,
-    moved_by,
-    refuse_other,
-    scattered,
-)
+from bcppl.inference.kernels import Kernel, fitted, halved, halves, moved_by
+from bcppl.inference.kernels.kernel import refuse_other, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.resampling import Scheme, systematic
@@ -81,7 +74,9 @@ def markov_chains(
 
     The kernel is fitted once, for each half of the chains to the starts of the other half, split by ancestry
     (`bcppl.inference.kernels.halving`), and then stays:
-    the target is left invariant however long the chains are.
+    the target is left invariant however long the chains are. From starts that are all at one value (a single
+    chain, or a mode) it learns no scale, and takes that of the prior (`bcppl.inference.proposals.spread_of`);
+    where the prior is much wider than the target, `warm_up` adapts several chains.
 
     Args:
         kernel: moves the chains.

@@ -1,5 +1,21 @@
 """Importance sampling, plain, tempered or stratified: the first step of SMC, or an estimate by itself.
 
+    import pyro
+    import pyro.distributions as dist
+    import torch
+    from bcppl.inference import importance_sampling, tempered, tempered_importance_sampling
+    from bcppl.inference.kernels import metropolis_hastings
+    from bcppl.inference.proposals import drift
+
+    def weighed():
+        mass = pyro.sample("mass", dist.Normal(torch.tensor(2.0).double(), 0.5))
+        pyro.sample("reading", dist.Normal(mass, 0.01))
+
+    population = importance_sampling(weighed, (), {"reading": 2.4}, 1000)
+    step = tempered(metropolis_hastings(drift("mass")))
+    moved = tempered_importance_sampling(weighed, (), {"reading": 2.4}, 1000, step).population
+    print(population.effective_sample_size, moved.effective_sample_size)
+
 Robert and Casella, Monte Carlo Statistical Methods, 2004, section 3.3; strata: Cochran, Sampling Techniques,
 1977, chapter 5, as in GenParticleFilters.jl's `pf_initialize`.
 """
@@ -79,9 +95,12 @@ def tempered_importance_sampling(
         The population, with the evidence of all observations, and a record of the steps.
 
     Raises:
-        InputError: an observed address is never visited.
+        InputError: an observed address is never visited, or the step does not temper.
         InferenceError: no particle is left with any weight.
     """
+    if not isinstance(step, Tempered):
+        name = getattr(step, "__name__", type(step).__name__)
+        raise InputError(f"{name} is given in place of a step that tempers; give tempered(kernel).")
     trace, log_likelihood = generate(program, args, observations, particles)
     prior = Population(trace, torch.zeros_like(log_likelihood))
     return step.temper(prior, [a for a in trace.addresses if a not in trace.choices], log_likelihood)

@@ -247,3 +247,15 @@ def _log_mean(log_weights: Tensor) -> float:
     if not math.isfinite(highest):
         return highest
     return highest + float(torch.log(torch.exp(log_weights - highest).mean()))
+
+
+def refuse_no_population(where: str, given: Any) -> None:
+    """Refuse what is no population."""
+    if isinstance(given, Population):
+        return
+    hint = "make it one, Population(trace, log_weights)"
+    if isinstance(given, tuple):
+        hint = "make it one, Population(*...)"
+    elif isinstance(given, Trace):
+        hint += ", or use a verb of bcppl.traces"
+    raise InputError(f"{where} is given a {type(given).__name__} in place of a population; {hint}.")

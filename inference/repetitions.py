@@ -1,4 +1,19 @@
-"""Repeated independent runs: their agreement, their pooled posterior, and the error of their evidence."""
+"""Repeated independent runs: their agreement, their pooled posterior, and the error of their evidence.
+
+    import pyro
+    import pyro.distributions as dist
+    import torch
+    from bcppl.inference import importance_sampling, repeated
+
+    def weighed():
+        mass = pyro.sample("mass", dist.Normal(torch.tensor(2.0).double(), 0.5))
+        pyro.sample("reading", dist.Normal(mass, 0.3))
+
+    runs = repeated(lambda seed: importance_sampling(weighed, (), {"reading": 2.4}, 1000), times=4)
+    print(runs)
+
+It prints the pooled evidence with its error, and how far the runs agree at each address.
+"""
 
 from __future__ import annotations
 
@@ -91,7 +106,7 @@ class Repeated:
         if not alive:
             raise NoWeightError(
                 f"no particle has any weight in any of {len(self)} runs: no particle explains the "
-                "measurements; widen the prior, or use more particles."
+                "observations; widen the prior, or use more particles."
             )
         return tuple(alive)
 

@@ -42,12 +42,12 @@ from bcppl.traces.series import SeriesTrace
 Address = str | tuple[str, int]
 
 COLLAPSED = (
-    "has collapsed to a point: all particles with weight are the same, so no measurement is informative; use "
+    "has collapsed to a point: all particles with weight are the same, so no observation is informative; use "
     "more particles, or move them apart first (rejuvenation)."
 )
 WEIGHTLESS = (
     "the belief has no weight: every particle's is zero; widen the prior, use more particles, or check the "
-    "measurements (`bcppl check`)."
+    "values that are observed."
 )
 
 

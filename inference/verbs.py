@@ -23,7 +23,7 @@ from bcppl.inference.filters.smcp3 import Pair, moved
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import Kernel, Until, moved_by
-from bcppl.inference.population import Population
+from bcppl.inference.population import Population, refuse_no_population
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.sensors.capabilities import Defers
@@ -94,9 +94,11 @@ def update(population: Population, observed: Observed, pair: Pair | None = None)
             that come with the observations are sampled from the program (a bootstrap filter).
 
     Raises:
+        InputError: what is given is no population (a trace has an `update` of its own, `bcppl.update`).
         NoWeightError: no particle has any weight left.
         NotANumberError: a weight is NaN or +inf.
     """
+    refuse_no_population("update", population)
     if pair is not None:
         return moved(population, pair, observed)
     trace, log_likelihood = extend(population.trace, *observed)
@@ -105,6 +107,7 @@ def update(population: Population, observed: Observed, pair: Pair | None = None)
 
 def resample(population: Population, scheme: Scheme = systematic) -> Population:
     """N particles of equal weight, drawn from the population."""
+    refuse_no_population("resample", population)
     return population.selected(scheme(population.log_weights))
 
 
@@ -116,6 +119,7 @@ def rejuvenate(
     Weights and evidence stay. `bcppl.inference.kernels.moved_by` returns acceptance and displacement, too.
 
     Raises:
-        InputError: what is given is no kernel, or no number of sweeps.
+        InputError: what is given is no population, no kernel, or no number of sweeps.
     """
+    refuse_no_population("rejuvenate", population)
     return moved_by(population, kernel, target, sweeps).population

@@ -218,6 +218,18 @@ def pose() -> None:
     pyro.sample("y", dist.Normal(part[..., :3], 0.1).to_event(1))
 
 
+@right(observations={"seen": 3})
+def thinned() -> None:
+    count = pyro.sample("count", dist.Binomial(number(20.0), number(0.3)))
+    pyro.sample("seen", dist.Binomial(count, number(0.5)))
+
+
+@right(observations={"seen": 3})
+def vague_rate() -> None:
+    rate = pyro.sample("rate", dist.Gamma(number(0.02), number(0.02)))
+    pyro.sample("seen", dist.Poisson(rate))
+
+
 @right()
 def rolled() -> None:
     x = normal("x")

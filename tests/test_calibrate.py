@@ -17,7 +17,7 @@ import torch
 
 from bcppl import poses
 from bcppl.distributions.poses import NormalPose, UniformPose
-from bcppl.errors import InputError, NoWeightError
+from bcppl.errors import InferenceError, InputError, NoWeightError
 from bcppl.inference import Step, importance_sampling, tempered_smc
 from bcppl.inference.calibration import Calibration, Joint, Recorded, calibrate, ranks_figure
 from bcppl.inference.calibration.ranks import band, p_value
@@ -265,3 +265,12 @@ def test_a_model_without_a_world_is_refused() -> None:
         Recorded(replace(point_probe.model, simulate_recording=None))
     with pytest.raises(InputError, match="pose moves"):
         Recorded(replace(point_probe.model, program=Series(lambda scene, actions: None, lambda state: None)))
+
+
+def test_an_inference_that_raises_is_named_with_its_seed() -> None:
+    def broken(data: Data) -> Population:
+        raise KeyError("nothing")
+
+    joint = Joint(NORMAL.program, NORMAL.args, NORMAL.observed)
+    with pytest.raises(InferenceError, match=r"round of seed \d+: the inference raised KeyError: 'nothing'"):
+        calibrate(joint, broken, 2)

@@ -24,10 +24,10 @@ from bcppl.inference.kernels import (
     mixture,
     moved_by,
     repeat,
-    scattered,
     sequence,
     until,
 )
+from bcppl.inference.kernels.kernel import scattered
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.targets import POSTERIOR, Target

@@ -28,7 +28,13 @@ def modules(package: str) -> list[str]:
     return names
 
 
-PUBLIC = ["bcppl.traces", *modules("bcppl.inference")]
+PUBLIC = [
+    "bcppl.traces",
+    "bcppl.distributions",
+    "bcppl.inference.importance",
+    "bcppl.inference.repetitions",
+    *modules("bcppl.inference"),
+]
 
 
 def example(text: str) -> str:
@@ -55,3 +61,9 @@ def test_the_example_is_the_first_block() -> None:
     assert example("One.\n\nTwo, without.\n\n    a = 1") == ""
     assert "bcppl.inference.saved" in PUBLIC and "bcppl.inference.tempered_smc" not in PUBLIC
     assert "bcppl.inference.filters.tempered_smc" in PUBLIC and len(PUBLIC) > 14
+
+
+def test_help_of_kernels_lists_none_of_the_language_behind_them() -> None:
+    assert not {"scattered", "takes", "refuse_other"}.intersection(
+        import_module("bcppl.inference.kernels").__all__
+    )

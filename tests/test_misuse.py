@@ -14,11 +14,12 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.inference import collectors
 from bcppl.inference.arviz import to_arviz
+from bcppl.inference.calibration import Joint, calibrate
 from bcppl.inference.chains import markov_chains
 from bcppl.inference.filters.step import Observed, steps
 from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.filters.waste_free import waste_free_moves
-from bcppl.inference.importance import importance_sampling
+from bcppl.inference.importance import importance_sampling, tempered_importance_sampling
 from bcppl.inference.kernels import (
     cycle,
     hmc,
@@ -30,9 +31,12 @@ from bcppl.inference.kernels import (
 )
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
+from bcppl.inference.saved import load, save
+from bcppl.inference.structures import Jump, Strata, generate_strata, jump, save_strata
 from bcppl.inference.summaries import mean
 from bcppl.inference.targets import POSTERIOR
-from bcppl.traces import Trace, generate
+from bcppl.inference.verbs import rejuvenate, resample, update
+from bcppl.traces import Trace, check_program, generate, structural
 
 
 def number(value: float) -> Tensor:
@@ -63,6 +67,14 @@ def learning(population: Population) -> Callable[[Trace], None]:
 
 def steadily(trace: Trace, size: float) -> None:
     pyro.sample("mu", dist.Normal(trace["mu"], size))
+
+
+def switched() -> None:
+    pyro.sample("x", dist.Normal(number(float(structural("on", dist.Bernoulli(number(0.5))))), 1.0))
+
+
+def strata() -> Strata:
+    return generate_strata(switched, (), {}, 10)
 
 
 walk = metropolis_hastings(nudge)
@@ -107,6 +119,47 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
     "a value of nothing": (lambda: start()["nope"], "no value at address 'nope'; it has mu"),
     "a number for ArviZ": (lambda: to_arviz(3), "a int was given"),
     "names for ArviZ": (lambda: to_arviz(["mu"]), "a str was given in place of a population"),
+    "arguments and observations exchanged": (
+        lambda: generate(program, {"y_0": 0.4}, (0,), 5),  # type: ignore[arg-type]
+        "values by address are given as a tuple; give a mapping",
+    ),
+    "a sample of exchanged ones": (
+        lambda: importance_sampling(program, {"y_0": 0.4}, (0,), 5),  # type: ignore[arg-type]
+        "values by address are given as a tuple; give a mapping",
+    ),
+    "a trace to update": (
+        lambda: update(start().trace, SEEN),  # type: ignore[arg-type]
+        r"update is given a Trace .* Population\(trace, log_weights\), or use a verb of bcppl.traces",
+    ),
+    "a trace to resample": (lambda: resample(start().trace), "resample is given a Trace"),  # type: ignore[arg-type]
+    "a trace to move": (lambda: rejuvenate(start().trace, walk), "rejuvenate is given a Trace"),  # type: ignore[arg-type]
+    "a name as a proposal": (
+        lambda: markov_chains(metropolis_hastings("mu"), start(), 2),  # type: ignore[arg-type]
+        r"'mu' is given in place of a proposal; .* drift\('x'\)",
+    ),
+    "a kernel to temper by": (
+        lambda: tempered_importance_sampling(program, (0,), {}, 5, walk),  # type: ignore[arg-type]
+        r"in place of a step that tempers; give tempered\(kernel\)",
+    ),
+    "tempered itself": (
+        lambda: tempered_importance_sampling(program, (0,), {}, 5, tempered),  # type: ignore[arg-type]
+        "tempered is given in place of a step that tempers",
+    ),
+    "a trace to save": (lambda: save(start().trace, "p.h5"), "save is given a Trace"),  # type: ignore[arg-type]
+    "a path to save": (lambda: save("p.h5", start()), "save is given a str"),  # type: ignore[arg-type]
+    "strata to save": (lambda: save(strata(), "p.h5"), "save them by `save_strata`"),  # type: ignore[arg-type]
+    "a population as strata": (lambda: save_strata(start(), "p.h5"), "a population to `save`"),  # type: ignore[arg-type]
+    "a program to load from": (lambda: load(program, "p.h5"), "there is no file <function"),  # type: ignore[arg-type]
+    "a jump to a number": (
+        lambda: jump(Jump(lambda s: s["on"] + 1, lambda s: None))(strata(), POSTERIOR),  # type: ignore[arg-type, return-value]
+        r"leads from Structure\(on=0\) to 1; .* by address",
+    ),
+    "an inference to calibrate first": (
+        lambda: calibrate(lambda data: start(), Joint(program, (1,), ("y_0",)), 5),  # type: ignore[arg-type]
+        r"calibrate is given a function .* Joint\(program, args, observed\) .* first",
+    ),
+    "a joint of nothing": (lambda: Joint(program, (1,), ("typo",)), "'typo' is one the program never visits"),
+    "a check of several structures": (lambda: check_program(switched), r"check_program\(..., \{'on': 1\}\)"),
     "a step of what is no series": (lambda: mean(start(), ("mu", 1)), "the program is no Series"),
 }
 

@@ -16,7 +16,6 @@ from bcppl import poses
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.inference.kernels import metropolis_hastings, moved_by
-from bcppl.inference.population import Population
 from bcppl.inference.proposals import (
     Continuous,
     Fitted,
@@ -31,7 +30,7 @@ from bcppl.inference.proposals import (
     rotations,
     symmetry,
 )
-from bcppl.inference.proposals.coordinates import coordinates_of
+from bcppl.inference.proposals.spread import weighted_places
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, assess, propose, simulate
 from tests.exact_targets import (
@@ -267,16 +266,11 @@ def test_a_mixture_is_fitted_to_both_modes() -> None:
     assert float(true.exp().mean()) > 0.3 * float(two_modes_density(population.trace["pose"]).exp().mean())
     turned = poses.local(CENTER, proposed)[:, 5] > 0.8
     assert 0.2 < float(turned.double().mean()) < 0.4
-    assert len(density._apart(*_known(population), count=5)) == 5
+    assert len(density._apart(weighted_places(population, "pose"), count=5)) == 5
 
 
 def two_modes_density(pose: Tensor) -> Tensor:
     return simulate(two_modes, (), len(pose)).at({"pose": pose}).log_prob()
-
-
-def _known(population: Population) -> tuple[Any, Tensor, Tensor]:
-    known = coordinates_of(population.trace, "pose")
-    return known, population.trace["pose"], torch.full((len(population),), 1.0 / len(population)).double()
 
 
 def test_whole_differences_lead_from_mode_to_mode() -> None:

@@ -235,6 +235,9 @@ def test_mutant_with_the_volume_of_the_seven_numbers(monkeypatch: pytest.MonkeyP
         }
 
     monkeypatch.setattr(smcp3, "charted", seven)
+    with pytest.raises(InputError, match="have to cancel"):
+        worst_z("turned on")
+    monkeypatch.setattr(smcp3, "refuse_unequal", lambda *given: None)
     assert worst_z("turned on") > BROKEN
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pyro
 import pyro.distributions as dist
 import pytest
 import torch
 
-from bcppl.errors import InputError
+from bcppl.errors import InputError, NoWeightError
+from bcppl.inference.structures import generate_strata
 from bcppl.traces import (
     ProgramError,
     Structure,
@@ -108,3 +111,18 @@ def test_a_program_is_checked_for_each_structure_by_itself() -> None:
     check_program(writes, (1,), {"y": number(0.4), "doubled": number(0.0)})
     with pytest.raises(ProgramError, match="'x'"):
         check_program(writes, (1,), {"y": number(0.4), "doubled": number(1.0)})
+
+
+@pytest.mark.parametrize("site", [dist.Categorical, dist.Bernoulli], ids=["categorical", "bernoulli"])
+def test_a_structure_of_prior_zero_has_no_weight(site: Any) -> None:
+    """Torch rounds a probability of 0 up to e^-36, all the weight of a structure that is asked for alone."""
+    probabilities = torch.tensor([1.0, 0.0]).double() if site is dist.Categorical else number(0.0)
+
+    def program() -> None:
+        pyro.sample("y", dist.Normal(number(float(structural("on", site(probabilities)))), 1.0))
+
+    trace, log_weight = generate(program, (), {"on": 1, "y": 0.2}, 5)
+    assert bool((log_weight == -torch.inf).all()) and bool((trace.log_prob("y") > -torch.inf).all())
+    assert generate_strata(program, (), {"y": 0.2}, 10).shares[Structure({"on": 0})] == 1.0
+    with pytest.raises(NoWeightError, match="the value at 'on' is impossible"):
+        _ = generate_strata(program, (), {"y": 0.2, "on": 1}, 10).shares

@@ -119,3 +119,12 @@ def test_a_site_that_cannot_be_sampled_is_named() -> None:
     with pytest.raises(InputError, match=sentence):
         generate(lazy, (), {}, N)
     assert generate(lazy, (), {"y": 0.25}, N)[1].shape == (N,)
+
+
+@pytest.mark.parametrize("site", [dist.Normal(number(0.2), 1.0), dist.Bernoulli(number(0.2))])
+def test_true_is_one(site: Any) -> None:
+    def program() -> None:
+        pyro.sample("y", site)
+
+    _, log_weight = generate(program, (), {"y": True}, 3)
+    torch.testing.assert_close(log_weight, site.log_prob(number(1.0)).expand(3))

@@ -25,8 +25,8 @@ def normalised(log_weights: Tensor, impossible: Sequence[str] = ()) -> Tensor:
     if not bool((log_weights > -torch.inf).any()):
         where = f" at {', '.join(map(repr, impossible))}" if impossible else ""
         raise NoWeightError(
-            f"no particle has any weight left: the measurement{where} is impossible at every particle; "
-            "widen the prior, use more particles, or check the recording with `bcppl check`."
+            f"no particle has any weight left: the value{where} is impossible at every particle; widen the "
+            "prior, use more particles, or check the values that are given."
         )
     return torch.softmax(log_weights, dim=0)
 

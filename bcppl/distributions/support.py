@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from typing import Any
 
 import torch
+from pyro.distributions import MixtureSameFamily, SineBivariateVonMises, SineSkewed, VonMises
 from pyro.distributions.torch_distribution import ExpandedDistribution, MaskedDistribution
 from torch import Tensor
-from torch.distributions import Distribution, Independent, constraints
+from torch.distributions import Bernoulli, Categorical, Distribution, Independent, constraints
 
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
 
 WRAPPERS = (Independent, ExpandedDistribution, MaskedDistribution)
+# Of angles: the densities are periodic on what torch and Pyro state as the support, the whole line, and
+# normalised on one turn, where the draws are.
+ANGLES = (VonMises, SineBivariateVonMises, SineSkewed)
+TURN = constraints.interval(-math.pi, math.pi)
 
 
 def base(distribution: Any) -> Any:
@@ -59,21 +65,40 @@ def refuse_several_poses(address: str, value: Tensor, distribution: Any) -> None
         )
 
 
-def support_of(distribution: Any) -> Any:
-    """A distribution's support without the event dimensions wrapped around it."""
+def is_of_angles(distribution: Any) -> bool:
+    """Whether the density of a distribution is periodic."""
+    innermost = base(distribution)
+    if isinstance(innermost, MixtureSameFamily):
+        return is_of_angles(innermost.component_distribution)
+    return isinstance(innermost, ANGLES)
+
+
+def whole_support(distribution: Any) -> Any:
+    """A distribution's support; of angles one turn, from -pi to pi."""
     support = distribution.support
+    if not is_of_angles(distribution):
+        return support
+    return constraints.independent(TURN, support.event_dim) if support.event_dim else TURN
+
+
+def support_of(distribution: Any) -> Any:
+    """A distribution's support without the event dimensions wrapped around it; of angles one turn."""
+    support = whole_support(distribution)
     while isinstance(support, constraints.independent):
         support = support.base_constraint
     return support
 
 
-def log_prob_inside(distribution: Any, value: Tensor) -> Tensor:
+def log_prob_inside(distribution: Any, value: Tensor, *, any_turn: bool = True) -> Tensor:
     """`distribution.log_prob(value)`, -inf where the value lies outside the support.
+
+    An observed angle may be given in any turn, a latent one is from -pi to pi: on the line it would have
+    infinitely much mass.
 
     Pyro's densities continue beyond it without validation: an exponential's grows below 0. Pose distributions
     and lazy ones check their support themselves. NaN is no value, and is passed on.
     """
-    if not _is_bounded(distribution):
+    if any_turn if is_of_angles(distribution) else not _is_bounded(distribution):
         return distribution.log_prob(value)
     inside = _inside(distribution, value, masked=True)
     if not bool(inside.all()):
@@ -87,6 +112,18 @@ def log_prob_inside(distribution: Any, value: Tensor) -> Tensor:
             safe = safe.reshape(safe.shape + (1,) * len(distribution.event_shape))
             value = torch.where(safe, value, drawn)
     return torch.where(inside, distribution.log_prob(value), -torch.inf)
+
+
+def has_probability(distribution: Any, value: int) -> Tensor:
+    """Whether a value has a probability above 0, over the batch; torch rounds a stated 0 up to e^-36."""
+    innermost = base(distribution)
+    probs = vars(innermost).get("probs")
+    if probs is not None and innermost._param is probs:  # not computed from logits, which may be any
+        if isinstance(innermost, Bernoulli):
+            return (probs if value else 1.0 - probs) > 0.0
+        if isinstance(innermost, Categorical) and 0 <= value < probs.shape[-1]:
+            return torch.as_tensor(probs[..., value] > 0.0)
+    return torch.tensor(True)
 
 
 def _is_bounded(distribution: Any) -> bool:
@@ -116,7 +153,7 @@ def _inside(distribution: Any, value: Tensor, masked: bool) -> Tensor:
         return ~_any_entry(~inside, distribution.reinterpreted_batch_ndims)
     if isinstance(distribution, ExpandedDistribution):
         return _inside(distribution.base_dist, value, masked)
-    support = distribution.support
+    support = whole_support(distribution)
     return ~_any_entry(~support.check(value), len(distribution.event_shape) - support.event_dim)
 
 

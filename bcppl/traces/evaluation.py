@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.shortcuts import narrowed
-from bcppl.distributions.support import log_prob_inside
+from bcppl.distributions.support import has_probability, log_prob_inside
 from bcppl.errors import InputError
 from bcppl.traces.dependence.surroundings import changed as surroundings_changed, evaluated, surroundings_of
 from bcppl.traces.differentiation.graph import graph, kept, refuse_cut, taken_out
@@ -40,7 +40,7 @@ def log_probability(
         refuse_masked(address, distribution)
     # A value that another one has moved out of the support is impossible, not a mistake.
     with graph(), pyro.validation_enabled(False):
-        value = _of_site(ran, address, distribution)
+        value = _of_site(ran, address, distribution, address in choices)
     batch = distribution.batch_shape
     if value.shape not in ((), batch):
         raise InputError(
@@ -48,6 +48,10 @@ def log_probability(
             f"must give {tuple(batch)}, one for each particle and each entry of its plates."
         )
     value = value.to(torch.float64).expand(batch)
+    if address in ran.structural:
+        # Asked for alone, an impossible structure would have all the weight.
+        possible = has_probability(distribution, int(ran.values[address].reshape(-1)[0]))
+        value = torch.where(possible, value, -torch.inf)
     if len(batch) > 1:
         value = value.sum(tuple(range(len(batch) - 1)))
     # The maximum is NaN where any is.
@@ -56,12 +60,12 @@ def log_probability(
     return value
 
 
-def _of_site(ran: Run, address: str, distribution: Any) -> Tensor:
+def _of_site(ran: Run, address: str, distribution: Any, latent: bool) -> Tensor:
     value = inward(ran.values[address], distribution)
     if not kept():
-        return _at(ran, address, narrowed(distribution), value)
+        return _at(ran, address, narrowed(distribution), value, latent)
     try:
-        attached = _at(ran, address, distribution, value)
+        attached = _at(ran, address, distribution, value, latent)
     except RuntimeError as error:
         if "requires grad" not in str(error):
             raise
@@ -71,13 +75,13 @@ def _of_site(ran: Run, address: str, distribution: Any) -> Tensor:
     return attached
 
 
-def _at(ran: Run, address: str, distribution: Any, value: Tensor) -> Tensor:
+def _at(ran: Run, address: str, distribution: Any, value: Tensor, latent: bool) -> Tensor:
     if address not in ran.surroundings:
-        return log_prob_inside(distribution, value)
+        return log_prob_inside(distribution, value, any_turn=not latent)
     then, now = ran.surroundings[address], surroundings_of(distribution)
     if (name := surroundings_changed(then, now)) is not None:
         raise changed_outside(address, name)
-    return evaluated(distribution, lambda: log_prob_inside(distribution, value))
+    return evaluated(distribution, lambda: log_prob_inside(distribution, value, any_turn=not latent))
 
 
 class Hiding(UserDict[str, Any]):

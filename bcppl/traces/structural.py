@@ -79,8 +79,9 @@ class UnchosenError(InputError):
     def __init__(self, address: str, distribution: Any, values: Mapping[str, Tensor]) -> None:
         super().__init__(
             f"site {address!r} determines which sites the program visits, and has no value; observe it for a "
-            "trace of one structure; for all, use generate_strata of bcppl.inference.structures, or "
-            "extend_strata where a new measurement brings it."
+            f"trace of one structure (and to check that: check_program(..., {{{address!r}: 1}})); for all, "
+            "use generate_strata of bcppl.inference.structures, or extend_strata where an observation brings "
+            "it."
         )
         self.address, self.distribution, self.values = address, distribution, values
 

@@ -16,22 +16,27 @@ Value = Tensor | npt.NDArray[Any] | float
 
 
 def tensors(given: Mapping[str, Value]) -> dict[str, Tensor]:
-    """Values by address as tensors: a float becomes float64, a whole number int64, an array keeps its type.
+    """Values by address as tensors.
+
+    A float becomes float64, as do True and False, 1 and 0; a whole number int64; an array keeps its type.
 
     Raises:
-        InputError: a value is none of these, or an array of no numbers; names its address.
+        InputError: they are no mapping, or a value is none of these or an array of no numbers; names its
+            address.
     """
+    if not isinstance(given, Mapping):
+        raise InputError(
+            f"values by address are given as a {type(given).__name__}; give a mapping, such as {{'y': 1.2}}."
+        )
     return {address: _tensor(address, value) for address, value in given.items()}
 
 
 def _tensor(address: str, value: Any) -> Tensor:
     if isinstance(value, Tensor):
         return value
-    if isinstance(value, float):
+    if isinstance(value, float | bool):
         return torch.tensor(value, dtype=torch.float64)
-    if isinstance(value, bool | int) or (
-        isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biuf"
-    ):
+    if isinstance(value, int) or (isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biuf"):
         return torch.as_tensor(np.asarray(value).copy())
     kind = f"{value.dtype} array" if isinstance(value, np.ndarray) else type(value).__name__
     raise InputError(

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.inference.filters.step import StepInfo, Stepped
-from bcppl.inference.kernels import Kernel, Until, moved_by, refuse_other, scattered
+from bcppl.inference.kernels import Kernel, Until, moved_by
+from bcppl.inference.kernels.kernel import refuse_other, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import Target

@@ -16,7 +16,7 @@ from torch import Tensor
 from bcppl.arguments import latent_address, number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.chains import Chains
-from bcppl.inference.kernels import Kernel, Move, fitted, refuse_other, scattered
+from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_other, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.targets import POSTERIOR, Target

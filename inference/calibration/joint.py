@@ -13,7 +13,7 @@ from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
 from bcppl.traces import Model, Series, Trace, generate, simulate
-from bcppl.traces.run import Program
+from bcppl.traces.run import Program, run
 
 Values = Mapping[str, Tensor]
 # A test quantity (K,) of latent values (K, *event) by address, and of the data.
@@ -85,17 +85,18 @@ class Joint:
         if isinstance(self.observed, str):
             raise InputError(f"observed addresses are given as {self.observed!r}; give a list of them.")
         object.__setattr__(self, "observed", tuple(self.observed))
+        with torch.random.fork_rng(devices=[]):
+            ran = run(self.program, self.args, 1, {}, {}, draws_lazy=False)
+        ran.refuse_unvisited(self.observed)
+        if ran.fixed:
+            raise InputError(
+                f"a program whose joint distribution is to be drawn observes {min(ran.fixed)!r} itself "
+                "(`obs=` or `pyro.factor`); sample that, and name it among the observed addresses."
+            )
 
     def draw(self) -> Drawn:
         """One draw of latent values and data."""
         trace = simulate(self.program, self.args, 1)
-        fixed = [a for a in trace.addresses if a not in trace.choices]
-        if fixed:
-            raise InputError(
-                f"a program whose joint distribution is to be drawn observes {fixed[0]!r} itself (`obs=` or "
-                "`pyro.factor`); sample that, and name it among the observed addresses."
-            )
-        trace._run.refuse_unvisited(self.observed)
         truth = {a: value[0] for a, value in trace.choices.items() if a not in self.observed}
         return Drawn(truth, {address: trace[address][0] for address in self.observed})
 

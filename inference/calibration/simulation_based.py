@@ -63,10 +63,16 @@ def calibrate(
             goes on from them.
 
     Raises:
-        InputError: a number is out of range, inference gives no population or one with other latent
-            addresses, it has fewer particles than `posterior_draws`, or the folder is of other settings.
-        InferenceError: inference fails; names the round and its seed.
+        InputError: what is given is no joint distribution, a number is out of range, inference gives no
+            population or one with other latent addresses, it has fewer particles than `posterior_draws`, or
+            the folder is of other settings.
+        InferenceError: inference fails; names the seed of the round.
     """
+    if not hasattr(joint, "draw"):
+        raise InputError(
+            f"calibrate is given a {type(joint).__name__} in place of a joint distribution; give "
+            "Joint(program, args, observed) or Recorded(model) first, and the inference second."
+        )
     draws = whole_number("a calibration of {} draws was asked for", draws)
     ranked = whole_number("truths are to be ranked among {} draws", posterior_draws)
     processes = whole_number("rounds in {} processes were asked for", processes)
@@ -123,8 +129,13 @@ class Round:
             quantities = Quantities(self.joint, data, tuple(truth))
             try:
                 population = _inferred(self.inference, data)
+            except InputError:
+                raise
             except InferenceError as error:
                 raise type(error)(f"round of seed {seed}: {error}") from error
+            except Exception as error:
+                what = f"round of seed {seed}: the inference raised {type(error).__name__}: {error}"
+                raise InferenceError(what) from error
             return self._ranked(population, truth, quantities)
 
     def _ranked(self, population: Population, truth: Mapping[str, Any], quantities: Quantities) -> Arrays:

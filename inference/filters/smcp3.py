@@ -37,6 +37,7 @@ from bcppl.inference.kernels.jacobian import (
     log_abs_det_jacobian,
     refuse_apart,
     refuse_leaving,
+    refuse_unequal,
 )
 from bcppl.inference.kernels.kernel import scattered, weighted
 from bcppl.inference.population import Population
@@ -72,8 +73,8 @@ class Pair:
             with the measurement; the others are sampled from the model. The earlier steps of a `Series` stay
             as they are: all that it chooses is new.
         backward: reads the new trace.
-        check: check, at every move, that the backward program undoes the forward one, and that particles are
-            not mixed.
+        check: check, at every move, that the backward program undoes the forward one, that the Jacobians of
+            both cancel, and that particles are not mixed.
     """
 
     forward: Proposal
@@ -195,6 +196,18 @@ def moved_trace(
         refuse_other_choices(chosen.choices, choices)
         undone = {(OLD, a): before.get(a, new[a]) for a in latent}
         refuse_apart("the backward program", inputs, undone | {(FORWARD, a): v for a, v in choices.items()})
+
+        def undo(point: dict[Key, Tensor]) -> dict[Key, Tensor]:
+            after = {a: point[NEW, a] for a in (*latent, *fresh)}
+            made = {a: point[BACKWARD, a] for a in back}
+            result = result_with_grad(backward, (with_gradients(new, after),), made, count)
+            given, returned = _read(result, made, {a: after[a] for a in latent}, list)
+            returned = returned if isinstance(result, tuple) else {**after, **returned}
+            return {(OLD, a): given.get(a, after[a]) for a in latent} | {
+                (FORWARD, a): returned[a] for a in chosen.choices
+            }
+
+        refuse_unequal("a pair", log_jacobian, log_abs_det_jacobian(undo, outputs, inputs))
     log_chosen = chosen.log_prob()
     log_factor = log_ratio + reverse.log_prob() - log_chosen + log_jacobian
     # A choice without density has left the range of its type (see `metropolis_hastings`).

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import takes
-from bcppl.inference.population import Population
+from bcppl.inference.population import Population, refuse_no_population
 from bcppl.inference.progress import watched
 from bcppl.traces.values import Value
 
@@ -101,11 +101,7 @@ def steps(
             "steps is given something else than a step; if it is a kernel, give tempered(kernel) from "
             "bcppl.inference.filters.tempering."
         )
-    if not isinstance(population, Population):
-        hint = "Population(*...)" if isinstance(population, tuple) else "Population(trace, log_weights)"
-        raise InputError(
-            f"steps is given a {type(population).__name__} in place of a population; make it one, {hint}."
-        )
+    refuse_no_population("steps", population)
     if isinstance(observed, Observed):
         raise InputError("steps is given one Observed; give a list of them, one for each step.")
 

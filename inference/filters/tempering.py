@@ -24,7 +24,8 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.exponents import next_exponent
 from bcppl.inference.filters.step import Observed, StepInfo, Stepped
-from bcppl.inference.kernels import Kernel, Until, moved_by, refuse_other
+from bcppl.inference.kernels import Kernel, Until, moved_by
+from bcppl.inference.kernels.kernel import refuse_other
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Resample, adaptive, check_resample, systematic
 from bcppl.inference.targets import POSTERIOR, Target, cost_of

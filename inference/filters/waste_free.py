@@ -12,7 +12,8 @@ import torch
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.filters.tempering import Rejuvenated, Rejuvenation
-from bcppl.inference.kernels import Kernel, fitted, halved, halves, refuse_other, scattered
+from bcppl.inference.kernels import Kernel, fitted, halved, halves
+from bcppl.inference.kernels.kernel import refuse_other, scattered
 from bcppl.inference.population import Population, log_pair
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import Target

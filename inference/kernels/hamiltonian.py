@@ -10,11 +10,12 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import normalised
+from bcppl.distributions.support import whole_support
 from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import Kernel, Move, decided
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Unflattened, VectorCoordinates, coordinates_of
-from bcppl.inference.proposals.spread import FLOOR
+from bcppl.inference.proposals.spread import FLOOR, weighted_places
 from bcppl.inference.summaries import weighted_covariance
 from bcppl.inference.targets import Target
 from bcppl.traces import Trace, update
@@ -29,9 +30,10 @@ def hmc(
     """Hamiltonian Monte Carlo with the leapfrog integrator.
 
     Neal, MCMC using Hamiltonian dynamics, Handbook of Markov Chain Monte Carlo, 2011, section 5.3. The
-    inverse mass matrix is the weighted covariance of the particles it learns from (not of those it moves),
-    so a step of 1 is about one standard deviation whatever the units. Constrained values (positive, in an
-    interval, on a simplex) move in unconstrained coordinates, the Jacobian included.
+    inverse mass matrix is the weighted covariance of the particles it learns from (not of those it moves;
+    along an axis on which these do not differ, that of the prior), so a step of 1 is about one standard
+    deviation whatever the units. Constrained values (positive, in an interval, on a simplex) move in
+    unconstrained coordinates, the Jacobian included.
 
     Args:
         addresses: latent addresses, one by one or as a list, moved together; the other latent values stay.
@@ -55,7 +57,7 @@ def hmc(
     jitter = number_within("hmc was given jitter {}", jitter, least=0.0, below=1.0)
 
     def kernel(population: Population) -> Move:
-        factor = _factor(Unconstrained(named, population.trace), population)
+        factor = _factor(named, population)
         return hamiltonian_move(named, factor, step_size, steps, jitter)
 
     return kernel
@@ -156,14 +158,18 @@ class Unconstrained:
         checks = [_all(torch.isfinite(v)) for v in values.values()]
         for address, value in values.items():
             site = self.sites[address]
-            within = site.support.check(inward(value, site))
+            within = whole_support(site).check(inward(value, site))
             checks.append(_all(within.movedim(len(site.batch_shape) - 1, 0)))
         return torch.stack(checks).all(dim=0)
 
     def refuse_moved_bounds(self, new: Trace) -> None:
         """Refuse supports that depend on what is moved: the reverse move would be in other coordinates."""
         for address, site in self.sites.items():
-            bounds = zip(_bounds(site.support), _bounds(new.distributions[address].support), strict=True)
+            bounds = zip(
+                _bounds(whole_support(site)),
+                _bounds(whole_support(new.distributions[address])),
+                strict=True,
+            )
             if any(not torch.equal(before, now) for before, now in bounds):
                 others = " or ".join(repr(a) for a in self.sites if a != address)
                 raise InputError(
@@ -199,12 +205,18 @@ def _all(mask: Tensor) -> Tensor:
     return mask.reshape(len(mask), -1).all(dim=1)
 
 
-def _factor(space: Unconstrained, population: Population) -> Tensor:
+def unlearned_variances(addresses: tuple[str, ...], population: Population) -> Tensor:
+    """The variances (D,) of the prior where no two particles differ (`Places.unlearned`), 0 elsewhere."""
+    return torch.cat([weighted_places(population, address).unlearned for address in addresses])
+
+
+def _factor(addresses: tuple[str, ...], population: Population) -> Tensor:
     """Cholesky factor (D, D) of the weighted covariance, its correlations shrunk."""
-    position = space.read(population.trace)
+    position = Unconstrained(addresses, population.trace).read(population.trace)
     weights = normalised(population.log_weights)
     weights = torch.where(torch.isfinite(position).all(dim=1), weights, 0.0)
     position = torch.nan_to_num(position, 0.0, 0.0, 0.0)
     weights = weights / weights.sum().clamp_min(torch.finfo(torch.float64).tiny)
     covariance = weighted_covariance(position, weights)
+    covariance = covariance + torch.diag(unlearned_variances(addresses, population))
     return torch.linalg.cholesky(0.9 * covariance + 0.1 * torch.diag(covariance.diagonal() + 10 * FLOOR**2))

@@ -15,6 +15,7 @@ from bcppl.inference.kernels.jacobian import (
     log_abs_det_jacobian,
     refuse_apart,
     refuse_leaving,
+    refuse_unequal,
 )
 from bcppl.inference.kernels.kernel import Kernel, Move, decided, refuse_observed
 from bcppl.inference.population import Population
@@ -78,7 +79,7 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
             log_forward = log_jacobian(start, after)
             if check:
                 refuse_apart("the involution, applied twice,", before, mapped(after))
-                _refuse_unequal(log_forward, log_jacobian(after, mapped(after)))
+                refuse_unequal("the involution", log_forward, log_jacobian(after, mapped(after)))
             updated = update(trace, new)
             refuse_observed("the program of an involution", forward.choices, updated.trace)
             choices = {a: v for (kind, a), v in after.items() if kind == "choice"}
@@ -111,13 +112,3 @@ def _mapped(involution: Involution, point: Mapping[Key, Tensor]) -> dict[Key, Te
                 )
             after[kind, address] = value
     return after
-
-
-def _refuse_unequal(forward: Tensor, reverse: Tensor) -> None:
-    wrong = ~((forward + reverse).abs() <= 1e-6)
-    if bool(wrong.any()):
-        particle = int(wrong.nonzero()[0])
-        raise InputError(
-            f"the Jacobian of the involution is exp({float(forward[particle]):.6g}) forward and "
-            f"exp({float(reverse[particle]):.6g}) in reverse for particle {particle}; they have to cancel."
-        )

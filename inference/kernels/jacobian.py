@@ -189,7 +189,7 @@ def log_abs_det_jacobian(
             f"a map takes {_listed(inputs, columns)} to {_listed(outputs, rows)}, so it {more} "
             f"{abs(high - wide)} coordinates too many; what goes in has to come out."
         )
-    value = next(iter(inputs.values())).value
+    value = next(iter((*inputs.values(), *outputs.values()))).value
     if not rows:
         return value.new_zeros(len(value), dtype=torch.float64)
     leaves = [
@@ -252,6 +252,19 @@ def refuse_apart(what: str, first: Point, second: Mapping[Key, Tensor]) -> None:
                 f"{what} does not give {address!r} ({kind}) back: particle {particle} began at "
                 f"{_short(value[particle])} and came to {_short(second[kind, address][particle])}."
             )
+
+
+def refuse_unequal(what: str, forward: Tensor, reverse: Tensor) -> None:
+    """Refuse log-Jacobians (N,) of a move and of its reverse that do not cancel."""
+    # Both infinite where a map is singular: their sum is no number, and is refused.
+    wrong = ~((forward + reverse).abs() <= 1e-6)
+    if bool(wrong.any()):
+        particle = int(wrong.nonzero()[0])
+        raise InputError(
+            f"the Jacobian of {what} is exp({float(forward[particle]):.6g}) forward and "
+            f"exp({float(reverse[particle]):.6g}) in reverse for particle {particle}; they have to cancel, "
+            "so compute all values in torch, without `.detach()`."
+        )
 
 
 def _remaining(inputs: Point, outputs: Point) -> tuple[list[Key], list[Key]]:

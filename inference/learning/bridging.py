@@ -20,7 +20,8 @@ from bcppl.errors import InputError
 from bcppl.inference.exponents import next_exponent
 from bcppl.inference.filters.step import StepInfo, Stepped
 from bcppl.inference.filters.tempering import kept_share
-from bcppl.inference.kernels import Kernel, Until, moved_by, refuse_other
+from bcppl.inference.kernels import Kernel, Until, moved_by
+from bcppl.inference.kernels.kernel import refuse_other
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import adaptive
 from bcppl.inference.targets import POSTERIOR

@@ -12,7 +12,12 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import normalised
 from bcppl.inference.kernels import Kernel, Move
-from bcppl.inference.kernels.hamiltonian import Unconstrained, hamiltonian_move, named_addresses
+from bcppl.inference.kernels.hamiltonian import (
+    Unconstrained,
+    hamiltonian_move,
+    named_addresses,
+    unlearned_variances,
+)
 from bcppl.inference.learning.mass import fisher_covariance
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import systematic
@@ -100,7 +105,8 @@ def learned_factor(addresses: tuple[str, ...], population: Population, target: T
     position = space.read(population.trace)
     exponents = target.exponents if isinstance(target, Target) else {}
     _, score = space.density(population.trace, position, exponents)
-    return torch.linalg.cholesky(fisher_covariance(position, score, normalised(population.log_weights)))
+    prior, weights = unlearned_variances(addresses, population), normalised(population.log_weights)
+    return torch.linalg.cholesky(fisher_covariance(position, score, weights, prior))
 
 
 def tuned(

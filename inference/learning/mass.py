@@ -12,7 +12,9 @@ from bcppl.inference.summaries import weighted_covariance
 FLATTEST = 1e-6
 
 
-def fisher_covariance(position: Tensor, score: Tensor, weights: Tensor) -> Tensor:
+def fisher_covariance(
+    position: Tensor, score: Tensor, weights: Tensor, unlearned: Tensor | None = None
+) -> Tensor:
     """The inverse mass matrix (D, D) in which particles and scores have the same covariance.
 
     With S the covariance of the particles and G that of their scores, the gradients of their log-density, it
@@ -27,6 +29,7 @@ def fisher_covariance(position: Tensor, score: Tensor, weights: Tensor) -> Tenso
         position: (N, D).
         score: (N, D) gradients of the log-density at the positions; rows that are not finite are left out.
         weights: (N,) normalised.
+        unlearned: (D,) variances of the prior on axes on which no two particles differ, 0 on the others.
     """
     finite = (torch.isfinite(position) & torch.isfinite(score)).all(dim=1)
     weights = torch.where(finite, weights, 0.0)
@@ -38,8 +41,13 @@ def fisher_covariance(position: Tensor, score: Tensor, weights: Tensor) -> Tenso
     spread, bend = (
         weighted_covariance(torch.nan_to_num(each, 0.0, 0.0, 0.0), weights) for each in (position, score)
     )
+    if unlearned is not None and bool((unlearned > 0.0).any()):
+        # The scores there, of one point, are at least those of the prior.
+        spread = spread + torch.diag(unlearned)
+        least = torch.where(unlearned > 0.0, 1.0 / unlearned, 0.0)
+        bend = bend + torch.diag((least - bend.diagonal()).clamp_min(0.0))
     of_particles, of_scores = spread.diagonal().clone(), bend.diagonal().clone()
-    of_particles[of_particles == 0.0] = 1.0  # no two particles differ: pilots learn the scale
+    of_particles[of_particles == 0.0] = 1.0  # no two particles differ, nor do draws of the prior
     of_scores = torch.maximum(of_scores, FLATTEST / of_particles)
     # In units in which each axis's particles and scores have the same standard deviation.
     unit = (of_particles / of_scores) ** 0.25

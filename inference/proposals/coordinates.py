@@ -1,8 +1,9 @@
 """Unbounded coordinates of a latent value: a pose's tangent space, or the real line for any other support.
 
 A value whose support is bounded (positive numbers, an interval, a simplex) is transformed to an unbounded one
-by torch's bijection for its support, and densities include its Jacobian. A place is a value in the form that
-`normal` and `mixture` take as a centre: a pose (..., 7), or a vector (..., d).
+by torch's bijection for its support, and densities include its Jacobian. An angle, whose density is periodic
+(von Mises), is one of the interval from -pi to pi, and a step does not cross its ends. A place is a value in
+the form that `normal` and `mixture` take as a centre: a pose (..., 7), or a vector (..., d).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from bcppl import poses
 from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief
 from bcppl.distributions.poses import MixturePose, NormalPose
-from bcppl.distributions.support import freedom_of, refuse_several_poses
+from bcppl.distributions.support import freedom_of, refuse_several_poses, whole_support
 from bcppl.distributions.vectors import NormalStep
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
@@ -49,6 +50,11 @@ class PoseCoordinates:
     def stepped(self, start: Tensor, step: Tensor) -> Tensor:
         """The poses after tangents (..., d)."""
         return poses.retract(start, self.freedom.embed(step))
+
+    def still(self, places: Tensor) -> Tensor:
+        """The axes (d,) along which no two places differ, bool."""
+        same = (places == places[0]).all(dim=0)
+        return self.freedom.coordinates(torch.cat([same[:3], same[3:].all().expand(3)]))
 
     def mean(self, places: Tensor, weights: Tensor) -> Tensor:
         """The weighted mean pose along the free axes; the held ones are those of the first place."""
@@ -92,6 +98,10 @@ class VectorCoordinates:
     def stepped(self, start: Tensor, step: Tensor) -> Tensor:
         """Sums."""
         return start + step
+
+    def still(self, places: Tensor) -> Tensor:
+        """The axes (d,) along which no two places differ, bool."""
+        return (places == places[0]).all(dim=0)
 
     def mean(self, places: Tensor, weights: Tensor) -> Tensor:
         """The weighted mean."""
@@ -141,7 +151,7 @@ class Unflattened(Transform):
 
     def __init__(self, distribution: Any, values: Tensor) -> None:
         super().__init__(cache_size=0)
-        self.to_support = biject_to(distribution.support)
+        self.to_support = biject_to(whole_support(distribution))
         self.plates = len(distribution.batch_shape) - 1
         self.unbounded = _is_identity(self.to_support)
         self._set(values)

@@ -15,6 +15,7 @@ from bcppl.inference.proposals.coordinates import Coordinates
 from bcppl.inference.proposals.proposal import Fitted
 from bcppl.inference.proposals.spread import (
     FLOOR,
+    Places,
     conditioned,
     covariance_about_mean,
     weighted_places,
@@ -63,15 +64,13 @@ def independent(
     width = number_within(f"{what} width {{}}", width, above=0.0)
 
     def fit(population: Population) -> Callable[[Trace], None]:
-        known, places, weights = weighted_places(population, address)
+        known, places, weights, unlearned = weighted_places(population, address)
         if len(population) > MOST_FITTED:
             places = places[systematic(weights.log(), MOST_FITTED)]
             weights = weights.new_full((MOST_FITTED,), 1.0 / MOST_FITTED)
-        if components is None:
-            mixture = _kernel_density(known, places, weights)
-        else:
-            mixture = _maximised(known, places, weights, components)
-        whole = covariance_about_mean(known, places, weights)
+        fitted = Places(known, places, weights, unlearned)
+        mixture = _kernel_density(fitted) if components is None else _maximised(fitted, components)
+        whole = covariance_about_mean(*fitted)
         shares = torch.cat([mixture.log_weights.exp() * (1.0 - share), weights.new_tensor([share])])
         centers = torch.cat([mixture.centers, known.mean(places, weights)[None]])
         covariances = torch.cat([inflation**2 * mixture.covariances, width**2 * whole[None]])
@@ -92,25 +91,27 @@ class Mixture(NamedTuple):
     covariances: Tensor
 
 
-def _kernel_density(coordinates: Coordinates, places: Tensor, weights: Tensor) -> Mixture:
+def _kernel_density(fitted: Places) -> Mixture:
     """A kernel density estimate: a normal at every particle, of Silverman's width."""
+    coordinates, places, weights, _ = fitted
     dimension, effective = coordinates.dimension, float(1.0 / (weights**2).sum())
     width = (4.0 / (dimension + 2.0)) ** (1.0 / (dimension + 4.0)) * effective ** (-1.0 / (dimension + 4.0))
-    whole = covariance_about_mean(coordinates, places, weights)
+    whole = covariance_about_mean(*fitted)
     return Mixture(weights.log(), places, (width**2 * whole).expand(len(places), -1, -1))
 
 
-def _maximised(coordinates: Coordinates, places: Tensor, weights: Tensor, components: int) -> Mixture:
+def _maximised(fitted: Places, components: int) -> Mixture:
     """A mixture fitted by expectation maximisation, its covariances shrunk towards the pooled one.
 
     They are posterior modes under an inverse Wishart prior at the pooled covariance, worth as many particles
     as there are coordinates (Fraley and Raftery, Journal of Classification 24, 2007, section 3).
     """
-    dimension, particles = coordinates.dimension, len(places)
-    centers = places[_apart(coordinates, places, weights, components)]
+    coordinates, places, weights, unlearned = fitted
+    dimension, particles, prior = coordinates.dimension, len(places), torch.diag(unlearned)
+    centers = places[_apart(fitted, components)]
     components = len(centers)
     steps = torch.stack([coordinates.steps(center, places) for center in centers])
-    metric = conditioned(weighted_covariance(steps[0], weights)).diagonal()
+    metric = conditioned(weighted_covariance(steps[0], weights) + prior).diagonal()
     nearest = (steps.square() / metric).sum(dim=-1).argmin(dim=0)
     shares = torch.nn.functional.one_hot(nearest, components).T.to(torch.float64)
     floor = FLOOR**2 * torch.eye(dimension, dtype=torch.float64)
@@ -124,7 +125,7 @@ def _maximised(coordinates: Coordinates, places: Tensor, weights: Tensor, compon
         centers = torch.stack([coordinates.mean(places, each) for each in within])
         covariances = torch.stack(
             [
-                weighted_covariance(coordinates.steps(center, places), each)
+                weighted_covariance(coordinates.steps(center, places), each) + prior
                 for center, each in zip(centers, within, strict=True)
             ]
         )
@@ -149,13 +150,14 @@ def _shares(coordinates: Coordinates, mixture: Mixture, places: Tensor) -> Tenso
     return torch.softmax(torch.stack(each), dim=0)
 
 
-def _apart(coordinates: Coordinates, places: Tensor, weights: Tensor, count: int) -> Tensor:
+def _apart(fitted: Places, count: int) -> Tensor:
     """Initial centres: the indices (K,), K at most `count`, of particles far apart from one another.
 
     Arthur and Vassilvitskii, k-means++: the advantages of careful seeding, SODA 2007.
     """
+    coordinates, places, weights, _ = fitted
     chosen = [int(torch.multinomial(weights, 1))]
-    metric = covariance_about_mean(coordinates, places, weights).diagonal()
+    metric = covariance_about_mean(*fitted).diagonal()
     nearest = torch.full_like(weights, torch.inf)
     while len(chosen) < count:
         apart = (coordinates.steps(places[chosen[-1]], places).square() / metric).sum(dim=-1)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from bcppl.errors import InputError
 from bcppl.inference.population import Population
 
 Program = Callable[..., Any]
@@ -30,7 +31,16 @@ Proposal = Program | Fitted
 def program_of(
     proposal: Proposal, learned: Sequence[Callable[[Population], Any]], population: Population
 ) -> Program:
-    """The program `program(trace)` of a proposal, fitted to a population."""
+    """The program `program(trace)` of a proposal, fitted to a population.
+
+    Raises:
+        InputError: what is given is neither a program nor one that learns.
+    """
+    if not isinstance(proposal, Fitted) and not callable(proposal):
+        raise InputError(
+            f"{proposal!r} is given in place of a proposal; give a program, or a shipped one such as "
+            "drift('x') from bcppl.inference.proposals."
+        )
     program = proposal.fit(population) if isinstance(proposal, Fitted) else proposal
     values = [learn(population) for learn in learned]
     return (lambda trace: program(trace, *values)) if values else program

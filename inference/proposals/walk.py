@@ -112,18 +112,19 @@ class _Link(NamedTuple):
 
 
 def _links(population: Population, addresses: tuple[str, ...]) -> list[_Link]:
-    steps, known = [], []
+    steps, known, unlearned = [], [], []
     for address in addresses:
-        coordinates, places, weights = weighted_places(population, address)
+        coordinates, places, weights, still = weighted_places(population, address)
         if len(places) < len(population):
             raise InputError(
                 f"joint_drift moves {address!r}, of which some particles are at the edge of the support, "
                 "0 or infinite; give its prior less spread."
             )
         known.append(coordinates)
+        unlearned.append(still)
         steps.append(coordinates.steps(coordinates.mean(places, weights), places))
     together = torch.cat(steps, dim=1)
-    covariance = weighted_covariance(together, weights)
+    covariance = weighted_covariance(together, weights) + torch.diag(torch.cat(unlearned))
     diagonal = torch.diag(covariance.diagonal() + FLOOR**2)
     covariance = ((1.0 - SHRUNK) * covariance + SHRUNK * diagonal) * (2.38**2 / together.shape[1])
     links, end = [], 0

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.inference.population import Population
+from bcppl.inference.population import Population, refuse_no_population
 from bcppl.inference.saved import plain
 from bcppl.inference.saved.approximations import approximation_content, approximation_of
 from bcppl.inference.saved.traces import Arguments, Content, content_of, trace_of
@@ -43,10 +43,15 @@ def save(population: Population | Sequence[Population], path: Location) -> None:
         path: where to.
 
     Raises:
-        InputError: there is no such folder, or something is no plain data: the state of a series without
+        InputError: what is given is no population (of strata see `bcppl.inference.structures.save_strata`),
+            there is no such folder, or something is no plain data: the state of a series without
             history, a field that a subclass adds, an approximation of another kind.
     """
-    several = [population] if isinstance(population, Population) else list(population)
+    several: list[Any] = list(population) if isinstance(population, list | tuple) else [population]
+    if hasattr(population, "populations"):
+        raise InputError("save is given strata; save them by `save_strata` of bcppl.inference.structures.")
+    for each in several:
+        refuse_no_population("save", each)
     content = {"populations": [population_content(each) for each in several]}
     write(path, content, torch.get_rng_state())
 
@@ -176,8 +181,7 @@ def opened(path: Location) -> Iterator[Content]:
     Raises:
         InputError: there is no such file, or it is damaged or of another version.
     """
-    path = Path(path)
-    if not path.is_file():
+    if not isinstance(path, str | os.PathLike) or not (path := Path(path)).is_file():
         raise InputError(f"there is no file {path}; give one that `save` wrote.")
     try:
         with h5py.File(path, "r") as file:

@@ -27,8 +27,13 @@ def save_strata(strata: Strata, path: Location) -> None:
         path: where to.
 
     Raises:
-        InputError: there is no such folder, or something is no plain data.
+        InputError: what is given are no strata, there is no such folder, or something is no plain data.
     """
+    if not isinstance(strata, Strata):
+        raise InputError(
+            f"save_strata is given a {type(strata).__name__}; give strata, and a population to `save` of "
+            "bcppl.inference.saved."
+        )
     populations = [population_content(each) for each in strata.populations.values()]
     content = {"populations": populations, "log_evidence": strata.log_evidence}
     write(path, content, torch.get_rng_state())

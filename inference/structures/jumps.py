@@ -43,7 +43,8 @@ class Jump:
         forward: program of a trace of the first structure (see `translated`); by default new values are
             sampled from the model.
         backward: program of a trace of the second.
-        check: check, at every move, that one program undoes the other, and that particles are not mixed.
+        check: check, at every move, that one program undoes the other, that the Jacobians of both cancel, and
+            that particles are not mixed.
     """
 
     to: Change
@@ -117,12 +118,19 @@ def jump(*jumps: Jump) -> StrataMove:
 
 def _ways(jumps: tuple[Jump, ...], structure: Structure) -> list[_Way]:
     """The jumps that start from a structure, each direction for itself."""
-    return [
+    ways = [
         _Way(each, backwards, values)
         for each in jumps
         for backwards, change in ((False, each.to), (True, each.back))
         if (values := change(structure)) is not None
     ]
+    for way in ways:
+        if not isinstance(way.values, Mapping):
+            raise InputError(
+                f"a jump leads from {structure} to {way.values!r}; let `to` and `back` give new values "
+                "of structural sites by address, {'count': 2}, or None."
+            )
+    return ways
 
 
 class _Jumped(NamedTuple):

@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
-from bcppl.inference.kernels import Kernel, Move, Until, moved_by, refuse_other
+from bcppl.inference.kernels import Kernel, Move, Until, moved_by
+from bcppl.inference.kernels.kernel import refuse_other
 from bcppl.inference.population import Population
 from bcppl.inference.structures.strata import Strata
 from bcppl.inference.targets import Target

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -36,10 +37,12 @@ from bcppl.inference.filters.smcp3 import (
 )
 from bcppl.inference.kernels.jacobian import (
     Key,
+    Point,
     charted,
     log_abs_det_jacobian,
     refuse_apart,
     refuse_leaving,
+    refuse_unequal,
 )
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Program
@@ -77,7 +80,8 @@ def translated(
         forward: reads the old trace.
         backward: reads the new trace.
         renewed: the trace of the other program at the values that are given, the others kept or sampled.
-        check: check that the backward program undoes the forward one, and that particles are not mixed.
+        check: check that the backward program undoes the forward one, that the Jacobians of both cancel, and
+            that particles are not mixed.
 
     Raises:
         InputError: a program gives an address that is not visited, more coordinates than it takes, or
@@ -105,23 +109,19 @@ def translated(
     inputs |= charted(FORWARD, chosen.choices, chosen.distributions)
     outputs = charted(NEW, after, new.distributions) | charted(BACKWARD, back, reverse.distributions)
 
-    def again(point: dict[Key, Tensor]) -> dict[Key, Tensor]:
-        start = {a: point[OLD, a] for a in before}
-        choices = {a: point[FORWARD, a] for a in chosen.choices}
-        result = result_with_grad(forward, (with_gradients(old, start),), choices, count)
-        given, returned = _read("forward", result, choices)
-        returned = start if returned is None else returned
-        return {(NEW, a): given[a] if a in given else start[a] for a in after} | {
-            (BACKWARD, a): returned[a] for a in back
-        }
-
-    log_jacobian = log_abs_det_jacobian(again, inputs, outputs, check=check)
+    there = partial(_mapped, "forward", forward, old, inputs, outputs)
+    log_jacobian = zero = torch.zeros(count, dtype=torch.float64)
+    if inputs or outputs:
+        log_jacobian = log_abs_det_jacobian(there, inputs, outputs, check=check)
     if check:
         forth = {a: new[a] for a in chosen.choices if a in new.choices} if forth is None else forth
         refuse_other_choices(chosen.choices, forth)
         ends = {(OLD, a): undone[a] if a in undone else new[a] for a in before}
         refuse_apart("the backward program", inputs, ends | {(FORWARD, a): v for a, v in forth.items()})
-    log_chosen, zero = chosen.log_prob(), torch.zeros(count, dtype=torch.float64)
+        if inputs or outputs:
+            undo = partial(_mapped, "backward", backward, new, outputs, inputs)
+            refuse_unequal("a translator", log_jacobian, log_abs_det_jacobian(undo, outputs, inputs))
+    log_chosen = chosen.log_prob()
     log_sampled = new.log_prob(*sampled) if sampled else zero
     log_lost = old.log_prob(*lost) if lost else zero
     log_factor = reverse.log_prob() + log_lost - log_chosen - log_sampled + log_jacobian
@@ -171,6 +171,29 @@ def translate(
 
 def sampling_nothing(trace: Trace) -> None:
     """A program that chooses nothing: new values are sampled from the model, and old ones kept."""
+
+
+def _mapped(
+    which: str, program: Program, trace: Trace, inputs: Point, outputs: Point, point: Mapping[Key, Tensor]
+) -> dict[Key, Tensor]:
+    """The other end of a translation, recomputed with gradients from a point of one end.
+
+    Args:
+        which: "forward" or "backward".
+        program: reads the trace.
+        trace: of N particles, at one end.
+        inputs: its values and the program's choices.
+        outputs: those at the other end.
+        point: values in place of those of the inputs.
+    """
+    choosing = FORWARD if which == "forward" else BACKWARD
+    start = {a: v for (kind, a), v in point.items() if kind != choosing}
+    choices = {a: v for (kind, a), v in point.items() if kind == choosing}
+    result = result_with_grad(program, (with_gradients(trace, start),), choices, trace.particles)
+    given, returned = _read(which, result, choices)
+    returned = start if returned is None else returned
+    reached = {**start, **given}
+    return {(kind, a): returned[a] if kind in (FORWARD, BACKWARD) else reached[a] for kind, a in outputs}
 
 
 def _read(which: str, result: Any, choices: Values) -> tuple[Values, Values | None]:

@@ -16,7 +16,7 @@ from typing import Any
 
 import pyro
 import torch
-from pyro.distributions import Delta
+from pyro.distributions import Delta, LKJCholesky
 from torch import Tensor
 from torch.distributions import Distribution, biject_to
 from torch.distributions.transforms import Transform
@@ -43,6 +43,8 @@ WIDEST = 10
 # Fraction of values within the declared support at which the density may be zero by rounding.
 ROUNDED = 0.01
 TRUSTED = ("torch.", "pyro.", "bcppl.")
+# Of torch's: draws of 3 rows at concentration 2 have E r^2 = 0.214 off the first column, the density 1/6.
+DOUBTED = (Delta, LKJCholesky)
 
 FITS = "make its draws and its density those of one distribution (its constants, and the Jacobian, too)"
 
@@ -110,8 +112,9 @@ def _inside(distribution: Any, value: Tensor) -> Tensor:
 def check_densities(trace: Trace) -> None:
     """Check that draws of each site at one particle's values follow the density of the site.
 
-    Distributions of torch, Pyro and bcppl are taken to be right, unless they are made of others; those of a
-    simulator (`cost` above 0) and of more than 10 coordinates are not compared.
+    Distributions of torch, Pyro and bcppl are taken to be right, unless they are made of others; torch's
+    LKJCholesky is not. Those of a simulator (`cost` above 0) and of more than 10 coordinates are not
+    compared.
 
     Raises:
         ProgramError: they do not (DENSITY), or the density is NaN or zero within the declared support
@@ -144,7 +147,7 @@ def _doubted(distribution: Any) -> bool:
 
 
 def _trusted(kind: type) -> bool:
-    return kind is not Delta and kind.__module__.startswith(TRUSTED)
+    return kind not in DOUBTED and kind.__module__.startswith(TRUSTED)
 
 
 def _made_of(distribution: Any) -> Iterator[type]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.distributions import biject_to
+from torch.distributions.transforms import Transform
 
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.support import freedom_of, support_of
@@ -32,23 +34,26 @@ def check_gradients(trace: Trace) -> None:
         distribution = trace.distributions[latent]
         if value.dtype != torch.float64 or freedom_of(distribution) is not None:
             continue
-        if isinstance(distribution, LazyDistribution) or support_of(distribution).event_dim > 0:
+        support = support_of(distribution)
+        if isinstance(distribution, LazyDistribution) or support.is_discrete or support.event_dim > 0:
             continue
-        _check(trace, latent, value)
+        _check(trace, latent, value, biject_to(support))
 
 
-def _check(trace: Trace, latent: str, value: Tensor) -> None:
-    direction = torch.randn_like(value)
-    step = STEP * (1.0 + value.abs())
-    ahead = log_probs(trace.at({latent: value + step * direction}))
-    behind = log_probs(trace.at({latent: value - step * direction}))
+def _check(trace: Trace, latent: str, value: Tensor, to_support: Transform) -> None:
+    # In unbounded coordinates a step stays within the support, however near to its edge the value is.
+    free = to_support.inv(value)
+    away = STEP * (1.0 + free.abs()) * torch.randn_like(value)
+    after, before = to_support(free + away), to_support(free - away)
+    step = (after - before) / 2.0
+    ahead, behind = log_probs(trace.at({latent: after})), log_probs(trace.at({latent: before}))
     for site in trace.addresses:
         if not bool((ahead[site] != behind[site]).any()):
             continue
         gradient = _gradient(trace, latent, value, site)
         if gradient is None:
             continue
-        along = (gradient * direction * step).reshape(len(value), -1).sum(1)
+        along = (gradient * step).reshape(len(value), -1).sum(1)
         difference = (ahead[site] - behind[site]) / 2.0
         rounding = 1e-9 * (1.0 + ahead[site].abs())
         wrong = (along - difference).abs() > RELATIVE * torch.maximum(
