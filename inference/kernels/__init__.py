@@ -24,7 +24,7 @@ from bcppl.inference.kernels.halving import halved, halves
 from bcppl.inference.kernels.hamiltonian import hmc
 from bcppl.inference.kernels.hastings import metropolis_hastings
 from bcppl.inference.kernels.involutions import involutive
-from bcppl.inference.kernels.kernel import Kernel, Move, fitted
+from bcppl.inference.kernels.kernel import Kernel, Move, fitted, scattered
 from bcppl.inference.kernels.rejuvenation import Moved, Until, displacement, distinct, moved_by, until
 from bcppl.inference.kernels.staged import Screened, Staged, Surrogate, delayed_acceptance, student_t
 
@@ -49,6 +49,7 @@ __all__ = [
     "mixture",
     "moved_by",
     "repeat",
+    "scattered",
     "sequence",
     "student_t",
     "until",
