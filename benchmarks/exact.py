@@ -80,13 +80,20 @@ KERNELS: dict[str, Callable[[int, int], Tempered]] = {
 
 UNTIL = (
     "particles stop while they still correlate with where they began, by about 0.75, and all at a sweep that "
-    "depends on them; repeat the moves, or ask for a larger displacement"
+    "depends on them; repeat the moves, or ask for a larger displacement: 1.5 in place of 0.5 gave "
+    "-.001 +- .024 in place of -.195 +- .060 (D = 6, N = 1000)"
 )
-FEW = "exponents and resampling that depend on the particles leave a bias of order 1/N; give more particles"
+FEW = (
+    "exponents and resampling that depend on the particles leave a bias of order 1/N (hmc, D = 6: -.2 at 75, "
+    "-.025 +- .010 at 1000); give more particles"
+)
 # Why a kernel may be biased here, by name.
 REASONS = {
     "drift until displaced": UNTIL,
     "mixture until displaced": UNTIL,
+    "differential evolution": "five sweeps are few: 20 gave -.009 +- .021, 5 -.179 +- .052 (D = 6)",
+    "hmc": FEW,
+    "hmc, always moved": FEW,
     "waste-free": "five states of a random walk hardly leave where they began; give fewer, longer chains",
 }
 
