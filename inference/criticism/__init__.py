@@ -1,6 +1,18 @@
 """Criticism of a model, given its posterior: predictive checks, rival hypotheses, and what is left open.
 
-from bcppl.inference.criticism.predictive import surprise
+    import pyro
+    import pyro.distributions as dist
+    import torch
+    from bcppl.inference import importance_sampling
+    from bcppl.inference.criticism.predictive import surprise
 
-checks = surprise(population)  # by site: p values of its measurement
+    def weighed():
+        mass = pyro.sample("mass", dist.Normal(torch.tensor(2.0).double(), 0.5))
+        pyro.sample("reading", dist.Normal(mass, 0.3))
+
+    population = importance_sampling(weighed, (), {"reading": torch.tensor(2.4).double()}, 1000)
+    print(surprise(population))  # p values, by address
+
+`hypotheses` compares a part with its mirror image and with turned ones by evidence, `undetermined` names the
+direction in which touches leave a position open.
 """
