@@ -1,7 +1,7 @@
 """Families and sides of particles: which descend from one ancestor, and in which half of the population.
 
-Both are (N,) tensors: the number of a particle's family, and whether it is on the first side. What they are
-for is told in `bcppl.inference.kernels.halving`.
+Both are (N,) tensors: the number of a particle's family, and whether it is on the first side. Proposals that
+move one half are fitted to the other (`bcppl.inference.kernels.halving`).
 """
 
 from __future__ import annotations

@@ -34,10 +34,10 @@ def searched(population: Population, proposal: Callable[[Any], Callable[..., Any
     approximation = population.approximation
     if approximation.shortfall(population.trace) < MISSED:
         return population
-    return compared(population, approximation, proposal)
+    return joined_with_draws(population, approximation, proposal)
 
 
-def compared(
+def joined_with_draws(
     population: Population, approximation: Any, proposal: Callable[[Any], Callable[..., Any]]
 ) -> Population:
     """The population, joined with one drawn from an approximation by their evidence.

@@ -3,10 +3,9 @@
 An image is approximated by a fit that starts from draws of the prior and ends in one mode, or its images
 under a part's near symmetries. Where the prior is wide the part is sometimes elsewhere. Then the image is
 improbable under its posterior predictive distribution, or no particle explains it better than no part does:
-the part is believed to be where nothing was measured. Climbs from all over the prior, in
-all images together (`bcppl.inference.proposals.climbing`), lead to other modes; fits follow these too, and
-particles drawn from the new approximation are compared with the old by evidence
-(`bcppl.inference.filters.second_search`).
+the part is believed to be where nothing was measured. Climbs from all over the prior, in all images together
+(`bcppl.inference.proposals.climbing`), lead to other modes; fits follow these too, and particles drawn from
+the new approximation are joined with the old by evidence (`bcppl.inference.filters.second_search`).
 
 The check renders `PARTICLES` times `REPLICAS` images (`bcppl.inference.criticism.predictive`), and draws from
 a generator of its own. A search costs about `CLIMBS` * 8 + 4,000 renderings of each image, and
@@ -24,7 +23,7 @@ from bcppl.distributions.depth import DepthDistribution
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import NoWeightError
 from bcppl.inference.criticism.predictive import THRESHOLD, surprise
-from bcppl.inference.filters.second_search import compared
+from bcppl.inference.filters.second_search import joined_with_draws
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.climbing import modes
 from bcppl.traces import Trace, generate
@@ -52,7 +51,7 @@ def searched_by_climbing(
     approximated: Callable[[Trace, torch.Tensor], Any],
     proposal: Callable[[Any], Callable[..., Any]],
 ) -> Population:
-    """The population, or one about modes that climbs lead to, chosen by evidence.
+    """The population, joined by evidence with one about the modes that climbs lead to.
 
     Args:
         population: weighted for all measurements of its trace.
@@ -70,4 +69,4 @@ def searched_by_climbing(
         ends = modes(climbers, pose, along)
     except NoWeightError:
         return population
-    return compared(population, approximated(trace, ends.centers), proposal)
+    return joined_with_draws(population, approximated(trace, ends.centers), proposal)
