@@ -23,7 +23,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
-from bcppl.distributions.contact_episodes import padded
+from bcppl.distributions.episodes.rows import padded
 from bcppl.inference.design import Ranking, expected_information_gain, linearised_information_gain
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.planning.candidate_layout import plan_candidates

@@ -20,7 +20,8 @@ from bcppl.arrays import Array
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, Rows
 from bcppl.contact.touch import Touch
-from bcppl.distributions.contact_episodes import COLUMNS, GIVEN, ContactEpisodes
+from bcppl.distributions.episodes import ContactEpisodes
+from bcppl.distributions.episodes.rows import COLUMNS, GIVEN, new_rows
 from bcppl.distributions.manifold import FARTHEST
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.parts import Guess
@@ -30,7 +31,6 @@ from bcppl.models import look_and_touch
 from bcppl.recordings import repeated
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors import Measurement, Recording
-from bcppl.sensors.likelihoods.probe_rows import new_rows
 from tests.test_manifold import around, differences, ledge
 
 NOISE, SHARED, DRIFT, LASTING, COMPLIANCE, VARYING, ROUGH = 6e-5, 1e-5, 2e-5, 0.1, 5e-6, 0.6, 0.2

@@ -57,6 +57,7 @@ def within(**bounds: Any) -> Mapping[str, Range]:
 POSITIVE = within(above=0.0)
 NONNEGATIVE = within(least=0.0)
 PROBABILITY = within(above=0.0, below=1.0)
+RARE = within(least=0.0, below=1.0)
 COUNT = within(least=1, whole=True)
 
 
@@ -72,7 +73,7 @@ def check_parameters(distribution: Any) -> None:
     kind: type = type(distribution)
     for name, allowed in ranges(kind).items():
         what = f"{kind.__name__} has {name} = {{}}"
-        setattr(distribution, name, allowed.checked(what, getattr(distribution, name)))
+        object.__setattr__(distribution, name, allowed.checked(what, getattr(distribution, name)))
 
 
 def check_shape(where: str, name: str, value: Any, *shapes: tuple[int, ...]) -> None:

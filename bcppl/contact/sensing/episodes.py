@@ -39,6 +39,8 @@ class Rows(NamedTuple):
         force: (R,) N.
         time: (R,) s.
         episode: (R,) the number of the contact, at rest or sliding, within a cell; -1 without contact.
+        wrench: (R, 6) on the peg, in its frame, N and N m.
+        velocity: (R, 3) of the peg, in the world, m/s.
     """
 
     world_from_peg: Array
@@ -48,6 +50,8 @@ class Rows(NamedTuple):
     force: Array
     time: Array
     episode: Array
+    wrench: Array
+    velocity: Array
 
 
 def cell_ends(stamps: Array) -> Indices:
@@ -94,18 +98,18 @@ class EpisodeExtractor:
         """Seconds after which a stamp and the one after it are decided: what comes later changes nothing."""
         return self.step * (1 + max(self._half, round(self.detector.agreement / self.step)))
 
-    def rows(self, time: Array, pose: Array, force: Array, last: bool) -> Rows:
+    def rows(self, time: Array, pose: Array, wrench: Array, last: bool) -> Rows:
         """The rows that are complete, of all stamps so far.
 
         Args:
             time: (T,) s.
             pose: (T, 7) world_from_peg.
-            force: (T, 3) tared, in the peg's frame, N; NaN while taring.
+            wrench: (T, 6) tared, in the peg's frame, N and N m; NaN while taring.
             last: whether the probe ends here.
         """
         until = math.inf if last or not len(time) else time[-1] - self._lag + 1e-6
-        felt, speed, pace = self._decided(time, pose, force)
-        size = np.linalg.norm(force, axis=1)
+        felt, speed, pace, velocity = self._decided(time, pose, wrench[:, :3])
+        size = np.linalg.norm(wrench[:, :3], axis=1)
         seen = _Stamps(time, pose, felt, size, pace)
         groups: list[tuple[slice, float, int]] = []
         begin = int(np.searchsorted(time, self._done, side="right"))
@@ -123,7 +127,7 @@ class EpisodeExtractor:
             k += 1
         self._done = float(time[end - 1]) if end > begin else self._done
         self._last_contact = -math.inf
-        return _rows(groups, time, pose, size, speed)
+        return _rows(groups, time, pose, size, speed, wrench, velocity)
 
     def _contact_row(self, first: int, end: int, seen: _Stamps) -> int:
         """The index after a row's last stamp; the row's episode is `_episode`."""
@@ -156,14 +160,16 @@ class EpisodeExtractor:
         then, place = self._last_free
         return time[k] - then > LONGEST - 1e-6 and bool(np.linalg.norm(pose[k, :3] - place) > _MOVED)
 
-    def _decided(self, time: Array, pose: Array, force: Array) -> tuple[Array, Array, Array]:
-        """1, 0 or NaN (T,) for contact, none and undecided; the speed of `Rows`, and the whole one."""
+    def _decided(self, time: Array, pose: Array, force: Array) -> tuple[Array, Array, Array, Array]:
+        """1, 0 or NaN (T,) for contact, none and undecided; the speed of `Rows`, the whole one, velocity."""
         felt, speed, pace = np.full(len(time), np.nan), np.zeros(len(time)), np.zeros(len(time))
+        moved = np.zeros((len(time), 3))
         if not len(time):
-            return felt, speed, pace
+            return felt, speed, pace, moved
         breaks = np.flatnonzero(np.diff(time) > 1.5 * self.step) + 1
         for part in np.split(np.arange(len(time)), breaks):
             velocity, acceleration = self._derivatives(pose[part, :3])
+            moved[part] = velocity
             given = torch.from_numpy(force[part]), torch.from_numpy(np.linalg.norm(acceleration, axis=1))
             felt[part] = self.detector(*given, self.step).numpy()
             world = Rotation.from_quat(pose[part][:, [4, 5, 6, 3]]).apply(np.nan_to_num(force[part]))
@@ -172,7 +178,7 @@ class EpisodeExtractor:
             along = np.abs(np.einsum("ij,ij->i", velocity, world)) / np.maximum(size, 1e-9)
             across = np.sqrt(np.maximum(whole**2 - along**2, 0.0))
             speed[part] = np.where(felt[part] == 1.0, np.maximum(along - _FRICTION * across, 0.0), whole)
-        return felt, speed, pace
+        return felt, speed, pace, moved
 
     def _derivatives(self, place: Array) -> tuple[Array, Array]:
         """Velocity and acceleration (T, 3) of a peg at (T, 3), by parabolas."""
@@ -186,7 +192,13 @@ class EpisodeExtractor:
 
 
 def _rows(
-    groups: list[tuple[slice, float, int]], time: Array, pose: Array, size: Array, speed: Array
+    groups: list[tuple[slice, float, int]],
+    time: Array,
+    pose: Array,
+    size: Array,
+    speed: Array,
+    wrench: Array,
+    velocity: Array,
 ) -> Rows:
     mean = np.empty((len(groups), 7))
     for row, (own, _, _) in enumerate(groups):
@@ -196,7 +208,8 @@ def _rows(
     slices = [own for own, _, _ in groups]
 
     def averaged(values: Array) -> Array:
-        return np.array([values[own].mean() for own in slices])
+        each = [values[own].mean(axis=0) for own in slices]
+        return np.array(each).reshape(len(slices), *values.shape[1:])
 
     return Rows(
         mean,
@@ -206,4 +219,6 @@ def _rows(
         averaged(size),
         averaged(time),
         np.array([episode for *_, episode in groups], dtype=np.float64),
+        averaged(wrench),
+        averaged(velocity),
     )

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from typing import NamedTuple
 
 import pyro
 import torch
@@ -16,8 +15,9 @@ from bcppl.arguments import number_within
 from bcppl.contact.quasi_static import QuasiStaticMotion, WindowMotion
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.location import ContactSensing
-from bcppl.distributions.contact_episodes import FELT, ContactEpisodes
-from bcppl.distributions.manifold import Gaps, MeasuresGap
+from bcppl.distributions.episodes import BenchError, BenchErrors, ContactEpisodes, Hypothesis
+from bcppl.distributions.episodes.rows import FELT, new_rows
+from bcppl.distributions.manifold import MeasuresGap
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
@@ -25,11 +25,12 @@ from bcppl.geometry.parts import Part
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.capabilities import Approximated
 from bcppl.sensors.likelihoods.probe_rows import (
+    Measured,
     ProbeRows,
     RememberedGaps,
+    after_those_before,
     capacity,
     cells_of,
-    new_rows,
     step_of,
 )
 from bcppl.sensors.measurements import Recording
@@ -58,6 +59,9 @@ class TouchSettings:
         gap_outlier: probability that a stamp without contact, or a contact, is an outlier.
         contact_detector: force thresholds of contact and of free motion.
         free_space: whether stamps without contact count, which exclude the part from where the peg moved.
+        bench: errors that all touches share.
+        hypotheses: of the contact's compliance, of how much wider the noise and the shared errors are; by
+            default nodes of the compliance.
     """
 
     gap_noise: float = 0.00006
@@ -70,6 +74,8 @@ class TouchSettings:
     gap_outlier: float = 0.001
     contact_detector: ContactDetector = field(default_factory=ContactDetector)
     free_space: bool = True
+    bench: tuple[BenchError, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("gap_noise", "lasting", "compliance", "compliance_decades"):
@@ -105,6 +111,7 @@ class ContactProbe:
             raise InputError("the recording has probe windows but no peg; add the peg that was held.")
         self.settings, self.peg = settings, recording.peg
         self.gap, self.quasi_static = _solids(recording.part, recording.peg)
+        self.bench = BenchErrors(settings.bench)
         self._streams: dict[str, ProbeRows] = {}
 
     @classmethod
@@ -127,7 +134,7 @@ class ContactProbe:
     def observe(self, number: int, action: ProbeWindow, world_from_part: Tensor) -> None:
         """Sample `touch_*`, unless the window is deferred."""
         if not self.is_deferred(action):
-            gaps = once(f"gaps of {action.probe.name}", partial(RememberedGaps, self.gap, world_from_part))
+            gaps = once("gaps of touches", partial(RememberedGaps, self.gap, world_from_part))
             shared = gaps if gaps.part is world_from_part else None
             pyro.sample(f"touch_{number}", self.site(action, world_from_part, gap=shared))
 
@@ -151,18 +158,23 @@ class ContactProbe:
             compliance=settings.compliance,
             uncertain=settings.compliance_decades,
             blur=blur,
+            bench=self.bench,
+            hypotheses=self.settings.hypotheses,
+            memory=gap.memory if isinstance(gap, RememberedGaps) else {},
         )
 
     def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
-        """The rows by address; each probe's wrench is tared whole."""
-        return {
-            f"touch_{windows[k].number}": value
-            for windows in by_probe(measurements)
-            for k, value in self._of_probe(windows).items()
-        }
+        """The rows by address, those of all earlier windows given; each probe's wrench is tared whole."""
+        each: dict[int, Tensor] = {}
+        for windows in by_probe(measurements):
+            for k, rows in self._of_probe(windows).items():
+                each[windows[k].number] = rows
+        ordered = [(n, each[n]) for n, _ in measurements if n in each]
+        room = [capacity(m.action) for n, m in measurements if n in each]
+        return {f"touch_{n}": value for n, value in after_those_before(ordered, room).items()}
 
     def _of_probe(self, windows: Sequence[Numbered]) -> Mapping[int, Tensor]:
-        """The values of a probe's windows, by their number among these."""
+        """The rows of a probe's windows, by their number among these."""
         seen = [measurement for _, measurement in windows]
         probe = seen[0].action.probe
         stream = self._streams.get(probe.name)
@@ -171,7 +183,7 @@ class ContactProbe:
             stream = self._streams[probe.name] = ProbeRows(probe, sensing, self.settings)
         for measurement in seen[len(stream.windows) :]:
             stream.add(measurement)
-        return {k: value for k, value in stream.values.items() if k < len(seen)}
+        return {k: rows for k, rows in stream.rows.items() if k < len(seen)}
 
     # ---- a quadratic approximation of the likelihood (`bcppl.sensors.capabilities.Linearised`)
 
@@ -187,18 +199,11 @@ class ContactProbe:
     def sites(
         self, measurements: Sequence[Approximated], part: Tensor, blur: float
     ) -> Iterator[tuple[ContactEpisodes, Tensor]]:
-        """Each probe's likelihood at poses (S, 7), all distances computed in one batch, and its rows."""
-        probes: dict[str, list[Approximated]] = {}
-        for each in measurements:
-            probes.setdefault(each.action.probe.name, []).append(each)
-        rows = [torch.cat([new_rows(value) for _, _, value in own]) for own in probes.values()]
-        gaps = self.gap(part, torch.cat(rows)[:, :7])
-        gradients, begin = gaps.gradient(part), 0
-        for own, value in zip(probes.values(), rows, strict=True):
-            used = slice(begin, begin + len(value))
-            begin += len(value)
-            measured = _Measured(gaps.distance[:, used], gradients[:, used])
-            yield self.site(own[-1].action, part, blur, measured), value
+        """The likelihood of all probes at poses (S, 7), and their rows."""
+        value = torch.cat([new_rows(value) for _, _, value in measurements])
+        gaps = self.gap(part, value[:, :7])
+        measured = Measured(gaps.distance, gaps.gradient(part))
+        yield self.site(measurements[-1].action, part, blur, measured), value
 
     def new_contact(self, measurements: Sequence[Approximated], newest: bool) -> bool:
         """Whether contact begins in one of the windows, or in the newest of them."""
@@ -222,16 +227,3 @@ class ContactProbe:
         last = int(onsets[-1])
         way = rows[last + 1, :3] - rows[max(0, last - 2), :3]
         return way / way.norm() if float(way.norm()) > _MOVED else None
-
-
-class _Measured(NamedTuple):
-    """Distances that are known already, in place of what measures them."""
-
-    distance: Tensor
-    gradients: Tensor
-
-    def gradient(self, world_from_part: Tensor) -> Tensor:
-        return self.gradients
-
-    def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gaps:
-        return self

@@ -15,13 +15,14 @@ from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, cell_ends
 from bcppl.contact.sensing.location import ContactSensing
-from bcppl.distributions.contact_episodes import COLUMNS, FELT, GIVEN, padded
+from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FELT, GIVEN, padded
+from bcppl.distributions.episodes.switching_filter import Branches
 from bcppl.distributions.manifold import Gaps, MeasuresGap
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors.measurements import Measurement
 
 _ROWS = 60  # of a cell at most: those of contact last 10 ms at least
-_REMEMBERED = 120  # rows of contact that are given to a window at most, the newest
+_REMEMBERED = 600  # rows that are given to a window at most, the newest
 
 
 class RowSettings(Protocol):
@@ -55,12 +56,25 @@ def cells_of(window: ProbeWindow) -> Indices:
 
 def capacity(window: ProbeWindow) -> int:
     """T, the rows that a window's value has room for."""
-    return min(window.last, _ROWS * max(1, len(cells_of(window))) + _REMEMBERED)
+    return _ROWS * max(1, len(cells_of(window))) + _REMEMBERED
 
 
-def new_rows(value: Tensor) -> Tensor:
-    """The rows (R, 13) of a value that no earlier window has used."""
-    return value[~torch.isnan(value[:, FELT]) & (value[:, GIVEN] != 1.0)]
+def after_those_before(each: Sequence[tuple[int, Tensor]], room: Sequence[int]) -> dict[int, Tensor]:
+    """The values (T, 22) of windows, by number: all rows of earlier windows are given, then their own.
+
+    Args:
+        each: number and rows (R, 22) of each window, in their order.
+        room: T of each.
+    """
+    given, values = torch.empty(0, COLUMNS, dtype=torch.float64), {}
+    for (number, new), most in zip(each, room, strict=True):
+        rows = new.clone()
+        if len(given):  # episodes of other probes are others
+            rows[:, EPISODE] += 1.0 + given[:, EPISODE].max()
+        values[number] = padded(torch.cat([given[max(0, len(given) + len(rows) - most) :], rows]), most)
+        rows[:, GIVEN] = 1.0
+        given = torch.cat([given, rows])[-_REMEMBERED:]
+    return values
 
 
 def _noise_of(place: Array) -> float:
@@ -77,14 +91,18 @@ class RememberedGaps:
     """The gaps at one set of poses of the part, each place of the peg measured once.
 
     The windows of a probe ask for those of earlier ones again.
+
+    Attributes:
+        memory: of `ContactEpisodes` at these poses.
     """
 
-    __caches__ = ("_number", "_distance")
+    __caches__ = ("_number", "_distance", "_gradient", "memory")
 
     def __init__(self, gap: MeasuresGap, part: Tensor) -> None:
         self.gap, self.part = gap, part
+        self.memory: dict[bytes, Branches] = {}
         self._number: dict[bytes, int] = {}
-        self._distance = part.new_zeros(len(part), 0)
+        self._distance, self._gradient = part.new_zeros(len(part), 0), part.new_zeros(len(part), 0, 6)
 
     def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gaps:
         """Gaps at poses (N, 7), those of `part`, and (T, 7) or (N, T, 7)."""
@@ -93,20 +111,28 @@ class RememberedGaps:
         keys = [row.tobytes() for row in world_from_peg.numpy()]
         new = [k for k, key in enumerate(keys) if key not in self._number]
         if new:
-            measured = self.gap(self.part, world_from_peg[new]).distance
+            measured = self.gap(self.part, world_from_peg[new])
             for place, k in enumerate(new, self._distance.shape[1]):
                 self._number[keys[k]] = place
-            self._distance = torch.cat([self._distance, measured], dim=1)
-        return _Distances(self._distance[:, [self._number[key] for key in keys]], self, world_from_peg)
+            self._distance = torch.cat([self._distance, measured.distance], dim=1)
+            self._gradient = torch.cat([self._gradient, measured.gradient(self.part)], dim=1)
+        used = [self._number[key] for key in keys]
+        return Measured(self._distance[:, used], self._gradient[:, used])
 
 
-class _Distances(NamedTuple):
+class Measured(NamedTuple):
+    """Gaps that are known already, in place of what measures them."""
+
     distance: Tensor
-    gaps: RememberedGaps
-    world_from_peg: Tensor
+    gradients: Tensor
 
     def gradient(self, world_from_part: Tensor) -> Tensor:
-        return self.gaps.gap(world_from_part, self.world_from_peg).gradient(world_from_part)
+        """(N, T, 6), at the poses where they were measured."""
+        return self.gradients
+
+    def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gaps:
+        """These, at the poses where they were measured."""
+        return self
 
 
 class ProbeRows:
@@ -114,18 +140,17 @@ class ProbeRows:
 
     Attributes:
         windows: so far.
-        values: (T, 13) by number of the window, of those in which a cell ends.
+        rows: (R, 22) by number of the window, of those in which a cell ends.
     """
 
     def __init__(self, probe: Probe, sensing: ContactSensing, settings: RowSettings) -> None:
         self.windows: list[Measurement] = []
-        self.values: dict[int, Tensor] = {}
+        self.rows: dict[int, Tensor] = {}
         self.probe, self.sensing, self.settings = probe, sensing, settings
         self._state = sensing.start(1)
         self._extractor = EpisodeExtractor(settings.contact_detector, step_of(probe))
         self._number = np.empty(0, dtype=np.int64)
-        self._pose, self._force = np.empty((0, 7)), np.empty((0, 3))
-        self._given = torch.empty(0, COLUMNS, dtype=torch.float64)
+        self._pose, self._wrench = np.empty((0, 7)), np.empty((0, 6))
 
     def begins(self, windows: Sequence[Measurement]) -> bool:
         """Whether the windows so far are the first of these, or these the first of them."""
@@ -140,18 +165,11 @@ class ProbeRows:
         fresh = number > (self._number[-1] if len(self._number) else -1)
         self._number = np.append(self._number, number[fresh])
         self._pose = np.concatenate([self._pose, touch.world_from_peg[fresh]])
-        self._force = np.concatenate([self._force, wrench[fresh, :3]])
+        self._wrench = np.concatenate([self._wrench, wrench[fresh]])
         self.windows.append(measurement)
         ends = cells_of(window)
-        if not len(ends):
-            return
-        new = torch.cat([self._rows(int(end)) for end in ends])
-        room = capacity(window)
-        given = self._given[max(0, len(self._given) - max(0, room - len(new))) :]
-        self.values[len(self.windows) - 1] = padded(torch.cat([given, new]), room)
-        contact = new[new[:, FELT] == 1.0]
-        contact[:, GIVEN] = 1.0
-        self._given = torch.cat([self._given, contact])[-_REMEMBERED:]
+        if len(ends):
+            self.rows[len(self.windows) - 1] = torch.cat([self._rows(int(end)) for end in ends])
 
     def _tip(self, pose: Array) -> Array:
         """Positions (T, 3) of the peg's farthest vertex."""
@@ -160,13 +178,13 @@ class ProbeRows:
         return np.asarray(poses.transform(torch.from_numpy(pose), tip[None])[:, 0].numpy())
 
     def _rows(self, end: int) -> Tensor:
-        """The rows (R, 13) that are complete at the end of a cell."""
+        """The rows (R, 22) that are complete at the end of a cell."""
         settings, so_far = self.settings, self._number < end
         number = self._number[so_far]
         rows = self._extractor.rows(
             self.probe.stamps[number],
             self._pose[so_far],
-            self._force[so_far],
+            self._wrench[so_far],
             end == len(self.probe.stamps),
         )
         stamp = float(
@@ -174,5 +192,6 @@ class ProbeRows:
         )
         noise = np.hypot(stamp / np.sqrt(rows.stamps), settings.delay * rows.speed)
         columns = [rows.felt, noise, rows.force, rows.time, rows.episode, np.zeros(len(noise))]
+        columns += [rows.wrench, rows.velocity]
         every = torch.from_numpy(np.column_stack([rows.world_from_peg, *columns]))
         return every if settings.free_space else every[every[:, FELT] == 1.0]

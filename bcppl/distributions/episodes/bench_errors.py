@@ -1,0 +1,315 @@
+"""Errors that all touches of a bench share, and that move the held peg linearly: nuisance parameters.
+
+Each has parameters that are standard normal a priori, and gives, for each row of a probe, how the peg is
+displaced from where it was measured (a twist in its frame, metres and radians) and how the gap changes,
+by one unit of each parameter. What the gap makes of a twist is the same for all errors, so an error never
+sees a particle. `EpisodeLikelihood` integrates the parameters out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.episodes.rows import VELOCITY, WRENCH
+from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE, RARE, check_parameters
+
+
+class Effect(NamedTuple):
+    """What M parameters do to the peg at T rows, by one standard deviation of each.
+
+    Attributes:
+        twist: (T, 6, M) of the peg in its frame, m and rad.
+        offset: (T, M) of the gap besides, m.
+    """
+
+    twist: Tensor
+    offset: Tensor
+
+
+class Jump(NamedTuple):
+    """A sudden change of an error's parameters, at the beginning of an episode.
+
+    Attributes:
+        name: in words, as "the peg slipped in the hand".
+        probability: at each episode.
+        variances: (M,) of the change of each parameter.
+    """
+
+    name: str
+    probability: float
+    variances: Tensor
+
+
+class BenchError(Protocol):
+    """An error that all touches share."""
+
+    @property
+    def name(self) -> str:
+        """In words."""
+
+    @property
+    def means(self) -> Tensor:
+        """(M,) prior means of the parameters, in their standard deviations."""
+
+    @property
+    def variances(self) -> Tensor:
+        """(M,) prior variances of the parameters: 1, or 0 for one that only jumps."""
+
+    @property
+    def jumps(self) -> Sequence[Jump]:
+        """Its sudden changes."""
+
+    def effect(self, rows: Tensor) -> Effect:
+        """Its effect at rows (T, 22)."""
+
+
+class _Unchanging:
+    """The parts of an error whose parameters are standard normal and never jump."""
+
+    count = 6
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+
+    @property
+    def means(self) -> Tensor:
+        return torch.zeros(self.count, dtype=torch.float64)
+
+    @property
+    def variances(self) -> Tensor:
+        return torch.ones(self.count, dtype=torch.float64)
+
+    @property
+    def jumps(self) -> Sequence[Jump]:
+        return ()
+
+
+@dataclass(frozen=True)
+class Grasp(_Unchanging):
+    """The peg sits off in the hand, and may slip.
+
+    Attributes:
+        shift, turn, yaw: standard deviations along each of the peg's axes (m), about those across it, and
+            about its own (rad).
+        slip, slip_turn: of a slip, m and rad.
+        slips: the probability of one, at each episode of contact.
+    """
+
+    shift: float = field(default=0.001, metadata=POSITIVE)
+    turn: float = field(default=math.radians(1.0), metadata=POSITIVE)
+    yaw: float = field(default=math.radians(2.0), metadata=POSITIVE)
+    slip: float = field(default=0.0005, metadata=NONNEGATIVE)
+    slip_turn: float = field(default=math.radians(0.2), metadata=NONNEGATIVE)
+    slips: float = field(default=0.005, metadata=RARE)
+    name = "the peg's pose in the hand"
+
+    @property
+    def _scale(self) -> Tensor:
+        return torch.tensor([self.shift] * 3 + [self.turn, self.turn, self.yaw], dtype=torch.float64)
+
+    @property
+    def jumps(self) -> Sequence[Jump]:
+        change = torch.tensor([self.slip] * 3 + [self.slip_turn] * 3, dtype=torch.float64) / self._scale
+        return (Jump("the peg slipped in the hand", self.slips, change**2),)
+
+    def effect(self, rows: Tensor) -> Effect:
+        return Effect(torch.diag(self._scale).expand(len(rows), 6, 6), rows.new_zeros(len(rows), 6))
+
+
+@dataclass(frozen=True)
+class ArmCompliance(_Unchanging):
+    """Arm and grip yield to the wrench, beyond what the joints measure.
+
+    Along and about each of the peg's axes the compliance is positive: its standard deviation is its mean, as
+    of an exponential distribution, of which it is the normal with the same moments.
+
+    Attributes:
+        translation: mean compliance along the axes, m/N.
+        rotation: about them, rad/(N m).
+    """
+
+    translation: float = field(default=2e-5, metadata=POSITIVE)
+    rotation: float = field(default=5e-4, metadata=POSITIVE)
+    name = "the compliance of arm and grip"
+
+    @property
+    def means(self) -> Tensor:
+        return torch.ones(6, dtype=torch.float64)
+
+    def effect(self, rows: Tensor) -> Effect:
+        scale = torch.tensor([self.translation] * 3 + [self.rotation] * 3, dtype=torch.float64)
+        yielded = torch.nan_to_num(rows[:, WRENCH]) * scale
+        return Effect(torch.diag_embed(yielded), rows.new_zeros(len(rows), 6))
+
+
+@dataclass(frozen=True)
+class KinematicError(_Unchanging):
+    """A smooth error of the arm's kinematics over the workspace, to first order.
+
+    That of a Gaussian process over the peg's position x with covariance s^2 exp(-|x - x'|^2 / 2 l^2) in each
+    axis of the world: a constant of standard deviation s, and a linear field of standard deviation s / l in
+    each of its nine derivatives.
+
+    Attributes:
+        size: s, m.
+        length: l, m.
+        center: (3,) x about which the field is linear, in the world, m.
+    """
+
+    size: float = field(default=0.0003, metadata=POSITIVE)
+    length: float = field(default=0.1, metadata=POSITIVE)
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    name = "the error of the arm's kinematics"
+    count = 12
+
+    def effect(self, rows: Tensor) -> Effect:
+        away = (rows[:, :3] - torch.tensor(self.center, dtype=torch.float64)) / self.length
+        basis = self.size * torch.cat([torch.ones_like(away[:, :1]), away], dim=1)  # (T, 4)
+        turned = poses.rotation_matrix(rows[:, :7]).transpose(-1, -2)  # of the world into the peg's frame
+        moved = (turned[:, :, None, :] * basis[:, None, :, None]).reshape(len(rows), 3, 12)
+        return Effect(torch.cat([moved, torch.zeros_like(moved)], dim=1), rows.new_zeros(len(rows), 12))
+
+
+@dataclass(frozen=True)
+class PartSlides:
+    """The part slides on its table when it is touched: it never does before the first jump.
+
+    Attributes:
+        shift: standard deviation along the table's two axes, m.
+        turn: about its normal, rad.
+        probability: at each episode of contact.
+        center: (3,) about which the part turns, in the world, m.
+    """
+
+    shift: float = field(default=0.0005, metadata=POSITIVE)
+    turn: float = field(default=math.radians(0.3), metadata=POSITIVE)
+    probability: float = field(default=0.005, metadata=RARE)
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    name = "the part's place on the table"
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+
+    @property
+    def means(self) -> Tensor:
+        return torch.zeros(3, dtype=torch.float64)
+
+    @property
+    def variances(self) -> Tensor:
+        return torch.zeros(3, dtype=torch.float64)
+
+    @property
+    def jumps(self) -> Sequence[Jump]:
+        return (Jump("the part slid", self.probability, torch.ones(3, dtype=torch.float64)),)
+
+    def effect(self, rows: Tensor) -> Effect:
+        # A part that moves one way is a peg that moves the other.
+        away = rows[:, :3] - torch.tensor(self.center, dtype=torch.float64)
+        moved = rows.new_zeros(len(rows), 6, 3)
+        moved[:, 0, 0] = moved[:, 1, 1] = self.shift
+        moved[:, 0, 2], moved[:, 1, 2], moved[:, 5, 2] = (
+            -self.turn * away[:, 1],
+            self.turn * away[:, 0],
+            self.turn,
+        )
+        into_peg = poses.rotation_matrix(rows[:, :7]).transpose(-1, -2)
+        return Effect(
+            -torch.cat([into_peg @ moved[:, :3], into_peg @ moved[:, 3:]], dim=1),
+            rows.new_zeros(len(rows), 3),
+        )
+
+
+@dataclass(frozen=True)
+class Delay(_Unchanging):
+    """The wrench is later than the pose: where it was felt, the peg was on the way.
+
+    Attributes:
+        seconds: standard deviation.
+    """
+
+    seconds: float = field(default=0.015, metadata=POSITIVE)
+    name = "the time between wrench and pose"
+    count = 1
+
+    def effect(self, rows: Tensor) -> Effect:
+        into_peg = poses.rotation_matrix(rows[:, :7]).transpose(-1, -2)
+        back = -self.seconds * (into_peg @ torch.nan_to_num(rows[:, VELOCITY])[..., None])
+        return Effect(torch.cat([back, torch.zeros_like(back)], dim=1), rows.new_zeros(len(rows), 1))
+
+
+@dataclass(frozen=True)
+class Size(_Unchanging):
+    """Part and peg are larger than stated by the same everywhere.
+
+    Attributes:
+        growth: standard deviation of how much the gap is smaller, m.
+    """
+
+    growth: float = field(default=0.0001, metadata=POSITIVE)
+    name = "the size of part and peg"
+    count = 1
+
+    def effect(self, rows: Tensor) -> Effect:
+        return Effect(rows.new_zeros(len(rows), 6, 1), rows.new_full((len(rows), 1), -self.growth))
+
+
+class Effects(NamedTuple):
+    """Several errors side by side: M parameters, at T rows."""
+
+    twist: Tensor  # (T, 6, M)
+    offset: Tensor  # (T, M)
+
+
+@dataclass(frozen=True)
+class BenchErrors:
+    """Several errors together, and which parameters are whose.
+
+    Attributes:
+        errors: each error.
+    """
+
+    errors: tuple[BenchError, ...] = ()
+
+    @property
+    def slices(self) -> Mapping[str, slice]:
+        """The parameters of each error, by its name."""
+        ends, places = 0, {}
+        for error in self.errors:
+            begin, ends = ends, ends + len(error.means)
+            places[error.name] = slice(begin, ends)
+        return places
+
+    @property
+    def means(self) -> Tensor:
+        """(M,)."""
+        return torch.cat([torch.zeros(0, dtype=torch.float64), *(e.means for e in self.errors)])
+
+    @property
+    def variances(self) -> Tensor:
+        """(M,)."""
+        return torch.cat([torch.zeros(0, dtype=torch.float64), *(e.variances for e in self.errors)])
+
+    @property
+    def jumps(self) -> list[Jump]:
+        """All sudden changes, their variances (M,) over all parameters."""
+        jumps, total = [], len(self.means)
+        for error in self.errors:
+            place = self.slices[error.name]
+            for jump in error.jumps:
+                variances = torch.zeros(total, dtype=torch.float64)
+                variances[place] = jump.variances
+                jumps.append(jump._replace(variances=variances))
+        return jumps
+
+    def effect(self, rows: Tensor) -> Effect:
+        """Of all parameters, at rows (T, 22)."""
+        none = Effect(rows.new_zeros(len(rows), 6, 0), rows.new_zeros(len(rows), 0))
+        each = [none, *(error.effect(rows) for error in self.errors)]
+        return Effect(torch.cat([e.twist for e in each], dim=2), torch.cat([e.offset for e in each], dim=1))

@@ -1,0 +1,277 @@
+"""Contacts of a probe by episodes: errors that last, errors that all touches share, rows already used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.special import bdtrc
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.checks import Check, chi_square
+from bcppl.distributions.episodes.bench_errors import BenchErrors
+from bcppl.distributions.episodes.covariances import Hypothesis, RowErrors, segments_of
+from bcppl.distributions.episodes.rows import COLUMNS, FELT, FORCE, GIVEN, NOISE, is_predicted, padded
+from bcppl.distributions.episodes.switching_filter import Branches, Prior, begun, filtered
+from bcppl.distributions.manifold import FARTHEST, ContactManifold, Gaps, Quadratic
+from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
+
+_FAR = 4.0  # standard deviations
+_REMEMBERED = 3  # windows: the last one's rows are those that the next one is given
+# Nodes of the compliance, in decades from its median: they are closer than `varying` is wide.
+_DECADES = torch.linspace(-1.25, 1.25, 11, dtype=torch.float64)
+# Prior standard deviations, m and rad, of the pose about which a likelihood is approximated: far wider than
+# what any touch leaves.
+_WIDE = torch.tensor([0.1] * 3 + [1.0] * 3, dtype=torch.float64)
+
+
+@dataclass(eq=False, repr=False)
+class ContactEpisodes(ContactManifold):
+    """Where a held peg was measured to be, and whether it felt the part, over the rows of a window.
+
+    A row is the mean of stamps that hardly differ, or one stamp. In an episode, which is an uninterrupted
+    contact, the gap at row i of force F_i is normal with mean -c F_i, and its errors have the covariance
+
+        (noise_i^2 + (0.2 c F_i)^2) [i = j] + drift^2 exp(-|t_i - t_j| / lasting) + shared^2
+        + (varying c)^2 F_i F_j:
+
+    noise of the rows, a stationary Ornstein-Uhlenbeck process in time, the unknown geometry, and a compliance
+    that differs from contact to contact by a factor. The compliance c of part and peg is common to a
+    recording and log-normal; it is integrated out by a sum over nodes. So a row adds what it adds whatever
+    the rate, and the product of the windows' likelihoods does not depend on how a probe is cut into them: a
+    row that an earlier window has used is in the value again, marked as given, and the log-likelihood is that
+    of all rows minus that of the given ones.
+
+    What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap
+    linearly and is integrated out (`bcppl.distributions.episodes.switching_filter`).
+
+    A row without contact has the probability that a gap about d is positive, as in `ContactManifold`; an
+    episode is an outlier as a whole.
+
+    The event is (T, 22): world_from_peg; 1 with contact, 0 without, NaN for a row that is not used; noise (m)
+    of the row; force (N); time (s); the number of the episode; 1 for a given row; the wrench on the peg (N
+    and N m, in its frame); its velocity (m/s, in the world). Where `motion` predicts the rows there are no
+    forces and times: these are NaN, and the rows are distributed as in `ContactManifold`.
+
+    Args:
+        drift: standard deviation of the errors that last, m.
+        lasting: the time after which they are forgotten, s.
+        compliance: median, m/N.
+        uncertain: standard deviation of its decimal logarithm.
+        varying: standard deviation of a contact's compliance, as a share of the recording's.
+        rough: the same of a row's.
+        blur: m by which the errors of rows are taken to be wider.
+        bench: errors that all touches share.
+        hypotheses: of compliance, noise and scale; by default the nodes of the compliance.
+        memory: of what is known after which rows, at these poses; where windows share one, each row is used
+            once.
+    """
+
+    __caches__ = ("memory",)
+
+    drift: float = field(default=0.00002, metadata=NONNEGATIVE)
+    lasting: float = field(default=0.1, metadata=POSITIVE)
+    compliance: float = field(default=0.000005, metadata=POSITIVE)
+    uncertain: float = field(default=0.5, metadata=POSITIVE)
+    varying: float = field(default=0.6, metadata=NONNEGATIVE)
+    rough: float = field(default=0.2, metadata=NONNEGATIVE)
+    blur: float = field(default=0.0, metadata=NONNEGATIVE)
+    bench: BenchErrors = field(default_factory=BenchErrors)
+    hypotheses: tuple[Hypothesis, ...] = ()
+    memory: dict[bytes, Branches] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super(ContactManifold, self).__init__(len(self.pose), (self.stamps, COLUMNS))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-likelihood (N,) of one window (T, 22), or of one for each particle (N, T, 22)."""
+        if is_predicted(value):
+            return super().log_prob(value[..., : FELT + 1])
+        given, rows = _given_and_all(value)
+        if len(given) == len(rows):
+            return self.pose.new_zeros(len(self.pose))
+        before = self.branches(given)
+        return torch.from_numpy(self.branches(rows, given).log_evidence - before.log_evidence)
+
+    def branches(self, rows: Tensor, after: Tensor | None = None) -> Branches:
+        """The hypotheses after rows (R, 22), of which the first are `after`, where these were seen before."""
+        key = rows.numpy().tobytes()
+        known = self.memory.get(key)
+        if known is None:
+            prior = self._prior(0)
+            begin = begun(prior, len(self.pose))
+            if after is not None and len(after) and not _is_cut(rows, len(after)):
+                known = self.memory.get(after.numpy().tobytes())
+                begin, rows = (begin, rows) if known is None else (known, rows[len(after) :])
+            known = self.memory[key] = self._filtered(begin, prior, rows).trimmed
+            for old in list(self.memory)[:-_REMEMBERED]:
+                del self.memory[old]
+        return known
+
+    def quadratic(self, value: Tensor) -> Quadratic:
+        """The log-likelihood of a window to second order, the shared errors integrated out.
+
+        Of several hypotheses it is the mixture's, by its first two moments.
+        """
+        if is_predicted(value):
+            return super().quadratic(value[..., : FELT + 1])
+        given, rows = _given_and_all(value)
+        count = len(self.pose)
+        whole = Quadratic(self.pose.new_zeros(count, 6), self.pose.new_zeros(count, 6, 6))
+        for sign, used in ((1.0, rows), (-1.0, given)):
+            if len(used):
+                own = self._quadratic_of(used)
+                whole = Quadratic(
+                    whole.gradient + sign * own.gradient, whole.information + sign * own.information
+                )
+        return whole
+
+    def residual(self, value: Tensor) -> Tensor:
+        """Gaps (N, T) that contradict the contact signal, as of `ContactManifold`; 0 for given rows."""
+        if is_predicted(value):
+            return super().residual(value[..., : FELT + 1])
+        stood, felt = value[:, :7].clone(), value[:, FELT]
+        stood[torch.isnan(felt)] = self.pose[0]
+        gaps = self.gap(self.pose, stood)
+        distance = gaps.distance
+        if len(self.bench.means):
+            branches = self.branches(_given_and_all(value)[1])
+            shared = (torch.from_numpy(branches.weights)[..., None] * torch.from_numpy(branches.mean)).sum(1)
+            used = torch.nan_to_num(value)
+            used[:, :7] = stood
+            distance = distance + (self._columns(gaps, used) @ shared[..., None])[..., 0]
+        contact = distance + self.compliance * torch.nan_to_num(value[:, FORCE])
+        residual = torch.where(felt == 1.0, contact, distance.clamp(max=0.0))
+        residual = torch.where(value[:, GIVEN] == 1.0, 0.0, residual)
+        return torch.where(torch.isnan(felt), torch.nan, residual)
+
+    def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check | None:
+        """The check of a window at P particles, as of `ContactManifold`, the shared errors integrated out."""
+        if is_predicted(value):
+            return super().predictive_check(value[..., : FELT + 1], replicas)
+        given, rows = _given_and_all(value)
+        new = rows[len(given) :]
+        if not len(new):
+            return None
+        whole, count = Check(1.0, "contacts", 0.0), int((new[:, FELT] == 1.0).sum())
+        branches = self.branches(rows, given)
+        if count:
+            squared = branches.squared.sum(axis=2)
+            if bool((given[:, FELT] == 1.0).any()):
+                # Of the rows that are new: those before them are squared alike in both.
+                before = self.branches(given)
+                squared = squared - (before.weights * before.squared.sum(axis=2)).sum(axis=1, keepdims=True)
+            whole = chi_square(torch.from_numpy((branches.weights * squared).sum(axis=1)), count, "contacts")
+        free = new[new[:, FELT] == 0.0]
+        if not len(free):
+            return whole
+        gaps = self.gap(self.pose, free[:, :7])
+        deep = (gaps.distance < -_FAR * self._spread_at(gaps, free, branches)).sum(dim=1)
+        outliers = float(bdtrc(deep.numpy() - 1, len(free), self.outlier).mean())
+        return Check(min(1.0, 2.0 * min(whole.probability, outliers)), "contacts", whole.excess)
+
+    def _with_errors(self, rows: Tensor) -> Tensor:
+        return padded(super()._with_errors(rows), self.stamps)
+
+    def _spread_at(self, gaps: Gaps, rows: Tensor, branches: Branches) -> Tensor:
+        """Standard deviations (N, R) of the gaps of rows without contact, a priori."""
+        own = rows[:, NOISE] ** 2 + self.blur**2 + self.drift**2 + self.shared**2
+        columns = self._columns(gaps, rows)
+        return (own + (columns**2 * self.bench.variances).sum(dim=-1)).sqrt()
+
+    @cached_property
+    def _every(self) -> tuple[Hypothesis, ...]:
+        if self.hypotheses:
+            return self.hypotheses
+        weights = (-0.5 * (_DECADES / self.uncertain) ** 2).log_softmax(dim=0)
+        nodes = self.compliance * 10.0**_DECADES
+        return tuple(Hypothesis(w, c) for w, c in zip(weights.tolist(), nodes.tolist(), strict=True))
+
+    def _prior(self, pose: int) -> Prior:
+        """With so many parameters of the pose before the others."""
+        bench, jumps = self.bench, self.bench.jumps
+        own = np.zeros(pose)
+        each = [np.array([h[k] for h in self._every]) for k in (0, 1, 3)]
+        variances = np.array([np.concatenate([own, j.variances.numpy()]) for j in jumps])
+        return Prior(
+            *each,
+            np.concatenate([own, bench.means.numpy()]),
+            np.concatenate([_WIDE.numpy()[:pose] ** 2, bench.variances.numpy()]),
+            np.log(np.array([j.probability for j in jumps], dtype=np.float64)),
+            variances.reshape(len(jumps), pose + len(bench.means)),
+            self.outlier,
+            FARTHEST,
+        )
+
+    def _columns(self, gaps: Gaps, rows: Tensor) -> Tensor:
+        """The gaps' changes (N, R, M) by the shared errors' parameters."""
+        effect = self.bench.effect(rows)
+        if not effect.offset.shape[1]:
+            return effect.offset.expand(len(self.pose), *effect.offset.shape)
+        slope = _by_twist_of_peg(gaps.gradient(self.pose), self.pose, rows[:, :7])
+        return torch.einsum("nra,ram->nrm", slope, effect.twist) + effect.offset
+
+    def _filtered(self, begin: Branches, prior: Prior, rows: Tensor, free: bool = False) -> Branches:
+        """The hypotheses after rows, the pose `free` to move about `self.pose` or held there."""
+        if not len(rows):
+            return begin
+        gaps = self.gap(self.pose, rows[:, :7])
+        columns = self._columns(gaps, rows)
+        if free:
+            columns = torch.cat([gaps.gradient(self.pose), columns], dim=-1)
+        errors = RowErrors(self.blur, self.shared, self.drift, self.lasting, self.varying, self.rough)
+        given = (gaps.distance, rows[:, FORCE], columns)
+        arrays = (np.ascontiguousarray(each.numpy()) for each in given)
+        return filtered(begin, prior, segments_of(rows, errors, self._every), *arrays)
+
+    def _quadratic_of(self, rows: Tensor) -> Quadratic:
+        prior = self._prior(6)
+        after = self._filtered(begun(prior, len(self.pose)), prior, rows, free=True)
+        weights = torch.from_numpy(after.weights)
+        means = torch.from_numpy(after.mean)[..., :6]
+        mean = (weights[..., None] * means).sum(dim=1)
+        away = means - mean[:, None]
+        each = torch.from_numpy(after.covariance)[..., :6, :6] + away[..., None] * away[..., None, :]
+        covariance = (weights[..., None, None] * each).sum(dim=1)
+        precision = torch.linalg.inv(covariance)
+        pull = (precision @ mean[..., None])[..., 0]
+        information = precision - torch.diag(_WIDE**-2)
+        return Quadratic(-pull, 0.5 * (information + information.transpose(-1, -2)))
+
+
+def _given_and_all(value: Tensor) -> tuple[Tensor, Tensor]:
+    """The rows that are given, and these and the new ones; both are marked as new."""
+    rows = value[~torch.isnan(value[:, FELT])]
+    count = int((rows[:, GIVEN] == 1.0).sum())
+    rows = rows.clone()
+    rows[:, GIVEN] = 0.0
+    return rows[:count], rows
+
+
+def _is_cut(rows: Tensor, place: int) -> bool:
+    """Whether rows before and from a place on are of one episode."""
+    both = rows[place - 1 : place + 1]
+    return len(both) == 2 and bool((both[:, FELT] == 1.0).all()) and bool(both[0, 11] == both[1, 11])
+
+
+def _by_twist_of_peg(gradient: Tensor, part: Tensor, peg: Tensor) -> Tensor:
+    """Derivatives (N, R, 6) of gaps by the peg's displacement along its axes and rotation about them.
+
+    Args:
+        gradient: (N, R, 6) by those of the part, as of `Gap.gradient`.
+        part: (N, 7) world_from_part.
+        peg: (R, 7) world_from_peg.
+    """
+    rotation = poses.rotation_matrix(part)
+    normal = -gradient[..., :3]
+    # The moment of the normal at the witness point, about the peg's origin, along the world's axes.
+    about_part = -(gradient[..., 3:] @ rotation.transpose(-1, -2))
+    apart = part[:, None, :3] - peg[:, :3]
+    moment = about_part + torch.linalg.cross(apart, normal)
+    into_peg = poses.rotation_matrix(peg)
+    return torch.cat([torch.einsum("nra,rab->nrb", each, into_peg) for each in (normal, moment)], dim=-1)
