@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, overload
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised
+from bcppl.beliefs.belief import ApparentPose, SeesPart
 from bcppl.distributions.support import freedom_of, refuse_several_poses
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.ancestry import inherited
@@ -200,7 +201,15 @@ class Population:
                 f"a belief over {address!r} was asked for, which is no pose: its values have shape "
                 f"{tuple(poses.shape[1:])}; use bcppl.inference.summaries."
             )
-        return Belief(poses, self.log_weights, freedom or FREE)
+        return Belief(poses, self.log_weights, freedom or FREE, self._apparent(poses))
+
+    def _apparent(self, poses: Tensor) -> ApparentPose | None:
+        """What the last of the observed sites that know of it says of the pose as seen from a held peg."""
+        for address in reversed(list(self.trace.observations)):
+            site = self.trace.distributions[address]
+            if isinstance(site, SeesPart) and site.is_displaced and torch.equal(site.pose, poses):
+                return partial(site.apparent_poses, self.trace[address])
+        return None
 
     def __repr__(self) -> str:
         try:

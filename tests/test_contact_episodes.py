@@ -20,7 +20,7 @@ from bcppl.arrays import Array
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, Rows
 from bcppl.contact.touch import Touch
-from bcppl.distributions.episodes import ContactEpisodes
+from bcppl.distributions.episodes import ContactEpisodes, Hypothesis
 from bcppl.distributions.episodes.rows import COLUMNS, GIVEN, new_rows
 from bcppl.distributions.manifold import FARTHEST
 from bcppl.geometry.extrusion import block, box_peg
@@ -31,6 +31,7 @@ from bcppl.models import look_and_touch
 from bcppl.recordings import repeated
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors import Measurement, Recording
+from bcppl.traces import Model
 from tests.test_manifold import around, differences, ledge
 
 NOISE, SHARED, DRIFT, LASTING, COMPLIANCE, VARYING, ROUGH = 6e-5, 1e-5, 2e-5, 0.1, 5e-6, 0.6, 0.2
@@ -103,18 +104,34 @@ def test_a_row_given_before_counts_once() -> None:
 
 
 def test_quadratic_is_the_gradient_and_nearly_the_curvature() -> None:
+    """Of one compliance, of which the log-likelihood is a quadratic function of the gaps."""
     step = torch.tensor([1e-7] * 3 + [3e-6] * 3, dtype=torch.float64)
     scale = torch.tensor([1e-4] * 3 + [3e-3] * 3, dtype=torch.float64)
     given = MIXED.clone()
     given[:2, GIVEN] = 1.0
+    one = (Hypothesis(0.0, COMPLIANCE),)
     for value in (MIXED, given):
         pose = around(1, 1, 1e-5, 1e-4)
-        stated = site(pose, 8).quadratic(value)
-        gradient, bend = differences(lambda p: site(p, 8), value, pose, step)
+        stated = site(pose, 8, hypotheses=one).quadratic(value)
+        gradient, bend = differences(lambda p: site(p, 8, hypotheses=one), value, pose, step)
         size = float((gradient * scale).abs().max())
         assert float(((stated.gradient[0] - gradient) * scale).abs().max()) < 0.12 * size
         information, curved = stated.information[0] * scale[:, None] * scale, bend * scale[:, None] * scale
         assert float((information - curved).abs().max()) < 0.3 * float(curved.abs().max())
+
+
+def test_quadratic_of_an_uncertain_compliance_has_the_likelihood_s_own_moments() -> None:
+    """Along the plane's normal: mean and variance of the normalised likelihood."""
+    pose = poses.identity(4001)
+    pose[:, 2] = torch.linspace(-1e-3, 1e-3, 4001, dtype=torch.float64)
+    weights = site(pose, 8).log_prob(MIXED).softmax(dim=0)
+    mean = weights @ pose[:, 2]
+    variance = weights @ (pose[:, 2] - mean) ** 2
+    stated = site(pose[2000:2001], 8).quadratic(MIXED)
+    information, slope = float(stated.information[0, 2, 2]), float(stated.gradient[0, 2])
+    # The other axes are known by nothing else here, so they are held.
+    assert 0.4 < 1.0 / information / float(variance) < 2.5
+    assert abs(-slope / information - float(mean)) < float(variance) ** 0.5
 
 
 # ---------------------------------------------------------------- rows of a probe
@@ -173,10 +190,12 @@ def cut(recording: Recording, length: int) -> Recording:
     return replace(recording, measurements=windows)
 
 
-def values_of(recording: Recording) -> tuple[Any, list[tuple[Any, Tensor]]]:
+def values_of(
+    recording: Recording, model: Model = look_and_touch.model
+) -> tuple[Any, list[tuple[Any, Tensor]]]:
     """The likelihood, and each value with its action, as a filter comes by them."""
-    scene = look_and_touch.model.prepare(recording)
-    steps = observations_of(look_and_touch.model, scene, recording.measurements)
+    scene = model.prepare(recording)
+    steps = observations_of(model, scene, recording.measurements)
     values = [(each.args[1][-1], value) for each in steps for value in each.observations.values()]
     return scene.likelihoods["window"], values
 

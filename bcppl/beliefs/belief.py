@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -12,12 +14,38 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arguments import whole_number
 from bcppl.beliefs import entropy, modes
 from bcppl.beliefs.distances import average_distance
 from bcppl.beliefs.regions import Measure, Region, pose_deviation, region
 from bcppl.beliefs.weights import effective_sample_size, merged, normalised, weighted_quantiles
 from bcppl.errors import InputError
-from bcppl.poses import FREE, Freedom
+from bcppl.poses import FREE, Freedom, as_pose
+
+
+class ApparentPose(Protocol):
+    """Where a part is as seen from a held peg, given its pose in the world."""
+
+    def __call__(self, world_from_peg: Tensor, draws: int) -> Tensor:
+        """Poses (N, draws, 7) that a part has in the world of a robot that takes its peg to be there.
+
+        They are `world_from_peg` times the true `peg_from_part`, for N particles, the errors between a peg's
+        measured pose (7,) and its true one drawn from their posterior.
+        """
+
+
+@runtime_checkable
+class SeesPart(Protocol):
+    """A site that observes how a held peg meets a part at poses (N, 7)."""
+
+    pose: Tensor
+
+    @property
+    def is_displaced(self) -> bool:
+        """Whether the peg may be elsewhere than it is measured."""
+
+    def apparent_poses(self, value: Tensor, world_from_peg: Tensor, draws: int) -> Tensor:
+        """As `ApparentPose`, given the value that was observed."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -28,6 +56,7 @@ class Belief:
         world_from_part: (N, 7) poses, float64 (made so, if they are of another type).
         log_weights: (N,) unnormalised, float64 (likewise).
         freedom: the free axes of the pose.
+        apparent: of these particles; None where the peg's measured pose is its true one.
 
     Raises:
         InputError: the poses are not (N, 7) or not finite, or the weights not (N,).
@@ -36,6 +65,7 @@ class Belief:
     world_from_part: Tensor
     log_weights: Tensor
     freedom: Freedom = FREE
+    apparent: ApparentPose | None = None
 
     def __post_init__(self) -> None:
         for name in ("world_from_part", "log_weights"):
@@ -57,6 +87,29 @@ class Belief:
 
     def __len__(self) -> int:
         return len(self.log_weights)
+
+    def relative(self, world_from_peg: Tensor | np.ndarray, draws: int = 8) -> Belief:
+        """The belief about where the part is as seen from the held peg, N times `draws` particles.
+
+        A peg that is off in the hand, and an arm that is off in the world, move all touches alike: the part's
+        pose in the world is unsure by as much, and its pose relative to the peg is not. A robot that takes
+        its peg to be where it measures it, and the part to be where this belief says, brings the two to where
+        they truly are relative to each other. It is the belief itself where the peg's pose has no error.
+
+        Args:
+            world_from_peg: (7,) the measured pose at which it is to hold, without a force.
+            draws: of the errors, for each particle.
+
+        Raises:
+            InputError: the pose is none, or the number of draws is not positive.
+        """
+        at = as_pose(world_from_peg, "the peg's pose, at which a relative belief is asked for,")
+        count = whole_number("a relative belief is asked for with {} draws", draws)
+        if self.apparent is None:
+            return self
+        world_from_part = self.apparent(at, count)
+        log_weights = (self.log_weights[:, None] - math.log(count)).expand(-1, count)
+        return Belief(world_from_part.reshape(-1, 7), log_weights.reshape(-1), self.freedom)
 
     def __repr__(self) -> str:
         return f"Belief({len(self)} poses, {self.freedom})"

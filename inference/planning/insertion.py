@@ -1,8 +1,9 @@
 """Plans of compliant insertions: a guarded descent, a spiral search, and a compliant push.
 
-The peg descends along the hole's axis at the posterior mean, presses softly, and follows a spiral as wide as
-the belief is uncertain until it sinks in; then it is pushed with a stiffness that lets it align with the
-hole.
+The pose of the hole is that relative to the held peg (`Belief.relative`): what peg and part are off by alike
+does not matter. The peg descends along the hole's axis at the posterior mean, presses softly, and follows a
+spiral as wide as the belief is uncertain until it sinks in; then it is pushed with a stiffness that lets it
+align with the hole.
 """
 
 from __future__ import annotations
@@ -95,6 +96,8 @@ def insertion_plan(
     hole = hole_of(part) if hole is None else hole
     fit = fit_in(hole, peg)
     part_from_hole = torch.from_numpy(hole.part_from_hole)
+    standing = poses.compose(poses.compose(belief.mean, part_from_hole), torch.from_numpy(fit.hole_from_peg))
+    belief = belief.relative(standing)
     world_from_hole = poses.compose(belief.mean, part_from_hole)
     covariance = _covariance(belief, world_from_hole, part_from_hole)
     height = max(0.001, chosen.standard_deviations * float(covariance[2, 2].sqrt()))

@@ -70,7 +70,8 @@ def success_probability(
     """
     whole_number("the success of an insertion is to be simulated for {} particles", particles)
     hole = hole_of(physics.part) if hole is None else hole
-    world_from_part = _draw(belief, particles, seed)
+    beginning = plan.search.world_from_peg[0]
+    world_from_part = _draw(belief.relative(beginning), particles, seed)
     count = len(world_from_part)
     hole_found, world_from_peg = _search(plan, physics, hole, world_from_part)
     success = _push(plan, physics, hole, world_from_part, world_from_peg)

@@ -80,14 +80,17 @@ class _Unchanging:
 
     @property
     def means(self) -> Tensor:
+        """(M,) in standard deviations."""
         return torch.zeros(self.count, dtype=torch.float64)
 
     @property
     def variances(self) -> Tensor:
+        """(M,) 1, or 0 for what only jumps."""
         return torch.ones(self.count, dtype=torch.float64)
 
     @property
     def jumps(self) -> Sequence[Jump]:
+        """Its sudden changes."""
         return ()
 
 
@@ -116,10 +119,12 @@ class Grasp(_Unchanging):
 
     @property
     def jumps(self) -> Sequence[Jump]:
+        """Its sudden changes."""
         change = torch.tensor([self.slip] * 3 + [self.slip_turn] * 3, dtype=torch.float64) / self._scale
         return (Jump("the peg slipped in the hand", self.slips, change**2),)
 
     def effect(self, rows: Tensor) -> Effect:
+        """Its effect at rows (T, 22)."""
         return Effect(torch.diag(self._scale).expand(len(rows), 6, 6), rows.new_zeros(len(rows), 6))
 
 
@@ -141,9 +146,11 @@ class ArmCompliance(_Unchanging):
 
     @property
     def means(self) -> Tensor:
+        """(M,) in standard deviations."""
         return torch.ones(6, dtype=torch.float64)
 
     def effect(self, rows: Tensor) -> Effect:
+        """Its effect at rows (T, 22)."""
         scale = torch.tensor([self.translation] * 3 + [self.rotation] * 3, dtype=torch.float64)
         yielded = torch.nan_to_num(rows[:, WRENCH]) * scale
         return Effect(torch.diag_embed(yielded), rows.new_zeros(len(rows), 6))
@@ -170,6 +177,7 @@ class KinematicError(_Unchanging):
     count = 12
 
     def effect(self, rows: Tensor) -> Effect:
+        """Its effect at rows (T, 22)."""
         away = (rows[:, :3] - torch.tensor(self.center, dtype=torch.float64)) / self.length
         basis = self.size * torch.cat([torch.ones_like(away[:, :1]), away], dim=1)  # (T, 4)
         turned = poses.rotation_matrix(rows[:, :7]).transpose(-1, -2)  # of the world into the peg's frame
@@ -199,17 +207,21 @@ class PartSlides:
 
     @property
     def means(self) -> Tensor:
+        """(M,) in standard deviations."""
         return torch.zeros(3, dtype=torch.float64)
 
     @property
     def variances(self) -> Tensor:
+        """(M,) 1, or 0 for what only jumps."""
         return torch.zeros(3, dtype=torch.float64)
 
     @property
     def jumps(self) -> Sequence[Jump]:
+        """Its sudden changes."""
         return (Jump("the part slid", self.probability, torch.ones(3, dtype=torch.float64)),)
 
     def effect(self, rows: Tensor) -> Effect:
+        """Its effect at rows (T, 22)."""
         # A part that moves one way is a peg that moves the other.
         away = rows[:, :3] - torch.tensor(self.center, dtype=torch.float64)
         moved = rows.new_zeros(len(rows), 6, 3)
@@ -239,6 +251,7 @@ class Delay(_Unchanging):
     count = 1
 
     def effect(self, rows: Tensor) -> Effect:
+        """Its effect at rows (T, 22)."""
         into_peg = poses.rotation_matrix(rows[:, :7]).transpose(-1, -2)
         back = -self.seconds * (into_peg @ torch.nan_to_num(rows[:, VELOCITY])[..., None])
         return Effect(torch.cat([back, torch.zeros_like(back)], dim=1), rows.new_zeros(len(rows), 1))
@@ -257,14 +270,8 @@ class Size(_Unchanging):
     count = 1
 
     def effect(self, rows: Tensor) -> Effect:
+        """Its effect at rows (T, 22)."""
         return Effect(rows.new_zeros(len(rows), 6, 1), rows.new_full((len(rows), 1), -self.growth))
-
-
-class Effects(NamedTuple):
-    """Several errors side by side: M parameters, at T rows."""
-
-    twist: Tensor  # (T, 6, M)
-    offset: Tensor  # (T, M)
 
 
 @dataclass(frozen=True)

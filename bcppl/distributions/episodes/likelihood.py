@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -150,6 +151,23 @@ class ContactEpisodes(ContactManifold):
         residual = torch.where(value[:, GIVEN] == 1.0, 0.0, residual)
         return torch.where(torch.isnan(felt), torch.nan, residual)
 
+    @property
+    def is_displaced(self) -> bool:
+        """Whether the peg may be elsewhere than it is measured."""
+        return bool(self.bench.errors)
+
+    def apparent_poses(self, value: Tensor, world_from_peg: Tensor, draws: int) -> Tensor:
+        """The part's poses (N, draws, 7) as of `bcppl.beliefs.belief.ApparentPose`, given a window's rows."""
+        branches = self.branches(_given_and_all(value)[1])
+        row = world_from_peg.new_zeros(1, COLUMNS)
+        row[0, :7] = world_from_peg
+        twist = drawn(branches, draws) @ self.bench.effect(row).twist[0].T
+        turn = poses.rotation_matrix(world_from_peg)
+        measured = world_from_peg.expand(*twist.shape[:-1], 7)
+        true = poses.retract(measured, torch.cat([twist[..., :3] @ turn.T, twist[..., 3:]], dim=-1))
+        part = self.pose[:, None].expand(*twist.shape[:-1], 7)
+        return poses.compose(measured, poses.compose(poses.inverse(true), part))
+
     def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check | None:
         """The check of a window at P particles, as of `ContactManifold`, the shared errors integrated out."""
         if is_predicted(value):
@@ -196,16 +214,18 @@ class ContactEpisodes(ContactManifold):
         """With so many parameters of the pose before the others."""
         bench, jumps = self.bench, self.bench.jumps
         own = np.zeros(pose)
-        each = [np.array([h[k] for h in self._every]) for k in (0, 1, 3)]
-        variances = np.array([np.concatenate([own, j.variances.numpy()]) for j in jumps])
+        log_weight, compliance, _, scale = np.array(self._every).T.copy()
+        changed = np.array([np.concatenate([own, j.variances.numpy()]) for j in jumps])
         return Prior(
-            *each,
-            np.concatenate([own, bench.means.numpy()]),
-            np.concatenate([_WIDE.numpy()[:pose] ** 2, bench.variances.numpy()]),
-            np.log(np.array([j.probability for j in jumps], dtype=np.float64)),
-            variances.reshape(len(jumps), pose + len(bench.means)),
-            self.outlier,
-            FARTHEST,
+            log_weight=log_weight,
+            compliance=compliance,
+            scale=scale,
+            mean=np.concatenate([own, bench.means.numpy()]),
+            variance=np.concatenate([_WIDE.numpy()[:pose] ** 2, bench.variances.numpy()]),
+            jump_log_probability=np.array([math.log(max(j.probability, 1e-300)) for j in jumps]),
+            jump_variance=changed.reshape(len(jumps), pose + len(bench.means)),
+            outlier=self.outlier,
+            farthest=FARTHEST,
         )
 
     def _columns(self, gaps: Gaps, rows: Tensor) -> Tensor:
@@ -242,6 +262,18 @@ class ContactEpisodes(ContactManifold):
         pull = (precision @ mean[..., None])[..., 0]
         information = precision - torch.diag(_WIDE**-2)
         return Quadratic(-pull, 0.5 * (information + information.transpose(-1, -2)))
+
+
+def drawn(branches: Branches, draws: int) -> Tensor:
+    """Parameters (N, draws, M) from their posterior, the same at each call."""
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.from_numpy(branches.weights)
+    which = torch.multinomial(weights, draws, replacement=True, generator=generator)
+    particle = torch.arange(len(weights))[:, None]
+    mean = torch.from_numpy(branches.mean)[particle, which]
+    variances, axes = torch.linalg.eigh(torch.from_numpy(branches.covariance)[particle, which])
+    standard = torch.randn(*mean.shape, 1, generator=generator, dtype=torch.float64)
+    return mean + ((axes * variances.clamp(min=0.0).sqrt()[..., None, :]) @ standard)[..., 0]
 
 
 def _given_and_all(value: Tensor) -> tuple[Tensor, Tensor]:

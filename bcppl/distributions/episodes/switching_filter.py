@@ -75,7 +75,7 @@ class Branches(NamedTuple):
     """The hypotheses of N particles after some rows.
 
     Attributes:
-        count: (N,) how many there are; others are not used.
+        number: (N,) how many there are; others are not used.
         log_weight: (N, B) unnormalised: their sum is the likelihood of the rows so far.
         which: (N, B) the hypothesis of the prior.
         mean: (N, B, M) of the parameters.
@@ -84,7 +84,7 @@ class Branches(NamedTuple):
         squared: (N, B, S) squared whitened errors of an episode, as predicted; 0 without contact.
     """
 
-    count: Indices
+    number: Indices
     log_weight: Array
     which: Indices
     mean: Array
@@ -95,21 +95,21 @@ class Branches(NamedTuple):
     @property
     def log_evidence(self) -> Array:
         """(N,) the log-likelihood of the rows so far."""
-        used = np.arange(self.log_weight.shape[1]) < self.count[:, None]
+        used = np.arange(self.log_weight.shape[1]) < self.number[:, None]
         return np.asarray(np.logaddexp.reduce(np.where(used, self.log_weight, -np.inf), axis=1))
 
     @property
     def weights(self) -> Array:
         """(N, B) normalised, 0 for those that are not used."""
-        used = np.arange(self.log_weight.shape[1]) < self.count[:, None]
+        used = np.arange(self.log_weight.shape[1]) < self.number[:, None]
         shifted = np.where(used, self.log_weight, -np.inf) - self.log_evidence[:, None]
         return np.asarray(np.exp(shifted))
 
     @property
     def trimmed(self) -> Branches:
         """The same without what no particle uses."""
-        most = int(self.count.max(initial=1))
-        return Branches(self.count, *(np.ascontiguousarray(each[:, :most]) for each in self[1:]))
+        most = int(self.number.max(initial=1))
+        return Branches._make([self.number, *(np.ascontiguousarray(each[:, :most]) for each in self[1:])])
 
 
 def begun(prior: Prior, particles: int) -> Branches:
@@ -152,14 +152,15 @@ def filtered(
     grown = [[(0, 0), (0, room), *[(0, 0)] * (each.ndim - 2)] for each in before[1:]]
     for each in grown[-2:]:
         each[2] = (0, new)
-    after = Branches(before.count.copy(), *(np.pad(e, by) for e, by in zip(before[1:], grown, strict=True)))
+    padded = (np.pad(each, by) for each, by in zip(before[1:], grown, strict=True))
+    after = Branches._make([before.number.copy(), *padded])
 
     def work(begin: int, end: int) -> int:
         _filter(begin, end, *after, prior, segments, distance, force, columns)
         return 0
 
     if new:
-        parallel_sum(work, 0, len(before.count), 8, thread_count())
+        parallel_sum(work, 0, len(before.number), 8, thread_count())
     return after
 
 
@@ -224,7 +225,7 @@ def _update(
 def _filter(
     begin: int,
     end: int,
-    count: Indices,
+    number: Indices,
     log_weight: Array,
     which: Indices,
     mean: Array,
@@ -258,7 +259,7 @@ def _filter(
             if segments.contact[s] == 0:
                 if distance[n, first] > _CLEAR:
                     continue
-                for b in range(count[n]):
+                for b in range(number[n]):
                     own = columns[n, first]
                     spread = segments.factor[which[n, b], first, 0]
                     gap, variance = distance[n, first], spread * spread
@@ -284,7 +285,7 @@ def _filter(
                 continue
             rows, found = last - first, 0
             stray = log_out - rows * math.log(prior.farthest)
-            for b in range(count[n]):
+            for b in range(number[n]):
                 h = which[n, b]
                 for option in range(1 + jumps):
                     means[found], covariances[found] = mean[n, b], covariance[n, b]
@@ -340,4 +341,4 @@ def _filter(
                 event[n, k], squared[n, k] = old_event[source[c]], old_squared[source[c]]
                 event[n, k, offset + s], squared[n, k, offset + s] = kind[c], square[c]
                 left += 1
-            count[n] = left
+            number[n] = left

@@ -24,6 +24,7 @@ from bcppl.geometry.gap import PegGap
 from bcppl.geometry.parts import Part
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.capabilities import Approximated
+from bcppl.sensors.likelihoods.bench_profiles import profile_named
 from bcppl.sensors.likelihoods.probe_rows import (
     Measured,
     ProbeRows,
@@ -59,9 +60,9 @@ class TouchSettings:
         gap_outlier: probability that a stamp without contact, or a contact, is an outlier.
         contact_detector: force thresholds of contact and of free motion.
         free_space: whether stamps without contact count, which exclude the part from where the peg moved.
-        bench: errors that all touches share.
-        hypotheses: of the contact's compliance, of how much wider the noise and the shared errors are; by
-            default nodes of the compliance.
+        profile: of the bench, which sets the priors of the errors that all touches share
+            (`bcppl.sensors.likelihoods.bench_profiles`).
+        bench: these errors themselves, in place of the profile's.
     """
 
     gap_noise: float = 0.00006
@@ -74,8 +75,8 @@ class TouchSettings:
     gap_outlier: float = 0.001
     contact_detector: ContactDetector = field(default_factory=ContactDetector)
     free_space: bool = True
-    bench: tuple[BenchError, ...] = ()
-    hypotheses: tuple[Hypothesis, ...] = ()
+    profile: str = "perfect"
+    bench: tuple[BenchError, ...] | None = None
 
     def __post_init__(self) -> None:
         for name in ("gap_noise", "lasting", "compliance", "compliance_decades"):
@@ -87,6 +88,19 @@ def _solids(part: Part, peg: Part) -> tuple[PegGap, QuasiStaticMotion]:
     """Distances between two solids, prepared once for all scenes of the same two."""
     gap = PegGap(part, peg)
     return gap, QuasiStaticMotion(gap)
+
+
+def _shared_errors(
+    recording: Recording, settings: TouchSettings
+) -> tuple[BenchErrors, tuple[Hypothesis, ...]]:
+    """The errors that all touches share, and the hypotheses of how good the bench is."""
+    profile = profile_named(settings.profile)
+    x, y, z = map(float, recording.guess.world_from_part[:3])
+    length = 0.0 if recording.peg is None else -float(recording.peg.vertices[:, 2].min())
+    part, peg = (x, y, z), (x, y, z + length)
+    own = () if profile is None else profile.errors(part, peg)
+    errors = BenchErrors(own if settings.bench is None else settings.bench)
+    return errors, () if profile is None else profile.hypotheses
 
 
 class ContactProbe:
@@ -111,7 +125,7 @@ class ContactProbe:
             raise InputError("the recording has probe windows but no peg; add the peg that was held.")
         self.settings, self.peg = settings, recording.peg
         self.gap, self.quasi_static = _solids(recording.part, recording.peg)
-        self.bench = BenchErrors(settings.bench)
+        self.bench, self.hypotheses = _shared_errors(recording, settings)
         self._streams: dict[str, ProbeRows] = {}
 
     @classmethod
@@ -159,7 +173,7 @@ class ContactProbe:
             uncertain=settings.compliance_decades,
             blur=blur,
             bench=self.bench,
-            hypotheses=self.settings.hypotheses,
+            hypotheses=self.hypotheses,
             memory=gap.memory if isinstance(gap, RememberedGaps) else {},
         )
 

@@ -1,0 +1,100 @@
+"""What is known of a bench before any touch: priors of the errors that all touches share.
+
+Standard deviations. A peg in parallel jaws sits 0.2 to 1 mm and 0.2 to 1 degree off; joints and grip yield by
+10 to 50 um/N; wrench and pose are 5 to 40 ms apart (arXiv 2602.16127: 35 to 40 ms); the pose of a flange
+repeats to hundredths of a millimetre and is wrong by tenths to millimetres.
+
+- ur5e: repeats to 0.03 mm (Universal Robots, UR5e technical details, ISO 9283); 0.3 mm over a bench once its
+  kinematics are calibrated (its factory calibration, or MUKCa, arXiv 2503.12584, which leaves 0.2 mm).
+- panda: repeats to 0.1 mm (Franka Emika, Panda datasheet); torque sensors and light links yield more.
+- industrial: repeats to 0.02 mm; stiff, with jaws that hold the peg in a pocket.
+- perfect: the peg is where it is measured.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from bcppl.distributions.episodes import (
+    ArmCompliance,
+    BenchError,
+    Delay,
+    Grasp,
+    Hypothesis,
+    KinematicError,
+    PartSlides,
+    Size,
+)
+from bcppl.errors import InputError
+
+Point = tuple[float, float, float]
+
+CONTACT = 5e-6  # m/N, of part and peg where they touch
+# Most benches are as stated, some half as good.
+SCALES = tuple(
+    Hypothesis(math.log(share * wide), CONTACT, noise, scale)
+    for share, noise in ((0.85, 1.0), (0.15, 2.5))
+    for wide, scale in ((0.65, 1.0), (0.35, 2.2))
+)
+
+
+@dataclass(frozen=True)
+class BenchProfile:
+    """Priors of a bench: metres, radians, seconds, N.
+
+    Attributes:
+        grasp: along and about the peg's axes, and about its own.
+        compliance: of arm and grip along and about the peg's axes, mean, m/N and rad/(N m).
+        kinematics: over the workspace, and the distance over which it changes.
+        delay: between wrench and pose.
+        size: of part and peg together.
+        slips, slides: probabilities that the peg slips in the hand or the part on the table, at each episode
+            of contact.
+        hypotheses: of how good the bench is.
+    """
+
+    grasp: tuple[float, float, float] = (0.0005, math.radians(0.5), math.radians(1.0))
+    compliance: tuple[float, float] = (1.5e-5, 3e-4)
+    kinematics: tuple[float, float] = (0.0003, 0.1)
+    delay: float = 0.015
+    size: float = 0.00005
+    slips: float = 0.005
+    slides: float = 0.005
+    hypotheses: tuple[Hypothesis, ...] = SCALES
+
+    def errors(self, part: Point, peg: Point) -> tuple[BenchError, ...]:
+        """The errors, smooth ones about a guess (3,) of where the part is and where the peg will be held."""
+        return (
+            Grasp(*self.grasp, slips=self.slips),
+            ArmCompliance(*self.compliance),
+            KinematicError(*self.kinematics, center=peg),
+            PartSlides(probability=self.slides, center=part),
+            Delay(self.delay),
+            Size(self.size),
+        )
+
+
+PROFILES: Mapping[str, BenchProfile | None] = {
+    "perfect": None,
+    "ur5e": BenchProfile(),
+    "panda": BenchProfile(compliance=(2.5e-5, 6e-4), kinematics=(0.0005, 0.1)),
+    "industrial": BenchProfile(
+        grasp=(0.0002, math.radians(0.2), math.radians(0.3)),
+        compliance=(5e-6, 1e-4),
+        kinematics=(0.0001, 0.1),
+        delay=0.005,
+    ),
+}
+
+
+def profile_named(name: str) -> BenchProfile | None:
+    """The profile of that name; None for a perfect bench.
+
+    Raises:
+        InputError: there is none.
+    """
+    if name not in PROFILES:
+        raise InputError(f"there is no profile {name!r} of a bench; choose {', '.join(PROFILES)}.")
+    return PROFILES[name]

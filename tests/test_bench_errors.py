@@ -1,0 +1,237 @@
+"""Errors that all touches share, integrated out: dense Gaussians, any cut, jumps, the peg's own view."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+from torch.special import log_ndtr
+
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.distributions.episodes import (
+    ArmCompliance,
+    BenchErrors,
+    ContactEpisodes,
+    Delay,
+    Grasp,
+    Hypothesis,
+    KinematicError,
+    PartSlides,
+    Size,
+)
+from bcppl.distributions.episodes.covariances import RowErrors, segments_of
+from bcppl.distributions.episodes.rows import FELT, FORCE, GIVEN, VELOCITY, WRENCH, new_rows
+from bcppl.errors import InputError
+from bcppl.geometry.extrusion import block, box_peg
+from bcppl.geometry.gap import PegGap
+from bcppl.models import look_and_touch
+from bcppl.sensors.likelihoods.bench_profiles import PROFILES
+from bcppl.sensors.measurements import Measurement, Recording
+from tests.test_contact_episodes import MIXED, cut, probed, values_of
+from tests.test_manifold import around, ledge
+
+ONE = (Hypothesis(0.0, 5e-6),)
+SHARED = (Grasp(slips=0.0), ArmCompliance(), KinematicError(center=(0.01, 0.0, 0.0)), Delay(), Size(0.001))
+OUTLIER = 1e-9
+
+
+def site(
+    pose: Tensor, rows: Tensor, *errors: Any, outlier: float = OUTLIER, **others: Any
+) -> ContactEpisodes:
+    given = {"hypotheses": ONE, "bench": BenchErrors(errors or SHARED), **others}
+    return ContactEpisodes(ledge, pose, len(rows), 6e-5, 1e-5, 2e-5, outlier, **given)
+
+
+def rows_with_wrenches(felt: list[float], episodes: list[int], seed: int = 0) -> Tensor:
+    """As `MIXED`: turned pegs, wrenches mostly along z, and velocities."""
+    rng = np.random.default_rng(seed)
+    rows = MIXED[:1].repeat(len(felt), 1)
+    rows[:, :7] = poses.retract(
+        poses.identity(len(felt)), torch.from_numpy(rng.normal(size=(len(felt), 6)) * [0.03] * 6)
+    )
+    rows[:, 2] = torch.from_numpy(rng.normal(0.0, 3e-4, len(felt)))
+    rows[:, FELT], rows[:, 11] = torch.tensor(felt), torch.tensor(episodes)
+    rows[:, 8] = torch.from_numpy(rng.uniform(2e-5, 9e-5, len(felt)))
+    rows[:, FORCE] = torch.from_numpy(rng.uniform(2.0, 12.0, len(felt)))
+    rows[:, 10] = torch.from_numpy(np.cumsum(rng.uniform(0.02, 0.08, len(felt))))
+    rows[:, WRENCH] = torch.from_numpy(rng.normal(size=(len(felt), 6)) * [1.0, 1.0, 4.0, 0.1, 0.1, 0.1])
+    rows[:, VELOCITY] = torch.from_numpy(rng.normal(0.0, 0.02, (len(felt), 3)))
+    return rows
+
+
+FIVE = rows_with_wrenches([1, 1, 1, 1, 1], [0, 0, 1, 1, 2])
+
+
+def moved(peg: Tensor, twist: Tensor) -> Tensor:
+    """Pegs (T, 7) displaced along their own axes and turned about them by twists (T, 6)."""
+    along = (poses.rotation_matrix(peg) @ twist[:, :3, None])[..., 0]
+    return poses.retract(peg, torch.cat([along, twist[:, 3:]], dim=1))
+
+
+def measured_columns(gap: Any, pose: Tensor, rows: Tensor, errors: BenchErrors) -> Tensor:
+    """The gap's changes (N, R, M) by each parameter, by finite differences of the gap itself."""
+    effect = errors.effect(rows)
+    columns = []
+    for k in range(len(errors.means)):
+        step = 1e-3
+        apart = [
+            gap(pose, moved(rows[:, :7], sign * step * effect.twist[..., k])).distance for sign in (1.0, -1.0)
+        ]
+        columns.append((apart[0] - apart[1]) / (2.0 * step) + effect.offset[:, k])
+    return torch.stack(columns, dim=-1)
+
+
+def dense(pose: Tensor, rows: Tensor, errors: BenchErrors, extra: Tensor | None = None) -> Tensor:
+    """Log-density (N,) of all contact rows at once; `extra` (R, R, M): variances that rows share besides."""
+    columns = measured_columns(ledge, pose, rows, errors)
+    factor = torch.from_numpy(segments_of(rows, RowErrors(0.0, 1e-5, 2e-5, 0.1, 0.6, 0.2), ONE).factor[0])
+    own = torch.zeros(len(rows), len(rows), dtype=torch.float64)
+    for episode in rows[:, 11].unique():
+        index = (rows[:, 11] == episode).nonzero()[:, 0]
+        part = factor[index][:, : len(index)]
+        own[index[:, None], index] = part @ part.T
+    covariance = own + columns @ (errors.variances[:, None] * columns.transpose(-1, -2))
+    if extra is not None:
+        covariance = covariance + torch.einsum("nrm,nsm,rsm->nrs", columns, columns, extra)
+    mean = -5e-6 * rows[:, FORCE] - columns @ errors.means
+    return MultivariateNormal(mean, covariance).log_prob(ledge(pose, rows[:, :7]).distance)
+
+
+def test_the_filter_is_the_dense_gaussian_and_each_error_matters() -> None:
+    pose = around(20)
+    expected = dense(pose, FIVE, BenchErrors(SHARED))
+    torch.testing.assert_close(site(pose, FIVE).log_prob(FIVE), expected, rtol=1e-4, atol=1e-3)
+    for k in range(len(SHARED)):
+        others = SHARED[:k] + SHARED[k + 1 :]
+        assert float((site(pose, FIVE, *others).log_prob(FIVE) - expected).abs().max()) > 0.02, SHARED[k].name
+
+    @dataclass(frozen=True)
+    class Pulled(ArmCompliance):
+        """Mutant: the arm yields towards the force."""
+
+        def effect(self, rows: Tensor) -> Any:
+            right = super().effect(rows)
+            return right._replace(twist=-right.twist)
+
+    wrong = site(pose, FIVE, *(Pulled() if isinstance(e, ArmCompliance) else e for e in SHARED))
+    assert float((wrong.log_prob(FIVE) - expected).abs().max()) > 0.1
+
+
+def test_the_gap_s_change_by_a_displaced_peg_is_that_of_the_gap_itself() -> None:
+    """On a real part, where witness points and normals matter, on its top and at its sides."""
+    gap, pose = PegGap(block((0.06, 0.06, 0.025)), box_peg(0.016, 0.05)), around(6, 3, 1e-3, 0.03)
+    rows = rows_with_wrenches([1, 1, 1, 1], [0, 0, 1, 1], seed=4)
+    rows[:, :3] = torch.tensor(
+        [[0.0, 0.01, 0.0502], [0.01, 0.0, 0.0505], [0.0382, 0.0, 0.03], [0, -0.0384, 0.03]]
+    )
+    errors = BenchErrors((*SHARED, PartSlides(center=(0.02, 0.01, 0.0))))
+    one = ContactEpisodes(gap, pose, 4, 6e-5, 1e-5, 2e-5, bench=errors)
+    stated = one._columns(gap(pose, rows[:, :7]), rows)
+    differences = (stated - measured_columns(gap, pose, rows, errors)).abs()
+    assert float(differences.quantile(0.95)) < 0.02 * float(stated.abs().quantile(0.95))
+
+
+def test_any_cut_gives_the_same_likelihood_with_shared_errors() -> None:
+    pose = around(10, 0, 3e-4, 3e-3)
+    model = replace(look_and_touch.model, prepare=lambda r: look_and_touch.prepare(r, profile="ur5e"))
+    totals = []
+    for length in (300, 100, 37, 10):
+        recording = cut(probed(100), length)
+        sensor, values = values_of(recording, model)
+        totals.append(sum(sensor.site(a, pose).log_prob(v) for a, v in values))
+        assert isinstance(totals[-1], Tensor)
+    for total in totals[1:]:
+        torch.testing.assert_close(total, totals[0], rtol=1e-7, atol=1e-5)
+    # A row within an episode too: the chain rule.
+    whole = site(pose, FIVE).log_prob(FIVE)
+    parts = torch.zeros_like(whole)
+    for k in range(5):
+        value = FIVE[: k + 1].clone()
+        value[:k, GIVEN] = 1.0
+        parts = parts + site(pose, value).log_prob(value)
+    torch.testing.assert_close(parts, whole, rtol=1e-6, atol=1e-4)
+
+
+def test_a_row_without_contact_is_positive_given_the_contacts_before() -> None:
+    pose = around(8)
+    rows = rows_with_wrenches([1, 1, 0], [0, 0, -1], seed=2)
+    errors = BenchErrors(SHARED)
+    columns, gaps = measured_columns(ledge, pose, rows, errors), ledge(pose, rows[:, :7]).distance
+    after = site(pose, rows).branches(rows[:2])
+    mean, covariance = torch.from_numpy(after.mean[:, 0]), torch.from_numpy(after.covariance[:, 0])
+    own = columns[:, 2]
+    variance = float(rows[2, 8]) ** 2 + 1e-10 + 4e-10 + torch.einsum("na,nab,nb->n", own, covariance, own)
+    expected = log_ndtr((gaps[:, 2] + (own * mean).sum(-1)) / variance.sqrt())
+    value = rows.clone()
+    value[:2, GIVEN] = 1.0
+    torch.testing.assert_close(site(pose, value).log_prob(value), expected, rtol=1e-3, atol=1e-3)
+
+
+def test_a_slip_is_one_of_the_sums_over_when_it_was() -> None:
+    """A peg that slips by 0.6 mm before the second of two touches: all times of a slip, enumerated."""
+    pose = around(4, 0, 1e-5, 1e-4)
+    rows = rows_with_wrenches([1, 1, 1, 1, 1, 1], [0, 0, 1, 1, 2, 2], seed=5)
+    rows[:, :2], rows[:, 2], rows[:, 3:7] = 0.0, 0.0, torch.tensor([1.0, 0, 0, 0])
+    rows[2:, 2] -= 6e-4
+    grasp = Grasp(1e-4, 1e-3, 1e-3, slip=5e-4, slip_turn=1e-3, slips=0.01)
+    errors = BenchErrors((grasp,))
+    jump = errors.jumps[0].variances
+    each = [dense(pose, rows, errors) + 3 * math.log(0.99)]
+    for begin in (0, 2, 4):
+        later = torch.zeros(6, dtype=torch.float64)
+        later[begin:] = 1.0
+        extra = (later[:, None] * later)[..., None] * jump
+        each.append(dense(pose, rows, errors, extra) + 2 * math.log(0.99) + math.log(0.01))
+    expected = torch.logsumexp(torch.stack(each), dim=0)
+    torch.testing.assert_close(site(pose, rows, grasp).log_prob(rows), expected, rtol=0.0, atol=0.1)
+    after = site(pose, rows, grasp).branches(rows)
+    slipped = (after.weights * (after.event[..., 1] == 2)).sum(axis=1)
+    assert bool((slipped > 0.9).all()), "the second episode is the one before which it slipped"
+    assert float((expected - each[0]).min()) > 3.0
+
+
+def pressed_with_the_peg_off(shift: float) -> Recording:
+    """`probed`, by a robot that takes its peg to be higher in the hand than it is by `shift`."""
+    recording = probed(100)
+    whole = recording.measurements[0]
+    measured = whole.observation.world_from_peg.copy()
+    measured[:, 2] += shift
+    touch = replace(whole.observation, world_from_peg=measured)
+    return replace(recording, measurements=[Measurement(whole.action, touch)])
+
+
+def test_the_pose_relative_to_the_peg_is_sure_where_that_in_the_world_is_not() -> None:
+    """Along z, where peg and part are off alike: what the touches fix is the one relative to the other."""
+    shift = 0.0008
+    recording = pressed_with_the_peg_off(shift)
+    sensor, values = values_of(
+        recording, replace(look_and_touch.model, prepare=lambda r: look_and_touch.prepare(r, profile="ur5e"))
+    )
+    (action, value), at = values[-1], torch.tensor([0.0, 0, 0.05, 1, 0, 0, 0], dtype=torch.float64)
+    height = torch.linspace(-1e-3, 1e-3, 41, dtype=torch.float64)
+    pose = poses.identity(41)
+    pose[:, 2] = height
+    one = sensor.site(action, pose)
+    log_weights = one.log_prob(value)
+    belief = Belief(pose, log_weights, apparent=lambda at, draws: one.apparent_poses(value, at, draws))
+    relative = belief.relative(at, 64)
+    assert float(belief.spread[2]) > 3e-4, "the world's pose is unsure by as much as the grasp is"
+    assert float(relative.spread[2]) < 1.2e-4
+    assert abs(float(relative.mean[2]) - shift) < 2e-4, "a peg that is lower meets a part that seems higher"
+    assert belief.relative(at).log_weights.shape == (41 * 8,)
+    assert Belief(pose, log_weights).relative(at).world_from_part is pose
+
+
+def test_a_perfect_bench_has_none_and_an_unknown_profile_is_refused() -> None:
+    _, values = values_of(probed(100))
+    assert len(torch.cat([new_rows(v) for _, v in values]))
+    assert PROFILES["perfect"] is None and {"ur5e", "panda", "industrial"} <= set(PROFILES)
+    with pytest.raises(InputError, match="no profile 'ur5'"):
+        look_and_touch.prepare(probed(100), profile="ur5")
