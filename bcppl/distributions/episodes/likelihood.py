@@ -17,7 +17,16 @@ from bcppl import poses
 from bcppl.distributions.checks import Check, chi_square
 from bcppl.distributions.episodes.bench_errors import BenchErrors
 from bcppl.distributions.episodes.covariances import Hypothesis, RowErrors, segments_of
-from bcppl.distributions.episodes.rows import COLUMNS, FELT, FORCE, GIVEN, NOISE, is_predicted, padded
+from bcppl.distributions.episodes.rows import (
+    COLUMNS,
+    EPISODE,
+    FELT,
+    FORCE,
+    GIVEN,
+    NOISE,
+    is_predicted,
+    padded,
+)
 from bcppl.distributions.episodes.switching_filter import Branches, Prior, begun, filtered
 from bcppl.distributions.manifold import FARTHEST, ContactManifold, Gaps, Quadratic
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
@@ -210,11 +219,16 @@ class ContactEpisodes(ContactManifold):
         nodes = self.compliance * 10.0**_DECADES
         return tuple(Hypothesis(w, c) for w, c in zip(weights.tolist(), nodes.tolist(), strict=True))
 
+    @property
+    def _few(self) -> tuple[Hypothesis, ...]:
+        """Those of an approximation to second order, which needs fewer nodes."""
+        return self.hypotheses or self._every[::2]
+
     def _prior(self, pose: int) -> Prior:
         """With so many parameters of the pose before the others."""
         bench, jumps = self.bench, self.bench.jumps
         own = np.zeros(pose)
-        log_weight, compliance, _, scale = np.array(self._every).T.copy()
+        log_weight, compliance, _, scale = np.array(self._few if pose else self._every).T.copy()
         changed = np.array([np.concatenate([own, j.variances.numpy()]) for j in jumps])
         return Prior(
             log_weight=log_weight,
@@ -245,12 +259,33 @@ class ContactEpisodes(ContactManifold):
         if free:
             columns = torch.cat([gaps.gradient(self.pose), columns], dim=-1)
         errors = RowErrors(self.blur, self.shared, self.drift, self.lasting, self.varying, self.rough)
-        given = (gaps.distance, rows[:, FORCE], columns)
+        given = [gaps.distance, rows[:, FORCE], columns]
+        if free and self.blur:
+            given.append(self._trust(gaps.distance, columns[..., 6:], rows))
         arrays = (np.ascontiguousarray(each.numpy()) for each in given)
-        return filtered(begin, prior, segments_of(rows, errors, self._every), *arrays)
+        return filtered(begin, prior, segments_of(rows, errors, self._few if free else self._every), *arrays)
+
+    def _trust(self, distance: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
+        """Factors (N, R) of contacts' errors, each by itself: what is far off hardly pulls.
+
+        While errors are taken to be wider than they are, to be led to a mode from afar, no row comes before
+        another. An episode counts by the probability that it is no outlier.
+        """
+        sunk = self.compliance * torch.nan_to_num(rows[:, FORCE])
+        own = rows[:, NOISE] ** 2 + self.blur**2 + self.drift**2 + self.shared**2 + (3.0 * sunk) ** 2
+        variance = own + (columns**2 * self.bench.variances).sum(dim=-1)
+        squared = (distance + sunk + columns @ self.bench.means) ** 2 / variance
+        inlier = -0.5 * (squared + (2.0 * math.pi * variance).log())
+        numbers, episode = rows[:, EPISODE].unique(return_inverse=True)
+        excess = distance.new_zeros(len(distance), len(numbers))
+        excess.index_add_(1, episode, inlier + math.log(FARTHEST))
+        sure = torch.sigmoid(excess + math.log1p(-self.outlier) - math.log(self.outlier))[:, episode]
+        return (sure * (_FAR**2 / squared).clamp(max=1.0)).sqrt()
 
     def _quadratic_of(self, rows: Tensor) -> Quadratic:
         prior = self._prior(6)
+        if self.blur:
+            prior = prior._replace(outlier=0.0)
         after = self._filtered(begun(prior, len(self.pose)), prior, rows, free=True)
         weights = torch.from_numpy(after.weights)
         means = torch.from_numpy(after.mean)[..., :6]

@@ -135,6 +135,7 @@ def filtered(
     distance: Array,
     force: Array,
     columns: Array,
+    trust: Array | None = None,
 ) -> Branches:
     """The hypotheses after further rows.
 
@@ -145,7 +146,9 @@ def filtered(
         distance: (N, R) gaps at the peg as measured, m.
         force: (R,) N.
         columns: (N, R, M) the gap's change by each parameter, m.
+        trust: (N, R) factors of the errors and columns of contacts; 1 unless given.
     """
+    trust = np.ones_like(distance) if trust is None else trust
     new = len(segments.first)
     room = max(0, KEPT - before.log_weight.shape[1])
     # Axes of a branch's arrays after the particles': branches, then what is appended for the new segments.
@@ -156,7 +159,7 @@ def filtered(
     after = Branches._make([before.number.copy(), *padded])
 
     def work(begin: int, end: int) -> int:
-        _filter(begin, end, *after, prior, segments, distance, force, columns)
+        _filter(begin, end, *after, prior, segments, distance, force, columns, trust)
         return 0
 
     if new:
@@ -237,12 +240,14 @@ def _filter(
     distance: Array,
     force: Array,
     columns: Array,
+    trust: Array,
 ) -> None:
     parameters, jumps, size = columns.shape[2], len(prior.jump_log_probability), log_weight.shape[1]
     new, longest = len(segments.first), segments.factor.shape[2]
     offset = event.shape[2] - new
     most = size * (2 + jumps)
-    log_in, log_out = math.log1p(-prior.outlier), math.log(prior.outlier)
+    log_in = math.log1p(-prior.outlier)
+    log_out = math.log(prior.outlier) if prior.outlier > 0.0 else -np.inf
     kept = 1.0
     for j in range(jumps):
         kept -= math.exp(prior.jump_log_probability[j])
@@ -295,8 +300,9 @@ def _filter(
                                 prior.jump_variance[option - 1, a] * prior.scale[h] ** 2
                             )
                     for i in range(rows):
-                        error[i] = distance[n, first + i] + prior.compliance[h] * force[first + i]
-                        column[i] = columns[n, first + i]
+                        sunk = prior.compliance[h] * force[first + i]
+                        error[i] = trust[n, first + i] * (distance[n, first + i] + sunk)
+                        column[i] = trust[n, first + i] * columns[n, first + i]
                     log_density, square[found] = _update(
                         error[:rows],
                         column[:rows],
