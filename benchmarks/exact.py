@@ -63,6 +63,7 @@ KERNELS: dict[str, Callable[[int, int], Tempered]] = {
     "drift": lambda d, n: swept(even("x"), 5, d),
     "drift, many scales": lambda d, n: swept(walk("x"), 8, d),
     "drift until displaced": lambda d, n: tempered(walk("x"), sweeps=until(displacement=0.5)),
+    "drift until displaced by 1.5": lambda d, n: tempered(walk("x"), sweeps=until(displacement=1.5)),
     "independent": lambda d, n: tempered(metropolis_hastings(independent("x"))),
     "independent, 1 normal": lambda d, n: tempered(near("x", 1)),
     "mixture drift, independent": lambda d, n: swept(mixture([even("x"), near("x", 1)]), 3, d),
@@ -71,6 +72,9 @@ KERNELS: dict[str, Callable[[int, int], Tempered]] = {
     ),
     "cycle drift, independent": lambda d, n: swept(cycle(even("x"), near("x", 1)), 2, d),
     "differential evolution": lambda d, n: swept(metropolis_hastings(differential_evolution("x")), 5, d),
+    "differential evolution, 20 sweeps": lambda d, n: swept(
+        metropolis_hastings(differential_evolution("x")), 20, d
+    ),
     "involutive": lambda d, n: swept(reflected("x"), 5, d),
     "delayed acceptance": lambda d, n: swept(delayed_acceptance(even("x"), surrogate=student_t("x")), 5, d),
     "hmc": lambda d, n: tempered(hmc("x")),
@@ -80,8 +84,7 @@ KERNELS: dict[str, Callable[[int, int], Tempered]] = {
 
 UNTIL = (
     "particles stop while they still correlate with where they began, by about 0.75, and all at a sweep that "
-    "depends on them; repeat the moves, or ask for a larger displacement: 1.5 in place of 0.5 gave "
-    "-.001 +- .024 in place of -.195 +- .060 (D = 6, N = 1000)"
+    "depends on them; repeat the moves, or ask for a larger displacement, as `drift until displaced by 1.5`"
 )
 FEW = (
     "exponents and resampling that depend on the particles leave a bias of order 1/N (hmc, D = 6: -.2 at 75, "
@@ -91,7 +94,7 @@ FEW = (
 REASONS = {
     "drift until displaced": UNTIL,
     "mixture until displaced": UNTIL,
-    "differential evolution": "five sweeps are few: 20 gave -.009 +- .021, 5 -.179 +- .052 (D = 6)",
+    "differential evolution": "five sweeps are few, see that with 20",
     "hmc": FEW,
     "hmc, always moved": FEW,
     "waste-free": "five states of a random walk hardly leave where they began; give fewer, longer chains",

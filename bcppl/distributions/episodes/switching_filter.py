@@ -333,18 +333,18 @@ def _filter(
                             log_weight[n, b] + log_in + log_density + prior.jump_log_probability[option - 1]
                         )
                         found += 1
-            order = np.argsort(-weight[:found])
-            best, left = weight[order[0]], 0
+            best, left = weight[:found].max(), 0
             old_which[:] = which[n]
             old_event[:] = event[n]
             old_squared[:] = squared[n]
-            for k in range(min(size, found)):
-                c = order[k]
+            while left < min(size, found):
+                c = weight[:found].argmax()
                 if weight[c] < best - _FAINT:
                     break
-                log_weight[n, k], which[n, k] = weight[c], old_which[source[c]]
-                mean[n, k], covariance[n, k] = means[c], covariances[c]
-                event[n, k], squared[n, k] = old_event[source[c]], old_squared[source[c]]
-                event[n, k, offset + s], squared[n, k, offset + s] = kind[c], square[c]
+                log_weight[n, left], which[n, left] = weight[c], old_which[source[c]]
+                mean[n, left], covariance[n, left] = means[c], covariances[c]
+                event[n, left], squared[n, left] = old_event[source[c]], old_squared[source[c]]
+                event[n, left, offset + s], squared[n, left, offset + s] = kind[c], square[c]
+                weight[c] = -np.inf
                 left += 1
             number[n] = left
