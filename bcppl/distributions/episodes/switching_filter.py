@@ -338,7 +338,7 @@ def _filter(
             old_event[:] = event[n]
             old_squared[:] = squared[n]
             while left < min(size, found):
-                c = weight[:found].argmax()
+                c = int(weight[:found].argmax())
                 if weight[c] < best - _FAINT:
                     break
                 log_weight[n, left], which[n, left] = weight[c], old_which[source[c]]
