@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,11 @@ from bcppl.distributions.episodes.rows import FELT, FORCE, GIVEN, VELOCITY, WREN
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.gap import PegGap
+from bcppl.inference.filters.default import infer
+from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models import look_and_touch
+from bcppl.models.worlds.bench import bench_scene
+from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.likelihoods.bench_profiles import PROFILES
 from bcppl.sensors.measurements import Measurement, Recording
 from tests.test_contact_episodes import MIXED, cut, probed, values_of
@@ -235,3 +240,37 @@ def test_a_perfect_bench_has_none_and_an_unknown_profile_is_refused() -> None:
     assert PROFILES["perfect"] is None and {"ur5e", "panda", "industrial"} <= set(PROFILES)
     with pytest.raises(InputError, match="no profile 'ur5'"):
         look_and_touch.prepare(probed(100), profile="ur5")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_peg_off_in_the_hand_leaves_a_belief_that_holds_the_truth(seed: int) -> None:
+    """Simulated touches of which the robot's poses are off, by half a millimetre and half a degree."""
+    scene, rng = bench_scene(seed), np.random.default_rng(seed)
+    *_, seen = infer(look_and_touch.model, scene.look(), seed=seed)
+    recording = scene.probe(three_two_one(seen.belief, scene.part, scene.peg))
+    grasp = torch.from_numpy(rng.normal(size=6) * ([5e-4] * 3 + [math.radians(0.5)] * 3))
+
+    def off(measurement: Measurement) -> Measurement:
+        if not isinstance(measurement.action, ProbeWindow):
+            return measurement
+        true = torch.from_numpy(measurement.observation.world_from_peg)
+        measured = poses.compose(true, poses.inverse(peg_from_true).expand(len(true), 7)).numpy()
+        return replace(measurement, observation=replace(measurement.observation, world_from_peg=measured))
+
+    peg_from_true = poses.retract(poses.identity(), grasp)
+    shifted = replace(recording, measurements=[off(m) for m in recording.measurements])
+    distances = {}
+    for profile in ("perfect", "ur5e"):
+        prepare = partial(look_and_touch.prepare, profile=profile)
+        *_, last = infer(replace(look_and_touch.model, prepare=prepare), shifted, seed=seed)
+        hole = poses.compose(last.belief.mean, torch.from_numpy(scene.kind.part_from_hole))
+        measured = poses.compose(hole, torch.tensor([0, 0, 0.08, 1, 0, 0, 0], dtype=torch.float64))
+        held = poses.compose(measured, peg_from_true)
+        truth = torch.from_numpy(scene.truth)
+        apparent = poses.compose(measured, poses.compose(poses.inverse(held), truth))
+        relative = last.belief.relative(measured)
+        away = poses.local(relative.mean, apparent)
+        distances[profile] = float(away @ torch.linalg.solve(relative.covariance, away))
+    assert distances["ur5e"] < 22.5, "99.9 % of chi-square with six degrees of freedom"
+    assert distances["perfect"] > 100.0
