@@ -21,9 +21,11 @@ from bcppl.arrays import Array
 from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.camera import Camera, looking_at
-from bcppl.geometry.extrusion import block
+from bcppl.geometry.extrusion import block, peg_for
 from bcppl.geometry.parts import Guess, Part
-from bcppl.models.worlds.bench_parts import PARTS, BenchPart, bench_part
+from bcppl.models.worlds.bench_errors import BenchErrors, DrawnErrors, drawn_errors
+from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, BenchPart, bench_part
+from bcppl.models.worlds.bench_reality import BenchReality
 from bcppl.models.worlds.guarded_motion import Execution, execute, stamps_of
 from bcppl.models.worlds.inserting import InsertionResult, insert, samples_of
 from bcppl.models.worlds.occlusion import occluder
@@ -67,6 +69,7 @@ class BenchParameters(ProbeErrors):
         friction: limits between which the coefficient is drawn.
         time_constant, damping_ratio: medians of the contacts'; drawn per scene, log-uniformly.
         contact_factor: the largest factor from the median.
+        errors: of the robot, the grasp and the parts, all off by default.
     """
 
     clearances: tuple[float, ...] = (0.0001, 0.0002, 0.0005, 0.001)
@@ -98,6 +101,12 @@ class BenchParameters(ProbeErrors):
     time_constant: float = 0.004
     damping_ratio: float = 1.0
     contact_factor: float = 2.0
+    errors: BenchErrors = field(default_factory=BenchErrors)
+
+    @classmethod
+    def real(cls) -> BenchParameters:
+        """A bench with all the errors of a real one."""
+        return cls(errors=BenchErrors.real())
 
     def __post_init__(self) -> None:
         number_within("the bench has camera_error_factor {}", self.camera_error_factor, least=0.0)
@@ -114,9 +123,10 @@ class BenchScene:
         bench: parameters that it was drawn from.
         kind: the part with its hole's outline and place.
         clearance: of hole and peg, diametral, metres.
-        peg: the held peg.
+        peg: the held peg, as it is stated; `true_peg` is what it is.
         guess: the prior of the part's pose.
-        truth: (7,) true `world_from_part`.
+        truth: (7,) true `world_from_part` before any touch. The target of inference is the pose after the
+            probe, which a recording states; they differ where the part slides.
         contact: the world's physics.
         cameras: the two cameras, with their stated poses.
         world_from_cameras: (2, 7) their true poses.
@@ -154,11 +164,12 @@ class BenchScene:
 
     def look(self) -> Recording:
         """The recording of the two views alone."""
-        return self._recording(())
+        return self._recording((), self.truth)
 
     def probe(self, plan: Plan) -> Recording:
         """The recording of the same two views and of an executed plan, in windows."""
-        return self._recording(self.measure(plan))
+        touches = self.measure(plan)
+        return self._recording(touches, self.reality.part_at())
 
     def measure(self, plan: Plan, errors: SensorErrors | None = None) -> list[Measurement]:
         """The windows of an executed plan, with the sensors' next errors, or those of their first use."""
@@ -167,24 +178,70 @@ class BenchScene:
         return windows(execution.probe, wrench, world_from_peg, length)
 
     def execute(self, plan: Plan, errors: SensorErrors | None = None) -> tuple[Execution, Array, Array]:
-        """The true execution of a plan, and the measured wrench (T, 6) and peg poses (T, 7)."""
-        error, pose_error = (errors or self.sensor_errors()).sample(len(stamps_of(plan)), plan.rate)
-        execution = execute(plan, self.part, self.peg, self.contact, self.truth, error)
-        true_poses = torch.from_numpy(execution.world_from_peg)
-        measured = poses.retract(true_poses, torch.from_numpy(pose_error)).numpy()
-        return execution, execution.wrench + error, measured
+        """The true execution of a plan, and the measured wrench (T, 6) and peg poses (T, 7).
+
+        With the errors of an earlier use what has slipped stays so; without, everything is as at first.
+        """
+        errors = errors or self.sensor_errors()
+        reality = errors.reality or self._fresh()
+        self._executed[:] = [reality]
+        error, pose_error = errors.sample(len(stamps_of(plan)), plan.rate)
+        reality.begin(plan)
+        execution = execute(plan, self.part, self.true_peg, self.contact, self.truth, error, reality=reality)
+        measured = poses.retract(torch.from_numpy(execution.encoders), torch.from_numpy(pose_error)).numpy()
+        return execution, execution.felt + error, measured
 
     def insert(self, plan: InsertionPlan, errors: SensorErrors | None = None) -> InsertionResult:
-        """The true result of an insertion."""
+        """The true result of an insertion, with peg and part where the executed plans have left them."""
         error, pose_error = (errors or self.sensor_errors()).sample(samples_of(plan), plan.search.rate)
-        hole = self.kind.part_from_hole
-        return insert(plan, self.part, self.peg, self.contact, self.truth, hole, error, pose_error)
+        hole, peg = self.kind.part_from_hole, self.true_peg
+        return insert(plan, self.part, peg, self.contact, self.truth, hole, error, pose_error, self.reality)
 
     def sensor_errors(self) -> SensorErrors:
-        """The errors of the sensors, from the first sample on."""
-        return SensorErrors(self.bench, self.seed)
+        """The errors of the sensors, from the first sample on, on a bench on which nothing has slipped."""
+        return SensorErrors(self.bench, self.seed, self._fresh())
 
-    def _recording(self, touches: Sequence[Measurement]) -> Recording:
+    # ---- what is really the case
+
+    @functools.cached_property
+    def drawn(self) -> DrawnErrors:
+        """The errors of this scene's robot, grasp and parts."""
+        return drawn_errors(self.seed, self.bench.errors, self.clearance)
+
+    @functools.cached_property
+    def true_peg(self) -> Part:
+        """The peg as it is, in the frame of the stated one."""
+        radius, length = self.drawn.peg_growth
+        if not (radius or length):
+            return self.peg
+        return peg_for(self.kind.hole, self.clearance - 2.0 * radius, PEG_LENGTH + length, self.peg.name)
+
+    @property
+    def reality(self) -> BenchReality:
+        """Where arm, peg and part truly are after the last executed plan."""
+        return self._executed[0] if self._executed else self._fresh()
+
+    def apparent(self, world_from_peg: Array) -> Array:
+        """The pose (7,) of the part relative to the peg: the one that an errorless robot would believe.
+
+        With the peg measured at a pose, without force, after the slips of the executed plans: the
+        `world_from_part` at which the part would be as it truly is relative to the peg. It is the truth
+        where nothing is wrong, and the right one to plan an insertion for.
+
+        Args:
+            world_from_peg: (7,) pose at which the robot's encoders state the peg.
+        """
+        return self.reality.apparent(world_from_peg)
+
+    @functools.cached_property
+    def _executed(self) -> list[BenchReality]:
+        """The reality of the last executed plan; empty before any."""
+        return []
+
+    def _fresh(self) -> BenchReality:
+        return BenchReality(self.drawn, self.truth)
+
+    def _recording(self, touches: Sequence[Measurement], truth: Array) -> Recording:
         images, background = self._views
         views = [Measurement(View(c), i) for c, i in zip(self.cameras, images, strict=True)]
         return Recording(
@@ -193,7 +250,7 @@ class BenchScene:
             measurements=[*views, *touches],
             peg=self.peg,
             background=background,
-            truth=self.truth,
+            truth=truth,
             model="look_and_touch",
             source=f"simulated by bcppl, accuracy bench, seed {self.seed}: {self.name}",
         )

@@ -17,6 +17,7 @@ from bcppl.contact.mujoco_model import ContactParameters, build_model, interpola
 from bcppl.contact.stepping import POSE, WRENCH, SimulationState, Stepper
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
+from bcppl.models.worlds.bench_reality import BenchReality, held
 from bcppl.robot.motion import Probe
 from bcppl.robot.plan import Manner, Plan
 
@@ -33,10 +34,14 @@ class Execution:
     Attributes:
         probe: the command and the stamps.
         stops: (s) when each guarded motion or search was stopped, by its number in the plan.
-        wrench: (T, 6) true wrench on the peg at the stamps, N and N m, in the peg's frame.
+        wrench: (T, 6) true wrench on the peg at the stamps, N and N m, in the grip's frame.
         world_from_peg: (T, 7) true poses of the peg.
-        contact_pose: (7,) of the peg when the last guarded motion was stopped; None where none was.
+        contact_pose: (7,) as `encoders`, when the last guarded motion was stopped; None where none was.
         state: of the simulation at the last stamp, from which the next motion continues.
+        world_from_grip: (T, 7) true poses of the frame that the robot takes for the peg's, at the sensor.
+        encoders: (T, 7) what the robot takes them to be, without noise.
+        felt: (T, 6) what the wrench sensor reads, without bias and noise: late, for instance.
+        world_from_part: (T, 7) true poses of the part.
     """
 
     probe: Probe
@@ -45,6 +50,10 @@ class Execution:
     world_from_peg: Array
     contact_pose: Array | None
     state: SimulationState
+    world_from_grip: Array
+    encoders: Array
+    felt: Array
+    world_from_part: Array
 
 
 def stamps_of(plan: Plan) -> Array:
@@ -107,8 +116,12 @@ def execute(
     stop_at_hole: bool = False,
     after: Execution | None = None,
     tare: Array | None = None,
+    reality: BenchReality | None = None,
 ) -> Execution:
     """Simulate an arm that executes a plan.
+
+    The physics is of the true peg and the true part, and the plan is relative to what the robot takes for
+    true: its encoders are driven to the command, and its monitors read its sensors.
 
     From 10 to 40 mm/s a motion guarded at 4 N ended at 3.0 to 5.9 N (it continues for up to 60 ms and the
     spring is 2500 N/m), at 60 mm/s at 6.7 to 8.4 N; the impact itself peaks at up to 46 N for a sample.
@@ -116,14 +129,15 @@ def execute(
     Args:
         plan: of the arm.
         part: in contact.
-        peg: the held peg.
+        peg: the held peg, truly.
         contact: the world's physics.
-        world_from_part: (7,) true pose of the part.
+        world_from_part: (7,) true pose of the part; not used with a reality.
         error: (T, 6) of the measured wrench at the stamps: bias, drift and noise, N and N m.
         stop_at_hole: whether the execution ends when a search has found its hole.
         after: the execution just before it, whose final position and velocity are the initial ones.
         tare: (3,) N, the sensor's reading without contact; by default the mean of the first ten samples,
             during which no motion is stopped.
+        reality: in which the robot is wrong, and whose slips continue; by default it is right.
 
     Raises:
         InputError: the plan takes less than the eleven samples by which the wrench is tared, or is sampled
@@ -135,17 +149,38 @@ def execute(
             f"plan {plan.name!r} has {len(stamps)} samples at {plan.rate:g} Hz; make it longer than "
             f"{TARE} samples, by which the wrench is tared, at {1.0 / STEP:g} Hz or less."
         )
-    model, pose = build_model(part, peg, contact), np.asarray(world_from_part, dtype=np.float64)[None]
+    reality = BenchReality.right(world_from_part) if reality is None else reality
+    grip_from_peg = reality.grip_from_peg(float(stamps[0]))
+    model = build_model(part, held(peg, grip_from_peg), contact)
     stops: dict[int, float] = {}
     probe = command_of(plan, stops)
-    stepper = Stepper(model, probe, contact.time_step)
+    stepper = Stepper(model, reality.driven(probe), contact.time_step)
     state = stepper.at_rest(1) if after is None else after.state
-    rows = np.empty((len(stamps), WRENCH.stop))
+    rows, pegs = np.empty((len(stamps), WRENCH.stop)), np.empty((len(stamps), 7))
+    parts, earlier = np.empty((len(stamps), 7)), None if after is None else after.wrench
     motion = np.clip(np.searchsorted(plan.times, stamps + 1e-9, side="right") - 1, 0, len(manners) - 1)
     count, contact_pose = len(stamps), None
+    middle = 0.5 * (part.vertices.min(axis=0) + part.vertices.max(axis=0))
+
+    def encoders(first: int, last: int) -> Array:
+        return reality.encoders(rows[first:last, POSE], rows[first:last, WRENCH])
+
+    def felt(last: int) -> Array:
+        return reality.felt(rows[:last, WRENCH], rows[:last, POSE], plan.rate, earlier)
+
     for k, of in enumerate(motion):
-        row, state = stepper.run(state, pose, {}, k, k + 1)
+        now = reality.grip_from_peg(float(stamps[k]))
+        if (now is not None and grip_from_peg is not None and (now != grip_from_peg).any()) or (
+            (now is None) != (grip_from_peg is None)
+        ):
+            grip_from_peg = now
+            model = build_model(part, held(peg, grip_from_peg), contact)
+            stepper = Stepper(model, reality.driven(probe), contact.time_step)
+        parts[k] = reality.part_at(float(stamps[k]))
+        row, state = stepper.run(state, parts[k : k + 1], {}, k, k + 1)
         rows[k] = row[0, 0]
+        pegs[k] = reality.pegs(rows[k : k + 1, POSE], grip_from_peg)[0]
+        reality.touched(float(stamps[k]), rows[k, POSE], rows[k, WRENCH], middle)
         if of in stops or k + 1 == len(stamps):
             continue
         if (
@@ -153,13 +188,13 @@ def execute(
             and stamps[k + 1] < plan.times[of + 1]
             and (k >= TARE or tare is not None)
         ):
-            force = rows[: k + 1, WRENCH][:, :3] + error[: k + 1, :3]
+            force = felt(k + 1)[:, :3] + error[: k + 1, :3]
             rest = force[:TARE].mean(axis=0) if tare is None else tare
             stopped = bool((np.linalg.norm(force[-SUSTAINED:] - rest, axis=1) > plan.force).all())
-            contact_pose = rows[k, POSE].copy() if stopped else contact_pose
+            contact_pose = encoders(k, k + 1)[0].copy() if stopped else contact_pose
         else:
             searching = manners[of] == "searching" and not _found_before(manners, stops, int(of))
-            depth = _sunk(probe, rows[k, POSE], float(stamps[k]), contact_pose) if searching else 0.0
+            depth = _sunk(probe, encoders(k, k + 1)[0], float(stamps[k]), contact_pose) if searching else 0.0
             stopped = searching and depth > plan.sink
             if stopped and stop_at_hole:
                 stops[int(of)], count = float(stamps[k]), k + 1
@@ -167,10 +202,20 @@ def execute(
         if stopped and manners[motion[k + 1]] == manners[of]:  # otherwise it ends now
             stops[int(motion[k + 1])] = float(stamps[k + 1])
             probe = _continued(probe, command_of(plan, stops), stamps[k + 1])
-            stepper = Stepper(model, probe, contact.time_step)
+            stepper = Stepper(model, reality.driven(probe), contact.time_step)
     rows = rows[:count]
-    probe = replace(probe, stamps=stamps[:count])
-    return Execution(probe, stops, rows[:, WRENCH].copy(), rows[:, POSE].copy(), contact_pose, state)
+    return Execution(
+        probe=replace(probe, stamps=stamps[:count]),
+        stops=stops,
+        wrench=rows[:, WRENCH].copy(),
+        world_from_peg=pegs[:count],
+        contact_pose=contact_pose,
+        state=state,
+        world_from_grip=rows[:, POSE].copy(),
+        encoders=encoders(0, count).copy(),
+        felt=felt(count).copy(),
+        world_from_part=parts[:count],
+    )
 
 
 def _sunk(probe: Probe, world_from_peg: Array, time: float, contact_pose: Array | None) -> float:

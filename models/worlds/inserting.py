@@ -11,6 +11,7 @@ from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.geometry.parts import Part
+from bcppl.models.worlds.bench_reality import BenchReality
 from bcppl.models.worlds.guarded_motion import TARE, execute, stamps_of
 from bcppl.robot.plan import InsertionPlan
 
@@ -48,23 +49,28 @@ def insert(
     part_from_hole: Array,
     error: Array,
     pose_error: Array,
+    reality: BenchReality | None = None,
 ) -> InsertionResult:
     """Simulate an arm that executes an insertion.
 
     Args:
         plan: of the insertion.
         part: with the hole.
-        peg: the held peg.
+        peg: the held peg, truly.
         contact: the world's physics.
-        world_from_part: (7,) true pose of the part.
+        world_from_part: (7,) true pose of the part; not used with a reality.
         part_from_hole: (7,) true pose of its hole.
         error: (T, 6) of the measured wrench, N and N m; T as `samples_of` the plan.
         pose_error: (T, 6) of the peg's measured pose, m and radians, in the peg's axes.
+        reality: in which the robot is wrong, and nothing slips any more; by default it is right.
     """
-    search = execute(plan.search, part, peg, contact, world_from_part, error, stop_at_hole=True)
+    reality = BenchReality.right(world_from_part) if reality is None else reality.settled()
+    search = execute(
+        plan.search, part, peg, contact, world_from_part, error, stop_at_hole=True, reality=reality
+    )
     done = len(search.wrench)
-    tare = (search.wrench[:TARE, :3] + error[:TARE, :3]).mean(axis=0)
-    last = torch.from_numpy(search.world_from_peg[-1])
+    tare = (search.felt[:TARE, :3] + error[:TARE, :3]).mean(axis=0)
+    last = torch.from_numpy(search.encoders[-1])
     measured = poses.retract(last, torch.from_numpy(pose_error[done - 1]))
     push = execute(
         plan.push_from(measured.numpy(), _below(search.contact_pose, measured)),
@@ -75,8 +81,9 @@ def insert(
         error[done:],
         after=search,
         tare=tare,
+        reality=reality,
     )
-    world_from_hole = poses.compose(torch.from_numpy(world_from_part), torch.from_numpy(part_from_hole))
+    world_from_hole = poses.compose(torch.from_numpy(reality.part_at()), torch.from_numpy(part_from_hole))
     tip = torch.tensor([[0.0, 0.0, float(peg.vertices[:, 2].min())]], dtype=torch.float64)
     end = poses.transform(torch.from_numpy(push.world_from_peg[-1]), tip)
     in_hole = poses.transform(poses.inverse(world_from_hole), end)[0]

@@ -20,6 +20,7 @@ from bcppl.sensors import DepthImage, Measurement
 
 if TYPE_CHECKING:
     from bcppl.models.worlds.bench import BenchParameters
+    from bcppl.models.worlds.bench_reality import BenchReality
 
 _WRENCH, _DRIFT, _POSE = range(5, 8)  # streams of random numbers, after those of `bcppl.models.worlds.bench`
 STEP = 0.005  # s between the command's poses
@@ -102,10 +103,12 @@ class SensorErrors:
 
     Attributes:
         bench: with the errors' standard deviations.
+        reality: of this use, with what has slipped in it; None for a bench whose robot is right.
     """
 
-    def __init__(self, bench: BenchParameters, seed: int) -> None:
+    def __init__(self, bench: BenchParameters, seed: int, reality: BenchReality | None = None) -> None:
         self.bench = bench
+        self.reality = reality
         self._bias = np.random.default_rng([seed, _WRENCH]).normal(size=6) * per_axis(
             bench.force_bias, bench.torque_bias
         )
