@@ -1,6 +1,6 @@
 """What is really the case on a bench whose robot is wrong: where its peg is, and where the part.
 
-Three poses are to be told apart. The encoders' is where the robot takes a nominally grasped peg to be: the
+There are three poses. The encoders' is where the robot takes a nominally grasped peg to be: the
 forward kinematics of the nominal arm at the true arm's joints. The grip's is where that frame truly is, with
 the arm's wrong links and what arm and gripper yield to the wrench. The peg's is where the peg truly is: in
 the grip by the grasp, and by how far it has slipped.

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.checks import Check, chi_square
-from bcppl.distributions.episodes.bench_errors import BenchErrors
 from bcppl.distributions.episodes.covariances import Hypothesis, RowErrors, segments_of
+from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.rows import (
     COLUMNS,
     EPISODE,
@@ -91,7 +91,7 @@ class ContactEpisodes(ContactManifold):
     varying: float = field(default=0.6, metadata=NONNEGATIVE)
     rough: float = field(default=0.2, metadata=NONNEGATIVE)
     blur: float = field(default=0.0, metadata=NONNEGATIVE)
-    bench: BenchErrors = field(default_factory=BenchErrors)
+    bench: LinearErrors = field(default_factory=LinearErrors)
     hypotheses: tuple[Hypothesis, ...] = ()
     memory: dict[bytes, Branches] = field(default_factory=dict)
 
@@ -149,7 +149,7 @@ class ContactEpisodes(ContactManifold):
         stood[torch.isnan(felt)] = self.pose[0]
         gaps = self.gap(self.pose, stood)
         distance = gaps.distance
-        if len(self.bench.means):
+        if self.is_displaced:
             branches = self.branches(_given_and_all(value)[1])
             shared = (torch.from_numpy(branches.weights)[..., None] * torch.from_numpy(branches.mean)).sum(1)
             used = torch.nan_to_num(value)
@@ -198,18 +198,21 @@ class ContactEpisodes(ContactManifold):
         if not len(free):
             return whole
         gaps = self.gap(self.pose, free[:, :7])
-        deep = (gaps.distance < -_FAR * self._spread_at(gaps, free, branches)).sum(dim=1)
+        deep = (gaps.distance < -_FAR * self._spread_at(gaps, free)).sum(dim=1)
         outliers = float(bdtrc(deep.numpy() - 1, len(free), self.outlier).mean())
         return Check(min(1.0, 2.0 * min(whole.probability, outliers)), "contacts", whole.excess)
 
     def _with_errors(self, rows: Tensor) -> Tensor:
         return padded(super()._with_errors(rows), self.stamps)
 
-    def _spread_at(self, gaps: Gaps, rows: Tensor, branches: Branches) -> Tensor:
+    def _spread_at(self, gaps: Gaps, rows: Tensor) -> Tensor:
         """Standard deviations (N, R) of the gaps of rows without contact, a priori."""
+        return self._variance(self._columns(gaps, rows), rows).sqrt()
+
+    def _variance(self, columns: Tensor, rows: Tensor) -> Tensor:
+        """Variances (N, R) of gaps a priori, without what the contact's compliance adds."""
         own = rows[:, NOISE] ** 2 + self.blur**2 + self.drift**2 + self.shared**2
-        columns = self._columns(gaps, rows)
-        return (own + (columns**2 * self.bench.variances).sum(dim=-1)).sqrt()
+        return own + (columns**2 * self.bench.variances).sum(dim=-1)
 
     @cached_property
     def _every(self) -> tuple[Hypothesis, ...]:
@@ -236,7 +239,7 @@ class ContactEpisodes(ContactManifold):
             scale=scale,
             mean=np.concatenate([own, bench.means.numpy()]),
             variance=np.concatenate([_WIDE.numpy()[:pose] ** 2, bench.variances.numpy()]),
-            jump_log_probability=np.array([math.log(max(j.probability, 1e-300)) for j in jumps]),
+            jump_log_probability=np.array([math.log(j.probability) for j in jumps]),
             jump_variance=changed.reshape(len(jumps), pose + len(bench.means)),
             outlier=self.outlier,
             farthest=FARTHEST,
@@ -272,8 +275,7 @@ class ContactEpisodes(ContactManifold):
         another. An episode counts by the probability that it is no outlier.
         """
         sunk = self.compliance * torch.nan_to_num(rows[:, FORCE])
-        own = rows[:, NOISE] ** 2 + self.blur**2 + self.drift**2 + self.shared**2 + (3.0 * sunk) ** 2
-        variance = own + (columns**2 * self.bench.variances).sum(dim=-1)
+        variance = self._variance(columns, rows) + (3.0 * sunk) ** 2
         squared = (distance + sunk + columns @ self.bench.means) ** 2 / variance
         inlier = -0.5 * (squared + (2.0 * math.pi * variance).log())
         numbers, episode = rows[:, EPISODE].unique(return_inverse=True)
@@ -323,7 +325,9 @@ def _given_and_all(value: Tensor) -> tuple[Tensor, Tensor]:
 def _is_cut(rows: Tensor, place: int) -> bool:
     """Whether rows before and from a place on are of one episode."""
     both = rows[place - 1 : place + 1]
-    return len(both) == 2 and bool((both[:, FELT] == 1.0).all()) and bool(both[0, 11] == both[1, 11])
+    return (
+        len(both) == 2 and bool((both[:, FELT] == 1.0).all()) and bool(both[0, EPISODE] == both[1, EPISODE])
+    )
 
 
 def _by_twist_of_peg(gradient: Tensor, part: Tensor, peg: Tensor) -> Tensor:

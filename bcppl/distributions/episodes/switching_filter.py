@@ -318,17 +318,17 @@ def _filter(
                         surprise = square[found] - rows > _SURPRISING * math.sqrt(2.0 * rows) + 1.0
                         if parameters == 0 or not surprise:
                             # Nothing differs between the two but a state that is hardly ever the outlier's.
-                            weight[found], kind[found] = _log_sum(inlier, outlier), 0
+                            weight[found], kind[found] = _log_sum(inlier, outlier), INLIER
                             found += 1
                             break
-                        weight[found], kind[found] = inlier + log_kept, 0
+                        weight[found], kind[found] = inlier + log_kept, INLIER
                         found += 1
                         means[found], covariances[found] = mean[n, b], covariance[n, b]
-                        weight[found], kind[found], source[found] = outlier, 1, b
+                        weight[found], kind[found], source[found] = outlier, OUTLIER, b
                         square[found] = square[found - 1]
                         found += 1
                     else:
-                        kind[found] = 1 + option
+                        kind[found] = OUTLIER + option
                         weight[found] = (
                             log_weight[n, b] + log_in + log_density + prior.jump_log_probability[option - 1]
                         )

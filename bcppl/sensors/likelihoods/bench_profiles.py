@@ -19,11 +19,11 @@ from dataclasses import dataclass
 
 from bcppl.distributions.episodes import (
     ArmCompliance,
-    BenchError,
     Delay,
     Grasp,
     Hypothesis,
     KinematicError,
+    LinearError,
     PartSlides,
     Size,
 )
@@ -31,13 +31,8 @@ from bcppl.errors import InputError
 
 Point = tuple[float, float, float]
 
-CONTACT = 5e-6  # m/N, of part and peg where they touch
-# Most benches are as stated, some half as good.
-SCALES = tuple(
-    Hypothesis(math.log(share * wide), CONTACT, noise, scale)
-    for share, noise in ((0.85, 1.0), (0.15, 2.5))
-    for wide, scale in ((0.65, 1.0), (0.35, 2.2))
-)
+# Factors of the noise and of the shared errors, after their probabilities: some benches are half as good.
+NOISES, SCALES = ((0.85, 1.0), (0.15, 2.5)), ((0.65, 1.0), (0.35, 2.2))
 
 
 @dataclass(frozen=True)
@@ -52,7 +47,6 @@ class BenchProfile:
         size: of part and peg together.
         slips, slides: probabilities that the peg slips in the hand or the part on the table, at each episode
             of contact.
-        hypotheses: of how good the bench is.
     """
 
     grasp: tuple[float, float, float] = (0.0005, math.radians(0.5), math.radians(1.0))
@@ -62,9 +56,8 @@ class BenchProfile:
     size: float = 0.00005
     slips: float = 0.005
     slides: float = 0.005
-    hypotheses: tuple[Hypothesis, ...] = SCALES
 
-    def errors(self, part: Point, peg: Point) -> tuple[BenchError, ...]:
+    def errors(self, part: Point, peg: Point) -> tuple[LinearError, ...]:
         """The errors, smooth ones about a guess (3,) of where the part is and where the peg will be held."""
         return (
             Grasp(*self.grasp, slips=self.slips),
@@ -73,6 +66,18 @@ class BenchProfile:
             PartSlides(probability=self.slides, center=part),
             Delay(self.delay),
             Size(self.size),
+        )
+
+    @staticmethod
+    def hypotheses(compliance: float) -> tuple[Hypothesis, ...]:
+        """How good the bench is, given the median compliance (m/N) of part and peg where they touch.
+
+        What differs from it is among the compliance of arm and grip.
+        """
+        return tuple(
+            Hypothesis(math.log(common * share), compliance, noise, scale)
+            for common, noise in NOISES
+            for share, scale in SCALES
         )
 
 

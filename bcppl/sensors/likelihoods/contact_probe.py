@@ -15,7 +15,7 @@ from bcppl.arguments import number_within
 from bcppl.contact.quasi_static import QuasiStaticMotion, WindowMotion
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.location import ContactSensing
-from bcppl.distributions.episodes import BenchError, BenchErrors, ContactEpisodes, Hypothesis
+from bcppl.distributions.episodes import ContactEpisodes, Hypothesis, LinearError, LinearErrors
 from bcppl.distributions.episodes.rows import FELT, new_rows
 from bcppl.distributions.manifold import MeasuresGap
 from bcppl.effort import Effort
@@ -76,7 +76,7 @@ class TouchSettings:
     contact_detector: ContactDetector = field(default_factory=ContactDetector)
     free_space: bool = True
     profile: str = "perfect"
-    bench: tuple[BenchError, ...] | None = None
+    bench: tuple[LinearError, ...] | None = None
 
     def __post_init__(self) -> None:
         for name in ("gap_noise", "lasting", "compliance", "compliance_decades"):
@@ -92,15 +92,15 @@ def _solids(part: Part, peg: Part) -> tuple[PegGap, QuasiStaticMotion]:
 
 def _shared_errors(
     recording: Recording, settings: TouchSettings
-) -> tuple[BenchErrors, tuple[Hypothesis, ...]]:
+) -> tuple[LinearErrors, tuple[Hypothesis, ...]]:
     """The errors that all touches share, and the hypotheses of how good the bench is."""
     profile = profile_named(settings.profile)
     x, y, z = map(float, recording.guess.world_from_part[:3])
     length = 0.0 if recording.peg is None else -float(recording.peg.vertices[:, 2].min())
     part, peg = (x, y, z), (x, y, z + length)
     own = () if profile is None else profile.errors(part, peg)
-    errors = BenchErrors(own if settings.bench is None else settings.bench)
-    return errors, () if profile is None else profile.hypotheses
+    errors = LinearErrors(own if settings.bench is None else settings.bench)
+    return errors, () if profile is None else profile.hypotheses(settings.compliance)
 
 
 class ContactProbe:

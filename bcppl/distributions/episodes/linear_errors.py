@@ -47,7 +47,7 @@ class Jump(NamedTuple):
     variances: Tensor
 
 
-class BenchError(Protocol):
+class LinearError(Protocol):
     """An error that all touches share."""
 
     @property
@@ -275,14 +275,14 @@ class Size(_Unchanging):
 
 
 @dataclass(frozen=True)
-class BenchErrors:
+class LinearErrors:
     """Several errors together, and which parameters are whose.
 
     Attributes:
         errors: each error.
     """
 
-    errors: tuple[BenchError, ...] = ()
+    errors: tuple[LinearError, ...] = ()
 
     @property
     def slices(self) -> Mapping[str, slice]:
@@ -305,11 +305,11 @@ class BenchErrors:
 
     @property
     def jumps(self) -> list[Jump]:
-        """All sudden changes, their variances (M,) over all parameters."""
+        """All sudden changes that are possible, their variances (M,) over all parameters."""
         jumps, total = [], len(self.means)
         for error in self.errors:
             place = self.slices[error.name]
-            for jump in error.jumps:
+            for jump in (each for each in error.jumps if each.probability > 0.0):
                 variances = torch.zeros(total, dtype=torch.float64)
                 variances[place] = jump.variances
                 jumps.append(jump._replace(variances=variances))

@@ -18,17 +18,18 @@ from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.distributions.episodes import (
     ArmCompliance,
-    BenchErrors,
     ContactEpisodes,
     Delay,
     Grasp,
     Hypothesis,
     KinematicError,
+    LinearErrors,
     PartSlides,
     Size,
 )
 from bcppl.distributions.episodes.covariances import RowErrors, segments_of
 from bcppl.distributions.episodes.rows import FELT, FORCE, GIVEN, VELOCITY, WRENCH, new_rows
+from bcppl.distributions.episodes.switching_filter import OUTLIER as IS_OUTLIER
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.gap import PegGap
@@ -50,7 +51,7 @@ OUTLIER = 1e-9
 def site(
     pose: Tensor, rows: Tensor, *errors: Any, outlier: float = OUTLIER, **others: Any
 ) -> ContactEpisodes:
-    given = {"hypotheses": ONE, "bench": BenchErrors(errors or SHARED), **others}
+    given = {"hypotheses": ONE, "bench": LinearErrors(errors or SHARED), **others}
     return ContactEpisodes(ledge, pose, len(rows), 6e-5, 1e-5, 2e-5, outlier, **given)
 
 
@@ -80,7 +81,7 @@ def moved(peg: Tensor, twist: Tensor) -> Tensor:
     return poses.retract(peg, torch.cat([along, twist[:, 3:]], dim=1))
 
 
-def measured_columns(gap: Any, pose: Tensor, rows: Tensor, errors: BenchErrors) -> Tensor:
+def measured_columns(gap: Any, pose: Tensor, rows: Tensor, errors: LinearErrors) -> Tensor:
     """The gap's changes (N, R, M) by each parameter, by finite differences of the gap itself."""
     effect = errors.effect(rows)
     columns = []
@@ -93,7 +94,7 @@ def measured_columns(gap: Any, pose: Tensor, rows: Tensor, errors: BenchErrors) 
     return torch.stack(columns, dim=-1)
 
 
-def dense(pose: Tensor, rows: Tensor, errors: BenchErrors, extra: Tensor | None = None) -> Tensor:
+def dense(pose: Tensor, rows: Tensor, errors: LinearErrors, extra: Tensor | None = None) -> Tensor:
     """Log-density (N,) of all contact rows at once; `extra` (R, R, M): variances that rows share besides."""
     columns = measured_columns(ledge, pose, rows, errors)
     factor = torch.from_numpy(segments_of(rows, RowErrors(0.0, 1e-5, 2e-5, 0.1, 0.6, 0.2), ONE).factor[0])
@@ -111,7 +112,7 @@ def dense(pose: Tensor, rows: Tensor, errors: BenchErrors, extra: Tensor | None 
 
 def test_the_filter_is_the_dense_gaussian_and_each_error_matters() -> None:
     pose = around(20)
-    expected = dense(pose, FIVE, BenchErrors(SHARED))
+    expected = dense(pose, FIVE, LinearErrors(SHARED))
     torch.testing.assert_close(site(pose, FIVE).log_prob(FIVE), expected, rtol=1e-4, atol=1e-3)
     for k in range(len(SHARED)):
         others = SHARED[:k] + SHARED[k + 1 :]
@@ -136,7 +137,7 @@ def test_the_gap_s_change_by_a_displaced_peg_is_that_of_the_gap_itself() -> None
     rows[:, :3] = torch.tensor(
         [[0.0, 0.01, 0.0502], [0.01, 0.0, 0.0505], [0.0382, 0.0, 0.03], [0, -0.0384, 0.03]]
     )
-    errors = BenchErrors((*SHARED, PartSlides(center=(0.02, 0.01, 0.0))))
+    errors = LinearErrors((*SHARED, PartSlides(center=(0.02, 0.01, 0.0))))
     one = ContactEpisodes(gap, pose, 4, 6e-5, 1e-5, 2e-5, bench=errors)
     stated = one._columns(gap(pose, rows[:, :7]), rows)
     differences = (stated - measured_columns(gap, pose, rows, errors)).abs()
@@ -167,7 +168,7 @@ def test_any_cut_gives_the_same_likelihood_with_shared_errors() -> None:
 def test_a_row_without_contact_is_positive_given_the_contacts_before() -> None:
     pose = around(8)
     rows = rows_with_wrenches([1, 1, 0], [0, 0, -1], seed=2)
-    errors = BenchErrors(SHARED)
+    errors = LinearErrors(SHARED)
     columns, gaps = measured_columns(ledge, pose, rows, errors), ledge(pose, rows[:, :7]).distance
     after = site(pose, rows).branches(rows[:2])
     mean, covariance = torch.from_numpy(after.mean[:, 0]), torch.from_numpy(after.covariance[:, 0])
@@ -186,7 +187,7 @@ def test_a_slip_is_one_of_the_sums_over_when_it_was() -> None:
     rows[:, :2], rows[:, 2], rows[:, 3:7] = 0.0, 0.0, torch.tensor([1.0, 0, 0, 0])
     rows[2:, 2] -= 6e-4
     grasp = Grasp(1e-4, 1e-3, 1e-3, slip=5e-4, slip_turn=1e-3, slips=0.01)
-    errors = BenchErrors((grasp,))
+    errors = LinearErrors((grasp,))
     jump = errors.jumps[0].variances
     each = [dense(pose, rows, errors) + 3 * math.log(0.99)]
     for begin in (0, 2, 4):
@@ -197,7 +198,7 @@ def test_a_slip_is_one_of_the_sums_over_when_it_was() -> None:
     expected = torch.logsumexp(torch.stack(each), dim=0)
     torch.testing.assert_close(site(pose, rows, grasp).log_prob(rows), expected, rtol=0.0, atol=0.1)
     after = site(pose, rows, grasp).branches(rows)
-    slipped = (after.weights * (after.event[..., 1] == 2)).sum(axis=1)
+    slipped = (after.weights * (after.event[..., 1] == IS_OUTLIER + 1)).sum(axis=1)
     assert bool((slipped > 0.9).all()), "the second episode is the one before which it slipped"
     assert float((expected - each[0]).min()) > 3.0
 
