@@ -8,8 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
-from bcppl.cli.predictive_checks import MEANING, NAMED, piece_errors, sentence, together
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.cli.predictive_checks import (
+    MEANING,
+    NAMED,
+    PredictiveChecks,
+    jump_sentence,
+    piece_errors,
+    sentence,
+    together,
+)
 from bcppl.geometry.parts import Piece
 from bcppl.inference.criticism.predictive import Check
 from bcppl.models.worlds.bench import BenchParameters, bench_scene
@@ -108,3 +119,20 @@ def test_pieces_that_are_not_the_mesh_are_named_and_those_that_are_are_not() -> 
         (warning,) = piece_errors(replace(recording, part=replace(recording.part, pieces=pieces)))
         assert recording.part.name in warning and "convex pieces" in warning
         assert_one_sentence(warning)
+
+
+def test_a_belief_that_jumps_is_named_where_a_check_fails_and_one_that_narrows_is_not() -> None:
+    """Means of beliefs of 1 mm, then the same, then 20 mm beside it; the prior is as wide as the jump."""
+    checks = PredictiveChecks()
+    for k, (mean, spread) in enumerate([(0.0, 0.02), (0.01, 0.001), (0.011, 0.0005), (0.03, 0.0005)]):
+        pose = poses.identity().repeat(400, 1)
+        pose[:, :3] = spread * torch.randn(400, 3, generator=torch.Generator().manual_seed(k))
+        pose[:, 0] += mean
+        belief = Belief(pose.double(), torch.zeros(400, dtype=torch.float64))
+        checks.compare(belief, f"touch {k}")
+        assert checks.jump is None or checks.jump.check.surprising == (k == 3)
+    assert checks.jump is not None and checks.jump.label == "touch 3"
+    assert checks.jump.distance == pytest.approx(0.019, abs=5e-4)
+    said = jump_sentence(checks.jump)
+    assert_one_sentence(said)
+    assert "19 mm at touch 3" in said and "moved" in said

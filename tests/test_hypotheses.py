@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 import pyro
@@ -12,13 +12,14 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.cli.predictive_checks import edge_sentence
+from bcppl.cli.predictive_checks import displaced_sentence, edge_sentence
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.poses import NormalPose, SwingTwistPose, UniformPose
 from bcppl.geometry.parts import Part
 from bcppl.inference.criticism import hypotheses
-from bcppl.inference.criticism.hypotheses import alternatives, edges, likeliest
+from bcppl.inference.criticism.hypotheses import alternatives, displaced, edges, likeliest
 from bcppl.inference.population import Population
+from bcppl.inference.resampling import seeded
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import generate
@@ -111,3 +112,56 @@ def test_a_mirrored_part_and_a_turned_one_are_named_and_the_right_one_is_not() -
     assert "mirrored along x" in likeliest(mirrored) and mirrored[0].gain > 20.0
     turned = alternatives(belief(prior, TRUTH, other(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]))))
     assert "turned by -90° about its z" in likeliest(turned) and turned[0].gain > 20.0
+
+
+@pytest.mark.parametrize("away", [(0.0, 0.0), (0.02, 0.0), (0.0, -0.015)])
+def test_an_image_of_a_part_that_moved_along_its_table_is_named_and_one_of_a_part_that_stood_is_not(
+    away: tuple[float, float],
+) -> None:
+    """Whatever the seed of the search."""
+    population = belief(UniformPose(TRUTH, 0.05, 0.5), moved(*away))
+    for seed in range(5):
+        found = displaced(population, seed=seed)
+        if away == (0.0, 0.0):
+            assert not found
+            continue
+        (one,) = found
+        assert one.address == "depth" and one.gain > 10.0
+        assert one.distance == pytest.approx(np.linalg.norm(away), abs=0.006)
+        assert_one_sentence(displaced_sentence({"view 2": one}))
+
+
+def test_the_evidence_of_a_displaced_part_is_that_of_quadrature() -> None:
+    """Log Bayes factors of a Gaussian image of three displacements, which has an exact answer."""
+
+    @dataclass(frozen=True)
+    class Bump:
+        pose: Tensor
+        width = torch.tensor([0.003] * 3 + [0.02] * 3, dtype=torch.float64)
+
+        def log_prob(self, image: Tensor) -> Tensor:
+            away = poses.local(poses.identity(), self.pose) - image
+            return -0.5 * (away / self.width).square().sum(dim=-1)
+
+    class Few:
+        def __init__(self, count: int) -> None:
+            self.distributions = {"depth": Bump(poses.identity().expand(count, 7))}
+
+        def chosen(self, index: Tensor) -> Few:
+            return Few(len(index))
+
+        def log_prob(self, address: str) -> Tensor:
+            return self.distributions[address].log_prob(self[address])
+
+        def __getitem__(self, address: str) -> Tensor:
+            return image
+
+    for shift in (0.0, 0.006, 0.02):
+        image = torch.tensor([shift, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+        wide = hypotheses.DISPLACEMENT.square() + Bump.width.square()
+        # Of a product of normal densities, against the likelihood at no displacement.
+        marginal = 0.5 * (Bump.width.square() / wide).log().sum() - 0.5 * (image.square() / wide).sum()
+        exact = float(marginal + 0.5 * (image / Bump.width).square().sum())
+        with seeded(0):
+            gain = hypotheses._displaced(cast(Any, Few(4)), "depth").gain
+        assert gain == pytest.approx(exact, abs=0.7)

@@ -5,10 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
+import torch
+
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.distributions.checks import chi_square
 from bcppl.geometry.hausdorff import hausdorff_error
-from bcppl.inference.criticism.hypotheses import Edge, alternatives, edges, likeliest
+from bcppl.inference.criticism.hypotheses import Displaced, Edge, alternatives, displaced, edges, likeliest
 from bcppl.inference.criticism.predictive import THRESHOLD, Check, surprise
 from bcppl.inference.criticism.undetermined import Undetermined, undetermined
 from bcppl.inference.population import Population
@@ -16,6 +21,7 @@ from bcppl.recordings import Recording
 
 MARK = "!"
 NAMED = 6  # measurements that a warning names
+FINEST = 1e-5  # m: a belief is not taken to be surer than this of where the part is
 PIECES = 0.01  # of a part's diameter: convex pieces that are so far off its mesh are warned of
 MEANING = {
     "image": "an unmodelled object may occlude the view, the camera may not be where it is stated to be, or "
@@ -29,17 +35,40 @@ MEANING = {
 }
 
 
+class Jump(NamedTuple):
+    """A measurement after which the mean position is where the belief before it had it least of all.
+
+    Attributes:
+        label: of the measurement.
+        distance: from mean to mean, metres.
+        check: of the difference, whitened by the covariance of the belief before it, against chi-square.
+    """
+
+    label: str
+    distance: float
+    check: Check
+
+
 @dataclass
 class PredictiveChecks:
-    """The checks of a run so far, and the labels of the measurements that each address came with."""
+    """The checks of a run so far.
+
+    Attributes:
+        labels: of the measurement that each address came with.
+        jump: of the mean, the least probable so far: that of a belief is a martingale, a moved part's is not.
+        before: the belief before the newest measurement.
+    """
 
     labels: dict[str, str] = field(default_factory=dict)
+    jump: Jump | None = None
+    before: Belief | None = None
 
     def cell(self, step: Any) -> str:
         """The p value of a step's measurement, marked where it is small; empty where there is none."""
         population = getattr(step, "population", None)
         if not isinstance(population, Population):
             return ""
+        self.compare(step.belief, step.info.label)
         new = [a for a in population.trace.addresses if a not in self.labels]
         is_prior = not self.labels
         self.labels.update(dict.fromkeys(new, step.info.label))
@@ -48,6 +77,20 @@ class PredictiveChecks:
             return ""
         probability = together(checks.values())
         return f"<{THRESHOLD:g}{MARK}" if probability < THRESHOLD else f"{probability:.3f}"
+
+    def compare(self, belief: Belief, label: str) -> None:
+        """Keep the jump of the mean at a measurement if it is the farthest so far, in standard deviations."""
+        before, self.before = self.before, belief
+        if before is None:
+            return
+        away = poses.local(before.mean, belief.mean)[:3]
+        scale = torch.linalg.cholesky(
+            before.covariance[:3, :3] + FINEST**2 * torch.eye(3, dtype=torch.float64)
+        )
+        white = torch.linalg.solve_triangular(scale, away[:, None], upper=False)
+        jump = Jump(label, float(away.norm()), chi_square(white.square().sum(dim=0), 3))
+        if self.jump is None or jump.check.excess > self.jump.check.excess:
+            self.jump = jump
 
     def warnings(self, step: Any, address: str) -> list[str]:
         """One sentence on each reason to doubt the belief of the last step; empty where there is none.
@@ -62,6 +105,11 @@ class PredictiveChecks:
             by_label.setdefault(self.labels[at], {})[at] = check
         off = {label: checks for label, checks in by_label.items() if together(checks.values()) < THRESHOLD}
         reasons = [sentence(off, list(by_label))] if off else []
+        if off and self.jump is not None and self.jump.check.surprising:
+            reasons.append(jump_sentence(self.jump))
+        beside = displaced(population)
+        if beside:
+            reasons.append(displaced_sentence({self.labels[each.address]: each for each in beside}))
         reasons += [edge_sentence(edge) for edge in edges(population, address) if edge.decisive or off]
         open_along = undetermined(population, address)
         if open_along is not None:
@@ -112,6 +160,26 @@ def edge_sentence(edge: Edge) -> str:
     return (
         f"{100 * edge.mass:.0f} % of the posterior is at the edge of the guess, {edge.axis} "
         f"{scale * edge.limit:+.3g} {unit} from its centre{better}: the part may be outside; widen the guess."
+    )
+
+
+def jump_sentence(jump: Jump) -> str:
+    """The warning for a belief that has left the place that it was sure of."""
+    return (
+        f"the belief moved by {1e3 * jump.distance:.2g} mm at {jump.label}, to where it had been sure that "
+        "the part was not: as if the part had moved before it, or the belief had been wrong."
+    )
+
+
+def displaced_sentence(beside: Mapping[str, Displaced]) -> str:
+    """The warning for images, by the label of their measurement, that see the part elsewhere."""
+    listed = "; ".join(
+        f"{label} {1e3 * each.distance:.2g} mm away, by {each.gain:.0f} nats"
+        for label, each in list(beside.items())[:NAMED]
+    )
+    return (
+        f"images fit the part better elsewhere than it is believed to be ({listed}): the part may have moved "
+        "between measurements, the camera may not be where it is stated to be, or the belief is wrong."
     )
 
 
