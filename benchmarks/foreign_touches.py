@@ -3,7 +3,8 @@
 Every scene of `foreign_world` is touched in two manners, by a contact softer and one stiffer than nominal,
 and read at two rates: eight recordings of the same two views. `--cuts` reads each probe at other rates and
 cuts it into other windows, of which the belief should not depend; `--faults` shows which faults are reported.
-`--check` prints the gap between peg and part at the true pose, from which a wrong recording would show.
+`--check` prints the gap between peg and part at the true pose, from which a wrong recording would show. With
+`--file` results are written as they are done, and a later call adds those that are missing.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import torch
 from foreign_faults import FAULTS, recut, resampled
 from foreign_world import CONTACTS, MANNERS, RATES, kept, scene_of
 from jobs import each
+from kept import added, recorded
 from report import Row, finish, options, show
 
 import bcppl
@@ -86,6 +88,13 @@ class Result(NamedTuple):
     def silent(self) -> bool:
         """Whether the belief is wrong, sure, and without a warning."""
         return self.add > FAR and not self.warned and not self.held[HELD.index(("translation", 0.9))]
+
+
+def known(case: Case, particles: int, folder: Path | None, file: Path | None) -> Result:
+    """The result of one recording, from a file where it is there."""
+    key = [particles, *case]
+    values = recorded(file, key) or added(file, key, lambda: inferred(case, particles, folder))
+    return Result(case, *values[1:])
 
 
 def inferred(case: Case, particles: int, folder: Path | None) -> Result:
@@ -229,6 +238,7 @@ def asked() -> argparse.Namespace:
     parser.add_argument(
         "--keep", type=Path, metavar="FOLDER", help="recordings are kept in it, and read from it"
     )
+    parser.add_argument("--file", type=Path, help="where the result of each recording is kept")
     parser.add_argument("--faults", action="store_true", help="good recordings beside faulty ones")
     parser.add_argument("--cuts", action="store_true", help="the same probes in other windows and rates")
     parser.add_argument("--check", action="store_true", help="the gaps at the true poses, and no inference")
@@ -262,7 +272,8 @@ def main() -> None:
     results: list[Result] = []
     for first in range(0, len(cases), max(given.jobs, 1)):
         batch = cases[first : first + max(given.jobs, 1)] if given.jobs > 1 else [cases[first]]
-        for one in each(partial(inferred, particles=given.particles, folder=given.keep), batch, given.jobs):
+        work = partial(known, particles=given.particles, folder=given.keep, file=given.file)
+        for one in each(work, batch, given.jobs):
             results.append(one)
             end = one.error or f"{one.add:.3f} mm, vision {one.vision:.2f} mm, {one.distance:.1f} squared"
             print(*one.case, end, "warned" if one.warned else "", f"{one.seconds:.1f} s", flush=True)
