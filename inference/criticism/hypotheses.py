@@ -261,5 +261,5 @@ def _log_normal(whitened: Tensor, scale: Tensor) -> Tensor:
 
 
 def likeliest(others: Sequence[Alternative]) -> str:
-    """The names of the alternatives that are as probable as the first, within what is very strong evidence."""
+    """The names of the alternatives that are as probable as the first, short of very strong evidence."""
     return " or ".join(each.name for each in others if each.gain > others[0].gain - VERY_STRONG)
