@@ -141,6 +141,15 @@ class ContactEpisodes(ContactManifold):
                 )
         return whole
 
+    def joint_covariance(self, value: Tensor) -> Tensor:
+        """Covariance (N, 6 + M, 6 + M) of the pose and the shared errors given a window's rows, linear here.
+
+        With hardly any prior of the pose (0.1 m, 1 rad): translation along the world's axes and rotation in
+        the part's frame, m and rad; then the shared errors, in their standard deviations. At the true pose
+        it is what touches can tell at best, a Bayesian Cramer-Rao bound of a linear model.
+        """
+        return self._joint_moments(_given_and_all(value)[1])[1]
+
     def residual(self, value: Tensor) -> Tensor:
         """Gaps (N, T) that contradict the contact signal, as of `ContactManifold`; 0 for given rows."""
         if is_predicted(value):
@@ -285,20 +294,23 @@ class ContactEpisodes(ContactManifold):
         return (sure * (_FAR**2 / squared).clamp(max=1.0)).sqrt()
 
     def _quadratic_of(self, rows: Tensor) -> Quadratic:
+        mean, covariance = self._joint_moments(rows)
+        precision = torch.linalg.inv(covariance[:, :6, :6])
+        pull = (precision @ mean[:, :6, None])[..., 0]
+        information = precision - torch.diag(_WIDE**-2)
+        return Quadratic(-pull, 0.5 * (information + information.transpose(-1, -2)))
+
+    def _joint_moments(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean (N, 6 + M) and covariance of the pose's displacement and the shared errors, given rows."""
         prior = self._prior(6)
         if self.blur:
             prior = prior._replace(outlier=0.0)
         after = self._filtered(begun(prior, len(self.pose)), prior, rows, free=True)
-        weights = torch.from_numpy(after.weights)
-        means = torch.from_numpy(after.mean)[..., :6]
+        weights, means = torch.from_numpy(after.weights), torch.from_numpy(after.mean)
         mean = (weights[..., None] * means).sum(dim=1)
         away = means - mean[:, None]
-        each = torch.from_numpy(after.covariance)[..., :6, :6] + away[..., None] * away[..., None, :]
-        covariance = (weights[..., None, None] * each).sum(dim=1)
-        precision = torch.linalg.inv(covariance)
-        pull = (precision @ mean[..., None])[..., 0]
-        information = precision - torch.diag(_WIDE**-2)
-        return Quadratic(-pull, 0.5 * (information + information.transpose(-1, -2)))
+        each = torch.from_numpy(after.covariance) + away[..., None] * away[..., None, :]
+        return mean, (weights[..., None, None] * each).sum(dim=1)
 
 
 def drawn(branches: Branches, draws: int) -> Tensor:
