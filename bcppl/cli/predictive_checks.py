@@ -21,6 +21,7 @@ from bcppl.recordings import Recording
 
 MARK = "!"
 NAMED = 6  # measurements that a warning names
+DOUBTFUL = 0.01  # a p value that with a jump of the belief is worth a warning: by itself it is not
 FINEST = 1e-5  # m: a belief is not taken to be surer than this of where the part is
 PIECES = 0.01  # of a part's diameter: convex pieces that are so far off its mesh are warned of
 MEANING = {
@@ -105,7 +106,8 @@ class PredictiveChecks:
             by_label.setdefault(self.labels[at], {})[at] = check
         off = {label: checks for label, checks in by_label.items() if together(checks.values()) < THRESHOLD}
         reasons = [sentence(off, list(by_label))] if off else []
-        if off and self.jump is not None and self.jump.check.surprising:
+        least = min((together(checks.values()) for checks in by_label.values()), default=1.0)
+        if least < DOUBTFUL and self.jump is not None and self.jump.check.surprising:
             reasons.append(jump_sentence(self.jump))
         beside = displaced(population)
         if beside:
