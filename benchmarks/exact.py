@@ -92,6 +92,10 @@ FEW = (
     "exponents and resampling that depend on the particles leave a bias of order 1/N (hmc, D = 6: -.2 at 75, "
     "-.025 +- .010 at 1000); give more particles"
 )
+UNLEARNED = (
+    "D (D + 3) / 2 means and covariances are learnt from half of the particles, 500 for 1325 at D = 50; give "
+    "10,000 there, or use hmc"
+)
 # Why a kernel may be biased here, by name.
 REASONS = {
     "drift until displaced": UNTIL,
@@ -205,6 +209,9 @@ def reason(cell: Cell, file: Path | None) -> str:
     """Why a kernel is biased: as stated, or what a cell with other seeds, if any, gives."""
     if cell.kernel in REASONS:
         return REASONS[cell.kernel]
+    axes = problem_named(cell.problem).dimension
+    if "independent" in cell.kernel and axes * (axes + 3) > cell.particles:
+        return UNLEARNED
     if cell.particles < 1000:
         return FEW
     if not cell.seeds:

@@ -43,6 +43,11 @@ def independent(
     Technometrics 37, 1995). Poses are fitted in their tangent spaces, other values in unbounded coordinates
     of their support. Of more than a thousand particles a thousand are resampled for the fit.
 
+    D coordinates have D (D + 3) / 2 means and covariances to learn from half of the particles. Where these
+    are not several times as many, hardly a move is accepted, the population dies out, and evidence is off by
+    nats: that of a Gaussian of D = 50 by +5.6 +- .4 with 1,000 particles (hmc: -.06 +- .05), by tenths with
+    10,000.
+
     Args:
         address: of the latent value.
         components: the number of normals, fitted by expectation maximisation; None for a kernel density
