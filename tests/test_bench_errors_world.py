@@ -11,9 +11,11 @@ import torch
 from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.geometry.gap import PegGap
+from bcppl.geometry.turns import turns_freely
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
 from bcppl.models.worlds.bench_errors import BenchErrors
+from bcppl.sensors.likelihoods.bench_profiles import profile_named
 
 SEED = 5
 
@@ -53,3 +55,18 @@ def test_a_part_appears_where_the_peg_meets_it(name: str) -> None:
 
 def test_an_arm_that_bends_seems_to_press_the_peg_into_the_part() -> None:
     assert np.median(with_error("bending")[1]) < np.median(with_error("none")[1]) - 3e-5
+
+
+@pytest.mark.parametrize("part", ["round 16 mm", "round tray", "square 8 mm", "hexagon 12 mm", "D 10 mm"])
+def test_a_round_peg_has_no_turn_about_its_axis_in_the_world_nor_in_the_model(part: str) -> None:
+    """No touch sees it, and an insertion does not depend on it."""
+    scene = bench_scene(SEED, BenchParameters(errors=BenchErrors.only("grasp")), part=part)
+    is_round = part.startswith("round")
+    assert turns_freely(scene.peg) == is_round
+    assert (scene.drawn.grasp[5] == 0.0) == is_round and np.all(scene.drawn.grasp[:5] != 0.0)
+    profile = profile_named("ur5e")
+    assert profile is not None
+    grasp = profile.errors((0.0, 0.0, 0.0), (0.0, 0.0, 0.1), is_round=is_round)[0]
+    by_yaw = grasp.effect(torch.zeros(1, 22, dtype=torch.float64)).twist[0, :, 5]
+    assert bool((by_yaw == 0.0).all()) == is_round
+    assert bool(torch.isfinite(grasp.jumps[0].variances).all())

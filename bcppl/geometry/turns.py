@@ -11,9 +11,12 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.parts import Part
 
 _STEP = math.radians(30.0)  # contains the symmetries of polygons with 2, 3, 4, 6 and 12 corners
+
+_ODD = (0.31, 1.17, 2.59)  # radians, symmetries of no polygon with few corners
 
 
 @lru_cache(maxsize=8)
@@ -36,3 +39,17 @@ def box_turns(part: Part) -> Tensor:
     turned = poses.from_translation_quaternion_xyzw(torch.zeros(len(other), 3).double(), other)
     there = torch.cat([middle, poses.identity()[3:]])
     return poses.compose(there, poses.compose(turned, poses.inverse(there)))
+
+
+@lru_cache(maxsize=8)
+def turns_freely(part: Part) -> bool:
+    """Whether a part is round about the z axis of its frame: turns about it leave its surface where it is.
+
+    A mesh is round to 1 % of its radius, the sagitta of a polygon of 22 corners.
+    """
+    radius = float(np.linalg.norm(part.vertices[:, :2], axis=1).max())
+    turned = torch.zeros(len(_ODD), 6, dtype=torch.float64)
+    turned[:, 5] = torch.tensor(_ODD)
+    points = torch.from_numpy(part.surface_points(200))
+    there = poses.transform(poses.retract(poses.identity(len(_ODD)), turned), points)
+    return float(SignedDistance(part)(there.reshape(-1, 3)).distance.abs().max()) < 0.01 * radius

@@ -23,6 +23,7 @@ from bcppl.distributions.poses import SwingTwistPose
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.extrusion import block, peg_for
 from bcppl.geometry.parts import Guess, Part
+from bcppl.geometry.turns import turns_freely
 from bcppl.models.worlds.bench_errors import BenchErrors, DrawnErrors, drawn_errors
 from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, BenchPart, bench_part
 from bcppl.models.worlds.bench_reality import BenchReality
@@ -206,7 +207,8 @@ class BenchScene:
     @functools.cached_property
     def drawn(self) -> DrawnErrors:
         """The errors of this scene's robot, grasp and parts."""
-        return drawn_errors(self.seed, self.bench.errors, self.clearance)
+        is_round = self.bench.errors.grasp_yaw > 0.0 and turns_freely(self.peg)
+        return drawn_errors(self.seed, self.bench.errors, self.clearance, is_round=is_round)
 
     @functools.cached_property
     def true_peg(self) -> Part:

@@ -172,7 +172,9 @@ class DrawnErrors:
         return replace(self, joints=self.joints * factors[:6], gripper=self.gripper * factors[6:])
 
 
-def drawn_errors(seed: int, errors: BenchErrors, clearance: float = math.inf) -> DrawnErrors:
+def drawn_errors(
+    seed: int, errors: BenchErrors, clearance: float = math.inf, *, is_round: bool = False
+) -> DrawnErrors:
     """The errors of a scene, by its seed.
 
     Args:
@@ -180,7 +182,9 @@ def drawn_errors(seed: int, errors: BenchErrors, clearance: float = math.inf) ->
         errors: their sizes.
         clearance: of peg and hole, m, diametral: a peg that leaves less than half of it is not drawn, for a
             peg that does not fit would not be on the bench.
+        is_round: whether the peg is round about its axis: then it has no turn about it.
     """
+    yaw = 0.0 if is_round else errors.grasp_yaw
     grasp = _stream(seed, _GRASP).normal(size=6)
     slip, slide = _stream(seed, _SLIP), _stream(seed, _SLIDE)
     zero, delay = _stream(seed, _ZERO), _stream(seed, _DELAY)
@@ -192,8 +196,7 @@ def drawn_errors(seed: int, errors: BenchErrors, clearance: float = math.inf) ->
         joints, gripper = _compliances(seed, errors)
     zero_share, zero_force, zero_along = zero.uniform(), zero.normal(size=3), zero.normal(size=3)
     return DrawnErrors(
-        grasp=grasp
-        * np.array([*[errors.grasp_shift] * 3, errors.grasp_turn, errors.grasp_turn, errors.grasp_yaw]),
+        grasp=grasp * np.array([*[errors.grasp_shift] * 3, errors.grasp_turn, errors.grasp_turn, yaw]),
         slip=errors.slip,
         slide=errors.slide,
         slip_at=slip_at,

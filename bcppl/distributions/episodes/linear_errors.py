@@ -100,14 +100,14 @@ class Grasp(_Unchanging):
 
     Attributes:
         shift, turn, yaw: standard deviations along each of the peg's axes (m), about those across it, and
-            about its own (rad).
+            about its own (rad): 0 for a round peg, which slips do not turn either.
         slip, slip_turn: of a slip, m and rad.
         slips: the probability of one, at each episode of contact.
     """
 
     shift: float = field(default=0.001, metadata=POSITIVE)
     turn: float = field(default=math.radians(1.0), metadata=POSITIVE)
-    yaw: float = field(default=math.radians(2.0), metadata=POSITIVE)
+    yaw: float = field(default=math.radians(2.0), metadata=NONNEGATIVE)
     slip: float = field(default=0.0005, metadata=NONNEGATIVE)
     slip_turn: float = field(default=math.radians(0.2), metadata=NONNEGATIVE)
     slips: float = field(default=0.005, metadata=RARE)
@@ -120,7 +120,8 @@ class Grasp(_Unchanging):
     @property
     def jumps(self) -> Sequence[Jump]:
         """Its sudden changes."""
-        change = torch.tensor([self.slip] * 3 + [self.slip_turn] * 3, dtype=torch.float64) / self._scale
+        slip = torch.tensor([self.slip] * 3 + [self.slip_turn] * 3, dtype=torch.float64)
+        change = torch.where(self._scale > 0.0, slip / self._scale, 0.0)
         return (Jump("the peg slipped in the hand", self.slips, change**2),)
 
     def effect(self, rows: Tensor) -> Effect:

@@ -57,10 +57,14 @@ class BenchProfile:
     slips: float = 0.005
     slides: float = 0.005
 
-    def errors(self, part: Point, peg: Point) -> tuple[LinearError, ...]:
-        """The errors, smooth ones about a guess (3,) of where the part is and where the peg will be held."""
+    def errors(self, part: Point, peg: Point, *, is_round: bool = False) -> tuple[LinearError, ...]:
+        """The errors, smooth ones about a guess (3,) of where the part is and where the peg will be held.
+
+        A peg that is round about its axis has no turn about it in the hand.
+        """
+        shift, turn, yaw = self.grasp
         return (
-            Grasp(*self.grasp, slips=self.slips),
+            Grasp(shift, turn, 0.0 if is_round else yaw, slips=self.slips),
             ArmCompliance(*self.compliance),
             KinematicError(*self.kinematics, center=peg),
             PartSlides(probability=self.slides, center=part),

@@ -22,6 +22,7 @@ from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.parts import Part
+from bcppl.geometry.turns import turns_freely
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.capabilities import Approximated
 from bcppl.sensors.likelihoods.bench_profiles import profile_named
@@ -96,9 +97,11 @@ def _shared_errors(
     """The errors that all touches share, and the hypotheses of how good the bench is."""
     profile = profile_named(settings.profile)
     x, y, z = map(float, recording.guess.world_from_part[:3])
-    length = 0.0 if recording.peg is None else -float(recording.peg.vertices[:, 2].min())
+    held = recording.peg
+    length = 0.0 if held is None else -float(held.vertices[:, 2].min())
     part, peg = (x, y, z), (x, y, z + length)
-    own = () if profile is None else profile.errors(part, peg)
+    is_round = profile is not None and held is not None and turns_freely(held)
+    own = () if profile is None else profile.errors(part, peg, is_round=is_round)
     errors = LinearErrors(own if settings.bench is None else settings.bench)
     return errors, () if profile is None else profile.hypotheses(settings.compliance)
 
