@@ -20,10 +20,10 @@ def inherited(ancestors: Tensor, families: Tensor, sides: Tensor) -> dict[str, T
 
     They are their ancestors' as long as either side has enough particles of enough families. Else the
     families are shared out to the sides again; where they are too few for that, copies of one ancestor are
-    one family from here on. Copies of earlier resamplings that have not moved since may then be on both sides,
-    so that moves are valid but for these. With all equal particles in one family, a population that its
-    proposals hardly move dies out: log Z of a Gaussian of D = 20 by 75 particles and `independent` is off by
-    -346 +- 31 nats so, and by +.6 +- 1.2 as it is; where particles do move, both give the same bits.
+    one family from here on. Copies of earlier resamplings that have not moved since may then be on both
+    sides, so that moves are valid but for these. With all equal particles in one family, a population that
+    its proposals hardly move dies out: log Z of a Gaussian of D = 20 by 75 particles and `independent` is off
+    by -346 +- 31 nats so, and by +.6 +- 1.2 as it is; where particles do move, both give the same bits.
     """
     families, sides = families[ancestors], sides[ancestors]
     if not _enough(families, sides):
