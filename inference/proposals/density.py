@@ -45,7 +45,7 @@ def independent(
 
     D coordinates have D (D + 3) / 2 means and covariances to learn from half of the particles. Where these
     are not several times as many, hardly a move is accepted, the population dies out, and evidence is off by
-    nats: that of a Gaussian of D = 50 by +5.6 +- .4 with 1,000 particles (hmc: -.06 +- .05), by tenths with
+    nats: that of a Gaussian of D = 50 by +5.6 +- .4 with 1,000 particles (hmc: -.06 +- .05), +.7 +- .6 with
     10,000.
 
     Args:
