@@ -1,8 +1,8 @@
 """The belief, and an insertion by it, on a bench with the errors of a real one, each alone and all together.
 
 A scene is seen, touched by the fixed probe and explained under the profile of a bench. Two poses are asked
-for: the part's in the world, as it was before any touch, and the part's as seen from the held peg where the
-insertion begins, which is what the insertion needs. Beside each error stands the least that could be expected
+for: the part's in the world, as it was before any touch, and the part's as seen from the held peg with its
+tip at the hole, which is what an insertion needs. Beside each error stands the least that could be expected
 (a Bayesian Cramer-Rao bound): touches linear about the true pose, the model's priors of what the bench
 shares, and the spread that the images left, without any search. `--profile perfect` is the model without
 shared errors. With `--file` results are written as they are done, and a later call adds the missing ones.
@@ -116,7 +116,7 @@ def followed(task: Task) -> Outcome:
     seconds += time.perf_counter() - begun
     belief = steps[-1].belief
     plan = insertion_plan(belief, scene.part, scene.peg)
-    world_from_peg = torch.from_numpy(plan.search.world_from_peg[0])
+    world_from_peg = torch.from_numpy(plan.push.world_from_peg[0])
     least = bounds(scene, recording, task.profile, seen.belief, world_from_peg)
     checks = PredictiveChecks()
     for step in [seen, *steps]:
