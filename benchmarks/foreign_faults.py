@@ -63,27 +63,24 @@ def resampled(recording: Recording, hertz: float) -> Recording:
 
 
 def part_moved(recording: Recording, distance: float = 0.02, heading: float = 0.7) -> Recording:
-    """The part is moved along the table halfway: so is all that the probe meets from then on.
+    """The part is moved along the table halfway through the touches: so is all that is met from then on.
 
     The peg's path is displaced smoothly while it is free. The truth is that of the first half.
 
     Raises:
-        InputError: the peg is nowhere free for long enough in the middle half of the probe.
+        InputError: the peg is nowhere free for long enough between two touches.
     """
     shift = distance * np.array([np.cos(heading), np.sin(heading), 0.0])
 
     def moved(probe: Probe, touch: Touch) -> list[Measurement]:
         force = touch.wrench[:, :3] - np.median(touch.wrench[touch.times < touch.times[0] + 0.3, :3], axis=0)
         felt = touch.times[np.linalg.norm(force, axis=1) > FELT]
-        length = float(np.ptp(touch.times))
-        free = [
-            t
-            for t in touch.times[0] + np.linspace(0.25, 0.75, 501) * length
-            if np.abs(felt - t).min(initial=np.inf) > APART
-        ]
+        # Moved before the first touch, all touches would agree, and cameras that are off explain it.
+        between = np.linspace(felt.min(initial=0.0), felt.max(initial=0.0), 1001)
+        free = [t for t in between if np.abs(felt - t).min(initial=0.0) > APART]
         if not free:
-            raise InputError("the peg is nowhere free in the middle of the probe; take another recording.")
-        middle = min(free, key=lambda t: abs(t - touch.times[0] - 0.5 * length))
+            raise InputError("the peg is nowhere free between two touches; take another recording.")
+        middle = min(free, key=lambda t: abs(t - 0.5 * (between[0] + between[-1])))
 
         def displaced(poses: Array, times: Array) -> Array:
             share = np.clip((times - middle) / APART + 0.5, 0.0, 1.0)
