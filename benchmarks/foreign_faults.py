@@ -76,8 +76,8 @@ def part_moved(recording: Recording, distance: float = 0.02, heading: float = 0.
         force = touch.wrench[:, :3] - np.median(touch.wrench[touch.times < touch.times[0] + 0.3, :3], axis=0)
         felt = touch.times[np.linalg.norm(force, axis=1) > FELT]
         # Moved before the first touch, all touches would agree, and cameras that are off explain it.
-        between = np.linspace(felt.min(initial=0.0), felt.max(initial=0.0), 1001)
-        free = [t for t in between if np.abs(felt - t).min(initial=0.0) > APART]
+        between = np.linspace(*felt[[0, -1]], 1001) if len(felt) else felt
+        free = [t for t in between if np.abs(felt - t).min() > APART]
         if not free:
             raise InputError("the peg is nowhere free between two touches; take another recording.")
         middle = min(free, key=lambda t: abs(t - 0.5 * (between[0] + between[-1])))
