@@ -22,7 +22,7 @@ Array = npt.NDArray[np.float64]
 Fault = Callable[[Recording], Recording]
 
 SEEN = 0.004  # m: a pixel nearer than the background by more shows the part
-FELT, APART = 1.5, 0.15  # N beyond the zero, and s from a stamp at which so much is felt: the peg is free
+FELT, APART = 1.5, 0.05  # N beyond the zero, and s from a stamp at which so much is felt: the peg is free
 
 
 # ---- the same probe, cut and read otherwise
@@ -77,13 +77,15 @@ def part_moved(recording: Recording, distance: float = 0.02, heading: float = 0.
         felt = touch.times[np.linalg.norm(force, axis=1) > FELT]
         # Moved before the first touch, all touches would agree, and cameras that are off explain it.
         between = np.linspace(*felt[[0, -1]], 1001) if len(felt) else felt
-        free = [t for t in between if np.abs(felt - t).min() > APART]
-        if not free:
+        away = np.array([np.abs(felt - t).min() for t in between])
+        if away.max(initial=0.0) < APART:
             raise InputError("the peg is nowhere free between two touches; take another recording.")
-        middle = min(free, key=lambda t: abs(t - 0.5 * (between[0] + between[-1])))
+        free = np.flatnonzero(away >= APART)
+        nearest = free[np.abs(free - 0.5 * len(between)).argmin()]
+        middle, lasts = between[nearest], away[nearest]
 
         def displaced(poses: Array, times: Array) -> Array:
-            share = np.clip((times - middle) / APART + 0.5, 0.0, 1.0)
+            share = np.clip((times - middle) / lasts + 0.5, 0.0, 1.0)
             smooth = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
             return np.hstack([poses[:, :3] + smooth[:, None] * shift, poses[:, 3:]])
 

@@ -21,7 +21,7 @@ from bcppl.recordings import Recording
 
 MARK = "!"
 NAMED = 6  # measurements that a warning names
-DOUBTFUL = 0.01  # a p value that with a jump of the belief is worth a warning: by itself it is not
+DOUBTFUL = 0.02  # a p value that with a jump of the belief is worth a warning: by itself it is not
 FINEST = 1e-5  # m: a belief is not taken to be surer than this of where the part is
 PIECES = 0.01  # of a part's diameter: convex pieces that are so far off its mesh are warned of
 MEANING = {
