@@ -21,7 +21,7 @@ from bcppl.recordings import Recording
 
 MARK = "!"
 NAMED = 6  # measurements that a warning names
-DOUBTFUL = 0.02  # a p value that with a jump of the belief is worth a warning: by itself it is not
+DOUBTFUL = 0.02  # a p value that with a jump of the belief is worth a warning: neither is by itself
 FINEST = 1e-5  # m: a belief is not taken to be surer than this of where the part is
 PIECES = 0.01  # of a part's diameter: convex pieces that are so far off its mesh are warned of
 MEANING = {
@@ -106,9 +106,6 @@ class PredictiveChecks:
             by_label.setdefault(self.labels[at], {})[at] = check
         off = {label: checks for label, checks in by_label.items() if together(checks.values()) < THRESHOLD}
         reasons = [sentence(off, list(by_label))] if off else []
-        least = min((together(checks.values()) for checks in by_label.values()), default=1.0)
-        if least < DOUBTFUL and self.jump is not None and self.jump.check.surprising:
-            reasons.append(jump_sentence(self.jump))
         beside = displaced(population)
         if beside:
             reasons.append(displaced_sentence({self.labels[each.address]: each for each in beside}))
@@ -122,6 +119,9 @@ class PredictiveChecks:
                 f"the images fit a part that is {likeliest(others)} better by {others[0].gain:.0f} nats: "
                 "check the mesh's axes and handedness, and how the part was put down."
             )
+        least = min((together(checks.values()) for checks in by_label.values()), default=1.0)
+        if self.jump is not None and self.jump.check.surprising and (reasons or least < DOUBTFUL):
+            reasons.insert(1, jump_sentence(self.jump))
         return reasons
 
 
