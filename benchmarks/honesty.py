@@ -5,9 +5,9 @@ it is and with one fault: the part moved by 20 mm halfway, the truth outside the
 mirrored or turned in its frame, convex pieces 10 % larger than the mesh. Views alone, of a part that moves
 after half of them, are explained by `part_in_view`; real pushes, the later ones displaced, by `point_probe`.
 A fault is named where one of the warnings of `bcppl run` holds the words that say what to look at. A mesh
-that is symmetric under its fault has none, and is left out. So is one whose evidence is not decisively less
-than that of the true mesh (log Bayes factor below 6.9), and pushes that a part which did not move explains
-as well as one that did: nothing measured can tell these; rows say how many.
+that is symmetric under its fault has none, and is left out. Where the evidence of a fault is not decisive
+(a log Bayes factor below 6.9) nothing could name it: such runs are counted by themselves. For a mesh it is
+that of the true mesh; for pushes, that of two poses, one for each half.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ FAULTS: dict[str, tuple[Callable[[Recording], Recording], str]] = {
 MESHES = ("mesh mirrored", "mesh turned by 90°")
 VIEWS = "part moved between views"
 PUSHES = "part moved by 20 mm between pushes"
-UNTOLD = ", which nothing measured tells"
+UNDECIDED = ", not decided by the data"
 
 
 def moved_between_pushes(seed: int, count: int = 10, distance: float = 0.02) -> Recording:
@@ -157,7 +157,7 @@ def main() -> None:
                 continue
             one = outcome(look_and_touch.model, faulty, truth, seed)
             if name in MESHES and good.log_evidence - one.log_evidence < DECISIVE:
-                name = f"{name}{UNTOLD}"
+                name = f"{name}{UNDECIDED}"
             note(name, seed, one)
         if VIEWS in arguments.only:
             seen = moved_between_views(seed)
@@ -169,8 +169,8 @@ def main() -> None:
             apart = sum(
                 outcome(point_probe.model, half, pushed.truth, seed).log_evidence for half in halves(pushed)
             )
-            told = apart - one.log_evidence > DECISIVE
-            note(PUSHES if told else f"{PUSHES}{UNTOLD}", seed, one)
+            decided = apart - one.log_evidence > DECISIVE
+            note(PUSHES if decided else f"{PUSHES}{UNDECIDED}", seed, one)
     for name, model in SHIPPED.items():
         shipped = load_recording(name)
         note(f"shipped {name}", 0, outcome(model, shipped, shipped.truth, 0))
@@ -186,7 +186,7 @@ def main() -> None:
             rows.append(Row(f"{case}: warned of", float(warned), f"of {len(several)}", 1.0, "min"))
         else:
             warned = np.mean([bool(one.warnings) for one in several])
-            goal = None if case.endswith(UNTOLD) else SILENT
+            goal = None if case.endswith(UNDECIDED) else SILENT
             rows.append(Row(f"{case}: warned of", float(warned), f"of {len(several)}", goal, "max"))
     finish(rows, arguments.json)
 

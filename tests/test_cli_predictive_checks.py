@@ -133,6 +133,6 @@ def test_a_belief_that_jumps_is_named_where_a_check_fails_and_one_that_narrows_i
         assert checks.jump is None or checks.jump.check.surprising == (k == 3)
     assert checks.jump is not None and checks.jump.label == "touch 3"
     assert checks.jump.distance == pytest.approx(0.019, abs=5e-4)
-    said = jump_sentence(checks.jump)
-    assert_one_sentence(said)
-    assert "19 mm at touch 3" in said and "moved" in said
+    warning = jump_sentence(checks.jump)
+    assert_one_sentence(warning)
+    assert "19 mm at touch 3" in warning and "moved" in warning

@@ -20,7 +20,8 @@ from bcppl.arrays import Array
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, Rows
 from bcppl.contact.touch import Touch
-from bcppl.distributions.episodes import ContactEpisodes, Hypothesis
+from bcppl.distributions.episodes import ContactEpisodes, Grasp, Hypothesis, LinearErrors
+from bcppl.distributions.episodes.likelihood import _WIDE
 from bcppl.distributions.episodes.rows import COLUMNS, GIVEN, new_rows
 from bcppl.distributions.manifold import FARTHEST
 from bcppl.geometry.extrusion import block, box_peg
@@ -316,3 +317,18 @@ def test_a_window_given_twice_counts_once_and_is_named() -> None:
     torch.testing.assert_close(
         log_likelihood(overlapping, pose), log_likelihood(once, pose), rtol=1e-9, atol=1e-6
     )
+
+
+def test_part_and_grasp_move_together_in_the_joint_covariance() -> None:
+    """Contacts with a plane leave both as open as the grasp's prior, and their difference not."""
+    one, bench = (Hypothesis(0.0, COMPLIANCE),), LinearErrors((Grasp(1e-3, 1e-9, 1e-9, slips=0.0),))
+    likelihood = site(poses.identity(1), 8, hypotheses=one, bench=bench)
+    covariance = likelihood.joint_covariance(MIXED)[0]
+    assert covariance.shape == (12, 12)
+    of_part, of_peg = torch.zeros(2, 12, dtype=torch.float64)
+    of_part[2], of_peg[8] = 1.0, 1e-3  # m along the plane's normal
+    apart = of_part - of_peg
+    assert float(of_part @ covariance @ of_part) > 0.5e-6
+    assert float(apart @ covariance @ apart) < 1e-8
+    given = torch.linalg.inv(likelihood.quadratic(MIXED).information[0] + torch.diag(_WIDE**-2))
+    torch.testing.assert_close(covariance[:6, :6], given, rtol=1e-6, atol=1e-14)

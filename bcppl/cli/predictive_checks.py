@@ -36,7 +36,7 @@ MEANING = {
 }
 
 
-class Jump(NamedTuple):
+class MeanJump(NamedTuple):
     """A measurement after which the mean position is where the belief before it had it least of all.
 
     Attributes:
@@ -61,7 +61,7 @@ class PredictiveChecks:
     """
 
     labels: dict[str, str] = field(default_factory=dict)
-    jump: Jump | None = None
+    jump: MeanJump | None = None
     before: Belief | None = None
 
     def cell(self, step: Any) -> str:
@@ -89,7 +89,7 @@ class PredictiveChecks:
             before.covariance[:3, :3] + FINEST**2 * torch.eye(3, dtype=torch.float64)
         )
         white = torch.linalg.solve_triangular(scale, away[:, None], upper=False)
-        jump = Jump(label, float(away.norm()), chi_square(white.square().sum(dim=0), 3))
+        jump = MeanJump(label, float(away.norm()), chi_square(white.square().sum(dim=0), 3))
         if self.jump is None or jump.check.excess > self.jump.check.excess:
             self.jump = jump
 
@@ -165,7 +165,7 @@ def edge_sentence(edge: Edge) -> str:
     )
 
 
-def jump_sentence(jump: Jump) -> str:
+def jump_sentence(jump: MeanJump) -> str:
     """The warning for a belief that has left the place that it was sure of."""
     return (
         f"the belief moved by {1e3 * jump.distance:.2g} mm at {jump.label}, to where it had been sure that "

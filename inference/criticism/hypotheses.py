@@ -157,7 +157,8 @@ def alternatives(population: Population, particles: int = PARTICLES) -> list[Alt
     believed to be; nothing is searched. A part that is symmetric has the same likelihood so, and is not
     named.
     """
-    few = _drawn(population, particles)
+    with seeded(0):
+        few = _drawn(population, particles)
     sites = [(few.distributions[address], few[address]) for address in _images(few)]
     images = [(site, image) for site, image in sites if type(site.renderer) is RayCaster]
     parts = {id(site.renderer.part): site.renderer.part for site, _ in images}
@@ -229,10 +230,10 @@ def displaced(population: Population, particles: int = PARTICLES, seed: int = 0)
     from a normal that is fitted to the best of the draws of each round before (the cross-entropy method,
     Rubinstein, Methodology and Computing in Applied Probability 1, 1999).
     """
-    few = _drawn(population, particles)
     with seeded(seed), torch.no_grad():
-        found = [_displaced(few, address) for address in _images(few)]
-    return [each for each in found if each.gain > DECISIVE]
+        few = _drawn(population, particles)
+        every = [_displaced(few, address) for address in _images(few)]
+    return [each for each in every if each.gain > DECISIVE]
 
 
 def _displaced(few: Trace, address: str) -> Displaced:
