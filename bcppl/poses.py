@@ -27,6 +27,9 @@ from bcppl.errors import InputError
 LOG_8_PI_SQUARED = math.log(8.0 * math.pi**2)
 
 
+_XYZW = torch.tensor([4, 5, 6, 3])
+
+
 def identity(*batch: int) -> Tensor:
     """The identity pose, shape (*batch, 7)."""
     pose = torch.zeros(*batch, 7, dtype=torch.float64)
@@ -48,7 +51,7 @@ def as_pose(values: object, name: str = "pose") -> Tensor:
 
 def quaternion_xyzw(pose: Tensor) -> Tensor:
     """The rotations of poses (..., 7) as unit quaternions in scipy's order, shape (..., 4)."""
-    return pose[..., [4, 5, 6, 3]]
+    return pose.index_select(-1, _XYZW)
 
 
 def from_translation_quaternion_xyzw(translation: Tensor, quaternion: Tensor) -> Tensor:
