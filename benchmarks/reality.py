@@ -32,7 +32,7 @@ from bcppl.beliefs.regions import rotation_deviation, translation_deviation
 from bcppl.cli.predictive_checks import PredictiveChecks
 from bcppl.distributions.episodes.rows import COLUMNS
 from bcppl.inference.planning.insertion import insertion_plan
-from bcppl.inference.planning.metrology import three_two_one
+from bcppl.inference.planning.metrology import ROCKED, three_two_one
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
 from bcppl.models.worlds.bench_errors import FAULTS, BenchErrors
@@ -113,7 +113,7 @@ def followed(task: Task) -> Outcome:
     begun = time.perf_counter()
     *_, seen = default_run(scene.look(), PARTICLES, task.seed)
     seconds = time.perf_counter() - begun
-    recording = scene.probe(three_two_one(seen.belief, scene.part, scene.peg))
+    recording = scene.probe(three_two_one(seen.belief, scene.part, scene.peg, ROCKED))
     begun = time.perf_counter()
     prepared = model.prepare(recording, profile=task.profile)
     steps = list(default_run(recording, PARTICLES, task.seed, scene=prepared, start=seen))

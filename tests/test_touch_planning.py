@@ -18,7 +18,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, round_peg
 from bcppl.geometry.gap import PegGap
 from bcppl.inference.planning.faces import boundary_points, points_on_top, section, sides
-from bcppl.inference.planning.metrology import MetrologyParameters, three_two_one
+from bcppl.inference.planning.metrology import ROCKED, MetrologyParameters, three_two_one
 from bcppl.models.parts import insert_peg, insert_tray
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.guarded_motion import Execution
@@ -264,6 +264,32 @@ def test_strokes_are_as_long_as_the_belief_is_unsure() -> None:
     assert lengths[0] == pytest.approx((shortest, shortest))
     assert lengths[2] == pytest.approx((longest, longest))
     assert shortest < lengths[1][1] < longest
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_rocked_peg_leans_and_turns_both_ways_about_its_tip_and_stays_in_contact(seed: int) -> None:
+    scene = bench_scene(seed)
+    plan = three_two_one(about(scene, 0.0), scene.part, scene.peg, ROCKED)
+    truth, commanded = torch.from_numpy(scene.truth), torch.from_numpy(plan.world_from_peg)
+    assert plan.times[-1] == pytest.approx(ROCKED.duration)
+    turned = poses.local(truth, commanded)[:, 3:]
+    leaning = turned.norm(dim=1) > 1e-9
+    # At two sides twice about the side's tangent, twice about the peg's axis, once each way.
+    assert int(leaning.sum()) == 8
+    for four in turned[leaning].split(4):
+        assert torch.allclose(four[0::2], -four[1::2], atol=1e-9)
+        assert four[0].norm() == pytest.approx(ROCKED.lean) and abs(float(four[0, 2])) < 1e-9
+        assert abs(float(four[2, 2])) == pytest.approx(ROCKED.turn)
+    tip = torch.tensor([[0.0, 0.0, float(scene.peg.vertices[:, 2].min())]], dtype=torch.float64)
+    tips = poses.transform(commanded, tip)[:, 0]
+    for k in torch.nonzero(leaning)[:, 0].tolist():
+        assert torch.allclose(tips[k], tips[k - 1], atol=1e-9)
+    motion = scene.execute(plan)[0]
+    gap = PegGap(scene.part, scene.peg)(truth[None], torch.from_numpy(motion.world_from_peg)).distance[0]
+    stamps = motion.probe.stamps
+    for k in torch.nonzero(leaning)[:, 0].tolist():
+        during = (stamps > plan.times[k - 1]) & (stamps < plan.times[k])
+        assert float(gap[torch.from_numpy(during)].max()) < 2e-4
 
 
 def test_a_part_with_no_room_on_top_is_refused() -> None:

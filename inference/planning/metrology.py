@@ -1,11 +1,13 @@
 """A fixed plan of touches: the 3-2-1 rule of metrology.
 
 Three points on the top determine a part's height and tilt, two on one side its position across and its yaw,
-one on the next side the remaining position. A peg that presses and slides touches all points on its path.
+one on the next side the remaining position. A peg that presses and slides touches all points on its path. One
+that leans and turns while it presses touches with several of its own points, so it shows how it is held.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -21,9 +23,9 @@ from bcppl.inference.planning.waypoints import (
     UP,
     Waypoint,
     half_stroke,
+    leaning,
     tip_of,
     top_of,
-    upright,
 )
 from bcppl.robot.plan import Manner, Plan
 
@@ -43,6 +45,8 @@ class MetrologyParameters(NamedTuple):
         contact_force: newtons that stop a guarded motion.
         press_depth: metres of the command beyond the point of contact: an impact may have stopped it.
         side_depth: metres below the top at which sides are touched, where the part is high enough.
+        lean, turn: radians by which the pressed peg leans away from a side and towards it, and turns about
+            its axis both ways, at the end of each slide along a side; 0 leaves it out.
         standard_deviations: half a stroke, in standard deviations of the surface's position along it.
         shortest_half_stroke, longest_half_stroke: limits of that, metres.
     """
@@ -57,6 +61,8 @@ class MetrologyParameters(NamedTuple):
     press_depth: float = 0.003
     side_depth: float = 0.012
     standard_deviations: float = 3.0
+    lean: float = 0.0
+    turn: float = 0.0
     shortest_half_stroke: float = 0.003
     longest_half_stroke: float = 0.012
 
@@ -74,13 +80,17 @@ class MetrologyParameters(NamedTuple):
         return [self.free(clear), Waypoint(stop, "guarded", speed), Waypoint(pressed, "held", speed)]
 
 
+# Where the peg's pose in the hand is uncertain. The time for it is that before the first contact.
+ROCKED = MetrologyParameters(first_contact=1.5, lean=math.radians(4.0), turn=math.radians(8.0))
+
+
 def three_two_one(
     belief: Belief, part: Part, peg: Part, parameters: MetrologyParameters | None = None
 ) -> Plan:
     """Three touches on the part's top, two on one side and two on the next, joined by slides.
 
-    The plan is for the belief's mean, and the peg keeps the part's orientation there. Strokes towards a face
-    are as long as the face's position is uncertain.
+    The plan is for the belief's mean, and the peg keeps the part's orientation there, unless `parameters` (as
+    `ROCKED`) let it lean and turn. Strokes towards a face are as long as the face's position is uncertain.
 
     Args:
         belief: over world_from_part.
@@ -110,10 +120,12 @@ def three_two_one(
         chosen.free(np.array([*begin, above]) + one.clear),
         *one.touch(begin),
         one.slide_to(end),
+        *one.rocked(end),
         chosen.free(corner),
         *_around(section(part, height), corner, other, here, radius, above),
         *other.touch(here),
         other.slide_to(there),
+        *other.rocked(there),
     ]
     return _timed(belief, waypoints, peg, chosen)
 
@@ -174,6 +186,18 @@ class _SideTouch(NamedTuple):
         """Of a slide to a position (2,)."""
         return self.parameters.slide(self.at(position) + self.stop - self.press)
 
+    def rocked(self, position: Array) -> list[Waypoint]:
+        """Of a pressed peg that leans and turns both ways, at a position (2,)."""
+        tangent = np.array([-self.face.normal[1], self.face.normal[0], 0.0])
+        here = self.at(position) + self.stop - self.press
+        speed = self.parameters.sliding_speed
+        leans = [
+            angle * axis for angle, axis in ((self.parameters.lean, tangent), (self.parameters.turn, UP))
+        ]
+        return [
+            Waypoint(here, "held", speed, sign * lean) for lean in leans if lean.any() for sign in (1, -1)
+        ]
+
     def touch(self, position: Array) -> list[Waypoint]:
         """Of a touch at a position (2,)."""
         here = self.at(position)
@@ -230,7 +254,10 @@ def _timed(belief: Belief, waypoints: list[Waypoint], peg: Part, parameters: Met
     positions = np.stack([waypoint.position for waypoint in waypoints])
     kinds = np.array([waypoint.manner for waypoint in waypoints[1:]])
     guarded = kinds == "guarded"
-    lengths = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    leans = np.stack([waypoint.lean for waypoint in waypoints])
+    # A peg that leans about its tip moves its other end.
+    swept = float(np.ptp(peg.vertices[:, 2])) * np.linalg.norm(np.diff(leans, axis=0), axis=1)
+    lengths = np.maximum(np.linalg.norm(np.diff(positions, axis=0), axis=1), swept)
     spans = np.maximum(lengths / np.array([waypoint.speed for waypoint in waypoints[1:]]), 0.04)
     first = int(guarded.argmax())
     # Half of the first stroke is over at the first contact; the rest of the plan must fit in the time left.
@@ -251,15 +278,15 @@ def _timed(belief: Belief, waypoints: list[Waypoint], peg: Part, parameters: Met
         slower = np.minimum(spans * (1.0 + spare / spans[slides].sum()), lengths / parameters.slowest_slide)
         spans = np.where(slides, np.maximum(spans, slower), spans)
     times = np.concatenate([[0.0], begin + np.concatenate([[0.0], np.cumsum(spans)])])
-    positions = np.concatenate([positions[:1], positions])
+    path = leaning(belief, [waypoints[0], *waypoints], tip_of(peg))
     manners: tuple[Manner, ...] = ("free", *(waypoint.manner for waypoint in waypoints[1:]))
     if times[-1] < parameters.duration - 1e-6:
         times = np.append(times, parameters.duration)
-        positions, manners = np.concatenate([positions, positions[-1:]]), (*manners, "held")
+        path, manners = np.concatenate([path, path[-1:]]), (*manners, "held")
     return Plan(
         "3-2-1",
         times,
-        upright(belief, positions - tip_of(peg) * UP),
+        path,
         manners,
         parameters.contact_force,
         np.array(STIFFNESS),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -21,14 +22,23 @@ if TYPE_CHECKING:
 STIFFNESS = (2500.0, 2500.0, 2500.0, 150.0, 150.0, 150.0)
 DAMPING = (120.0, 120.0, 120.0, 2.5, 2.5, 2.5)
 UP = np.array([0.0, 0.0, 1.0])
+NO_LEAN = np.zeros(3)
 
 
 class Waypoint(NamedTuple):
-    """A waypoint of the peg in the part's frame (3,), m, the manner of the motion to it, its speed, m/s."""
+    """A waypoint of the peg's tip in the part's frame.
+
+    Attributes:
+        position: (3,) metres.
+        manner: of the motion to it.
+        speed: of that, m/s.
+        lean: (3,) rotation vector by which the peg leans from the part's z axis, about its tip, radians.
+    """
 
     position: Array
     manner: Manner
     speed: float
+    lean: Array = NO_LEAN
 
 
 def half_stroke(
@@ -52,6 +62,17 @@ def upright(belief: Belief, positions: Array) -> Array:
     world_from_peg = belief.mean.expand(len(positions), 7).clone()
     world_from_peg[:, :3] = poses.transform(belief.mean, torch.from_numpy(positions))
     return np.asarray(world_from_peg.numpy())
+
+
+def leaning(belief: Belief, waypoints: Sequence[Waypoint], tip: float) -> Array:
+    """Poses (K, 7) in the world of a peg whose tip, at z = `tip` in its frame, is at each waypoint."""
+    lean = torch.from_numpy(np.stack([waypoint.lean for waypoint in waypoints]))
+    part_from_peg = poses.identity(len(waypoints))
+    part_from_peg[:, :3] = torch.from_numpy(np.stack([waypoint.position for waypoint in waypoints]))
+    part_from_peg = poses.retract(part_from_peg, torch.cat([torch.zeros_like(lean), lean], dim=-1))
+    peg_from_tip = poses.identity()
+    peg_from_tip[2] = -tip
+    return np.asarray(poses.compose(belief.mean, poses.compose(part_from_peg, peg_from_tip)).numpy())
 
 
 def top_of(part: Part) -> float:
