@@ -28,7 +28,16 @@ from bcppl.distributions.episodes import (
     Size,
 )
 from bcppl.distributions.episodes.covariances import RowErrors, segments_of
-from bcppl.distributions.episodes.rows import FELT, FORCE, GIVEN, VELOCITY, WRENCH, new_rows
+from bcppl.distributions.episodes.rows import (
+    EARLIER,
+    FELT,
+    FORCE,
+    GIVEN,
+    SECONDS,
+    WRENCH,
+    late,
+    new_rows,
+)
 from bcppl.distributions.episodes.switching_filter import OUTLIER as IS_OUTLIER
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg
@@ -36,7 +45,8 @@ from bcppl.geometry.gap import PegGap
 from bcppl.inference.filters.default import infer
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models import look_and_touch
-from bcppl.models.worlds.bench import bench_scene
+from bcppl.models.worlds.bench import BenchParameters, bench_scene
+from bcppl.models.worlds.bench_errors import BenchErrors
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.likelihoods.bench_profiles import PROFILES
 from bcppl.sensors.measurements import Measurement, Recording
@@ -56,7 +66,7 @@ def site(
 
 
 def rows_with_wrenches(felt: list[float], episodes: list[int], seed: int = 0) -> Tensor:
-    """As `MIXED`: turned pegs, wrenches mostly along z, and velocities."""
+    """As `MIXED`: turned pegs that come from elsewhere, and wrenches mostly along z."""
     rng = np.random.default_rng(seed)
     rows = MIXED[:1].repeat(len(felt), 1)
     rows[:, :7] = poses.retract(
@@ -68,7 +78,8 @@ def rows_with_wrenches(felt: list[float], episodes: list[int], seed: int = 0) ->
     rows[:, FORCE] = torch.from_numpy(rng.uniform(2.0, 12.0, len(felt)))
     rows[:, 10] = torch.from_numpy(np.cumsum(rng.uniform(0.02, 0.08, len(felt))))
     rows[:, WRENCH] = torch.from_numpy(rng.normal(size=(len(felt), 6)) * [1.0, 1.0, 4.0, 0.1, 0.1, 0.1])
-    rows[:, VELOCITY] = torch.from_numpy(rng.normal(0.0, 0.02, (len(felt), 3)))
+    steps = rng.normal(0.0, 1.0, (len(felt), len(SECONDS), 6)) * ([2e-4] * 3 + [1e-3] * 3)
+    rows[:, EARLIER] = torch.from_numpy(steps.cumsum(axis=1)).flatten(1)
     return rows
 
 
@@ -96,18 +107,23 @@ def measured_columns(gap: Any, pose: Tensor, rows: Tensor, errors: LinearErrors)
 
 def dense(pose: Tensor, rows: Tensor, errors: LinearErrors, extra: Tensor | None = None) -> Tensor:
     """Log-density (N,) of all contact rows at once; `extra` (R, R, M): variances that rows share besides."""
-    columns = measured_columns(ledge, pose, rows, errors)
     factor = torch.from_numpy(segments_of(rows, RowErrors(0.0, 1e-5, 2e-5, 0.1, 0.6, 0.2), ONE).factor[0])
     own = torch.zeros(len(rows), len(rows), dtype=torch.float64)
     for episode in rows[:, 11].unique():
         index = (rows[:, 11] == episode).nonzero()[:, 0]
         part = factor[index][:, : len(index)]
         own[index[:, None], index] = part @ part.T
-    covariance = own + columns @ (errors.variances[:, None] * columns.transpose(-1, -2))
-    if extra is not None:
-        covariance = covariance + torch.einsum("nrm,nsm,rsm->nrs", columns, columns, extra)
-    mean = -5e-6 * rows[:, FORCE] - columns @ errors.means
-    return MultivariateNormal(mean, covariance).log_prob(ledge(pose, rows[:, :7]).distance)
+    each = []
+    for interval, probability in errors.delays.items():
+        then, twist = late(rows, interval)
+        columns = measured_columns(ledge, pose, then, errors)
+        covariance = own + columns @ (errors.variances[:, None] * columns.transpose(-1, -2))
+        if extra is not None:
+            covariance = covariance + torch.einsum("nrm,nsm,rsm->nrs", columns, columns, extra)
+        mean = -5e-6 * rows[:, FORCE] - columns @ errors.means
+        gaps = ledge(pose, moved(rows[:, :7], twist)).distance
+        each.append(MultivariateNormal(mean, covariance).log_prob(gaps) + math.log(probability))
+    return torch.logsumexp(torch.stack(each), dim=0)
 
 
 def test_the_filter_is_the_dense_gaussian_and_each_error_matters() -> None:
@@ -139,9 +155,15 @@ def test_the_gap_s_change_by_a_displaced_peg_is_that_of_the_gap_itself() -> None
     )
     errors = LinearErrors((*SHARED, PartSlides(center=(0.02, 0.01, 0.0))))
     one = ContactEpisodes(gap, pose, 4, 6e-5, 1e-5, 2e-5, bench=errors)
-    stated = one._columns(gap(pose, rows[:, :7]), rows)
-    differences = (stated - measured_columns(gap, pose, rows, errors)).abs()
-    assert float(differences.quantile(0.95)) < 0.02 * float(stated.abs().quantile(0.95))
+    shifts, columns = one._late(gap(pose, rows[:, :7]), rows)
+    for place, interval in enumerate(errors.delays):
+        then, twist = late(rows, interval)
+        differences = (columns[:, place] - measured_columns(gap, pose, then, errors)).abs()
+        assert float(differences.quantile(0.95)) < 0.02 * float(columns.abs().quantile(0.95))
+        step = 1e-3  # a shift is linear, as are the errors
+        apart = [gap(pose, moved(rows[:, :7], sign * step * twist)).distance for sign in (1.0, -1.0)]
+        differences = (shifts[:, place] - (apart[0] - apart[1]) / (2.0 * step)).abs()
+        assert float(differences.quantile(0.9)) < 0.02 * float(shifts.abs().quantile(0.9))
 
 
 def test_any_cut_gives_the_same_likelihood_with_shared_errors() -> None:
@@ -168,16 +190,17 @@ def test_any_cut_gives_the_same_likelihood_with_shared_errors() -> None:
 def test_a_row_without_contact_is_positive_given_the_contacts_before() -> None:
     pose = around(8)
     rows = rows_with_wrenches([1, 1, 0], [0, 0, -1], seed=2)
-    errors = LinearErrors(SHARED)
+    certain = [error for error in SHARED if not error.delays]
+    errors = LinearErrors(tuple(certain))
     columns, gaps = measured_columns(ledge, pose, rows, errors), ledge(pose, rows[:, :7]).distance
-    after = site(pose, rows).branches(rows[:2])
+    after = site(pose, rows, *certain).branches(rows[:2])
     mean, covariance = torch.from_numpy(after.mean[:, 0]), torch.from_numpy(after.covariance[:, 0])
     own = columns[:, 2]
     variance = float(rows[2, 8]) ** 2 + 1e-10 + 4e-10 + torch.einsum("na,nab,nb->n", own, covariance, own)
     expected = log_ndtr((gaps[:, 2] + (own * mean).sum(-1)) / variance.sqrt())
     value = rows.clone()
     value[:2, GIVEN] = 1.0
-    torch.testing.assert_close(site(pose, value).log_prob(value), expected, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(site(pose, value, *certain).log_prob(value), expected, rtol=1e-3, atol=1e-3)
 
 
 def test_a_slip_is_one_of_the_sums_over_when_it_was() -> None:
@@ -241,6 +264,31 @@ def test_a_perfect_bench_has_none_and_an_unknown_profile_is_refused() -> None:
     assert PROFILES["perfect"] is None and {"ur5e", "panda", "industrial"} <= set(PROFILES)
     with pytest.raises(InputError, match="no profile 'ur5'"):
         look_and_touch.prepare(probed(100), profile="ur5")
+
+
+@pytest.mark.parametrize(
+    ("seed", "fault"), [(21000, "delay"), (21001, "delay"), (21004, "delay"), (21004, "none")]
+)
+def test_touches_tell_by_how_much_the_wrench_is_late(seed: int, fault: str) -> None:
+    """By 35, 30, 14 and 0 ms; up to 14 ms less, since a peg that meets a part sinks in and comes back."""
+    scene = bench_scene(seed, BenchParameters(errors=BenchErrors.only(fault)))
+    truth = torch.from_numpy(scene.truth)
+    certain = Belief(truth.repeat(4, 1), torch.zeros(4, dtype=torch.float64))
+    recording = scene.probe(three_two_one(certain, scene.part, scene.peg))
+    prepared = look_and_touch.prepare(recording, profile="ur5e")
+    values = [v for a, v in prepared.observed(recording.measurements).items() if a.startswith("touch")]
+    one = prepared.likelihoods["window"].site(recording.measurements[-1].action, truth[None])
+    rows = torch.cat([new_rows(value) for value in values])
+    branches = one.branches(rows)
+    ends, (error,) = np.array([0.0, 0.0, *SECONDS]), [e for e in one.bench.errors if isinstance(e, Delay)]
+    interval = [one._every[which].delay for which in branches.which[0]]
+    rest = error.within * branches.mean[0][:, one.bench.slices[error.name]][:, 0]
+    each = 0.5 * (ends[1:] + ends[:-1])[interval] + 0.5 * np.diff(ends)[interval] * rest
+    assert abs(branches.weights[0] @ each - scene.drawn.delay) < 0.016
+    # What is felt from 12 mm away, in free motion, is the tool's inertia: a late wrench feels it later.
+    then, twist = late(rows, int(np.searchsorted(SECONDS, scene.drawn.delay)) + 1)
+    gaps = one.gap(truth[None], moved(then[:, :7], twist)).distance[0]
+    assert float(gaps[rows[:, FELT] == 1.0].max()) < 1.5e-3
 
 
 @pytest.mark.long

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing.contact_detection import ContactDetector
@@ -40,7 +41,7 @@ class Rows(NamedTuple):
         time: (R,) s.
         episode: (R,) the number of the contact, at rest or sliding, within a cell; -1 without contact.
         wrench: (R, 6) on the peg, in its frame, N and N m.
-        velocity: (R, 3) of the peg, in the world, m/s.
+        earlier: (R, K, 7) where the peg was, by each of the extractor's delays before.
     """
 
     world_from_peg: Array
@@ -51,7 +52,7 @@ class Rows(NamedTuple):
     time: Array
     episode: Array
     wrench: Array
-    velocity: Array
+    earlier: Array
 
 
 def cell_ends(stamps: Array) -> Indices:
@@ -77,10 +78,12 @@ class EpisodeExtractor:
     Attributes:
         detector: force thresholds.
         step: s between stamps.
+        delays: (K,) s, increasing, by which the wrench may be later than the pose.
     """
 
     detector: ContactDetector
     step: float
+    delays: tuple[float, ...] = ()
     _done: float = -math.inf  # s: rows of stamps up to here are returned
     _episode: int = -1
     _onset: float = -math.inf
@@ -108,7 +111,7 @@ class EpisodeExtractor:
             last: whether the probe ends here.
         """
         until = math.inf if last or not len(time) else time[-1] - self._lag + 1e-6
-        felt, speed, pace, velocity = self._decided(time, pose, wrench[:, :3])
+        felt, speed, pace = self._decided(time, pose, wrench[:, :3])
         size = np.linalg.norm(wrench[:, :3], axis=1)
         seen = _Stamps(time, pose, felt, size, pace)
         groups: list[tuple[slice, float, int]] = []
@@ -127,7 +130,7 @@ class EpisodeExtractor:
             k += 1
         self._done = float(time[end - 1]) if end > begin else self._done
         self._last_contact = -math.inf
-        return _rows(groups, time, pose, size, speed, wrench, velocity)
+        return _rows(groups, time, pose, size, speed, wrench, self.delays)
 
     def _contact_row(self, first: int, end: int, seen: _Stamps) -> int:
         """The index after a row's last stamp; the row's episode is `_episode`."""
@@ -160,25 +163,29 @@ class EpisodeExtractor:
         then, place = self._last_free
         return time[k] - then > LONGEST - 1e-6 and bool(np.linalg.norm(pose[k, :3] - place) > _MOVED)
 
-    def _decided(self, time: Array, pose: Array, force: Array) -> tuple[Array, Array, Array, Array]:
-        """1, 0 or NaN (T,) for contact, none and undecided; the speed of `Rows`, the whole one, velocity."""
+    def _decided(self, time: Array, pose: Array, force: Array) -> tuple[Array, Array, Array]:
+        """1, 0 or NaN (T,) for contact, none and undecided; the speed of `Rows`, and the whole one."""
         felt, speed, pace = np.full(len(time), np.nan), np.zeros(len(time)), np.zeros(len(time))
-        moved = np.zeros((len(time), 3))
         if not len(time):
-            return felt, speed, pace, moved
+            return felt, speed, pace
         breaks = np.flatnonzero(np.diff(time) > 1.5 * self.step) + 1
         for part in np.split(np.arange(len(time)), breaks):
             velocity, acceleration = self._derivatives(pose[part, :3])
-            moved[part] = velocity
-            given = torch.from_numpy(force[part]), torch.from_numpy(np.linalg.norm(acceleration, axis=1))
-            felt[part] = self.detector(*given, self.step).numpy()
+            inertial = self._largest_since(np.linalg.norm(acceleration, axis=1))
+            felt[part] = self.detector(torch.from_numpy(force[part]), inertial, self.step).numpy()
             world = Rotation.from_quat(pose[part][:, [4, 5, 6, 3]]).apply(np.nan_to_num(force[part]))
             size = np.linalg.norm(world, axis=1)
             pace[part] = whole = np.linalg.norm(velocity, axis=1)
             along = np.abs(np.einsum("ij,ij->i", velocity, world)) / np.maximum(size, 1e-9)
             across = np.sqrt(np.maximum(whole**2 - along**2, 0.0))
             speed[part] = np.where(felt[part] == 1.0, np.maximum(along - _FRICTION * across, 0.0), whole)
-        return felt, speed, pace, moved
+        return felt, speed, pace
+
+    def _largest_since(self, acceleration: Array) -> Tensor:
+        """(T,) the largest of the accelerations that may be felt at each stamp: the wrench may be late."""
+        late = round(self.delays[-1] / self.step) if self.delays else 0
+        seen = np.pad(acceleration, (late, 0), mode="edge")
+        return torch.from_numpy(np.lib.stride_tricks.sliding_window_view(seen, late + 1).max(axis=1))
 
     def _derivatives(self, place: Array) -> tuple[Array, Array]:
         """Velocity and acceleration (T, 3) of a peg at (T, 3), by parabolas."""
@@ -198,19 +205,25 @@ def _rows(
     size: Array,
     speed: Array,
     wrench: Array,
-    velocity: Array,
+    delays: tuple[float, ...],
 ) -> Rows:
-    mean = np.empty((len(groups), 7))
-    for row, (own, _, _) in enumerate(groups):
-        quaternion = pose[own, 3:] * np.sign(pose[own, 3:] @ pose[own.start, 3:])[:, None]
-        mean[row, :3], mean[row, 3:] = pose[own, :3].mean(axis=0), quaternion.mean(axis=0)
-    mean[:, 3:] /= np.linalg.norm(mean[:, 3:], axis=1, keepdims=True)
     slices = [own for own, _, _ in groups]
 
     def averaged(values: Array) -> Array:
         each = [values[own].mean(axis=0) for own in slices]
         return np.array(each).reshape(len(slices), *values.shape[1:])
 
+    smooth = pose.copy()  # no quaternion changes its sign
+    smooth[1:, 3:] *= np.cumprod(np.where((pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1) < 0.0, -1.0, 1.0))[
+        :, None
+    ]
+    earlier = np.empty((len(groups), len(delays), 7))
+    for k, delay in enumerate(delays):
+        then = [np.interp(time - delay, time, column) for column in smooth.T]
+        earlier[:, k] = averaged(np.column_stack(then))
+    mean = averaged(smooth)
+    for place in (mean, earlier):
+        place[..., 3:] /= np.linalg.norm(place[..., 3:], axis=-1, keepdims=True)
     return Rows(
         mean,
         np.array([felt for _, felt, _ in groups]),
@@ -220,5 +233,5 @@ def _rows(
         averaged(time),
         np.array([episode for *_, episode in groups], dtype=np.float64),
         averaged(wrench),
-        averaged(velocity),
+        earlier,
     )

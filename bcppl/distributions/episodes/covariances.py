@@ -21,12 +21,14 @@ class Hypothesis(NamedTuple):
         compliance: of part and peg where they touch, m/N.
         noise: by which the rows' own errors are wider than stated.
         scale: by which the errors that all touches share are wider than stated.
+        delay: the interval in which the wrench's delay lies, from 1 on (`rows.late`); 0 for no delay.
     """
 
     log_weight: float
     compliance: float
     noise: float = 1.0
     scale: float = 1.0
+    delay: int = 0
 
 
 class RowErrors(NamedTuple):
@@ -41,7 +43,7 @@ class RowErrors(NamedTuple):
 
 
 def segments_of(rows: Tensor, errors: RowErrors, hypotheses: tuple[Hypothesis, ...]) -> Segments:
-    """The segments of rows (R, 22), with the factors of their covariances under each hypothesis."""
+    """The segments of rows (R, COLUMNS), with the factors of their covariances under each hypothesis."""
     columns = rows[:, [FELT, NOISE, FORCE, TIME, EPISODE]].contiguous()
     return _segments(columns.numpy().tobytes(), errors, hypotheses)
 

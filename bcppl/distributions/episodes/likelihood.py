@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -25,6 +25,7 @@ from bcppl.distributions.episodes.rows import (
     GIVEN,
     NOISE,
     is_predicted,
+    late,
     padded,
 )
 from bcppl.distributions.episodes.switching_filter import Branches, Prior, begun, filtered
@@ -63,10 +64,11 @@ class ContactEpisodes(ContactManifold):
     A row without contact has the probability that a gap about d is positive, as in `ContactManifold`; an
     episode is an outlier as a whole.
 
-    The event is (T, 22): world_from_peg; 1 with contact, 0 without, NaN for a row that is not used; noise (m)
-    of the row; force (N); time (s); the number of the episode; 1 for a given row; the wrench on the peg (N
-    and N m, in its frame); its velocity (m/s, in the world). Where `motion` predicts the rows there are no
-    forces and times: these are NaN, and the rows are distributed as in `ContactManifold`.
+    The event is (T, COLUMNS): world_from_peg; 1 with contact, 0 without, NaN for a row that is not used;
+    noise (m) of the row; force (N); time (s); the number of the episode; 1 for a given row; the wrench on the
+    peg (N and N m, in its frame); twists (m and rad, in its frame) to where it was a little earlier
+    (`rows.EARLIER`). Where `motion` predicts the rows there are no forces and times: these are NaN, and the
+    rows are distributed as in `ContactManifold`.
 
     Args:
         drift: standard deviation of the errors that last, m.
@@ -99,7 +101,7 @@ class ContactEpisodes(ContactManifold):
         super(ContactManifold, self).__init__(len(self.pose), (self.stamps, COLUMNS))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-likelihood (N,) of one window (T, 22), or of one for each particle (N, T, 22)."""
+        """Log-likelihood (N,) of one window (T, COLUMNS), or of one for each particle (N, T, COLUMNS)."""
         if is_predicted(value):
             return super().log_prob(value[..., : FELT + 1])
         given, rows = _given_and_all(value)
@@ -109,15 +111,15 @@ class ContactEpisodes(ContactManifold):
         return torch.from_numpy(self.branches(rows, given).log_evidence - before.log_evidence)
 
     def branches(self, rows: Tensor, after: Tensor | None = None) -> Branches:
-        """The hypotheses after rows (R, 22), of which the first are `after`, where these were seen before."""
+        """The hypotheses after rows (R, COLUMNS), the first of them `after`, where these were seen before."""
         key = rows.numpy().tobytes()
         known = self.memory.get(key)
         if known is None:
-            prior = self._prior(0)
-            begin = begun(prior, len(self.pose))
+            prior, begin = self._prior(0), None
             if after is not None and len(after) and not _is_cut(rows, len(after)):
-                known = self.memory.get(after.numpy().tobytes())
-                begin, rows = (begin, rows) if known is None else (known, rows[len(after) :])
+                begin = self.memory.get(after.numpy().tobytes())
+                rows = rows if begin is None else rows[len(after) :]
+            begin = begun(prior, len(self.pose)) if begin is None else begin
             known = self.memory[key] = self._filtered(begin, prior, rows).trimmed
             for old in list(self.memory)[:-_REMEMBERED]:
                 del self.memory[old]
@@ -160,10 +162,9 @@ class ContactEpisodes(ContactManifold):
         distance = gaps.distance
         if self.is_displaced:
             branches = self.branches(_given_and_all(value)[1])
-            shared = (torch.from_numpy(branches.weights)[..., None] * torch.from_numpy(branches.mean)).sum(1)
             used = torch.nan_to_num(value)
             used[:, :7] = stood
-            distance = distance + (self._columns(gaps, used) @ shared[..., None])[..., 0]
+            distance = distance + self._shift(gaps, used, branches)
         contact = distance + self.compliance * torch.nan_to_num(value[:, FORCE])
         residual = torch.where(felt == 1.0, contact, distance.clamp(max=0.0))
         residual = torch.where(value[:, GIVEN] == 1.0, 0.0, residual)
@@ -216,36 +217,49 @@ class ContactEpisodes(ContactManifold):
 
     def _spread_at(self, gaps: Gaps, rows: Tensor) -> Tensor:
         """Standard deviations (N, R) of the gaps of rows without contact, a priori."""
-        return self._variance(self._columns(gaps, rows), rows).sqrt()
+        prior, (moved, columns) = self._prior(0), self._late(gaps, rows)
+        weights = torch.from_numpy(np.bincount(prior.delay, np.exp(prior.log_weight)))
+        return torch.einsum("d,ndr->nr", weights, self._variance(columns, rows) + moved**2).sqrt()
 
     def _variance(self, columns: Tensor, rows: Tensor) -> Tensor:
-        """Variances (N, R) of gaps a priori, without what the contact's compliance adds."""
+        """Variances (N, D, R) of gaps a priori, without what the contact's compliance adds."""
         own = rows[:, NOISE] ** 2 + self.blur**2 + self.drift**2 + self.shared**2
         return own + (columns**2 * self.bench.variances).sum(dim=-1)
 
+    @property
+    def _nodes(self) -> list[Hypothesis]:
+        weights = (-0.5 * (_DECADES / self.uncertain) ** 2).log_softmax(dim=0).tolist()
+        nodes = (self.compliance * 10.0**_DECADES).tolist()
+        return [Hypothesis(w, c) for w, c in zip(weights, nodes, strict=True)]
+
     @cached_property
     def _every(self) -> tuple[Hypothesis, ...]:
-        if self.hypotheses:
-            return self.hypotheses
-        weights = (-0.5 * (_DECADES / self.uncertain) ** 2).log_softmax(dim=0)
-        nodes = self.compliance * 10.0**_DECADES
-        return tuple(Hypothesis(w, c) for w, c in zip(weights.tolist(), nodes.tolist(), strict=True))
+        return self._with_delays(self.hypotheses or self._nodes)
 
-    @property
+    @cached_property
     def _few(self) -> tuple[Hypothesis, ...]:
         """Those of an approximation to second order, which needs fewer nodes."""
-        return self.hypotheses or self._every[::2]
+        return self._with_delays(self.hypotheses or self._nodes[::2])
+
+    def _with_delays(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
+        return tuple(
+            each._replace(log_weight=each.log_weight + math.log(probability), delay=interval)
+            for interval, probability in self.bench.delays.items()
+            for each in hypotheses
+        )
 
     def _prior(self, pose: int) -> Prior:
         """With so many parameters of the pose before the others."""
         bench, jumps = self.bench, self.bench.jumps
         own = np.zeros(pose)
-        log_weight, compliance, _, scale = np.array(self._few if pose else self._every).T.copy()
+        hypotheses = self._few if pose else self._every
+        log_weight, compliance, _, scale, delay = np.array(hypotheses).T.copy()
         changed = np.array([np.concatenate([own, j.variances.numpy()]) for j in jumps])
         return Prior(
             log_weight=log_weight,
             compliance=compliance,
             scale=scale,
+            delay=np.searchsorted(list(bench.delays), delay),
             mean=np.concatenate([own, bench.means.numpy()]),
             variance=np.concatenate([_WIDE.numpy()[:pose] ** 2, bench.variances.numpy()]),
             jump_log_probability=np.array([math.log(j.probability) for j in jumps]),
@@ -254,31 +268,49 @@ class ContactEpisodes(ContactManifold):
             farthest=FARTHEST,
         )
 
-    def _columns(self, gaps: Gaps, rows: Tensor) -> Tensor:
-        """The gaps' changes (N, R, M) by the shared errors' parameters."""
-        effect = self.bench.effect(rows)
-        if not effect.offset.shape[1]:
-            return effect.offset.expand(len(self.pose), *effect.offset.shape)
+    def _late(self, gaps: Gaps, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """The gaps' changes (N, D, R) by each delay, and (N, D, R, M) by the shared errors' parameters."""
+        count, delays = len(self.pose), list(self.bench.delays)
+        each = [late(rows, delay) for delay in delays]
+        effect = self.bench.effect(torch.cat([moved for moved, _ in each]))
+        offset, twist = (
+            part.unflatten(0, (len(delays), len(rows))) for part in (effect.offset, effect.twist)
+        )
+        if not self.bench.errors:
+            return rows.new_zeros(count, 1, len(rows)), offset.expand(count, *offset.shape)
         slope = _by_twist_of_peg(gaps.gradient(self.pose), self.pose, rows[:, :7])
-        return torch.einsum("nra,ram->nrm", slope, effect.twist) + effect.offset
+        by_errors = torch.einsum("nra,dram->ndrm", slope, twist) + offset
+        return torch.einsum("nra,dra->ndr", slope, torch.stack([twist for _, twist in each])), by_errors
+
+    def _shift(self, gaps: Gaps, rows: Tensor, branches: Branches) -> Tensor:
+        """The gaps' changes (N, R) by the delay and the shared errors, on average over hypotheses."""
+        moved, columns = self._late(gaps, rows)
+        delay = torch.from_numpy(self._prior(0).delay[branches.which])  # (N, B)
+        particle = torch.arange(len(delay))[:, None]
+        each = moved[particle, delay]
+        each = each + torch.einsum("nbrm,nbm->nbr", columns[particle, delay], torch.from_numpy(branches.mean))
+        return (torch.from_numpy(branches.weights)[..., None] * each).sum(dim=1)
 
     def _filtered(self, begin: Branches, prior: Prior, rows: Tensor, free: bool = False) -> Branches:
         """The hypotheses after rows, the pose `free` to move about `self.pose` or held there."""
         if not len(rows):
             return begin
         gaps = self.gap(self.pose, rows[:, :7])
-        columns = self._columns(gaps, rows)
-        if free:
-            columns = torch.cat([gaps.gradient(self.pose), columns], dim=-1)
-        errors = RowErrors(self.blur, self.shared, self.drift, self.lasting, self.varying, self.rough)
-        given = [gaps.distance, rows[:, FORCE], columns]
+        moved, columns = self._late(gaps, rows)
+        distance = gaps.distance[:, None] + moved
+        trusted = []
         if free and self.blur:
-            given.append(self._trust(gaps.distance, columns[..., 6:], rows))
+            trusted.append(self._trust(distance, columns, rows))
+        if free:
+            own = gaps.gradient(self.pose)[:, None].expand(*columns.shape[:-1], 6)
+            columns = torch.cat([own, columns], dim=-1)
+        errors = RowErrors(self.blur, self.shared, self.drift, self.lasting, self.varying, self.rough)
+        given = [distance, rows[:, FORCE], columns, *trusted]
         arrays = (np.ascontiguousarray(each.numpy()) for each in given)
         return filtered(begin, prior, segments_of(rows, errors, self._few if free else self._every), *arrays)
 
     def _trust(self, distance: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
-        """Factors (N, R) of contacts' errors, each by itself: what is far off hardly pulls.
+        """Factors (N, D, R) of contacts' errors, each by itself: what is far off hardly pulls.
 
         While errors are taken to be wider than they are, to be led to a mode from afar, no row comes before
         another. An episode counts by the probability that it is no outlier.
@@ -288,9 +320,9 @@ class ContactEpisodes(ContactManifold):
         squared = (distance + sunk + columns @ self.bench.means) ** 2 / variance
         inlier = -0.5 * (squared + (2.0 * math.pi * variance).log())
         numbers, episode = rows[:, EPISODE].unique(return_inverse=True)
-        excess = distance.new_zeros(len(distance), len(numbers))
-        excess.index_add_(1, episode, inlier + math.log(FARTHEST))
-        sure = torch.sigmoid(excess + math.log1p(-self.outlier) - math.log(self.outlier))[:, episode]
+        excess = distance.new_zeros(*distance.shape[:-1], len(numbers))
+        excess.index_add_(-1, episode, inlier + math.log(FARTHEST))
+        sure = torch.sigmoid(excess + math.log1p(-self.outlier) - math.log(self.outlier))[..., episode]
         return (sure * (_FAR**2 / squared).clamp(max=1.0)).sqrt()
 
     def _quadratic_of(self, rows: Tensor) -> Quadratic:

@@ -11,13 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.episodes.rows import VELOCITY, WRENCH
+from bcppl.distributions.episodes.rows import SECONDS, WITHIN, WRENCH
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE, RARE, check_parameters
 
 
@@ -66,8 +67,12 @@ class LinearError(Protocol):
     def jumps(self) -> Sequence[Jump]:
         """Its sudden changes."""
 
+    @property
+    def delays(self) -> Mapping[int, float]:
+        """Probabilities of the intervals (`rows.late`) of the wrench's delay; empty for another error."""
+
     def effect(self, rows: Tensor) -> Effect:
-        """Its effect at rows (T, 22)."""
+        """Its effect at rows (T, COLUMNS)."""
 
 
 class _Unchanging:
@@ -92,6 +97,11 @@ class _Unchanging:
     def jumps(self) -> Sequence[Jump]:
         """Its sudden changes."""
         return ()
+
+    @property
+    def delays(self) -> Mapping[int, float]:
+        """None: it is no delay."""
+        return {}
 
 
 @dataclass(frozen=True)
@@ -125,7 +135,7 @@ class Grasp(_Unchanging):
         return (Jump("the peg slipped in the hand", self.slips, change**2),)
 
     def effect(self, rows: Tensor) -> Effect:
-        """Its effect at rows (T, 22)."""
+        """Its effect at rows (T, COLUMNS)."""
         return Effect(torch.diag(self._scale).expand(len(rows), 6, 6), rows.new_zeros(len(rows), 6))
 
 
@@ -151,7 +161,7 @@ class ArmCompliance(_Unchanging):
         return torch.ones(6, dtype=torch.float64)
 
     def effect(self, rows: Tensor) -> Effect:
-        """Its effect at rows (T, 22)."""
+        """Its effect at rows (T, COLUMNS)."""
         scale = torch.tensor([self.translation] * 3 + [self.rotation] * 3, dtype=torch.float64)
         yielded = torch.nan_to_num(rows[:, WRENCH]) * scale
         return Effect(torch.diag_embed(yielded), rows.new_zeros(len(rows), 6))
@@ -178,7 +188,7 @@ class KinematicError(_Unchanging):
     count = 12
 
     def effect(self, rows: Tensor) -> Effect:
-        """Its effect at rows (T, 22)."""
+        """Its effect at rows (T, COLUMNS)."""
         away = (rows[:, :3] - torch.tensor(self.center, dtype=torch.float64)) / self.length
         basis = self.size * torch.cat([torch.ones_like(away[:, :1]), away], dim=1)  # (T, 4)
         turned = poses.rotation_matrix(rows[:, :7]).transpose(-1, -2)  # of the world into the peg's frame
@@ -221,8 +231,13 @@ class PartSlides:
         """Its sudden changes."""
         return (Jump("the part slid", self.probability, torch.ones(3, dtype=torch.float64)),)
 
+    @property
+    def delays(self) -> Mapping[int, float]:
+        """None: it is no delay."""
+        return {}
+
     def effect(self, rows: Tensor) -> Effect:
-        """Its effect at rows (T, 22)."""
+        """Its effect at rows (T, COLUMNS)."""
         # A part that moves one way is a peg that moves the other.
         away = rows[:, :3] - torch.tensor(self.center, dtype=torch.float64)
         moved = rows.new_zeros(len(rows), 6, 3)
@@ -243,19 +258,30 @@ class PartSlides:
 class Delay(_Unchanging):
     """The wrench is later than the pose: where it was felt, the peg was on the way.
 
+    A peg that stops, as in a touch, was not where its velocity says: so intervals of the delay are hypotheses
+    (`Hypothesis.delay`), each with a place of its own for the peg. The parameter is of the rest.
+
     Attributes:
-        seconds: standard deviation.
+        longest: s, at most the last of `rows.SECONDS`; the delay is anything between 0 and it, evenly.
+        within: standard deviation of the rest, in halves of an interval: 0.58 of an even distribution.
     """
 
-    seconds: float = field(default=0.015, metadata=POSITIVE)
+    longest: float = field(default=SECONDS[-1], metadata=POSITIVE)
+    within: float = field(default=0.7, metadata=POSITIVE)
     name = "the time between wrench and pose"
     count = 1
 
+    @property
+    def delays(self) -> Mapping[int, float]:
+        """Probabilities of the intervals in which it may lie."""
+        ends = [min(end, self.longest) for end in (0.0, *SECONDS)]
+        spans = {k: ends[k] - ends[k - 1] for k in range(1, len(ends))}
+        return {k: span / ends[-1] for k, span in spans.items() if span > 0.0}
+
     def effect(self, rows: Tensor) -> Effect:
-        """Its effect at rows (T, 22)."""
-        into_peg = poses.rotation_matrix(rows[:, :7]).transpose(-1, -2)
-        back = -self.seconds * (into_peg @ torch.nan_to_num(rows[:, VELOCITY])[..., None])
-        return Effect(torch.cat([back, torch.zeros_like(back)], dim=1), rows.new_zeros(len(rows), 1))
+        """Its effect at rows (T, COLUMNS)."""
+        twist = self.within * torch.nan_to_num(rows[:, WITHIN])[..., None]
+        return Effect(twist, rows.new_zeros(len(rows), 1))
 
 
 @dataclass(frozen=True)
@@ -271,7 +297,7 @@ class Size(_Unchanging):
     count = 1
 
     def effect(self, rows: Tensor) -> Effect:
-        """Its effect at rows (T, 22)."""
+        """Its effect at rows (T, COLUMNS)."""
         return Effect(rows.new_zeros(len(rows), 6, 1), rows.new_full((len(rows), 1), -self.growth))
 
 
@@ -285,7 +311,7 @@ class LinearErrors:
 
     errors: tuple[LinearError, ...] = ()
 
-    @property
+    @cached_property
     def slices(self) -> Mapping[str, slice]:
         """The parameters of each error, by its name."""
         ends, places = 0, {}
@@ -294,17 +320,17 @@ class LinearErrors:
             places[error.name] = slice(begin, ends)
         return places
 
-    @property
+    @cached_property
     def means(self) -> Tensor:
         """(M,)."""
         return torch.cat([torch.zeros(0, dtype=torch.float64), *(e.means for e in self.errors)])
 
-    @property
+    @cached_property
     def variances(self) -> Tensor:
         """(M,)."""
         return torch.cat([torch.zeros(0, dtype=torch.float64), *(e.variances for e in self.errors)])
 
-    @property
+    @cached_property
     def jumps(self) -> list[Jump]:
         """All sudden changes that are possible, their variances (M,) over all parameters."""
         jumps, total = [], len(self.means)
@@ -316,8 +342,14 @@ class LinearErrors:
                 jumps.append(jump._replace(variances=variances))
         return jumps
 
+    @cached_property
+    def delays(self) -> Mapping[int, float]:
+        """Probabilities of the intervals of the wrench's delay: of none, 0, where no error is one."""
+        several = [error.delays for error in self.errors if error.delays]
+        return several[0] if several else {0: 1.0}
+
     def effect(self, rows: Tensor) -> Effect:
-        """Of all parameters, at rows (T, 22)."""
+        """Of all parameters, at rows (T, COLUMNS)."""
         none = Effect(rows.new_zeros(len(rows), 6, 0), rows.new_zeros(len(rows), 0))
         each = [none, *(error.effect(rows) for error in self.errors)]
         return Effect(torch.cat([e.twist for e in each], dim=2), torch.cat([e.offset for e in each], dim=1))

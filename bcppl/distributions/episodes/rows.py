@@ -5,15 +5,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Of a row: the peg's pose, then these; WRENCH is that on the peg, in its frame, VELOCITY the peg's, in the
-# world's.
+# Of a row: the peg's pose, then these; WRENCH is that on the peg, in its frame. EARLIER are the twists in it
+# that lead to where the peg was so many SECONDS before, m and rad: the wrench may be late by as much. WITHIN
+# is the twist by which that differs within an interval of the delay (`late`), 0 for none.
 FELT, NOISE, FORCE, TIME, EPISODE, GIVEN = range(7, 13)
-WRENCH, VELOCITY = slice(13, 19), slice(19, 22)
-COLUMNS = 22
+WRENCH, WITHIN = slice(13, 19), slice(19, 25)
+SECONDS = (0.006, 0.024, 0.048)  # clocks that agree are common
+EARLIER = slice(25, 25 + 6 * len(SECONDS))
+COLUMNS = EARLIER.stop
 
 
 def padded(rows: Tensor, stamps: int) -> Tensor:
-    """Rows (..., S, C) as (..., T, 22); those that are added repeat the first pose and are not used."""
+    """Rows (..., S, C) as (..., T, COLUMNS); those that are added repeat the first pose and are not used."""
     full = torch.full((*rows.shape[:-2], stamps, COLUMNS), torch.nan, dtype=torch.float64)
     if rows.shape[-2]:
         full[..., :7] = rows[..., :1, :7]
@@ -26,6 +29,25 @@ def is_predicted(value: Tensor) -> bool:
     return value.ndim == 3 or bool((torch.isnan(value[:, TIME]) & ~torch.isnan(value[:, FELT])).any())
 
 
+def late(rows: Tensor, interval: int) -> tuple[Tensor, Tensor]:
+    """Rows (R, COLUMNS) as they are if the wrench is late by no time (0), or by one in the k-th interval.
+
+    It ends at `SECONDS[k - 1]`, and begins where the one before ends, the first at 0.
+
+    Returns:
+        The rows, with `WITHIN` from the middle of the interval to its end, and the twists (R, 6) from where
+        the peg was measured to where it was in the middle.
+    """
+    if interval == 0:
+        return rows, rows.new_zeros(len(rows), 6)
+    twists = torch.nan_to_num(rows[:, EARLIER]).unflatten(1, (len(SECONDS), 6))
+    end = twists[:, interval - 1]
+    begin = twists[:, interval - 2] if interval > 1 else torch.zeros_like(end)
+    rows = rows.clone()
+    rows[:, WITHIN] = 0.5 * (end - begin)
+    return rows, 0.5 * (begin + end)
+
+
 def new_rows(value: Tensor) -> Tensor:
-    """The rows (R, 22) of a value that no earlier window has used."""
+    """The rows (R, COLUMNS) of a value that no earlier window has used."""
     return value[~torch.isnan(value[:, FELT]) & (value[:, GIVEN] != 1.0)]

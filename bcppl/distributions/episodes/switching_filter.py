@@ -53,6 +53,7 @@ class Prior(NamedTuple):
     Attributes:
         log_weight, compliance, scale: (H,) of each hypothesis: its log-probability, the compliance of a
             contact in m/N, and the factor of the shared errors' standard deviations.
+        delay: (H,) the place of its delay among those for which gaps are given.
         mean, variance: (M,) of the parameters.
         jump_log_probability: (J,) at each episode.
         jump_variance: (J, M).
@@ -63,6 +64,7 @@ class Prior(NamedTuple):
     log_weight: Array
     compliance: Array
     scale: Array
+    delay: Indices
     mean: Array
     variance: Array
     jump_log_probability: Array
@@ -143,10 +145,10 @@ def filtered(
         before: after the rows before these.
         prior: of all hypotheses.
         segments: of these rows.
-        distance: (N, R) gaps at the peg as measured, m.
+        distance: (N, D, R) gaps at the peg as measured, with each delay, m.
         force: (R,) N.
-        columns: (N, R, M) the gap's change by each parameter, m.
-        trust: (N, R) factors of the errors and columns of contacts; 1 unless given.
+        columns: (N, D, R, M) the gap's change by each parameter, m.
+        trust: (N, D, R) factors of the errors and columns of contacts; 1 unless given.
     """
     trust = np.ones_like(distance) if trust is None else trust
     new = len(segments.first)
@@ -188,6 +190,24 @@ def _log_sum(a: float, b: float) -> float:
 
 
 @compiled
+def _times(covariance: Array, column: Array, product: Array) -> float:
+    """Set `product` (M,) to a symmetric matrix times a column (M,); returns the column's square by it.
+
+    The inner loop is over neighbouring numbers, which the processor takes several at a time.
+    """
+    parameters, square = len(column), 0.0
+    product[:] = 0.0
+    for b in range(parameters):
+        share = column[b]
+        if share != 0.0:
+            for a in range(parameters):
+                product[a] += share * covariance[b, a]
+    for a in range(parameters):
+        square += column[a] * product[a]
+    return square
+
+
+@compiled
 def _update(
     error: Array, columns: Array, factor: Array, mean: Array, covariance: Array, pull: Array
 ) -> tuple[float, float]:
@@ -206,14 +226,9 @@ def _update(
             columns[i] -= factor[i, j] * columns[j]
         error[i] /= factor[i, i]
         columns[i] /= factor[i, i]
-        innovation, variance = error[i], 1.0
+        innovation, variance = error[i], 1.0 + _times(covariance, columns[i], pull)
         for a in range(parameters):
             innovation += columns[i, a] * mean[a]
-            along = 0.0
-            for b in range(parameters):
-                along += covariance[a, b] * columns[i, b]
-            pull[a] = along
-            variance += columns[i, a] * along
         for a in range(parameters):
             share = pull[a] / variance
             mean[a] -= share * innovation
@@ -242,7 +257,7 @@ def _filter(
     columns: Array,
     trust: Array,
 ) -> None:
-    parameters, jumps, size = columns.shape[2], len(prior.jump_log_probability), log_weight.shape[1]
+    parameters, jumps, size = columns.shape[3], len(prior.jump_log_probability), log_weight.shape[1]
     new, longest = len(segments.first), segments.factor.shape[2]
     offset = event.shape[2] - new
     most = size * (2 + jumps)
@@ -262,19 +277,16 @@ def _filter(
         for s in range(new):
             first, last = segments.first[s], segments.last[s]
             if segments.contact[s] == 0:
-                if distance[n, first] > _CLEAR:
-                    continue
                 for b in range(number[n]):
-                    own = columns[n, first]
+                    delay = prior.delay[which[n, b]]
+                    if distance[n, delay, first] > _CLEAR:
+                        continue
+                    own = columns[n, delay, first]
                     spread = segments.factor[which[n, b], first, 0]
-                    gap, variance = distance[n, first], spread * spread
+                    gap, variance = distance[n, delay, first], spread * spread
+                    variance += _times(covariance[n, b], own, pull)
                     for a in range(parameters):
                         gap += own[a] * mean[n, b, a]
-                        along = 0.0
-                        for c in range(parameters):
-                            along += covariance[n, b, a, c] * own[c]
-                        pull[a] = along
-                        variance += own[a] * along
                     root = math.sqrt(variance)
                     score = gap / root
                     positive = _log_ndtr(score)
@@ -292,6 +304,7 @@ def _filter(
             stray = log_out - rows * math.log(prior.farthest)
             for b in range(number[n]):
                 h = which[n, b]
+                delay = prior.delay[h]
                 for option in range(1 + jumps):
                     means[found], covariances[found] = mean[n, b], covariance[n, b]
                     if option:
@@ -301,8 +314,9 @@ def _filter(
                             )
                     for i in range(rows):
                         sunk = prior.compliance[h] * force[first + i]
-                        error[i] = trust[n, first + i] * (distance[n, first + i] + sunk)
-                        column[i] = trust[n, first + i] * columns[n, first + i]
+                        share = trust[n, delay, first + i]
+                        error[i] = share * (distance[n, delay, first + i] + sunk)
+                        column[i] = share * columns[n, delay, first + i]
                     log_density, square[found] = _update(
                         error[:rows],
                         column[:rows],

@@ -43,7 +43,7 @@ class BenchProfile:
         grasp: along and about the peg's axes, and about its own.
         compliance: of arm and grip along and about the peg's axes, mean, m/N and rad/(N m).
         kinematics: over the workspace, and the distance over which it changes.
-        delay: between wrench and pose.
+        delay: by which the wrench is later than the pose, at most; evenly from 0.
         size: of part and peg together.
         slips, slides: probabilities that the peg slips in the hand or the part on the table, at each episode
             of contact.
@@ -52,7 +52,7 @@ class BenchProfile:
     grasp: tuple[float, float, float] = (0.0005, math.radians(0.5), math.radians(1.0))
     compliance: tuple[float, float] = (1.5e-5, 3e-4)
     kinematics: tuple[float, float] = (0.0003, 0.1)
-    delay: float = 0.015
+    delay: float = 0.045
     size: float = 0.00005
     slips: float = 0.005
     slides: float = 0.005
@@ -93,7 +93,7 @@ PROFILES: Mapping[str, BenchProfile | None] = {
         grasp=(0.0002, math.radians(0.2), math.radians(0.3)),
         compliance=(5e-6, 1e-4),
         kinematics=(0.0001, 0.1),
-        delay=0.005,
+        delay=0.01,
     ),
 }
 

@@ -197,7 +197,9 @@ class ContactProbe:
         stream = self._streams.get(probe.name)
         if stream is None or not stream.begins(seen):
             sensing = ContactSensing(self.peg, rate=1.0 / step_of(probe), cutoff=None)
-            stream = self._streams[probe.name] = ProbeRows(probe, sensing, self.settings)
+            stream = self._streams[probe.name] = ProbeRows(
+                probe, sensing, self.settings, max(self.bench.delays)
+            )
         for measurement in seen[len(stream.windows) :]:
             stream.add(measurement)
         return {k: rows for k, rows in stream.rows.items() if k < len(seen)}

@@ -15,7 +15,7 @@ from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, cell_ends
 from bcppl.contact.sensing.location import ContactSensing
-from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FELT, GIVEN, padded
+from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FELT, GIVEN, SECONDS, padded
 from bcppl.distributions.episodes.switching_filter import Branches
 from bcppl.distributions.manifold import Gaps, MeasuresGap
 from bcppl.robot.motion import Probe, ProbeWindow
@@ -60,10 +60,10 @@ def capacity(window: ProbeWindow) -> int:
 
 
 def after_those_before(each: Sequence[tuple[int, Tensor]], room: Sequence[int]) -> dict[int, Tensor]:
-    """The values (T, 22) of windows, by number: all rows of earlier windows are given, then their own.
+    """The values (T, COLUMNS) of windows, by number: all rows of earlier windows are given, then their own.
 
     Args:
-        each: number and rows (R, 22) of each window, in their order.
+        each: number and rows (R, COLUMNS) of each window, in their order.
         room: T of each.
     """
     given, values = torch.empty(0, COLUMNS, dtype=torch.float64), {}
@@ -138,17 +138,21 @@ class Measured(NamedTuple):
 class ProbeRows:
     """One probe, as far as it is measured.
 
+    The wrench may be late by times in the first intervals of `rows.SECONDS`, so many as `intervals`.
+
     Attributes:
         windows: so far.
-        rows: (R, 22) by number of the window, of those in which a cell ends.
+        rows: (R, COLUMNS) by number of the window, of those in which a cell ends.
     """
 
-    def __init__(self, probe: Probe, sensing: ContactSensing, settings: RowSettings) -> None:
+    def __init__(
+        self, probe: Probe, sensing: ContactSensing, settings: RowSettings, intervals: int = 0
+    ) -> None:
         self.windows: list[Measurement] = []
         self.rows: dict[int, Tensor] = {}
         self.probe, self.sensing, self.settings = probe, sensing, settings
         self._state = sensing.start(1)
-        self._extractor = EpisodeExtractor(settings.contact_detector, step_of(probe))
+        self._extractor = EpisodeExtractor(settings.contact_detector, step_of(probe), SECONDS[:intervals])
         self._number = np.empty(0, dtype=np.int64)
         self._pose, self._wrench = np.empty((0, 7)), np.empty((0, 6))
 
@@ -178,7 +182,7 @@ class ProbeRows:
         return np.asarray(poses.transform(torch.from_numpy(pose), tip[None])[:, 0].numpy())
 
     def _rows(self, end: int) -> Tensor:
-        """The rows (R, 22) that are complete at the end of a cell."""
+        """The rows (R, COLUMNS) that are complete at the end of a cell."""
         settings, so_far = self.settings, self._number < end
         number = self._number[so_far]
         rows = self._extractor.rows(
@@ -192,6 +196,9 @@ class ProbeRows:
         )
         noise = np.hypot(stamp / np.sqrt(rows.stamps), settings.delay * rows.speed)
         columns = [rows.felt, noise, rows.force, rows.time, rows.episode, np.zeros(len(noise))]
-        columns += [rows.wrench, rows.velocity]
-        every = torch.from_numpy(np.column_stack([rows.world_from_peg, *columns]))
+        peg_from_world = poses.inverse(torch.from_numpy(rows.world_from_peg))[:, None]
+        earlier = poses.compose(peg_from_world, torch.from_numpy(rows.earlier))
+        twists = poses.local(poses.identity(), earlier).flatten(1).numpy()
+        columns += [rows.wrench, np.zeros((len(noise), 6)), twists]
+        every = padded(torch.from_numpy(np.column_stack([rows.world_from_peg, *columns])), len(noise))
         return every if settings.free_space else every[every[:, FELT] == 1.0]
