@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import pyro
 import pytest
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from torch.special import log_ndtr
 
 from bcppl import poses
 from bcppl.beliefs import Belief
+from bcppl.cli.predictive_checks import change_sentence
 from bcppl.distributions.episodes import (
     ArmCompliance,
     ContactEpisodes,
@@ -39,23 +41,28 @@ from bcppl.distributions.episodes.rows import (
     new_rows,
 )
 from bcppl.distributions.episodes.switching_filter import OUTLIER as IS_OUTLIER
+from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.gap import PegGap
+from bcppl.inference import importance_sampling
+from bcppl.inference.criticism.sudden_changes import SuddenChange, sudden_changes
 from bcppl.inference.filters.default import infer
-from bcppl.inference.planning.metrology import three_two_one
+from bcppl.inference.planning.metrology import ROCKED, three_two_one
 from bcppl.models import look_and_touch
 from bcppl.models.worlds.bench import BenchParameters, bench_scene
 from bcppl.models.worlds.bench_errors import BenchErrors
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.likelihoods.bench_profiles import PROFILES
 from bcppl.sensors.measurements import Measurement, Recording
+from tests.made_recordings import assert_one_sentence
 from tests.test_contact_episodes import MIXED, cut, probed, values_of
 from tests.test_manifold import around, ledge
 
 ONE = (Hypothesis(0.0, 5e-6),)
 SHARED = (Grasp(slips=0.0), ArmCompliance(), KinematicError(center=(0.01, 0.0, 0.0)), Delay(), Size(0.001))
 OUTLIER = 1e-9
+ZERO = torch.zeros(4, dtype=torch.float64)
 
 
 def site(
@@ -256,6 +263,32 @@ def test_the_pose_relative_to_the_peg_is_sure_where_that_in_the_world_is_not() -
     assert abs(float(relative.mean[2]) - shift) < 2e-4, "a peg that is lower meets a part that seems higher"
     assert belief.relative(at).log_weights.shape == (41 * 8,)
     assert Belief(pose, log_weights).relative(at).world_from_part is pose
+
+
+def changes_of(fault: str, seed: int = 21004) -> list[SuddenChange]:
+    """What has changed, by touches, at the true pose: the part slides and turns by 0.5 degrees at 2.84 s."""
+    scene = bench_scene(seed, BenchParameters(errors=BenchErrors.only(fault)))
+    truth = torch.from_numpy(scene.truth)
+    recording = scene.probe(three_two_one(Belief(truth.repeat(4, 1), ZERO), scene.part, scene.peg, ROCKED))
+    prepared = look_and_touch.prepare(recording, profile="ur5e")
+    touches = {a: v for a, v in prepared.observed(recording.measurements).items() if a.startswith("touch")}
+
+    def near_the_truth() -> None:
+        part = pyro.sample("part", NormalPose(truth, [1e-6] * 6))
+        for k, measurement in enumerate(recording.measurements):
+            if f"touch_{k}" in touches:
+                prepared.likelihoods["window"].observe(k, measurement.action, part)
+
+    population = importance_sampling(near_the_truth, (), touches, 3)
+    return sudden_changes(population)
+
+
+def test_a_part_that_slid_is_named_with_its_time_and_one_that_stood_is_not() -> None:
+    (change,) = changes_of("slide")
+    assert change.name == "the part slid" and change.probability > 0.9
+    assert 2.84 <= change.time < 3.0
+    assert_one_sentence(change_sentence(change))
+    assert not changes_of("none")
 
 
 def test_a_perfect_bench_has_none_and_an_unknown_profile_is_refused() -> None:

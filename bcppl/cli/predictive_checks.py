@@ -15,6 +15,7 @@ from bcppl.distributions.checks import chi_square
 from bcppl.geometry.hausdorff import hausdorff_error
 from bcppl.inference.criticism.hypotheses import Displaced, Edge, alternatives, displaced, edges, likeliest
 from bcppl.inference.criticism.predictive import THRESHOLD, Check, surprise
+from bcppl.inference.criticism.sudden_changes import SuddenChange, sudden_changes
 from bcppl.inference.criticism.undetermined import Undetermined, undetermined
 from bcppl.inference.population import Population
 from bcppl.recordings import Recording
@@ -113,6 +114,7 @@ class PredictiveChecks:
         open_along = undetermined(population, address)
         if open_along is not None:
             reasons.append(open_sentence(open_along))
+        reasons += [change_sentence(change) for change in sudden_changes(population)]
         others = alternatives(population)
         if others:
             reasons.append(
@@ -182,6 +184,14 @@ def displaced_sentence(beside: Mapping[str, Displaced]) -> str:
     return (
         f"images fit the part better elsewhere than it is believed to be ({listed}): the part may have moved "
         "between measurements, the camera may not be where it is stated to be, or the belief is wrong."
+    )
+
+
+def change_sentence(change: SuddenChange) -> str:
+    """The warning for what has changed between touches, which the belief allows for."""
+    return (
+        f"{change.name} before the touch at {change.time:.2f} s of the probe (probability "
+        f"{change.probability:.2f}): the belief allows for it; hold peg and part more firmly, or press less."
     )
 
 

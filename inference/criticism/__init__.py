@@ -14,5 +14,5 @@
     print(surprise(population))  # p values, by address
 
 `hypotheses` compares a part with its mirror image and with turned ones by evidence, `undetermined` names the
-direction in which touches leave a position open.
+direction in which touches leave a position open, `sudden_changes` when a peg slipped or a part slid.
 """

@@ -24,11 +24,12 @@ from bcppl.distributions.episodes.rows import (
     FORCE,
     GIVEN,
     NOISE,
+    TIME,
     is_predicted,
     late,
     padded,
 )
-from bcppl.distributions.episodes.switching_filter import Branches, Prior, begun, filtered
+from bcppl.distributions.episodes.switching_filter import OUTLIER, Branches, Prior, begun, filtered
 from bcppl.distributions.manifold import FARTHEST, ContactManifold, Gaps, Quadratic
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 
@@ -170,6 +171,24 @@ class ContactEpisodes(ContactManifold):
         residual = torch.where(value[:, GIVEN] == 1.0, 0.0, residual)
         return torch.where(torch.isnan(felt), torch.nan, residual)
 
+    def changes(self, value: Tensor) -> list[tuple[str, float, Tensor]]:
+        """The sudden changes given a window's rows and those before them.
+
+        Returns:
+            The name of each, the time of the first row after it (s), and its probabilities (N,).
+        """
+        _, rows = _given_and_all(value)
+        if is_predicted(value) or not self.bench.jumps or not len(rows):
+            return []
+        branches = self.branches(rows)
+        weights, segments = branches.weights[..., None], segments_of(rows, self._row_errors, self._every)
+        found = []
+        for number, jump in enumerate(self.bench.jumps, OUTLIER + 1):
+            probability = torch.from_numpy((weights * (branches.event == number)).sum(axis=1))
+            for k in probability.any(dim=0).nonzero()[:, 0].tolist():
+                found.append((jump.name, float(rows[segments.first[k], TIME]), probability[:, k]))
+        return sorted(found, key=lambda change: change[1])
+
     @property
     def is_displaced(self) -> bool:
         """Whether the peg may be elsewhere than it is measured."""
@@ -304,10 +323,15 @@ class ContactEpisodes(ContactManifold):
         if free:
             own = gaps.gradient(self.pose)[:, None].expand(*columns.shape[:-1], 6)
             columns = torch.cat([own, columns], dim=-1)
-        errors = RowErrors(self.blur, self.shared, self.drift, self.lasting, self.varying, self.rough)
         given = [distance, rows[:, FORCE], columns, *trusted]
         arrays = (np.ascontiguousarray(each.numpy()) for each in given)
-        return filtered(begin, prior, segments_of(rows, errors, self._few if free else self._every), *arrays)
+        return filtered(
+            begin, prior, segments_of(rows, self._row_errors, self._few if free else self._every), *arrays
+        )
+
+    @property
+    def _row_errors(self) -> RowErrors:
+        return RowErrors(self.blur, self.shared, self.drift, self.lasting, self.varying, self.rough)
 
     def _trust(self, distance: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
         """Factors (N, D, R) of contacts' errors, each by itself: what is far off hardly pulls.
