@@ -46,6 +46,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.gap import PegGap
 from bcppl.inference import importance_sampling
+from bcppl.inference.criticism.shared_errors import shared_errors
 from bcppl.inference.criticism.sudden_changes import SuddenChange, sudden_changes
 from bcppl.inference.filters.default import infer
 from bcppl.inference.planning.metrology import ROCKED, three_two_one
@@ -263,6 +264,23 @@ def test_the_pose_relative_to_the_peg_is_sure_where_that_in_the_world_is_not() -
     assert abs(float(relative.mean[2]) - shift) < 2e-4, "a peg that is lower meets a part that seems higher"
     assert belief.relative(at).log_weights.shape == (41 * 8,)
     assert Belief(pose, log_weights).relative(at).world_from_part is pose
+
+
+def test_what_touches_tell_of_the_grasp_is_its_posterior() -> None:
+    """One press along z: part and grasp share it evenly, and of the others' variance nothing is taken."""
+    grasp = Grasp(1e-3, 1e-9, 1e-9, slips=0.0)
+    rows = MIXED[MIXED[:, FELT] == 1.0]
+
+    def pressed() -> None:
+        part = pyro.sample("part", NormalPose(poses.identity(), [1e-3] * 3 + [1e-9] * 3))
+        pyro.sample("touch", site(part, rows, grasp))
+
+    population = importance_sampling(pressed, (), {"touch": rows}, 4000)
+    (error,) = shared_errors(population)
+    assert error.name == grasp.name
+    expected = torch.tensor([1.0, 1.0, math.sqrt(0.5), 1.0, 1.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(error.deviation, expected, rtol=0.04, atol=0.0)
+    assert not shared_errors(importance_sampling(lambda: None, (), {}, 2)), "nothing is shared"
 
 
 def changes_of(fault: str, seed: int = 21004) -> list[SuddenChange]:

@@ -212,6 +212,22 @@ def test_where_to_touch_chooses_and_ends_in_the_hole(kernel: Any, smaller: Small
     assert "inserted: True" in printed["insert"]
 
 
+@shipped_or({"imports": [("PARTICLES = 50", "PARTICLES = 20")]})
+def test_a_bench_that_is_not_perfect_is_seen_explained_and_the_peg_inserted(
+    kernel: Any, smaller: Smaller
+) -> None:
+    printed, drawn = run("is_my_bench_honest", kernel, smaller)
+    assert drawn == {"explained"}
+    perfect, honest = re.findall(r"squared distance (\d+)$", printed["two"], flags=re.MULTILINE)
+    assert float(perfect) > 100.0 > 25.0 > float(honest)
+    (gain,) = re.findall(r"perfect: ([+-][\d.]+) nats", printed["evidence"])
+    assert float(gain) > 5.0
+    assert "the peg's pose in the hand" in printed["explained"]
+    offs = [float(off) for off in re.findall(r"relative: ([\d.]+) mm off", printed["relative"])]
+    assert offs[1] < offs[0] + 0.1
+    assert "inserted: True" in printed["insert"]
+
+
 @shipped_or(
     {
         "imports": [("SEED, T = 0, 60", "SEED, T = 0, 15")],

@@ -14,5 +14,6 @@
     print(surprise(population))  # p values, by address
 
 `hypotheses` compares a part with its mirror image and with turned ones by evidence, `undetermined` names the
-direction in which touches leave a position open, `sudden_changes` when a peg slipped or a part slid.
+direction in which touches leave a position open, `sudden_changes` when a peg slipped or a part slid, and
+`shared_errors` what measurements tell of the errors that they share.
 """

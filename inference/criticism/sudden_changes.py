@@ -1,4 +1,4 @@
-"""Sudden changes that a likelihood integrates out, such as a peg that slipped in the hand, by their probability.
+"""Sudden changes that a likelihood integrates out, such as a slip of the peg, by their probability.
 
     for change in sudden_changes(population):
         print(change.name, change.time, change.probability)

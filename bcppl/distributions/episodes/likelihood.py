@@ -189,6 +189,15 @@ class ContactEpisodes(ContactManifold):
                 found.append((jump.name, float(rows[segments.first[k], TIME]), probability[:, k]))
         return sorted(found, key=lambda change: change[1])
 
+    def shared_moments(self, value: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
+        """Means and variances (N, M) of each shared error, given a window's rows and those before them."""
+        branches = self.branches(_given_and_all(value)[1])
+        weights, each = torch.from_numpy(branches.weights)[..., None], torch.from_numpy(branches.mean)
+        mean = (weights * each).sum(dim=1)
+        own = torch.from_numpy(branches.covariance).diagonal(dim1=-2, dim2=-1)
+        variance = (weights * (own + (each - mean[:, None]).square())).sum(dim=1)
+        return {name: (mean[:, place], variance[:, place]) for name, place in self.bench.slices.items()}
+
     @property
     def is_displaced(self) -> bool:
         """Whether the peg may be elsewhere than it is measured."""
