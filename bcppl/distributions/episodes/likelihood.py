@@ -177,8 +177,8 @@ class ContactEpisodes(ContactManifold):
         Returns:
             The name of each, the time of the first row after it (s), and its probabilities (N,).
         """
-        _, rows = _given_and_all(value)
-        if is_predicted(value) or not self.bench.jumps or not len(rows):
+        rows = value[:0] if is_predicted(value) else _given_and_all(value)[1]
+        if not len(rows):
             return []
         branches = self.branches(rows)
         weights, segments = branches.weights[..., None], segments_of(rows, self._row_errors, self._every)
@@ -191,7 +191,8 @@ class ContactEpisodes(ContactManifold):
 
     def shared_moments(self, value: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Means and variances (N, M) of each shared error, given a window's rows and those before them."""
-        branches = self.branches(_given_and_all(value)[1])
+        rows = value[:0] if is_predicted(value) else _given_and_all(value)[1]
+        branches = self.branches(rows)
         weights, each = torch.from_numpy(branches.weights)[..., None], torch.from_numpy(branches.mean)
         mean = (weights * each).sum(dim=1)
         own = torch.from_numpy(branches.covariance).diagonal(dim1=-2, dim2=-1)
