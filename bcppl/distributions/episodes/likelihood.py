@@ -17,6 +17,7 @@ from bcppl import poses
 from bcppl.distributions.checks import Check, chi_square
 from bcppl.distributions.episodes.covariances import Hypothesis, RowErrors, segments_of
 from bcppl.distributions.episodes.linear_errors import LinearErrors
+from bcppl.distributions.episodes.posterior import drawn, moments, probable_jumps
 from bcppl.distributions.episodes.rows import (
     COLUMNS,
     EPISODE,
@@ -25,11 +26,13 @@ from bcppl.distributions.episodes.rows import (
     GIVEN,
     NOISE,
     TIME,
+    given_and_all,
+    is_cut,
     is_predicted,
     late,
     padded,
 )
-from bcppl.distributions.episodes.switching_filter import OUTLIER, Branches, Prior, begun, filtered
+from bcppl.distributions.episodes.switching_filter import Branches, Prior, begun, filtered
 from bcppl.distributions.manifold import FARTHEST, ContactManifold, Gaps, Quadratic
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 
@@ -105,7 +108,7 @@ class ContactEpisodes(ContactManifold):
         """Log-likelihood (N,) of one window (T, COLUMNS), or of one for each particle (N, T, COLUMNS)."""
         if is_predicted(value):
             return super().log_prob(value[..., : FELT + 1])
-        given, rows = _given_and_all(value)
+        given, rows = given_and_all(value)
         if len(given) == len(rows):
             return self.pose.new_zeros(len(self.pose))
         before = self.branches(given)
@@ -117,7 +120,7 @@ class ContactEpisodes(ContactManifold):
         known = self.memory.get(key)
         if known is None:
             prior, begin = self._prior(0), None
-            if after is not None and len(after) and not _is_cut(rows, len(after)):
+            if after is not None and len(after) and not is_cut(rows, len(after)):
                 begin = self.memory.get(after.numpy().tobytes())
                 rows = rows if begin is None else rows[len(after) :]
             begin = begun(prior, len(self.pose)) if begin is None else begin
@@ -133,7 +136,7 @@ class ContactEpisodes(ContactManifold):
         """
         if is_predicted(value):
             return super().quadratic(value[..., : FELT + 1])
-        given, rows = _given_and_all(value)
+        given, rows = given_and_all(value)
         count = len(self.pose)
         whole = Quadratic(self.pose.new_zeros(count, 6), self.pose.new_zeros(count, 6, 6))
         for sign, used in ((1.0, rows), (-1.0, given)):
@@ -151,7 +154,7 @@ class ContactEpisodes(ContactManifold):
         the part's frame, m and rad; then the shared errors, in their standard deviations. At the true pose
         it is what touches can tell at best, a Bayesian Cramer-Rao bound of a linear model.
         """
-        return self._joint_moments(_given_and_all(value)[1])[1]
+        return self._joint_moments(given_and_all(value)[1])[1]
 
     def residual(self, value: Tensor) -> Tensor:
         """Gaps (N, T) that contradict the contact signal, as of `ContactManifold`; 0 for given rows."""
@@ -162,7 +165,7 @@ class ContactEpisodes(ContactManifold):
         gaps = self.gap(self.pose, stood)
         distance = gaps.distance
         if self.is_displaced:
-            branches = self.branches(_given_and_all(value)[1])
+            branches = self.branches(given_and_all(value)[1])
             used = torch.nan_to_num(value)
             used[:, :7] = stood
             distance = distance + self._shift(gaps, used, branches)
@@ -177,26 +180,17 @@ class ContactEpisodes(ContactManifold):
         Returns:
             The name of each, the time of the first row after it (s), and its probabilities (N,).
         """
-        rows = value[:0] if is_predicted(value) else _given_and_all(value)[1]
+        rows = value[:0] if is_predicted(value) else given_and_all(value)[1]
         if not len(rows):
             return []
-        branches = self.branches(rows)
-        weights, segments = branches.weights[..., None], segments_of(rows, self._row_errors, self._every)
-        found = []
-        for number, jump in enumerate(self.bench.jumps, OUTLIER + 1):
-            probability = torch.from_numpy((weights * (branches.event == number)).sum(axis=1))
-            for k in probability.any(dim=0).nonzero()[:, 0].tolist():
-                found.append((jump.name, float(rows[segments.first[k], TIME]), probability[:, k]))
-        return sorted(found, key=lambda change: change[1])
+        segments = segments_of(rows, self._row_errors, self._every)
+        times = rows[segments.first, TIME].tolist()
+        return probable_jumps(self.branches(rows), [jump.name for jump in self.bench.jumps], times)
 
     def shared_moments(self, value: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Means and variances (N, M) of each shared error, given a window's rows and those before them."""
-        rows = value[:0] if is_predicted(value) else _given_and_all(value)[1]
-        branches = self.branches(rows)
-        weights, each = torch.from_numpy(branches.weights)[..., None], torch.from_numpy(branches.mean)
-        mean = (weights * each).sum(dim=1)
-        own = torch.from_numpy(branches.covariance).diagonal(dim1=-2, dim2=-1)
-        variance = (weights * (own + (each - mean[:, None]).square())).sum(dim=1)
+        rows = value[:0] if is_predicted(value) else given_and_all(value)[1]
+        mean, variance = moments(self.branches(rows))
         return {name: (mean[:, place], variance[:, place]) for name, place in self.bench.slices.items()}
 
     @property
@@ -206,7 +200,7 @@ class ContactEpisodes(ContactManifold):
 
     def apparent_poses(self, value: Tensor, world_from_peg: Tensor, draws: int) -> Tensor:
         """The part's poses (N, draws, 7) as of `bcppl.beliefs.belief.ApparentPose`, given a window's rows."""
-        branches = self.branches(_given_and_all(value)[1])
+        branches = self.branches(given_and_all(value)[1])
         row = world_from_peg.new_zeros(1, COLUMNS)
         row[0, :7] = world_from_peg
         twist = drawn(branches, draws) @ self.bench.effect(row).twist[0].T
@@ -220,7 +214,7 @@ class ContactEpisodes(ContactManifold):
         """The check of a window at P particles, as of `ContactManifold`, the shared errors integrated out."""
         if is_predicted(value):
             return super().predictive_check(value[..., : FELT + 1], replicas)
-        given, rows = _given_and_all(value)
+        given, rows = given_and_all(value)
         new = rows[len(given) :]
         if not len(new):
             return None
@@ -377,35 +371,6 @@ class ContactEpisodes(ContactManifold):
         away = means - mean[:, None]
         each = torch.from_numpy(after.covariance) + away[..., None] * away[..., None, :]
         return mean, (weights[..., None, None] * each).sum(dim=1)
-
-
-def drawn(branches: Branches, draws: int) -> Tensor:
-    """Parameters (N, draws, M) from their posterior, the same at each call."""
-    generator = torch.Generator().manual_seed(0)
-    weights = torch.from_numpy(branches.weights)
-    which = torch.multinomial(weights, draws, replacement=True, generator=generator)
-    particle = torch.arange(len(weights))[:, None]
-    mean = torch.from_numpy(branches.mean)[particle, which]
-    variances, axes = torch.linalg.eigh(torch.from_numpy(branches.covariance)[particle, which])
-    standard = torch.randn(*mean.shape, 1, generator=generator, dtype=torch.float64)
-    return mean + ((axes * variances.clamp(min=0.0).sqrt()[..., None, :]) @ standard)[..., 0]
-
-
-def _given_and_all(value: Tensor) -> tuple[Tensor, Tensor]:
-    """The rows that are given, and these and the new ones; both are marked as new."""
-    rows = value[~torch.isnan(value[:, FELT])]
-    count = int((rows[:, GIVEN] == 1.0).sum())
-    rows = rows.clone()
-    rows[:, GIVEN] = 0.0
-    return rows[:count], rows
-
-
-def _is_cut(rows: Tensor, place: int) -> bool:
-    """Whether rows before and from a place on are of one episode."""
-    both = rows[place - 1 : place + 1]
-    return (
-        len(both) == 2 and bool((both[:, FELT] == 1.0).all()) and bool(both[0, EPISODE] == both[1, EPISODE])
-    )
 
 
 def _by_twist_of_peg(gradient: Tensor, part: Tensor, peg: Tensor) -> Tensor:

@@ -51,3 +51,20 @@ def late(rows: Tensor, interval: int) -> tuple[Tensor, Tensor]:
 def new_rows(value: Tensor) -> Tensor:
     """The rows (R, COLUMNS) of a value that no earlier window has used."""
     return value[~torch.isnan(value[:, FELT]) & (value[:, GIVEN] != 1.0)]
+
+
+def given_and_all(value: Tensor) -> tuple[Tensor, Tensor]:
+    """The rows that are given, and these and the new ones; both are marked as new."""
+    rows = value[~torch.isnan(value[:, FELT])]
+    count = int((rows[:, GIVEN] == 1.0).sum())
+    rows = rows.clone()
+    rows[:, GIVEN] = 0.0
+    return rows[:count], rows
+
+
+def is_cut(rows: Tensor, place: int) -> bool:
+    """Whether rows before and from a place on are of one episode."""
+    both = rows[place - 1 : place + 1]
+    return (
+        len(both) == 2 and bool((both[:, FELT] == 1.0).all()) and bool(both[0, EPISODE] == both[1, EPISODE])
+    )

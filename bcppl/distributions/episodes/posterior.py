@@ -1,0 +1,47 @@
+"""What the hypotheses of a probe's episodes say of the errors that all touches share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from bcppl.distributions.episodes.switching_filter import OUTLIER, Branches
+
+
+def drawn(branches: Branches, draws: int) -> Tensor:
+    """Parameters (N, draws, M) from their posterior, the same at each call."""
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.from_numpy(branches.weights)
+    which = torch.multinomial(weights, draws, replacement=True, generator=generator)
+    particle = torch.arange(len(weights))[:, None]
+    mean = torch.from_numpy(branches.mean)[particle, which]
+    variances, axes = torch.linalg.eigh(torch.from_numpy(branches.covariance)[particle, which])
+    standard = torch.randn(*mean.shape, 1, generator=generator, dtype=torch.float64)
+    return mean + ((axes * variances.clamp(min=0.0).sqrt()[..., None, :]) @ standard)[..., 0]
+
+
+def moments(branches: Branches) -> tuple[Tensor, Tensor]:
+    """Means and variances (N, M) of the parameters."""
+    weights, each = torch.from_numpy(branches.weights)[..., None], torch.from_numpy(branches.mean)
+    mean = (weights * each).sum(dim=1)
+    own = torch.from_numpy(branches.covariance).diagonal(dim1=-2, dim2=-1)
+    return mean, (weights * (own + (each - mean[:, None]).square())).sum(dim=1)
+
+
+def probable_jumps(
+    branches: Branches, names: Sequence[str], times: Sequence[float]
+) -> list[tuple[str, float, Tensor]]:
+    """The jumps that any hypothesis holds, by name and time, in their order, with their probabilities (N,).
+
+    Args:
+        branches: after S segments.
+        names: of the jumps.
+        times: (S,) of the segments' first rows, s.
+    """
+    weights, held = branches.weights[..., None], []
+    for number, name in enumerate(names, OUTLIER + 1):
+        probability = torch.from_numpy((weights * (branches.event == number)).sum(axis=1))
+        held += [(name, times[k], probability[:, k]) for k in probability.any(dim=0).nonzero()[:, 0].tolist()]
+    return sorted(held, key=lambda jump: jump[1])
