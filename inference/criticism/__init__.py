@@ -14,6 +14,9 @@
     print(surprise(population))  # p values, by address
 
 `hypotheses` compares a part with its mirror image and with turned ones by evidence, `undetermined` names the
-direction in which touches leave a position open, `sudden_changes` when a peg slipped or a part slid, and
-`shared_errors` what measurements tell of the errors that they share.
+direction in which touches leave a position open, `shared_errors` how grasp, arm and clock are off.
 """
+
+from bcppl.inference.criticism.nuisances import SharedError, SuddenChange, shared_errors, sudden_changes
+
+__all__ = ["SharedError", "SuddenChange", "shared_errors", "sudden_changes"]

@@ -9,6 +9,7 @@ from bcppl.inference.planning.insertion import (
     insertion_plan as insertion_plan,
 )
 from bcppl.inference.planning.metrology import (
+    ROCKED as ROCKED,
     MetrologyParameters as MetrologyParameters,
     three_two_one as three_two_one,
 )

@@ -4,3 +4,4 @@ from bcppl.models.worlds.bench import (
     bench_scene as bench_scene,
 )
 from bcppl.models.worlds.bench_arm import BenchArm as BenchArm
+from bcppl.models.worlds.bench_errors import BenchErrors as BenchErrors

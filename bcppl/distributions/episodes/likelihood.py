@@ -190,7 +190,8 @@ class ContactEpisodes(ContactManifold):
     def shared_moments(self, value: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Means and variances (N, M) of each shared error, given a window's rows and those before them."""
         rows = value[:0] if is_predicted(value) else given_and_all(value)[1]
-        mean, variance = moments(self.branches(rows))
+        mean, covariance = moments(self.branches(rows))
+        variance = covariance.diagonal(dim1=-2, dim2=-1)
         return {name: (mean[:, place], variance[:, place]) for name, place in self.bench.slices.items()}
 
     @property
@@ -365,12 +366,7 @@ class ContactEpisodes(ContactManifold):
         prior = self._prior(6)
         if self.blur:
             prior = prior._replace(outlier=0.0)
-        after = self._filtered(begun(prior, len(self.pose)), prior, rows, free=True)
-        weights, means = torch.from_numpy(after.weights), torch.from_numpy(after.mean)
-        mean = (weights[..., None] * means).sum(dim=1)
-        away = means - mean[:, None]
-        each = torch.from_numpy(after.covariance) + away[..., None] * away[..., None, :]
-        return mean, (weights[..., None, None] * each).sum(dim=1)
+        return moments(self._filtered(begun(prior, len(self.pose)), prior, rows, free=True))
 
 
 def _by_twist_of_peg(gradient: Tensor, part: Tensor, peg: Tensor) -> Tensor:

@@ -23,11 +23,12 @@ def drawn(branches: Branches, draws: int) -> Tensor:
 
 
 def moments(branches: Branches) -> tuple[Tensor, Tensor]:
-    """Means and variances (N, M) of the parameters."""
-    weights, each = torch.from_numpy(branches.weights)[..., None], torch.from_numpy(branches.mean)
-    mean = (weights * each).sum(dim=1)
-    own = torch.from_numpy(branches.covariance).diagonal(dim1=-2, dim2=-1)
-    return mean, (weights * (own + (each - mean[:, None]).square())).sum(dim=1)
+    """Mean (N, M) and covariance (N, M, M) of the parameters."""
+    weights, means = torch.from_numpy(branches.weights), torch.from_numpy(branches.mean)
+    mean = (weights[..., None] * means).sum(dim=1)
+    away = means - mean[:, None]
+    each = torch.from_numpy(branches.covariance) + away[..., None] * away[..., None, :]
+    return mean, (weights[..., None, None] * each).sum(dim=1)
 
 
 def probable_jumps(
