@@ -14,6 +14,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.vectors import NormalMixture
 from bcppl.errors import InputError
 from bcppl.inference.kernels import metropolis_hastings, moved_by
 from bcppl.inference.proposals import (
@@ -199,10 +200,10 @@ def test_mutant_that_steps_up_a_difference_only(monkeypatch: pytest.MonkeyPatch)
     assert worst_z(exact, differential_evolution("x"), functions) < SOUND
 
     def upwards(self: Any, sample_shape: Any = torch.Size()) -> Tensor:
-        ends = self.component_distribution.loc[:, 0]
+        ends = self.centers[:, 0]
         return ends + 0.01 * torch.randn_like(ends)
 
-    monkeypatch.setattr(dist.MixtureSameFamily, "sample", upwards)
+    monkeypatch.setattr(NormalMixture, "sample", upwards)
     assert worst_z(exact, differential_evolution("x"), functions) > BROKEN
 
 

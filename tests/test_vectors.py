@@ -1,10 +1,10 @@
-"""Normal steps: the density and the draws are those of a multivariate normal."""
+"""Normal steps and mixtures: the density and the draws are those of multivariate normals."""
 
 import pytest
 import torch
-from torch.distributions import MultivariateNormal
+from torch.distributions import Categorical, MixtureSameFamily, MultivariateNormal
 
-from bcppl.distributions.vectors import NormalStep
+from bcppl.distributions.vectors import NormalMixture, NormalStep
 
 FACTOR = torch.tensor([[0.5, 0.0, 0.0], [0.3, 1.0, 0.0], [-0.2, 0.4, 2.0]], dtype=torch.float64)
 
@@ -32,3 +32,31 @@ def test_draws_have_the_covariance_of_the_density() -> None:
 
     assert whitened(FACTOR) < 0.03
     assert whitened(FACTOR.mT) > 0.3
+
+
+SHARES = torch.tensor([0.2, 0.5, 0.3], dtype=torch.float64)
+FACTORS = torch.stack([FACTOR, 2.0 * FACTOR, torch.eye(3, dtype=torch.float64)])
+
+
+@pytest.mark.parametrize("factors", [FACTOR, FACTORS], ids=["one factor", "a factor each"])
+@pytest.mark.parametrize("own", [False, True], ids=["same centers", "centers for each particle"])
+def test_density_and_draws_of_a_mixture(factors: torch.Tensor, own: bool) -> None:
+    """The draws by their mean log-density and their moments, which a component of the wrong share changes."""
+    torch.manual_seed(2)
+    particles = 100_000
+    centers = 4.0 * torch.randn(3, 3, dtype=torch.float64)
+    logits = SHARES.log() + 5.0  # of any sum
+    if own:
+        centers, logits = centers.expand(particles, 3, 3), logits.expand(particles, 3)
+    mine = NormalMixture(particles, logits, centers, factors)
+    each = MultivariateNormal(centers.expand(particles, 3, 3), scale_tril=factors)
+    expected = MixtureSameFamily(Categorical(logits=logits.expand(particles, 3)), each)
+    value = mine.sample()
+    torch.testing.assert_close(mine.log_prob(value), expected.log_prob(value))
+    drawn = expected.sample()
+    error = (value - drawn).std(0) / particles**0.5
+    assert bool(((value - drawn).mean(0).abs() < 4.5 * error).all())
+    covariance = torch.cov(value.T) - torch.cov(drawn.T)
+    assert float(covariance.abs().max()) < 0.02 * float(torch.cov(drawn.T).abs().max())
+    entropies = mine.log_prob(value) - mine.log_prob(drawn)
+    assert abs(float(entropies.mean() / entropies.std())) < 4.5 / particles**0.5

@@ -39,3 +39,43 @@ class NormalStep(LazyDistribution):
         """One value for each particle, of the shape of `at`."""
         noise = torch.randn(len(self.at), len(self.factor), dtype=self.at.dtype, device=self.at.device)
         return self.at + (self.size[:, None] * (noise @ self.factor.mT)).reshape(self.at.shape)
+
+
+class NormalMixture(LazyDistribution):
+    """A mixture of normals for each of N particles; components share their covariances among particles.
+
+    The density is that of a `MixtureSameFamily` of `MultivariateNormal`, which expands every factor to all
+    particles and draws from all components to keep one.
+
+    Args:
+        particles: how many.
+        log_weights: (K,) or (N, K) log weights, of any sum.
+        centers: (K, d) or (N, K, d).
+        factors: (d, d), or (K, d, d) for each component, lower Cholesky factors of the covariances.
+    """
+
+    def __init__(self, particles: int, log_weights: Tensor, centers: Tensor, factors: Tensor) -> None:
+        self.log_weights, self.centers, self.factors = log_weights.log_softmax(-1), centers, factors
+        super().__init__(particles, (centers.shape[-1],))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (N,) w.r.t. Lebesgue of the values (N, d)."""
+        off = (value[:, None] - self.centers).permute(1, 2, 0)
+        white = torch.linalg.solve_triangular(self.factors, off, upper=False)
+        entries = self.factors.shape[-1]
+        volume = self.factors.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 0.5 * entries * math.log(2 * math.pi)
+        return (self.log_weights - 0.5 * white.square().sum(1).mT - volume).logsumexp(-1)
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """One value (N, d) for each particle."""
+        chances = self.log_weights.exp().expand(*self.batch_shape, -1)
+        which = torch.searchsorted(chances.cumsum(-1), torch.rand_like(chances[:, :1])).squeeze(-1)
+        which = which.clamp_(max=chances.shape[-1] - 1)
+        centers = self.centers.expand(*chances.shape, -1)[torch.arange(len(which)), which]
+        noise = torch.randn_like(centers)
+        if self.factors.ndim == 2:
+            return centers + noise @ self.factors.mT
+        for component in which.unique().tolist():
+            drawn = which == component
+            noise[drawn] = noise[drawn] @ self.factors[component].mT
+        return centers + noise

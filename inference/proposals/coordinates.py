@@ -22,7 +22,7 @@ from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief
 from bcppl.distributions.poses import MixturePose, NormalPose
 from bcppl.distributions.support import freedom_of, refuse_several_poses, whole_support
-from bcppl.distributions.vectors import NormalStep
+from bcppl.distributions.vectors import NormalMixture, NormalStep
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
 from bcppl.traces import Trace
@@ -112,15 +112,9 @@ class VectorCoordinates:
         return self._on_support(NormalStep(center, torch.linalg.cholesky(covariance), size))
 
     def mixture(self, log_weights: Tensor, centers: Tensor, covariance: Tensor) -> Any:
-        """A mixture of multivariate normals, transformed to the support."""
-        particles, count = self.transform.particles, log_weights.shape[-1]
-        which = dist.Categorical(logits=log_weights.to(torch.float64), validate_args=False)
-        each = dist.MultivariateNormal(
-            centers.expand(particles, count, self.dimension), covariance, validate_args=False
-        )
-        return self._on_support(
-            dist.MixtureSameFamily(which.expand(torch.Size([particles])), each, validate_args=False)
-        )
+        """A mixture of multivariate normals, transformed to the support; covariances (d, d) or (K, d, d)."""
+        factors = torch.linalg.cholesky(covariance)
+        return self._on_support(NormalMixture(self.transform.particles, log_weights, centers, factors))
 
     def _on_support(self, base: Any) -> Any:
         if self.transform.trivial:

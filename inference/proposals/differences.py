@@ -55,7 +55,8 @@ def differential_evolution(
 
         def along(trace: Trace) -> None:
             coordinates = known.of(trace)
-            which = pyro.sample("difference", dist.Categorical(torch.ones(len(drawn), dtype=torch.float64)))
+            # A categorical one would be given the chances of all for each particle.
+            which = pyro.sample("difference", dist.Uniform(drawn.new_zeros(()), float(len(drawn)))).long()
             whole = pyro.sample("whole", dist.Bernoulli(torch.tensor(jumps, dtype=torch.float64)))
             step = sizes[whole.long()][:, None] * drawn[which]
             place = coordinates.places(trace[address])
@@ -74,7 +75,9 @@ def _differences(coordinates: Coordinates, places: Tensor, weights: Tensor) -> T
     if int((weights > 0).sum()) < 2:
         return torch.zeros(1, coordinates.dimension, dtype=torch.float64)
     first = torch.multinomial(weights, DIFFERENCES, replacement=True)
-    others = weights.expand(DIFFERENCES, -1).clone()
-    others[torch.arange(DIFFERENCES), first] = 0.0
-    second = torch.multinomial(others, 1)[:, 0]
-    return coordinates.steps(places[first], places[second])
+    # The second by inversion of what is left, the weights without the first's.
+    below = weights.cumsum(0)
+    point = torch.rand(DIFFERENCES, dtype=torch.float64) * (below[-1] - weights[first])
+    beyond = point >= below[first] - weights[first]
+    second = torch.searchsorted(below, point + torch.where(beyond, weights[first], 0.0), right=True)
+    return coordinates.steps(places[first], places[second.clamp_(max=len(weights) - 1)])
