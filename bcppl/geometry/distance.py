@@ -82,10 +82,15 @@ class SignedDistance:
         self._tree.init(self._vertices, self._faces)
         by_angle = igl.PerVertexNormalsWeightingType.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE
         evenly = igl.PerEdgeNormalsWeightingType.PER_EDGE_NORMALS_WEIGHTING_TYPE_UNIFORM
-        self._face_normals = igl.per_face_normals(self._vertices, self._faces)
-        self._vertex_normals = igl.per_vertex_normals(self._vertices, self._faces, by_angle)
-        self._edge_normals, _, edge_of = igl.per_edge_normals(self._vertices, self._faces, evenly)
-        self._edge_of = edge_of.reshape(3, -1)
+        edge_normals, _, edge_of = igl.per_edge_normals(self._vertices, self._faces, evenly)
+        self._mesh = _Mesh(
+            self._vertices,
+            self._faces,
+            igl.per_face_normals(self._vertices, self._faces),
+            edge_normals,
+            igl.per_vertex_normals(self._vertices, self._faces, by_angle),
+            np.ascontiguousarray(edge_of.reshape(3, -1), dtype=np.int64),
+        )
 
     def __call__(self, points: Tensor) -> Proximity:
         """Proximities of points (..., 3) in the part's frame, metres; detached from autograd."""
@@ -94,34 +99,68 @@ class SignedDistance:
         if len(flat) == 0:
             return Proximity(points.new_zeros(shape), points.clone(), points.clone())
         with self.effort.measure(items=len(flat)):
-            squared, face, closest = self._tree.squared_distance(self._vertices, self._faces, flat)
-            normal = self._pseudonormals(face, closest)
-            distance = np.copysign(np.sqrt(squared), np.einsum("pi,pi->p", flat - closest, normal))
-        away = np.abs(distance) > ON_SURFACE
-        normal[away] = (flat[away] - closest[away]) / distance[away, None]
-        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+            _, face, closest = self._tree.squared_distance(self._vertices, self._faces, flat)
+            distance, normal = np.empty(len(flat)), np.empty_like(flat)
+            _signed(flat, face.astype(np.int64).reshape(-1), closest, self._mesh, distance, normal)
         return Proximity(
             torch.from_numpy(distance).reshape(shape),
             torch.from_numpy(closest).reshape(*shape, 3),
             torch.from_numpy(normal).reshape(*shape, 3),
         )
 
-    def _pseudonormals(self, face: Indices, closest: Array) -> Array:
-        """Pseudonormals (P, 3) at points of the mesh: of a face, an edge or a vertex."""
-        corners = self._vertices[self._faces[face]]
-        opposite = corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]]
-        across = np.cross(opposite, closest[:, None] - corners[:, [1, 2, 0]])
-        shares = np.einsum("pki,pi->pk", across, self._face_normals[face])
-        shares /= np.maximum(shares.sum(axis=1, keepdims=True), 1e-300)
-        beside = shares <= _ON_EDGE
-        normal = self._face_normals[face].copy()
-        count = beside.sum(axis=1)
-        edge = np.flatnonzero(count == 1)
-        normal[edge] = self._edge_normals[self._edge_of[beside[edge].argmax(axis=1), face[edge]]]
-        corner = np.flatnonzero(count >= 2)
-        nearest = self._faces[face[corner], shares[corner].argmax(axis=1)]
-        normal[corner] = self._vertex_normals[nearest]
-        return normal
+
+class _Mesh(NamedTuple):
+    """A closed mesh: vertices (V, 3), faces (F, 3), and pseudonormals of faces, edges and vertices.
+
+    `edge_of` (3, F) is the number of the edge across from each face's corner.
+    """
+
+    vertices: Array
+    faces: Indices
+    face_normals: Array
+    edge_normals: Array
+    vertex_normals: Array
+    edge_of: Indices
+
+
+@compiled
+def _signed(
+    points: Array, faces: Indices, closest: Array, mesh: _Mesh, distance: Array, normal: Array
+) -> None:
+    """Set the signed distances (P,) and unit gradients (P, 3) of points (P, 3), by their closest points."""
+    shares, pseudonormal, away = np.empty(3), np.empty(3), np.empty(3)
+    for p in range(len(points)):
+        face = faces[p]
+        beside, edge, most = 0, 0, 0
+        for k in range(3):
+            start = mesh.vertices[mesh.faces[face, (k + 1) % 3]]
+            end = mesh.vertices[mesh.faces[face, (k + 2) % 3]]
+            # Twice the area of the triangle that the closest point makes with the edge across from corner k.
+            area = 0.0
+            for i in range(3):
+                j, m = (i + 1) % 3, (i + 2) % 3
+                across = (end[j] - start[j]) * (closest[p, m] - start[m])
+                across -= (end[m] - start[m]) * (closest[p, j] - start[j])
+                area += across * mesh.face_normals[face, i]
+            shares[k] = area
+        total = max(shares.sum(), 1e-300)
+        for k in range(3):
+            if shares[k] / total <= _ON_EDGE:
+                beside, edge = beside + 1, k
+            if shares[k] > shares[most]:
+                most = k
+        if beside == 0:
+            pseudonormal[:] = mesh.face_normals[face]
+        elif beside == 1:
+            pseudonormal[:] = mesh.edge_normals[mesh.edge_of[edge, face]]
+        else:
+            pseudonormal[:] = mesh.vertex_normals[mesh.faces[face, most]]
+        away[:] = points[p] - closest[p]
+        length = np.sqrt((away * away).sum())
+        distance[p] = np.copysign(length, (away * pseudonormal).sum())
+        if length > ON_SURFACE:
+            pseudonormal[:] = away / distance[p]
+        normal[p] = pseudonormal / np.sqrt((pseudonormal * pseudonormal).sum())
 
 
 class DistanceGrid(NamedTuple):

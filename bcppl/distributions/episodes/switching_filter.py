@@ -130,6 +130,13 @@ def begun(prior: Prior, particles: int) -> Branches:
     return Branches(count, log_weight, which, mean, covariance, none.astype(np.int64), none)
 
 
+def _with_room(each: Array | Indices, *sizes: int) -> Array | Indices:
+    """A copy of (N, B, ...) with the axes after the particles' grown to `sizes`; what is added is 0."""
+    grown: Array | Indices = np.zeros((len(each), *sizes, *each.shape[1 + len(sizes) :]), each.dtype)
+    grown[tuple(slice(size) for size in each.shape)] = each
+    return grown
+
+
 def filtered(
     before: Branches,
     prior: Prior,
@@ -152,13 +159,10 @@ def filtered(
     """
     trust = np.ones_like(distance) if trust is None else trust
     new = len(segments.first)
-    room = max(0, KEPT - before.log_weight.shape[1])
-    # Axes of a branch's arrays after the particles': branches, then what is appended for the new segments.
-    grown = [[(0, 0), (0, room), *[(0, 0)] * (each.ndim - 2)] for each in before[1:]]
-    for each in grown[-2:]:
-        each[2] = (0, new)
-    padded = (np.pad(each, by) for each, by in zip(before[1:], grown, strict=True))
-    after = Branches._make([before.number.copy(), *padded])
+    branches = max(KEPT, before.log_weight.shape[1])
+    grown = [_with_room(each, branches) for each in before[1:-2]]
+    grown += [_with_room(each, branches, each.shape[2] + new) for each in before[-2:]]
+    after = Branches._make([before.number.copy(), *grown])
 
     def work(begin: int, end: int) -> int:
         _filter(begin, end, *after, prior, segments, distance, force, columns, trust)
