@@ -183,3 +183,13 @@ def test_what_cannot_be_run_or_simulated_is_refused(bcppl: Callable[..., Ran]) -
 
 def test_the_bar_names_the_measurement_in_progress() -> None:
     assert [next_label(short(3), taken) for taken in range(1, 5)] == ["push 1", "push 2", "push 3", "push 3"]
+
+
+def test_a_run_keeps_its_warnings_and_explains_touches(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    """Pushes of a finger have no peg that could be turned: nothing is supposed, and the run states that."""
+    save(short(1), tmp_path / "short.h5")
+    ran = bcppl("run", "short.h5", "--particles", 20, "--out", "out", "--explain")
+    assert ran.code == 0
+    assert "no other supposition explains the touches" in ran.out
+    record = json.loads((tmp_path / "out/run.json").read_text())
+    assert record["explanations"] == [] and isinstance(record["warnings"], list)

@@ -13,6 +13,7 @@ from bcppl import poses
 from bcppl.beliefs import Belief, average_distance, average_nearest_distance, average_point_distance
 from bcppl.cli import latent_sites
 from bcppl.cli.predictive_checks import PredictiveChecks, piece_errors
+from bcppl.inference.criticism import Explanation, explanations
 from bcppl.recordings import Recording
 from bcppl.traces import Model
 
@@ -77,8 +78,8 @@ class Report:
         line = " ".join([first.strip().ljust(WIDTHS["measurement"]), *others])
         self.console.print(line, style=style, soft_wrap=True, markup=False)
 
-    def finish(self) -> None:
-        """Print the posterior after the last step, and the warnings."""
+    def finish(self) -> list[str]:
+        """Print the posterior after the last step, and the warnings, which it gives back."""
         last, sites = self.steps[-1], latent_sites.summarised(self.steps[-1])
         total = len(self.recording.measurements)
         if len(self.steps) <= total:
@@ -96,10 +97,21 @@ class Report:
                 f"the particles missed the truth, which scores {gap:.0f} nats better than the best of them: "
                 "try more particles or another seed."
             )
-        for warning in [*self._checks.warnings(last, self.model.pose), *piece_errors(self.recording)]:
+        warnings = [*self._checks.warnings(last, self.model.pose), *piece_errors(self.recording)]
+        for warning in warnings:
             self._warn(warning)
         self._note(self._effort())
         self.console.print(result(last.belief, self.recording), markup=False)
+        return warnings
+
+    def explain(self) -> list[Explanation]:
+        """Print what would explain the touches better than what is stated, and give it back."""
+        found = explanations(self.model, self.recording)
+        for each in found:
+            self._warn(f"touches fit better by {each.gain:.0f} nats if {each.supposition}.")
+        if not found:
+            self._note("no other supposition explains the touches better than what the recording states.")
+        return found
 
     def _warn(self, sentence: str) -> None:
         self.console.print(sentence, style="yellow", markup=False)

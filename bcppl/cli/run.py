@@ -33,6 +33,10 @@ def run(
         Path | None,
         typer.Option(file_okay=False, help="Folder for beliefs and figures; runs/RECORDING by default."),
     ] = None,
+    explain: Annotated[
+        bool,
+        typer.Option(help="Compare by evidence what could be wrong with the touches; takes about a minute."),
+    ] = False,
 ) -> None:
     """Estimate the part's pose: a row per measurement, the posterior, and a folder of beliefs and figures."""
     from rich.console import Console
@@ -76,9 +80,11 @@ def run(
     finally:
         # Whatever stopped the run, what was computed is shown and kept.
         if report.steps:
-            report.finish()
+            folder.note(warnings=report.finish())
             folder.draw(report.steps)
             console.print(f"beliefs and figures are in {path}")
+    if explain:
+        folder.note(explanations=[each._asdict() for each in report.explain()])
 
 
 def next_label(recording: Recording, count: int) -> str:

@@ -30,7 +30,7 @@ class RunFolder:
     def __init__(self, path: Path, recording: Recording, settings: Mapping[str, Any]) -> None:
         self.path = path
         self.recording = recording
-        self.record = {**settings, "version": version("bcppl")}
+        self.record: dict[str, Any] = {**settings, "version": version("bcppl")}
         self.rows: list[Mapping[str, str]] = []
 
     def add(self, step: Any, row: Mapping[str, str]) -> None:
@@ -50,9 +50,13 @@ class RunFolder:
             of=fingerprint(self.recording, number),
         )
         self.rows.append(row)
-        whole = {**self.record, "rows": self.rows, "latent": latent_sites.summarised(step)}
+        self.note(rows=self.rows, latent=latent_sites.summarised(step))
+
+    def note(self, **entries: Any) -> None:
+        """Add entries to run.json, or replace them."""
+        self.record.update(entries)
         with replacing(self.path / "run.json") as beside:
-            beside.write_text(json.dumps(whole, indent=1), encoding="utf-8")
+            beside.write_text(json.dumps(self.record, indent=1), encoding="utf-8")
 
     def draw(self, steps: Sequence[Any]) -> None:
         """Draw ADD over the measurements, from the final mean where the truth is unknown, and beliefs."""

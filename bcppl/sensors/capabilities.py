@@ -93,6 +93,39 @@ class Defers(Protocol):
         """Whether a measurement's observations come with a later one."""
 
 
+class PegRows(NamedTuple):
+    """R moments of a held peg's motion.
+
+    Attributes:
+        time: (R,) s.
+        felt: (R,) bool, whether it was felt to touch.
+        episode: (R,) int64, the same number for one uninterrupted contact.
+        world_from_peg: (R, 7) as measured.
+        force: (R, 3) on the peg, in the world's axes, N.
+    """
+
+    time: Tensor
+    felt: Tensor
+    episode: Tensor
+    world_from_peg: Tensor
+    force: Tensor
+
+    @property
+    def contacts(self) -> PegRows:
+        """Those at which it was felt to touch."""
+        return PegRows(*(column[self.felt] for column in self))
+
+
+@runtime_checkable
+class FeelsForces(Protocol):
+    """A likelihood of what a held peg touches, by its gap to the part and the forces."""
+
+    gap: Any  # of poses (N, 7) of the part and (R, 7) of the peg
+
+    def peg_rows(self, measurements: Sequence[Approximated]) -> PegRows:
+        """How the peg moved in some measurements, and when it touched."""
+
+
 @runtime_checkable
 class Grasping(Protocol):
     """A likelihood of what a held peg touches, which may sit off in the hand."""

@@ -14,9 +14,11 @@
     print(surprise(population))  # p values, by address
 
 `hypotheses` compares a part with its mirror image and with turned ones by evidence, `undetermined` names the
-direction in which touches leave a position open, `shared_errors` how grasp, arm and clock are off.
+direction in which touches leave a position open, `shared_errors` how grasp, arm and clock are off, and
+`explanations` what else would explain touches: a late wrench, a turned peg, a part that moved.
 """
 
 from bcppl.inference.criticism.nuisances import SharedError, SuddenChange, shared_errors, sudden_changes
+from bcppl.inference.criticism.suppositions import Explanation, explanations
 
-__all__ = ["SharedError", "SuddenChange", "shared_errors", "sudden_changes"]
+__all__ = ["Explanation", "SharedError", "SuddenChange", "explanations", "shared_errors", "sudden_changes"]

@@ -11,12 +11,13 @@ import pyro
 import torch
 from torch import Tensor
 
+from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.contact.quasi_static import QuasiStaticMotion, WindowMotion
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.location import ContactSensing
 from bcppl.distributions.episodes import ContactEpisodes, Hypothesis, LinearError, LinearErrors
-from bcppl.distributions.episodes.rows import FELT, new_rows
+from bcppl.distributions.episodes.rows import EPISODE, FELT, TIME, WRENCH, new_rows
 from bcppl.distributions.manifold import MeasuresGap
 from bcppl.effort import Effort
 from bcppl.errors import InputError
@@ -24,7 +25,7 @@ from bcppl.geometry.gap import PegGap
 from bcppl.geometry.parts import Part
 from bcppl.geometry.turns import turns_freely
 from bcppl.robot.motion import ProbeWindow
-from bcppl.sensors.capabilities import Approximated
+from bcppl.sensors.capabilities import Approximated, PegRows
 from bcppl.sensors.likelihoods.bench_profiles import profile_named
 from bcppl.sensors.likelihoods.probe_rows import (
     Measured,
@@ -246,3 +247,11 @@ class ContactProbe:
         last = int(onsets[-1])
         way = rows[last + 1, :3] - rows[max(0, last - 2), :3]
         return way / way.norm() if float(way.norm()) > _MOVED else None
+
+    # ---- the peg's motion itself (`bcppl.sensors.capabilities.FeelsForces`)
+
+    def peg_rows(self, measurements: Sequence[Approximated]) -> PegRows:
+        """The rows of all measurements."""
+        rows = torch.cat([new_rows(value) for _, _, value in measurements])
+        force = (poses.rotation_matrix(rows[:, :7]) @ rows[:, WRENCH][:, :3, None])[..., 0]
+        return PegRows(rows[:, TIME], rows[:, FELT] == 1.0, rows[:, EPISODE].long(), rows[:, :7], force)

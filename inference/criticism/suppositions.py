@@ -1,0 +1,231 @@
+"""What would explain touches that do not fit: each supposition by its evidence.
+
+    from bcppl.inference.criticism import explanations
+    from bcppl.models.look_and_touch import model
+
+    for each in explanations(model, recording):
+        print(f"{each.supposition}: {each.gain:.0f} nats")
+
+A wrench that is read late, a peg that is turned in the hand, a part that moved: each is a recording as it
+would be otherwise (`bcppl.sensors.supposed`), and the touches have an evidence under it, the pose and all
+that is shared integrated out in the Gaussian approximation about the posterior's modes. That of a
+supposition with several values, a clock that is off by 0.1 or by 0.2 s, is the mean over them: to try many
+costs the logarithm of how many (Occam's factor).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.manifold import FARTHEST
+from bcppl.geometry.turns import turns_freely
+from bcppl.inference.approximations.gaussian import GaussianApproximation
+from bcppl.recordings import Recording
+from bcppl.sensors.capabilities import Approximated, Defers, FeelsForces, FitsPose
+from bcppl.sensors.supposed import (
+    with_peg_along,
+    with_peg_thicker,
+    with_peg_turned,
+    with_wrench_earlier,
+    with_wrench_reversed,
+)
+from bcppl.traces import Model
+
+# Very strong evidence, 150 to 1 (Kass and Raftery, Bayes factors, JASA 90, 1995, section 3.2).
+VERY_STRONG = 5.0
+CLOCK = (0.05, 0.1, 0.2, 0.4)  # s, early or late
+TURN = (9.0, 18.0, 27.0, 36.0, 45.0)  # degrees, either way
+THICKNESS = (0.00025, 0.0005, 0.001)  # m, thicker or thinner
+ALONG, STEP = 0.3, 0.002  # m: how far off the peg's pose may be along its axis, and a step of the search
+OFF = 0.003  # m from which on that is worth a supposition
+FAR, FEW, MINIMA = 0.02, 2, 3  # m beyond which a row does not decide that; every so many rows; minima
+OUTWARDS = 0.98  # the probability that the mean force of a contact points out of the part
+
+
+class Explanation(NamedTuple):
+    """A supposition under which touches are more probable.
+
+    Attributes:
+        supposition: such as "the wrench is read 0.2 s late".
+        gain: its log Bayes factor to the recording as it is stated, nats.
+    """
+
+    supposition: str
+    gain: float
+
+
+def explanations(model: Model, recording: Recording, **settings: Any) -> list[Explanation]:
+    """The suppositions for which a recording's touches are very strong evidence, the best first.
+
+    Images are taken as they are, for their own faults see `hypotheses`. What the model's prior allows for, a
+    peg that is a little off in the hand under the profile of a real bench, is no supposition. About thirty
+    evidences are computed, each for a second or two.
+
+    Args:
+        model: with a prior and sensors of the part's pose, such as `look_and_touch`.
+        recording: with touches of a held peg that the model explains by its gap to the part
+            (`bcppl.sensors.capabilities.FeelsForces`); without any nothing is explained.
+        **settings: of the model's scene, such as `profile`.
+
+    Raises:
+        InputError: the model has no prior and sensors, or its prior holds an axis of the pose.
+    """
+    sensors = getattr(model.prepare(recording, **settings), "likelihoods", {}).values()
+    if recording.peg is None or not any(isinstance(sensor, FeelsForces) for sensor in sensors):
+        return []
+    stated = approximated(model, recording, **settings)
+    if not any(_forces(stated)):
+        return []
+    least = log_evidence(stated)
+    families = [
+        {
+            name: log_evidence(approximated(model, supposed, stated.fits, **settings))
+            for name, supposed in family.items()
+        }
+        for family in _suppositions(recording, stated)
+    ]
+    results = []
+    for family in [*families, _moved(stated)]:
+        if family:
+            mean = torch.tensor([*family.values()], dtype=torch.float64).logsumexp(0) - math.log(len(family))
+            results.append(Explanation(max(family, key=family.__getitem__), float(mean) - least))
+    return sorted((one for one in results if one.gain > VERY_STRONG), key=lambda one: -one.gain)
+
+
+def approximated(
+    model: Model, recording: Recording, fits: Mapping[str, Any] | None = None, **settings: Any
+) -> GaussianApproximation:
+    """The Gaussian approximation given all of a recording; its images' fits are computed unless given."""
+    scene = model.prepare(recording, **settings)
+    approximation = GaussianApproximation(pose=model.pose, scene=scene, fits=fits or {})
+    observed = model.observe(scene, recording.measurements)
+    for number, measurement in enumerate(recording.measurements):
+        action, sensor = measurement.action, scene.sensor(measurement.action)
+        known = fits is not None and isinstance(sensor, FitsPose)
+        if not known and not (isinstance(sensor, Defers) and sensor.is_deferred(action)):
+            approximation = approximation.deferring(scene, number, action, observed)
+    return _with_contacts(approximation, approximation.contacts)
+
+
+def log_evidence(approximation: GaussianApproximation) -> float:
+    """The log-probability of an approximation's touches, given its images, to that of touches by chance.
+
+    By Laplace's method at each mode, for where Gauss-Newton has not converged its quadratic promises too
+    much. Beside it stand the directions of the forces, which the likelihood leaves out. By chance a row of a
+    contact is anywhere in `FARTHEST`: so suppositions compare that change how many rows there are.
+    """
+    prior, modes = approximation.prior, approximation.quadratic
+    if modes is None:
+        return 0.0
+    own = prior.component(modes.around)
+    precision = torch.linalg.inv(prior.covariances[own])
+    away = poses.local(modes.around, prior.centers[own])
+    sizes = torch.linalg.slogdet(precision)[1] - torch.linalg.slogdet(precision + modes.information)[1]
+    squared = ((away[:, None] @ precision)[:, 0] * away).sum(dim=1)
+    each = modes.log_likelihood + prior.log_weights[own] + 0.5 * (sizes - squared)
+    for sensor, contacts in _forces(approximation):
+        outwards = _points_outwards(sensor, contacts, modes.around)
+        each = each + torch.where(outwards, OUTWARDS, 1.0 - OUTWARDS).log().sum(dim=1)
+        each = each + int(sensor.peg_rows(contacts).felt.sum()) * math.log(FARTHEST)
+    return float(each.logsumexp(0))
+
+
+def _points_outwards(sensor: FeelsForces, contacts: Sequence[Approximated], part: Tensor) -> Tensor:
+    """Whether the mean force of each contact pushes the peg out of the part, at poses (M, 7): (M, E)."""
+    felt = sensor.peg_rows(contacts).contacts
+    normal = -sensor.gap(part, felt.world_from_peg).gradient(part)[..., :3]
+    episodes, which = felt.episode.unique(return_inverse=True)
+    along = (normal * felt.force).sum(dim=-1)
+    return along.new_zeros(len(part), len(episodes)).index_add_(1, which, along) > 0.0
+
+
+def _with_contacts(
+    approximation: GaussianApproximation, contacts: Sequence[Approximated]
+) -> GaussianApproximation:
+    """The approximation of some contacts, all of them: evidences compare only where all count."""
+    relevant = {contact.number: True for contact in contacts}
+    return replace(
+        approximation, contacts=tuple(contacts), relevant=relevant, quadratic=None, stale=True
+    ).updated()
+
+
+def _forces(approximation: GaussianApproximation) -> Iterator[tuple[FeelsForces, list[Approximated]]]:
+    """The sensors that feel forces, each with its contacts."""
+    for sensor in approximation.scene.likelihoods.values():
+        own = [c for c in approximation.contacts if approximation.scene.sensor(c.action) is sensor]
+        if own and isinstance(sensor, FeelsForces):
+            yield sensor, own
+
+
+def _suppositions(recording: Recording, stated: GaussianApproximation) -> Iterator[dict[str, Recording]]:
+    """Families of suppositions, by name in each."""
+    yield {
+        f"the wrench is read {seconds:g} s {word}": with_wrench_earlier(recording, sign * seconds)
+        for sign, word in ((1.0, "late"), (-1.0, "early"))
+        for seconds in CLOCK
+    }
+    yield {"forces and torques have the wrong sign": with_wrench_reversed(recording)}
+    assert recording.peg is not None
+    yield {
+        f"the peg is {1e3 * metres:g} mm {word}": with_peg_thicker(recording, sign * metres)
+        for sign, word in ((1.0, "thicker"), (-1.0, "thinner"))
+        for metres in THICKNESS
+    }
+    if not turns_freely(recording.peg):
+        yield {
+            f"the peg is turned by {sign * angle:+g}° about its axis in the hand": with_peg_turned(
+                recording, math.radians(sign * angle)
+            )
+            for sign in (1.0, -1.0)
+            for angle in TURN
+        }
+    yield {
+        f"the peg's pose is off by {1e3 * along:+.0f} mm along its axis, as that of another frame of the "
+        "tool": with_peg_along(recording, along)
+        for along in _along(stated)
+        if abs(along) > OFF
+    }
+
+
+def _along(stated: GaussianApproximation) -> list[float]:
+    """How much farther along its axis the peg may be, m: where touches fit best to the part as it is seen."""
+    shifts = torch.arange(-ALONG, ALONG + 0.5 * STEP, STEP, dtype=torch.float64)
+    tip = torch.zeros(len(shifts), 3, dtype=torch.float64)
+    tip[:, 2] = shifts
+    total = torch.zeros(len(shifts), dtype=torch.float64)
+    for sensor, contacts in _forces(stated):
+        rows = sensor.peg_rows(contacts)
+        felt, pose = rows.felt[::FEW], rows.world_from_peg[::FEW]
+        turn = pose[:, None, 3:].expand(-1, len(shifts), 4)
+        there = torch.cat([poses.transform(pose, tip), turn], dim=2)
+        gaps = sensor.gap(stated.prior.centers[:1], there.reshape(-1, 7)).distance.reshape(len(pose), -1)
+        misfit = torch.where(felt[:, None], gaps.abs(), (-gaps).clamp(min=0.0))
+        # A row that is far off under any shift, an outlier, does not decide.
+        total = total + misfit.clamp(max=FAR).sum(dim=0)
+    lowest = (total[1:-1] <= total[:-2]) & (total[1:-1] <= total[2:])
+    minima = 1 + lowest.nonzero().flatten()
+    return shifts[minima[total[minima].argsort()[:MINIMA]]].tolist()
+
+
+def _moved(stated: GaussianApproximation) -> dict[str, float]:
+    """The evidence of two poses, one of the touches before a time and one of those after it, by the time."""
+    evidences = {}
+    for k in range(1, len(stated.contacts)):
+        parts = stated.contacts[:k], stated.contacts[k:]
+        before, after = (
+            [s.peg_rows(own).contacts for s, own in _forces(replace(stated, contacts=part))] for part in parts
+        )
+        if not (before and after and len(before[-1].time) and len(after[0].time)):
+            continue
+        if before[-1].episode[-1] != after[0].episode[0]:
+            when = float(after[0].time[0])
+            name = f"the part moved, or the peg slipped, before the touch at {when:.2f} s of the probe"
+            evidences[name] = sum(log_evidence(_with_contacts(stated, part)) for part in parts)
+    return evidences
