@@ -136,7 +136,7 @@ def test_a_fault_is_named_first(name: str) -> None:
 
 @pytest.mark.long
 def test_a_part_that_moved_is_named_with_its_time() -> None:
-    """Before the fifth touch, at 4.4 s, which is from above and does not tell, or before the sixth, at 5.4 s."""
+    """Before the fifth touch, at 4.4 s, which is from above and does not show it, or the sixth, at 5.4 s."""
     first = explanations(model, touched(moved=0.003))[0].supposition
     time = re.search(r"the part moved, or the peg slipped, before the touch at (.*) s", first)
     assert time is not None and 4.39 <= float(time[1]) <= 5.41
