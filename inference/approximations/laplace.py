@@ -17,7 +17,7 @@ BLURS = (0.003, 0.002, 0.001, 0.0005, 0.0002, 0.0, 0.0, 0.0)
 SHARP = (0.0005, 0.0005, 0.0002, 0.0, 0.0, 0.0, 0.0)
 FINE = (0.0002, 0.0002, 0.0001, 0.00005, 0.0, 0.0, 0.0)
 _AHEAD = torch.tensor([0.0, 0.003, 0.006, 0.01], dtype=torch.float64)  # m
-_STEP_LENGTHS = torch.tensor([0.0, 0.15, 0.5, 1.0], dtype=torch.float64)
+_STEP_LENGTHS = torch.tensor([0.15, 0.5, 1.0], dtype=torch.float64)
 # Starts of Gauss-Newton, in prior standard deviations; they are the same in every run.
 _STARTS = torch.randn(6, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 _PLACES = torch.randn(32, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -134,12 +134,15 @@ def gauss_newton(
         pull = (precision @ poses.local(pose, center)[..., None])[..., 0] - quadratic.gradient
         step = torch.linalg.solve(precision + quadratic.information, pull[..., None])
         # Which corner touches changes along the step: it is made only as long as it gains.
-        tried = poses.retract(pose[:, None], _STEP_LENGTHS[:, None] * step[:, None, :, 0])
-        away = poses.local(center, tried.reshape(-1, 7))
-        total = -0.5 * ((away @ precision[0]) * away).sum(dim=-1)
-        for site, value in sites(tried.reshape(-1, 7), blur):
-            total = total + site.log_prob(value)
-        density, farthest = total.reshape(tried.shape[:2]).max(dim=1)
+        ahead = poses.retract(pose[:, None], _STEP_LENGTHS[:, None] * step[:, None, :, 0])
+        log_likelihood = pose.new_zeros(ahead.shape[:2])
+        for site, value in sites(ahead.reshape(-1, 7), blur):
+            log_likelihood = log_likelihood + site.log_prob(value).reshape(ahead.shape[:2])
+        tried = torch.cat([pose[:, None], ahead], dim=1)
+        total = torch.cat([quadratic.log_likelihood[:, None], log_likelihood], dim=1)
+        away = poses.local(center, tried)
+        total = total - 0.5 * ((away @ precision[0]) * away).sum(dim=-1)
+        density, farthest = total.max(dim=1)
         kept = density.topk(min(len(pose), max(least, len(pose) // 2))).indices
         pose, density = tried[kept, farthest[kept]], density[kept]
     return pose[:least], density[:least]
