@@ -193,3 +193,38 @@ def test_a_run_keeps_its_warnings_and_explains_touches(bcppl: Callable[..., Ran]
     assert "no other supposition explains the touches" in ran.out
     record = json.loads((tmp_path / "out/run.json").read_text())
     assert record["explanations"] == [] and isinstance(record["warnings"], list)
+
+
+def test_settings_of_the_model_reach_the_run_and_the_next_probe(
+    bcppl: Callable[..., Ran], tmp_path: Path
+) -> None:
+    """A finger that is off by a centimetre puts the part a centimetre elsewhere."""
+    save(short(3), tmp_path / "short.h5")
+
+    def mean(folder: str, *options: object) -> np.ndarray:
+        ran = bcppl("run", "short.h5", "--particles", 50, "--out", folder, *options)
+        assert ran.code == 0
+        return load_belief(tmp_path / folder / "belief_003.h5").mean.numpy()
+
+    plain, off = mean("plain"), mean("off", "--set", "offset=0.01")
+    assert np.linalg.norm(plain[:2] - off[:2]) > 0.003
+    assert json.loads((tmp_path / "off/run.json").read_text())["settings"] == {"offset": 0.01}
+    code = bcppl("probe", "off/belief_003.h5", "--candidates", "push:2", "--set", "offest=0.01").code
+    assert code == 2
+
+
+REFUSED = {
+    "x": "give a setting's name and value",
+    "offest=0.1": "has no setting 'offest'; its settings are ",
+    "outlier=2": "outlier",
+    "offset=near": "setting 'offset' of point_probe is given 'near'",
+    "offset=[0.1]": "setting 'offset' of point_probe is given [0.1]",
+}
+
+
+@pytest.mark.parametrize("setting", REFUSED)
+def test_a_setting_that_cannot_be_is_refused(setting: str, bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    save(short(1), tmp_path / "short.h5")
+    ran = bcppl("run", "short.h5", "--set", setting, "--out", "out")
+    assert ran.code == 2 and "Traceback" not in ran.err
+    assert REFUSED[setting] in ran.err and len(ran.err.strip().splitlines()) == 1

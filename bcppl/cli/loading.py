@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import json
 import pkgutil
 import sys
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -46,6 +48,32 @@ def model(given: str | None, named: str = "", by: str = "the recording") -> Mode
             "if you trust the file, give it with --model."
         )
     return _defined(named if given is None else given, MODEL)
+
+
+def settings(given: Sequence[str]) -> dict[str, Any]:
+    """The settings that --set gives, `name=value`: values as in JSON, numbers and `null`, or else words."""
+    read: dict[str, Any] = {}
+    for each in given:
+        name, equals, value = each.partition("=")
+        if not (equals and name.isidentifier()):
+            raise InputError(f"--set is given {each!r}; give a setting's name and value, --set profile=ur5e.")
+        try:
+            read[name] = json.loads(value)
+        except ValueError:
+            read[name] = value
+    return read
+
+
+def with_settings(model: Model, settings: Mapping[str, Any], name: str) -> Model:
+    """A model with settings; InputError where it takes none."""
+    try:
+        inspect.signature(model.prepare).bind(None, **settings)
+    except TypeError as error:
+        raise InputError(
+            f"model {name} takes no setting {next(iter(settings))!r}: its `prepare` is called with the "
+            "recording alone; leave --set out, or let it take settings."
+        ) from error
+    return model.with_settings(**settings) if settings else model
 
 
 def inference(given: str | None, chosen: Model) -> tuple[str, Infer]:

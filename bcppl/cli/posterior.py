@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ def posterior(
     name: str,
     of: str | None,
     model: str | None,
+    settings: Mapping[str, Any],
     inference: str | None,
     particles: int,
     seed: int,
@@ -44,12 +45,13 @@ def posterior(
     if Path(name).is_file() and is_belief(name):
         if inference is not None:
             raise InputError(f"--inference is given with {name}, a belief, which needs no run; leave it out.")
-        return _read(Path(name), of, model, check)
+        return _read(Path(name), of, model, settings, check)
     if of is not None:
         raise InputError(f"--of names a belief's recording, but {name} is a recording; leave it out.")
     recording = loading.recording(name)
     check(recording)
-    chosen = _static(loading.model(model, recording.model), model or recording.model)
+    named = model or recording.model
+    chosen = _static(loading.with_settings(loading.model(model, recording.model), settings, named), named)
     _, infer = loading.inference(inference, chosen)
     scene = chosen.prepare(recording)
     population = None
@@ -72,7 +74,13 @@ def _static(model: Model, name: str) -> Model:
     return model
 
 
-def _read(path: Path, of: str | None, model: str | None, check: Callable[[Recording], None]) -> Posterior:
+def _read(
+    path: Path,
+    of: str | None,
+    model: str | None,
+    settings: Mapping[str, Any],
+    check: Callable[[Recording], None],
+) -> Posterior:
     """The population of a belief's file, its sites observed as the recording has them."""
     label, belief, latent = load_label(path), load_belief(path), load_latent(path)
     record = _run_record(path)
@@ -82,7 +90,10 @@ def _read(path: Path, of: str | None, model: str | None, check: Callable[[Record
     whole = loading.recording(of)
     by = "the recording" if record.get("model") is None else str(path.parent / "run.json")
     named = record.get("model") or whole.model
-    chosen = _static(loading.model(model, named, by), model or named)
+    own = record.get("settings")
+    settings = {**(own if isinstance(own, dict) else {}), **settings}
+    chosen = loading.with_settings(loading.model(model, named, by), settings, model or named)
+    chosen = _static(chosen, model or named)
     assimilated = _assimilated(path, label)
     if assimilated > len(whole.measurements):
         raise InputError(

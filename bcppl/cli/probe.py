@@ -45,6 +45,14 @@ def probe(
     ] = None,
     of: Annotated[str | None, typer.Option(help="The recording that a belief is of.")] = None,
     model: Annotated[str | None, typer.Option(help="A model's name or file, as for `bcppl run`.")] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="A model's setting, as for `bcppl run`; a belief has its own.",
+        ),
+    ] = None,
     inference: Annotated[
         str | None, typer.Option(help="An inference program's name or file, as for `bcppl run`.")
     ] = None,
@@ -95,7 +103,7 @@ def probe(
     from rich.console import Console
     from rich.markup import escape
 
-    from bcppl.cli import candidates as options
+    from bcppl.cli import candidates as options, loading
     from bcppl.cli.posterior import posterior
     from bcppl.figures import action_in_3d
     from bcppl.inference.design.rules import by_linearised_gain, by_reweighted_gain, can_be_linearised
@@ -111,7 +119,8 @@ def probe(
     constraints += options.reach(robot, link, link_from_peg, world_from_base, seed)
     console = Console(highlight=False)
     refuse = partial(options.refuse_without_peg, asked)
-    now = posterior(recording, of, model, inference, particles, seed, console, refuse)
+    given = loading.settings(set_ or [])
+    now = posterior(recording, of, model, given, inference, particles, seed, console, refuse)
     belief = now.population.belief(now.model.pose)
     require_uncertain(belief)
     listed = options.planned(asked, belief, now.recording, constraints, table, seed)

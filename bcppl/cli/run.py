@@ -33,6 +33,14 @@ def run(
         Path | None,
         typer.Option(file_okay=False, help="Folder for beliefs and figures; runs/RECORDING by default."),
     ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="A setting of the model, profile=ur5e; may be repeated.",
+        ),
+    ] = None,
     explain: Annotated[
         bool,
         typer.Option(help="Compare by evidence what could be wrong with the touches; takes about a minute."),
@@ -47,7 +55,8 @@ def run(
     from bcppl.inference.progress import sole_bar
 
     measured = loading.recording(recording)
-    chosen = loading.model(model, measured.model)
+    given = loading.settings(set_ or [])
+    chosen = loading.with_settings(loading.model(model, measured.model), given, model or measured.model)
     inference, infer = loading.inference(inference, chosen)
     path = out or Path("runs") / Path(recording).stem
     blocked = next((p for p in (path, *path.parents) if p.exists() and not p.is_dir()), None)
@@ -59,6 +68,7 @@ def run(
         "inference": inference,
         "particles": particles,
         "seed": seed,
+        "settings": given,
     }
     scene = chosen.prepare(measured)
     chosen.observe(scene, measured.measurements)  # refuses what cannot be read before anything is written

@@ -171,6 +171,9 @@ def likelihoods_for(
     return {kind: each for kind, each in prepared.items() if each is not None}
 
 
+_KINDS = (str, Sequence, Mapping)  # what is one of these is no number, and the other way round
+
+
 def chosen(model: str, given: Mapping[str, Any], *defaults: Any) -> list[Any]:
     """The default settings, each with those of the given values that are its fields.
 
@@ -180,13 +183,21 @@ def chosen(model: str, given: Mapping[str, Any], *defaults: Any) -> list[Any]:
         defaults: dataclasses.
 
     Raises:
-        InputError: no default has a field of a given name, or a value is out of range.
+        InputError: no default has a field of a given name, or a value is of another kind or out of range.
     """
     names = [{field.name for field in fields(each)} for each in defaults]
     unknown = sorted(set(given).difference(*names))
     if unknown:
         known = ", ".join(sorted(set().union(*names)))
         raise InputError(f"{model} has no setting {unknown[0]!r}; its settings are {known}.")
+    for each, own in zip(defaults, names, strict=True):
+        for name in own.intersection(given):
+            value, default = given[name], getattr(each, name)
+            if default is not None and any(isinstance(value, k) != isinstance(default, k) for k in _KINDS):
+                raise InputError(
+                    f"setting {name!r} of {model} is given {value!r}; give a value such as its default, "
+                    f"{default!r}."
+                )
     return [
         replace(each, **{name: value for name, value in given.items() if name in own})
         for each, own in zip(defaults, names, strict=True)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -42,3 +43,7 @@ class Model:
     simulate_recording: Callable[..., Any] | None = None
     proposals: Sequence[Callable[..., Any]] = ()
     inference: tuple[str, Mapping[str, Any]] = ("tempered_smc", MappingProxyType({}))
+
+    def with_settings(self, **settings: Any) -> Model:
+        """The model whose scenes are prepared with settings, such as `profile="ur5e"` of `look_and_touch`."""
+        return replace(self, prepare=partial(self.prepare, **settings))
