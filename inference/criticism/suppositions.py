@@ -173,10 +173,12 @@ def _suppositions(recording: Recording, stated: GaussianApproximation) -> Iterat
     }
     yield {"forces and torques have the wrong sign": with_wrench_reversed(recording)}
     assert recording.peg is not None
+    width = 2.0 * float(abs(recording.peg.vertices[:, :2]).max())
     yield {
         f"the peg is {1e3 * metres:g} mm {word}": with_peg_thicker(recording, sign * metres)
         for sign, word in ((1.0, "thicker"), (-1.0, "thinner"))
         for metres in THICKNESS
+        if metres < 0.2 * width
     }
     if not turns_freely(recording.peg):
         yield {
@@ -219,13 +221,15 @@ def _moved(stated: GaussianApproximation) -> dict[str, float]:
     evidences = {}
     for k in range(1, len(stated.contacts)):
         parts = stated.contacts[:k], stated.contacts[k:]
-        before, after = (
-            [s.peg_rows(own).contacts for s, own in _forces(replace(stated, contacts=part))] for part in parts
+        # Only before a window in which the peg is felt: one without contact does not tell a new pose.
+        before, window = (
+            [sensor.peg_rows(own).contacts for sensor, own in _forces(replace(stated, contacts=some))]
+            for some in (parts[0], parts[1][:1])
         )
-        if not (before and after and len(before[-1].time) and len(after[0].time)):
+        if not (before and window and len(before[-1].time) and len(window[0].time)):
             continue
-        if before[-1].episode[-1] != after[0].episode[0]:
-            when = float(after[0].time[0])
+        if before[-1].episode[-1] != window[0].episode[0]:
+            when = float(window[0].time[0])
             name = f"the part moved, or the peg slipped, before the touch at {when:.2f} s of the probe"
             evidences[name] = sum(log_evidence(_with_contacts(stated, part)) for part in parts)
     return evidences
