@@ -68,6 +68,9 @@ KERNELS: dict[str, Callable[[int, int], Tempered]] = {
     "drift until displaced by 1.5": lambda d, n: tempered(walk("x"), sweeps=until(displacement=1.5)),
     "independent": lambda d, n: tempered(metropolis_hastings(independent("x"))),
     "independent, 1 normal": lambda d, n: tempered(near("x", 1)),
+    "independent, 1 normal, less wide": lambda d, n: tempered(
+        metropolis_hastings(independent("x", 1, inflation=1.05 ** min(1.0, 6.0 / d)))
+    ),
     "mixture drift, independent": lambda d, n: swept(mixture([even("x"), near("x", 1)]), 3, d),
     "mixture until displaced": lambda d, n: tempered(
         mixture([walk("x"), metropolis_hastings(independent("x"))]), sweeps=until(displacement=0.5)
@@ -95,6 +98,10 @@ FEW = (
 UNLEARNED = (
     "D (D + 3) / 2 means and covariances are learnt from half of the particles, 500 for 1325 at D = 50; give "
     "10,000 there, or use hmc"
+)
+WIDE = (
+    "1.05 times as wide along each of D axes is 11 times the volume at D = 50: particles near the mode hardly "
+    "move; give an inflation nearer to 1 where many particles are learnt from, see that less wide"
 )
 # Why a kernel may be biased here, by name.
 REASONS = {
@@ -212,6 +219,8 @@ def reason(cell: Cell, file: Path | None) -> str:
     axes = problem_named(cell.problem).dimension
     if "independent" in cell.kernel and axes * (axes + 3) > cell.particles:
         return UNLEARNED
+    if "independent" in cell.kernel and axes >= 50:
+        return WIDE
     if cell.particles < 1000:
         return FEW
     if not cell.seeds:
