@@ -100,8 +100,8 @@ UNLEARNED = (
     "10,000 there, or use hmc"
 )
 WIDE = (
-    "1.05 times as wide along each of D axes is 11 times the volume at D = 50: particles near the mode hardly "
-    "move; give an inflation nearer to 1 where many particles are learnt from, see that less wide"
+    "1.05 times as wide along each of 50 axes is 11 times the volume: near the mode hardly any moves; give "
+    "an inflation nearer to 1 where there are many to learn from, see that less wide"
 )
 # Why a kernel may be biased here, by name.
 REASONS = {

@@ -46,9 +46,9 @@ def independent(
     D coordinates have D (D + 3) / 2 means and covariances to learn from half of the particles. Where these
     are not several times as many, hardly a move is accepted, the population dies out, and evidence is off by
     nats: that of a Gaussian of D = 50 by +5.6 +- .4 with 1,000 particles, of D = 100 by +45 +- 2 (hmc: -.06
-    +- .05, +.08 +- .16). Where they are, a normal that is wider along every axis keeps particles near the mode
-    from moving: with 10,000 and one component an inflation of 1.05 leaves -.34 +- .07 at D = 50, and 1.006
-    nothing (`benchmarks/exact.py`); give 1.05^(6 / D).
+    +- .05, +.08 +- .16). Where they are, a normal that is wider along every axis keeps particles near the
+    mode from moving: with 10,000 and one component an inflation of 1.05 leaves -.34 +- .07 at D = 50, and
+    1.006 nothing (`benchmarks/exact.py`); give 1.05^(6 / D).
 
     Args:
         address: of the latent value.
