@@ -7,7 +7,7 @@ mean over the axes, and the mean ratio of estimated to exact variance.
 
 A bias is explained where it is within two standard errors of minus half the variance of log Z; for other
 kernels that are known to be biased `REASONS` states why. All kernels of a problem have the same seeds, so
-their errors are correlated: a bias common to all of them is one draw, not fourteen. Of so many cells one in
+their errors are correlated: a bias common to all of them is one draw, not many. Of so many cells one in
 twenty lies beyond two standard errors by chance: --confirm runs those without a stated reason again, with
 other seeds, and prints both. With --file cells are written as they are done, and a later call adds those that
 are missing. With --limit a cell is left out, and its row says so, where a run with fewer particles took
