@@ -228,3 +228,18 @@ def test_a_setting_that_cannot_be_is_refused(setting: str, bcppl: Callable[..., 
     ran = bcppl("run", "short.h5", "--set", setting, "--out", "out")
     assert ran.code == 2 and "Traceback" not in ran.err
     assert REFUSED[setting] in ran.err and len(ran.err.strip().splitlines()) == 1
+
+
+def test_a_model_without_settings_is_given_none(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    save(short(1), tmp_path / "short.h5")
+    (tmp_path / "plain.py").write_text(
+        "from dataclasses import replace\n"
+        "from bcppl.models.point_probe import model as shipped\n"
+        "def prepare(recording):\n"
+        "    return shipped.prepare(recording)\n"
+        "model = replace(shipped, prepare=prepare)\n"
+    )
+    words = ("run", "short.h5", "--particles", 20, "--model", "plain.py", "--out", "out")
+    assert bcppl(*words).code == 0
+    ran = bcppl(*words, "--set", "offset=0.01")
+    assert ran.code == 2 and "model plain.py takes no setting 'offset'" in ran.err

@@ -66,6 +66,8 @@ def settings(given: Sequence[str]) -> dict[str, Any]:
 
 def with_settings(model: Model, settings: Mapping[str, Any], name: str) -> Model:
     """A model with settings; InputError where it takes none."""
+    if not settings:
+        return model
     try:
         inspect.signature(model.prepare).bind(None, **settings)
     except TypeError as error:
@@ -73,7 +75,7 @@ def with_settings(model: Model, settings: Mapping[str, Any], name: str) -> Model
             f"model {name} takes no setting {next(iter(settings))!r}: its `prepare` is called with the "
             "recording alone; leave --set out, or let it take settings."
         ) from error
-    return model.with_settings(**settings) if settings else model
+    return model.with_settings(**settings)
 
 
 def inference(given: str | None, chosen: Model) -> tuple[str, Infer]:
