@@ -111,8 +111,8 @@ class Report:
             self._warn(f"touches fit better by {each.gain:.0f} nats if {each.supposition}.")
         if not found:
             self._note(
-                "no other supposition explains the touches better than what the recording states; compared are "
-                "touches of a held peg that the model explains by its gap to the part."
+                "no other supposition explains the touches better than what the recording states; compared "
+                "are touches of a held peg that the model explains by its gap to the part."
             )
         return found
 
