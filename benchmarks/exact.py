@@ -217,7 +217,8 @@ def reason(cell: Cell, file: Path | None) -> str:
     if cell.kernel in REASONS:
         return REASONS[cell.kernel]
     axes = problem_named(cell.problem).dimension
-    if "independent" in cell.kernel and axes * (axes + 3) > cell.particles:
+    learning = "independent" in cell.kernel or cell.kernel == "delayed acceptance"
+    if learning and axes * (axes + 3) > cell.particles:
         return UNLEARNED
     if "independent" in cell.kernel and axes >= 50:
         return WIDE

@@ -123,7 +123,9 @@ class Screened(Target):
 def student_t(address: str, degrees: float = 5.0, width: float = 1.3) -> Surrogate:
     """A surrogate: the multivariate t about the particles' weighted mean at a latent address.
 
-    Its tails are heavy: a particle where the surrogate is far too low would hardly ever move.
+    Its tails are heavy: a particle where the surrogate is far too low would hardly ever move. As of
+    `independent`, D (D + 3) / 2 numbers are learnt: from 1,000 particles at D = 50 too many, and log evidence
+    is off by +2.9 +- 1.2 (`benchmarks/exact.py`).
 
     Args:
         address: of a pose or of another continuous value, in the coordinates in which proposals move it
