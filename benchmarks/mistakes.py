@@ -1,4 +1,4 @@
-"""Whether gross mistakes are named: what a recording states wrongly, beside what a run says of it.
+"""Whether gross mistakes are named: what a recording states wrongly, beside what a run warns of.
 
 A scene of the accuracy bench is seen and touched by a probe that rocks (`ROCKED`). Then its recording is made
 to state something wrong, is run by the default inference, and both what the run warns of and the suppositions
@@ -134,7 +134,7 @@ MISTAKES: dict[str, Mistake] = {
 
 
 class Outcome(NamedTuple):
-    """What a run says: its warnings, the suppositions by gain, and the error in position, mm."""
+    """What came of a run: its warnings, the suppositions by gain, and the error in position, mm."""
 
     warnings: list[str]
     suppositions: list[str]
