@@ -1,10 +1,10 @@
 """Whether gross mistakes are named: what a recording states wrongly, beside what a run warns of.
 
 A scene of the accuracy bench is seen and touched by a probe that rocks (`ROCKED`). Then its recording is made
-to state something wrong, is run by the default inference, and both what the run warns of and the suppositions
+to state something wrong, is run by the default inference, and both what the run warns of and the hypotheses
 that explain its touches (`bcppl.inference.criticism.explanations`) are noted. A mistake is named if a warning
-has its words, or one of the first two suppositions. Each mistake is made by code of its own, not by the one
-that supposes it. With `--file` results are written as they are done, and a later call adds the missing ones.
+has its words, or one of the first two hypotheses. Each mistake is made by code of its own, not by the one
+of the hypothesis. With `--file` results are written as they are done, and a later call adds the missing ones.
 """
 
 from __future__ import annotations
@@ -134,15 +134,15 @@ MISTAKES: dict[str, Mistake] = {
 
 
 class Outcome(NamedTuple):
-    """What came of a run: its warnings, the suppositions by gain, and the error in position, mm."""
+    """What came of a run: its warnings, the hypotheses by gain, and the error in position, mm."""
 
     warnings: list[str]
-    suppositions: list[str]
+    hypotheses: list[str]
     error: float
 
     def names(self, words: tuple[str, ...]) -> bool:
-        """Whether the words are in a warning or in one of the first two suppositions."""
-        return any(word in text for word in words for text in [*self.warnings, *self.suppositions[:2]])
+        """Whether the words are in a warning or in one of the first two hypotheses."""
+        return any(word in text for word in words for text in [*self.warnings, *self.hypotheses[:2]])
 
 
 def outcomes(seed: int, profile: str, names: tuple[str, ...], file: Path | None) -> dict[str, Outcome]:
@@ -175,10 +175,10 @@ def outcome(good: Recording, name: str, seed: int, profile: str) -> Outcome | No
         checks.cell(step)
     error = 1e3 * float((step.belief.mean[:3] - torch.as_tensor(good.truth)[:3]).norm())
     ranked = explanations(model, recording, profile=profile)
-    suppositions = [f"{one.supposition} ({one.gain:.0f} nats)" for one in ranked]
-    result = Outcome(checks.warnings(step, model.pose), suppositions, error)
+    hypotheses = [f"{one.hypothesis} ({one.gain:.0f} nats)" for one in ranked]
+    result = Outcome(checks.warnings(step, model.pose), hypotheses, error)
     print(
-        f"{name}, seed {seed}: {error:.2f} mm; {suppositions[:2]}; {len(result.warnings)} warnings",
+        f"{name}, seed {seed}: {error:.2f} mm; {hypotheses[:2]}; {len(result.warnings)} warnings",
         flush=True,
     )
     return result
@@ -202,7 +202,7 @@ def main() -> None:
         several = [found[name] for found in scenes if name in found]
         if not several:
             continue
-        warned = float(np.mean([bool(one.warnings or one.suppositions) for one in several]))
+        warned = float(np.mean([bool(one.warnings or one.hypotheses) for one in several]))
         count = f"of {len(several)}"
         if name == GOOD:
             rows.append(Row("no mistake: warned of", warned, count, SILENT, "max"))
@@ -211,10 +211,10 @@ def main() -> None:
             rows.append(Row(f"{name}: named", named, count, NAMED, "min"))
             rows.append(Row(f"{name}: warned of", warned, count, WARNED, "min"))
         lines += [
-            [name, k, one.error, len(one.warnings), " | ".join(one.suppositions[:2])[:120]]
+            [name, k, one.error, len(one.warnings), " | ".join(one.hypotheses[:2])[:120]]
             for k, one in enumerate(several)
         ]
-    show("mistakes", ["mistake", "scene", "off mm", "warnings", "suppositions"], lines)
+    show("mistakes", ["mistake", "scene", "off mm", "warnings", "hypotheses"], lines)
     finish(rows, arguments.json)
 
 

@@ -186,11 +186,11 @@ def test_the_bar_names_the_measurement_in_progress() -> None:
 
 
 def test_a_run_keeps_its_warnings_and_explains_touches(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
-    """Pushes of a finger have no peg that could be turned: nothing is supposed, and the run states that."""
+    """Pushes of a finger have no peg that could be turned: no hypothesis is compared, which is stated."""
     save(short(1), tmp_path / "short.h5")
     ran = bcppl("run", "short.h5", "--particles", 20, "--out", "out", "--explain")
     assert ran.code == 0
-    assert "no other supposition explains the touches" in " ".join(ran.out.split())
+    assert "no other hypothesis explains the touches" in " ".join(ran.out.split())
     record = json.loads((tmp_path / "out/run.json").read_text())
     assert record["explanations"] == [] and isinstance(record["warnings"], list)
 

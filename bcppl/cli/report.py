@@ -108,10 +108,10 @@ class Report:
         """Print what would explain the touches better than what is stated, and give it back."""
         found = explanations(self.model, self.recording)
         for each in found:
-            self._warn(f"touches fit better by {each.gain:.0f} nats if {each.supposition}.")
+            self._warn(f"touches fit better by {each.gain:.0f} nats if {each.hypothesis}.")
         if not found:
             self._note(
-                "no other supposition explains the touches better than what the recording states; compared "
+                "no other hypothesis explains the touches better than what the recording states; compared "
                 "are touches of a held peg that the model explains by its gap to the part."
             )
         return found

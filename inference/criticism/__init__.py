@@ -19,6 +19,6 @@ direction in which touches leave a position open, `shared_errors` how grasp, arm
 """
 
 from bcppl.inference.criticism.nuisances import SharedError, SuddenChange, shared_errors, sudden_changes
-from bcppl.inference.criticism.suppositions import Explanation, explanations
+from bcppl.inference.criticism.rival_hypotheses import Explanation, explanations
 
 __all__ = ["Explanation", "SharedError", "SuddenChange", "explanations", "shared_errors", "sudden_changes"]

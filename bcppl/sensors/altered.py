@@ -1,8 +1,8 @@
 """Recordings as they would be if something about their probes were otherwise than it was written down.
 
-    late = with_wrench_earlier(recording, 0.2)  # as it would be if the wrench had been read 0.2 s late
+    on_time = with_wrench_earlier(recording, 0.2)  # if the wrench was read 0.2 s late
 
-Inference on such a recording is inference under that supposition. Measurements other than of probes stay.
+Inference on such a recording is inference under that hypothesis. Measurements other than of probes stay.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _stretched(part: Part, factor: Array) -> Part:
     return replace(part, vertices=part.vertices * factor, pieces=tuple(pieces))
 
 
-def _probed(recording: Recording, supposed: Callable[[Touch], Touch]) -> Recording:
+def _probed(recording: Recording, altered: Callable[[Touch], Touch]) -> Recording:
     """The recording with what each probe's windows observe, taken together, as it would be."""
     measurements = list(recording.measurements)
     by_probe: dict[str, list[int]] = {}
@@ -98,7 +98,7 @@ def _probed(recording: Recording, supposed: Callable[[Touch], Touch]) -> Recordi
     for numbers in by_probe.values():
         touches = [measurements[k].observation for k in numbers]
         columns = ("times", "wrench", "world_from_peg")
-        whole = supposed(Touch(*(np.concatenate([getattr(t, c) for t in touches]) for c in columns)))
+        whole = altered(Touch(*(np.concatenate([getattr(t, c) for t in touches]) for c in columns)))
         ends = np.cumsum([len(touch.times) for touch in touches])[:-1]
         each = zip(*(np.split(getattr(whole, column), ends) for column in columns), strict=True)
         for k, own in zip(numbers, each, strict=True):

@@ -1,4 +1,4 @@
-"""Suppositions on touches that are kinematic, without any physics: what was wrong is named, else nothing."""
+"""Rival hypotheses on kinematic touches, without any physics: what was wrong is named, else nothing."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg, cylinder_peg
 from bcppl.geometry.parts import Part
 from bcppl.inference.criticism import explanations
-from bcppl.inference.criticism.suppositions import VERY_STRONG, approximated, log_evidence
+from bcppl.inference.criticism.rival_hypotheses import VERY_STRONG, approximated, log_evidence
 from bcppl.models.look_and_touch import model
 from bcppl.recordings import Guess, Measurement, Probe, ProbeWindow, Recording
-from bcppl.sensors.supposed import (
+from bcppl.sensors.altered import (
     with_peg_along,
     with_peg_thicker,
     with_peg_turned,
@@ -131,13 +131,13 @@ def test_evidence_is_for_what_was_wrong_and_for_nothing_else(name: str) -> None:
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_is_named_first(name: str) -> None:
     wrong, _, words = FAULTS[name]
-    assert words in explanations(model, wrong)[0].supposition
+    assert words in explanations(model, wrong)[0].hypothesis
 
 
 @pytest.mark.long
 def test_a_part_that_moved_is_named_with_its_time() -> None:
     """Before the fifth touch, at 4.4 s, which is from above and does not show it, or the sixth, at 5.4 s."""
-    first = explanations(model, touched(moved=0.003))[0].supposition
+    first = explanations(model, touched(moved=0.003))[0].hypothesis
     time = re.search(r"the part moved, or the peg slipped, before the touch at (.*) s", first)
     assert time is not None and 4.39 <= float(time[1]) <= 5.41
 
@@ -145,7 +145,7 @@ def test_a_part_that_moved_is_named_with_its_time() -> None:
 @pytest.mark.long
 def test_how_far_off_a_frame_is_along_the_peg_is_stated() -> None:
     """As far as the prior, 5 mm wide, leaves the part's height open."""
-    first = explanations(model, FAULTS["along"][0])[0].supposition
+    first = explanations(model, FAULTS["along"][0])[0].hypothesis
     off = re.search(r"off by (.*) mm along its axis", first)
     assert off is not None and abs(float(off[1]) + 100.0) < 5.0
 

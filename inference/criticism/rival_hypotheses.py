@@ -1,15 +1,15 @@
-"""What would explain touches that do not fit: each supposition by its evidence.
+"""What would explain touches that do not fit: each hypothesis by its evidence.
 
     from bcppl.inference.criticism import explanations
     from bcppl.models.look_and_touch import model
 
     for each in explanations(model, recording):
-        print(f"{each.supposition}: {each.gain:.0f} nats")
+        print(f"{each.hypothesis}: {each.gain:.0f} nats")
 
 A wrench that is read late, a peg that is turned in the hand, a part that moved: each is a recording as it
-would be otherwise (`bcppl.sensors.supposed`), and the touches have an evidence under it, the pose and all
+would be otherwise (`bcppl.sensors.altered`), and the touches have an evidence under it, the pose and all
 that is shared integrated out in the Gaussian approximation about the posterior's modes. That of a
-supposition with several values, a clock that is off by 0.1 or by 0.2 s, is the mean over them: to try many
+hypothesis with several values, a clock that is off by 0.1 or by 0.2 s, is the mean over them: to try many
 costs the logarithm of how many (Occam's factor).
 """
 
@@ -28,14 +28,14 @@ from bcppl.distributions.manifold import FARTHEST
 from bcppl.geometry.turns import turns_freely
 from bcppl.inference.approximations.gaussian import GaussianApproximation
 from bcppl.recordings import Recording
-from bcppl.sensors.capabilities import Approximated, Defers, FeelsForces, FitsPose
-from bcppl.sensors.supposed import (
+from bcppl.sensors.altered import (
     with_peg_along,
     with_peg_thicker,
     with_peg_turned,
     with_wrench_earlier,
     with_wrench_reversed,
 )
+from bcppl.sensors.capabilities import Approximated, Defers, FeelsForces, FitsPose
 from bcppl.traces import Model
 
 # Very strong evidence, 150 to 1 (Kass and Raftery, Bayes factors, JASA 90, 1995, section 3.2).
@@ -44,28 +44,28 @@ CLOCK = (0.05, 0.1, 0.2, 0.4)  # s, early or late
 TURN = (9.0, 18.0, 27.0, 36.0, 45.0)  # degrees, either way
 THICKNESS = (0.00025, 0.0005, 0.001)  # m, thicker or thinner
 ALONG, STEP = 0.3, 0.002  # m: how far off the peg's pose may be along its axis, and a step of the search
-OFF = 0.003  # m from which on that is worth a supposition
+OFF = 0.003  # m from which on that is worth a hypothesis
 FAR, FEW, MINIMA = 0.02, 2, 3  # m beyond which a row does not decide that; every so many rows; minima
 OUTWARDS = 0.98  # the probability that the mean force of a contact points out of the part
 
 
 class Explanation(NamedTuple):
-    """A supposition under which touches are more probable.
+    """A hypothesis under which touches are more probable.
 
     Attributes:
-        supposition: such as "the wrench is read 0.2 s late".
+        hypothesis: such as "the wrench is read 0.2 s late".
         gain: its log Bayes factor to the recording as it is stated, nats.
     """
 
-    supposition: str
+    hypothesis: str
     gain: float
 
 
 def explanations(model: Model, recording: Recording, **settings: Any) -> list[Explanation]:
-    """The suppositions for which a recording's touches are very strong evidence, the best first.
+    """The hypotheses for which a recording's touches are very strong evidence, the best first.
 
     Images are taken as they are, for their own faults see `hypotheses`. What the model's prior allows for, a
-    peg that is a little off in the hand under the profile of a real bench, is no supposition. About thirty
+    peg that is a little off in the hand under the profile of a real bench, is no hypothesis. About thirty
     evidences are computed, each for a second or two.
 
     Args:
@@ -86,10 +86,10 @@ def explanations(model: Model, recording: Recording, **settings: Any) -> list[Ex
     least = log_evidence(stated)
     families = [
         {
-            name: log_evidence(approximated(model, supposed, stated.fits, **settings))
-            for name, supposed in family.items()
+            name: log_evidence(approximated(model, altered, stated.fits, **settings))
+            for name, altered in family.items()
         }
-        for family in _suppositions(recording, stated)
+        for family in _hypotheses(recording, stated)
     ]
     results = []
     for family in [*families, _moved(stated)]:
@@ -119,7 +119,7 @@ def log_evidence(approximation: GaussianApproximation) -> float:
 
     By Laplace's method at each mode, for where Gauss-Newton has not converged its quadratic promises too
     much. Beside it stand the directions of the forces, which the likelihood leaves out. By chance a row of a
-    contact is anywhere in `FARTHEST`: so suppositions compare that change how many rows there are.
+    contact is anywhere in `FARTHEST`: so hypotheses compare that change how many rows there are.
     """
     prior, modes = approximation.prior, approximation.quadratic
     if modes is None:
@@ -164,8 +164,8 @@ def _forces(approximation: GaussianApproximation) -> Iterator[tuple[FeelsForces,
             yield sensor, own
 
 
-def _suppositions(recording: Recording, stated: GaussianApproximation) -> Iterator[dict[str, Recording]]:
-    """Families of suppositions, by name in each."""
+def _hypotheses(recording: Recording, stated: GaussianApproximation) -> Iterator[dict[str, Recording]]:
+    """Families of hypotheses, by name in each."""
     yield {
         f"the wrench is read {seconds:g} s {word}": with_wrench_earlier(recording, sign * seconds)
         for sign, word in ((1.0, "late"), (-1.0, "early"))
