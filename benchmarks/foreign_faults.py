@@ -111,18 +111,18 @@ def truth_at_edge(recording: Recording) -> Recording:
 
 def part_mirrored(recording: Recording) -> Recording:
     """The part's mesh and pieces are those of its mirror image in the y-z plane of its frame."""
-    return replace(recording, part=_mapped(recording.part, np.diag([-1.0, 1.0, 1.0])))
+    return replace(recording, part=mapped(recording.part, np.diag([-1.0, 1.0, 1.0])))
 
 
 def part_turned(recording: Recording) -> Recording:
     """The part's mesh and pieces are turned by 90 degrees about z in their frame, not the part itself."""
     turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    return replace(recording, part=_mapped(recording.part, turned))
+    return replace(recording, part=mapped(recording.part, turned))
 
 
 def part_scaled(recording: Recording, factor: float = 1.1) -> Recording:
     """The part's mesh and pieces are larger than the part by a factor, about their frame's origin."""
-    return replace(recording, part=_mapped(recording.part, factor * np.eye(3)))
+    return replace(recording, part=mapped(recording.part, factor * np.eye(3)))
 
 
 def view_repeated(recording: Recording, times: int = 10) -> Recording:
@@ -188,7 +188,7 @@ FAULTS: dict[str, Fault] = {
 }
 
 
-def _mapped(part: Part, linear: Array) -> Part:
+def mapped(part: Part, linear: Array) -> Part:
     """The part under a linear map (3, 3): each piece becomes a hull."""
     faces = part.faces if np.linalg.det(linear) > 0.0 else part.faces[:, ::-1]
     pieces = [Piece("hull", _corners(piece) @ linear.T) for piece in part.pieces]

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from foreign_faults import part_mirrored, part_moved, truth_outside
+from foreign_faults import mapped, part_mirrored, part_moved, truth_outside
 from honesty import symmetric
 from jobs import each
 from kept import added, recorded
@@ -27,7 +27,6 @@ from scipy.spatial.transform import Rotation
 
 from bcppl.cli.predictive_checks import PredictiveChecks
 from bcppl.errors import InputError
-from bcppl.geometry.parts import Part, Piece
 from bcppl.geometry.turns import turns_freely
 from bcppl.inference.criticism import explanations
 from bcppl.inference.planning.metrology import ROCKED, three_two_one
@@ -112,13 +111,7 @@ def peg_stated_thicker(recording: Recording, metres: float = 0.0005) -> Recordin
     peg = recording.peg
     width = float(np.ptp(peg.vertices[:, :2], axis=0).max())
     scale = np.diag([1.0 + metres / width, 1.0 + metres / width, 1.0])
-    pieces = [Piece("hull", corners(peg, piece) @ scale) for piece in peg.pieces]
-    return replace(recording, peg=replace(peg, vertices=peg.vertices @ scale, pieces=tuple(pieces)))
-
-
-def corners(peg: Part, piece: Piece) -> np.ndarray:
-    """The vertices of a convex piece; of one that is no hull the peg's own, for such a peg is convex."""
-    return piece.size if piece.kind == "hull" else peg.vertices
+    return replace(recording, peg=mapped(peg, scale))
 
 
 MISTAKES: dict[str, Mistake] = {
@@ -170,11 +163,11 @@ def outcome(good: Recording, name: str, seed: int, profile: str) -> Outcome | No
     if symmetric(good, recording):
         return None
     checks = PredictiveChecks()
-    scene = model.prepare(recording, profile=profile)
-    for step in default_run(recording, PARTICLES, seed, scene=scene):
+    profiled = model.with_settings(profile=profile)
+    for step in default_run(recording, PARTICLES, seed, scene=profiled.prepare(recording)):
         checks.cell(step)
     error = 1e3 * float((step.belief.mean[:3] - torch.as_tensor(good.truth)[:3]).norm())
-    ranked = explanations(model, recording, profile=profile)
+    ranked = explanations(profiled, recording)
     hypotheses = [f"{one.hypothesis} ({one.gain:.0f} nats)" for one in ranked]
     result = Outcome(checks.warnings(step, model.pose), hypotheses, error)
     print(

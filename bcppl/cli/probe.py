@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from bcppl.arguments import LARGEST_SEED
+from bcppl.cli.setting_option import Settings
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
@@ -45,14 +46,7 @@ def probe(
     ] = None,
     of: Annotated[str | None, typer.Option(help="The recording that a belief is of.")] = None,
     model: Annotated[str | None, typer.Option(help="A model's name or file, as for `bcppl run`.")] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help="A model's setting, as for `bcppl run`; a belief has its own.",
-        ),
-    ] = None,
+    set_: Settings = None,
     inference: Annotated[
         str | None, typer.Option(help="An inference program's name or file, as for `bcppl run`.")
     ] = None,

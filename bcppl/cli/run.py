@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bcppl.arguments import LARGEST_SEED
+from bcppl.cli.setting_option import Settings
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,14 +34,7 @@ def run(
         Path | None,
         typer.Option(file_okay=False, help="Folder for beliefs and figures; runs/RECORDING by default."),
     ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help="A setting of the model, profile=ur5e; may be repeated.",
-        ),
-    ] = None,
+    set_: Settings = None,
     explain: Annotated[
         bool,
         typer.Option(help="Compare by evidence what could be wrong with the touches; takes about a minute."),

@@ -1,7 +1,6 @@
 """What would explain touches that do not fit: each hypothesis by its evidence.
 
     from bcppl.inference.criticism import explanations
-    from bcppl.models.look_and_touch import model
 
     for each in explanations(model, recording):
         print(f"{each.hypothesis}: {each.gain:.0f} nats")
@@ -27,6 +26,7 @@ from bcppl import poses
 from bcppl.distributions.manifold import FARTHEST
 from bcppl.geometry.turns import turns_freely
 from bcppl.inference.approximations.gaussian import GaussianApproximation
+from bcppl.inference.criticism.hypotheses import VERY_STRONG
 from bcppl.recordings import Recording
 from bcppl.sensors.altered import (
     with_peg_along,
@@ -38,8 +38,6 @@ from bcppl.sensors.altered import (
 from bcppl.sensors.capabilities import Approximated, Defers, FeelsForces, FitsPose
 from bcppl.traces import Model
 
-# Very strong evidence, 150 to 1 (Kass and Raftery, Bayes factors, JASA 90, 1995, section 3.2).
-VERY_STRONG = 5.0
 CLOCK = (0.05, 0.1, 0.2, 0.4)  # s, early or late
 TURN = (9.0, 18.0, 27.0, 36.0, 45.0)  # degrees, either way
 THICKNESS = (0.00025, 0.0005, 0.001)  # m, thicker or thinner
@@ -61,7 +59,7 @@ class Explanation(NamedTuple):
     gain: float
 
 
-def explanations(model: Model, recording: Recording, **settings: Any) -> list[Explanation]:
+def explanations(model: Model, recording: Recording) -> list[Explanation]:
     """The hypotheses for which a recording's touches are very strong evidence, the best first.
 
     Images are taken as they are, for their own faults see `hypotheses`. What the model's prior allows for, a
@@ -69,26 +67,23 @@ def explanations(model: Model, recording: Recording, **settings: Any) -> list[Ex
     evidences are computed, each for a second or two.
 
     Args:
-        model: with a prior and sensors of the part's pose, such as `look_and_touch`.
+        model: with a prior and sensors of the part's pose, such as `look_and_touch`; under the profile of a
+            bench `model.with_settings(profile="ur5e")`.
         recording: with touches of a held peg that the model explains by its gap to the part
             (`bcppl.sensors.capabilities.FeelsForces`); without any nothing is explained.
-        **settings: of the model's scene, such as `profile`.
 
     Raises:
         InputError: the model has no prior and sensors, or its prior holds an axis of the pose.
     """
-    sensors = getattr(model.prepare(recording, **settings), "likelihoods", {}).values()
+    sensors = getattr(model.prepare(recording), "likelihoods", {}).values()
     if recording.peg is None or not any(isinstance(sensor, FeelsForces) for sensor in sensors):
         return []
-    stated = approximated(model, recording, **settings)
+    stated = approximated(model, recording)
     if not any(_forces(stated)):
         return []
     least = log_evidence(stated)
     families = [
-        {
-            name: log_evidence(approximated(model, altered, stated.fits, **settings))
-            for name, altered in family.items()
-        }
+        {name: log_evidence(approximated(model, altered, stated.fits)) for name, altered in family.items()}
         for family in _hypotheses(recording, stated)
     ]
     results = []
@@ -100,10 +95,10 @@ def explanations(model: Model, recording: Recording, **settings: Any) -> list[Ex
 
 
 def approximated(
-    model: Model, recording: Recording, fits: Mapping[str, Any] | None = None, **settings: Any
+    model: Model, recording: Recording, fits: Mapping[str, Any] | None = None
 ) -> GaussianApproximation:
     """The Gaussian approximation given all of a recording; its images' fits are computed unless given."""
-    scene = model.prepare(recording, **settings)
+    scene = model.prepare(recording)
     approximation = GaussianApproximation(pose=model.pose, scene=scene, fits=fits or {})
     observed = model.observe(scene, recording.measurements)
     for number, measurement in enumerate(recording.measurements):
