@@ -29,6 +29,7 @@ from bcppl.distributions.episodes import (
     PartSlides,
     Size,
 )
+from bcppl.distributions.episodes.branches import OUTLIER as IS_OUTLIER
 from bcppl.distributions.episodes.covariances import RowErrors, segments_of
 from bcppl.distributions.episodes.rows import (
     EARLIER,
@@ -40,7 +41,6 @@ from bcppl.distributions.episodes.rows import (
     late,
     new_rows,
 )
-from bcppl.distributions.episodes.switching_filter import OUTLIER as IS_OUTLIER
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg

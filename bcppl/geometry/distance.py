@@ -212,30 +212,34 @@ def interpolated(x: float, y: float, z: float, grid: DistanceGrid) -> float:
 def plane_gradient(point: Array, grid: DistanceGrid, gradient: Array) -> bool:
     """Whether a single plane is closest around a point; `gradient` (3,) is set to the unit gradient there."""
     low, spacing, distance = grid
-    cell, share = np.empty(3, np.int64), np.empty(3)
-    for axis in range(3):
-        at = min(max((point[axis] - low[axis]) / spacing, 0.0), distance.shape[axis] - 1.000001)
-        cell[axis] = int(at)
-        share[axis] = at - cell[axis]
-    i, j, k = cell
-    gradient[:] = 0.0
+    i, u = _cell(point[0], low[0], spacing, distance.shape[0])
+    j, v = _cell(point[1], low[1], spacing, distance.shape[1])
+    k, w = _cell(point[2], low[2], spacing, distance.shape[2])
+    along_x, along_y, along_z = 0.0, 0.0, 0.0
     for corner in range(8):
         a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
         here = distance[i + a, j + b, k + c]
-        wa = share[0] if a else 1.0 - share[0]
-        wb = share[1] if b else 1.0 - share[1]
-        wc = share[2] if c else 1.0 - share[2]
-        gradient[0] += (2 * a - 1) * wb * wc * here
-        gradient[1] += (2 * b - 1) * wa * wc * here
-        gradient[2] += (2 * c - 1) * wa * wb * here
+        wa = u if a else 1.0 - u
+        wb = v if b else 1.0 - v
+        wc = w if c else 1.0 - w
+        along_x += (2 * a - 1) * wb * wc * here
+        along_y += (2 * b - 1) * wa * wc * here
+        along_z += (2 * c - 1) * wa * wb * here
     plane = True
     first = distance[i, j, k]
     for corner in range(8):
         a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
-        expected = first + a * gradient[0] + b * gradient[1] + c * gradient[2]
+        expected = first + a * along_x + b * along_y + c * along_z
         plane = plane and abs(distance[i + a, j + b, k + c] - expected) < 1e-6
-    length = np.sqrt((gradient * gradient).sum())
+    length = np.sqrt(along_x * along_x + along_y * along_y + along_z * along_z)
     plane = plane and abs(length / spacing - 1.0) < 1e-3
-    if length > 0.0:
-        gradient /= length
+    scale = 1.0 / length if length > 0.0 else 1.0
+    gradient[0], gradient[1], gradient[2] = along_x * scale, along_y * scale, along_z * scale
     return plane
+
+
+@compiled
+def _cell(at: float, low: float, spacing: float, count: int) -> tuple[int, float]:
+    """The cell of a coordinate on an axis of the grid, and the share of it that lies below."""
+    inside = min(max((at - low) / spacing, 0.0), count - 1.000001)
+    return int(inside), inside - int(inside)

@@ -17,6 +17,7 @@ from bcppl import poses
 from bcppl.arrays import Array, Indices, Mask
 from bcppl.compiled import compiled
 from bcppl.effort import Effort
+from bcppl.geometry.bounding_spheres import bounding_sphere, compact_groups
 from bcppl.geometry.distance import DistanceGrid, SignedDistance, distance_grid, interpolated, plane_gradient
 from bcppl.geometry.hausdorff import planes_of, solid_of
 from bcppl.geometry.parts import Part
@@ -33,6 +34,7 @@ from bcppl.threads import parallel_sum, thread_count
 
 _NEAR = 0.002  # m: below this gap edges are evaluated, and distances exactly where the grid is inexact
 _MARGIN = 0.012  # m around the part that the grid covers
+_STEEPEST = 3.0**0.5  # slope of a distance that is interpolated axis by axis, at most
 _CHUNK = 8  # particles of a chunk of work, at least
 _PAIRS = 256  # pairs of poses of a chunk, at least
 
@@ -133,11 +135,14 @@ class PegGap:
 class _Solids(NamedTuple):
     """A peg as convex solids: distinct vertices (V, 3), and a bounding box (2, 3).
 
-    Planes (P, 4) are the outward unit normals and offsets of all solids, `ends` (S,) the index after each
-    solid's last plane.
+    Vertices of a compact group are contiguous: `stops` (G,) are the indices after each group's last one, and
+    `spheres` (G, 4) lie about them. Planes (P, 4) are the outward unit normals and offsets of all solids,
+    `ends` (S,) the index after each solid's last plane.
     """
 
     corners: Array
+    stops: Indices
+    spheres: Array
     planes: Array
     ends: Indices
     box: Array
@@ -146,12 +151,50 @@ class _Solids(NamedTuple):
 def _solids(peg: Part) -> _Solids:
     meshes = [peg.mesh.convex_hull] if peg.mesh.is_convex or not peg.pieces else map(solid_of, peg.pieces)
     planes = [np.unique(np.round(planes_of(mesh), 9), axis=0) for mesh in meshes]
+    corners = np.unique(np.round(peg.vertices, 9), axis=0)
+    groups = compact_groups(corners)
     return _Solids(
-        corners=np.unique(np.round(peg.vertices, 9), axis=0),
+        corners=corners[np.concatenate(groups)],
+        stops=np.cumsum([len(group) for group in groups]),
+        spheres=np.stack([bounding_sphere(corners[group]) for group in groups]),
         planes=np.concatenate(planes),
         ends=np.cumsum([len(each) for each in planes]),
         box=np.stack([peg.vertices.min(axis=0), peg.vertices.max(axis=0)]),
     )
+
+
+@compiled
+def relative(part: Frames, n: int, peg: Frames, own: int, t: int, turn: Array, shift: Array) -> None:
+    """Set `turn` (3, 3) and `shift` (3,) to the peg's frame in the part's.
+
+    Written out: numpy's product of two small matrices takes longer than all that is looked up there.
+    """
+    for i in range(3):
+        shift[i] = 0.0
+        for k in range(3):
+            along = part.rotation[n, k, i]
+            shift[i] += along * (peg.translation[own, t, k] - part.translation[n, k])
+        for j in range(3):
+            turn[i, j] = 0.0
+            for k in range(3):
+                turn[i, j] += part.rotation[n, k, i] * peg.rotation[own, t, k, j]
+
+
+@compiled
+def placed(point: Array, turn: Array, shift: Array, result: Array) -> None:
+    """Set `result` (3,) to a point of the peg's frame in the part's."""
+    for axis in range(3):
+        result[axis] = dot(turn[axis], point) + shift[axis]
+
+
+@compiled
+def interpolated_at(points: Array, p: int, turn: Array, shift: Array, grid: DistanceGrid) -> float:
+    """The interpolated distance to the part at one of some points (P, 3) of the peg's frame."""
+    a, b, c = points[p, 0], points[p, 1], points[p, 2]
+    x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + shift[0]
+    y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c + shift[1]
+    z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c + shift[2]
+    return interpolated(x, y, z, grid)
 
 
 @compiled
@@ -168,24 +211,31 @@ def _evaluate(
     normal: Array,
     rounded: Mask,
 ) -> None:
-    corners, planes, box = solids.corners, solids.planes, solids.box
+    corners, stops, spheres = solids.corners, solids.stops, solids.spheres
+    planes, box, bound = solids.planes, solids.box, np.empty(len(spheres))
     gradient, start, stop, middle = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    turn, shift = np.empty((3, 3)), np.empty(3)
     for n in range(first, last):
         own = n if len(peg.rotation) > 1 else 0
         for t in range(peg.rotation.shape[1]):
             # part_from_peg
-            turn = part.rotation[n].T @ peg.rotation[own, t]
-            shift = part.rotation[n].T @ (peg.translation[own, t] - part.translation[n])
+            relative(part, n, peg, own, t, turn, shift)
+            lowest = np.inf
+            for g in range(len(spheres)):
+                bound[g] = interpolated_at(spheres, g, turn, shift, grid) - _STEEPEST * spheres[g, 3]
+                if bound[g] < lowest:
+                    lowest, first_group = bound[g], g
             least, which = np.inf, 0
-            for c in range(len(corners)):
-                p = corners[c]
-                x = turn[0, 0] * p[0] + turn[0, 1] * p[1] + turn[0, 2] * p[2] + shift[0]
-                y = turn[1, 0] * p[0] + turn[1, 1] * p[1] + turn[1, 2] * p[2] + shift[1]
-                z = turn[2, 0] * p[0] + turn[2, 1] * p[1] + turn[2, 2] * p[2] + shift[2]
-                here = interpolated(x, y, z, grid)
-                if here < least:
-                    least, which = here, c
-            witness[n, t] = turn @ corners[which] + shift
+            for k in range(-1, len(spheres)):
+                g = first_group if k < 0 else k
+                # The closest group comes first, so that hardly any other has to be looked into.
+                if k == first_group or bound[g] > least:
+                    continue
+                for c in range(stops[g - 1] if g else 0, stops[g]):
+                    here = interpolated_at(corners, c, turn, shift, grid)
+                    if here < least:
+                        least, which = here, c
+            placed(corners[which], turn, shift, witness[n, t])
             rounded[n, t] = not plane_gradient(witness[n, t], grid, gradient) and abs(least) < _NEAR
             normal[n, t] = gradient
             # A farther edge cannot be in contact.
@@ -193,14 +243,14 @@ def _evaluate(
             next_edge = 0
             for g in range(len(edges.groups)):
                 first_edge, next_edge = next_edge, edges.stops[g]
-                if not may_be_nearer(edges.groups[g], turn, shift, box, nearer):
+                if not may_be_nearer(edges.groups, g, turn, shift, box, nearer):
                     continue
                 for e in range(first_edge, next_edge):
-                    if not may_be_nearer(edges.spheres[e], turn, shift, box, nearer):
+                    if not may_be_nearer(edges.spheres, e, turn, shift, box, nearer):
                         continue
-                    to_peg_frame(turn, shift, edges.spheres[e], middle)
-                    to_peg_frame(turn, shift, edges.ends[e, 0], start)
-                    to_peg_frame(turn, shift, edges.ends[e, 1], stop)
+                    to_peg_frame(turn, shift, edges.spheres, e, middle)
+                    to_peg_frame(turn, shift, edges.ends[:, 0], e, start)
+                    to_peg_frame(turn, shift, edges.ends[:, 1], e, stop)
                     begin = 0
                     for s in range(len(solids.ends)):
                         solid = planes[begin : solids.ends[s]]

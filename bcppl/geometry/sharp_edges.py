@@ -8,11 +8,11 @@ import numpy as np
 
 from bcppl.arrays import Array, Indices
 from bcppl.compiled import compiled
+from bcppl.geometry.bounding_spheres import bounding_sphere, compact_groups
 from bcppl.geometry.parts import Part
 
 _LONGEST = 0.008  # m; longer edges are subdivided
 _SHARP = np.radians(5.0)  # smallest dihedral angle
-_GROUP = 16  # segments, at most
 _ROUNDS = 12  # cutting planes, at most
 _EXACT = 1e-8  # m
 _CANCELLED = 0.1  # length of a sum of unit normals below which they are opposite
@@ -45,36 +45,23 @@ def sharp_edges(part: Part) -> SharpEdges:
         points = np.linspace(start, stop, count + 1)
         segments.append(np.stack([points[:-1], points[1:]], axis=1))
     ends = np.concatenate(segments)
-    members = _partitioned(ends.mean(axis=1), np.arange(len(ends)))
+    members = compact_groups(ends.mean(axis=1))
     if not members:
         return SharpEdges(ends, np.empty((0, 4)), np.empty((0, 4)), np.empty(0, dtype=np.int64))
     ends = ends[np.concatenate(members)]
     stops = np.cumsum([len(group) for group in members])
-    groups = np.stack([_sphere(group.reshape(-1, 3)) for group in np.split(ends, stops[:-1])])
-    return SharpEdges(ends, np.stack([_sphere(each) for each in ends]), groups, stops)
+    groups = np.stack([bounding_sphere(group.reshape(-1, 3)) for group in np.split(ends, stops[:-1])])
+    return SharpEdges(ends, np.stack([bounding_sphere(each) for each in ends]), groups, stops)
 
 
-def _partitioned(middles: Array, members: Indices) -> list[Indices]:
-    """Members in compact groups, by recursive bisection across their widest axis."""
-    if len(members) <= _GROUP:
-        return [members] if len(members) else []
-    axis = int(np.ptp(middles[members], axis=0).argmax())
-    order = members[np.argsort(middles[members, axis], kind="stable")]
-    half = len(order) // 2
-    return _partitioned(middles, order[:half]) + _partitioned(middles, order[half:])
-
-
-def _sphere(points: Array) -> Array:
-    """Centre and radius (4,) of a bounding sphere of points (P, 3)."""
-    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    return np.array([*middle, np.linalg.norm(points - middle, axis=1).max()])
+# Compiled code slices a row more slowly than it looks its numbers up: these are given the array and the row.
 
 
 @compiled
-def may_be_nearer(sphere: Array, turn: Array, shift: Array, box: Array, least: float) -> bool:
+def may_be_nearer(spheres: Array, row: int, turn: Array, shift: Array, box: Array, least: float) -> bool:
     """Whether a sphere in the part's frame may come closer than `least` to the peg's bounding box."""
-    reach = sphere[3] + least
-    x, y, z = sphere[0] - shift[0], sphere[1] - shift[1], sphere[2] - shift[2]
+    reach = spheres[row, 3] + least
+    x, y, z = spheres[row, 0] - shift[0], spheres[row, 1] - shift[1], spheres[row, 2] - shift[2]
     for axis in range(3):
         along = turn[0, axis] * x + turn[1, axis] * y + turn[2, axis] * z
         if along < box[0, axis] - reach or along > box[1, axis] + reach:
@@ -89,9 +76,9 @@ def dot(first: Array, second: Array) -> float:
 
 
 @compiled
-def to_peg_frame(turn: Array, shift: Array, point: Array, result: Array) -> None:
+def to_peg_frame(turn: Array, shift: Array, points: Array, row: int, result: Array) -> None:
     """Set `result` (3,) to a point of the part's frame in the peg's."""
-    x, y, z = point[0] - shift[0], point[1] - shift[1], point[2] - shift[2]
+    x, y, z = points[row, 0] - shift[0], points[row, 1] - shift[1], points[row, 2] - shift[2]
     for axis in range(3):
         result[axis] = turn[0, axis] * x + turn[1, axis] * y + turn[2, axis] * z
 
@@ -99,12 +86,11 @@ def to_peg_frame(turn: Array, shift: Array, point: Array, result: Array) -> None
 @compiled
 def is_separated(point: Array, planes: Array, reach: float) -> bool:
     """Whether a plane of a convex solid separates it from a point by more than `reach`."""
-    separated = False
+    x, y, z = point
     for f in range(len(planes)):
-        separated = dot(planes[f], point) - planes[f, 3] > reach
-        if separated:
-            break
-    return separated
+        if planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z - planes[f, 3] > reach:
+            return True
+    return False
 
 
 @compiled
@@ -122,12 +108,12 @@ def segment_distance(
     """
     low, high = 0.0, 1.0
     at_low, plane_low = _farthest_plane(start, stop, low, planes)
-    slope_low = dot(planes[plane_low], stop) - dot(planes[plane_low], start)
+    slope_low = _slope(planes, plane_low, start, stop)
     if slope_low >= 0.0:
         normal[:] = planes[plane_low, :3]
         return at_low, low
     at_high, plane_high = _farthest_plane(start, stop, high, planes)
-    slope_high = dot(planes[plane_high], stop) - dot(planes[plane_high], start)
+    slope_high = _slope(planes, plane_high, start, stop)
     if slope_high <= 0.0:
         normal[:] = planes[plane_high, :3]
         return at_high, high
@@ -142,7 +128,7 @@ def segment_distance(
         here, plane = _farthest_plane(start, stop, share, planes)
         if here <= bound + _EXACT:
             break
-        slope = dot(planes[plane], stop) - dot(planes[plane], start)
+        slope = _slope(planes, plane, start, stop)
         if slope < 0.0:
             low, at_low, slope_low, plane_low = share, here, slope, plane
         else:
@@ -169,3 +155,13 @@ def _farthest_plane(start: Array, stop: Array, share: float, planes: Array) -> t
         if away > farthest:
             farthest, plane = away, f
     return farthest, plane
+
+
+@compiled
+def _slope(planes: Array, plane: int, start: Array, stop: Array) -> float:
+    """By how much the distance to a plane is longer at the end of a segment than at its start."""
+    return (
+        planes[plane, 0] * (stop[0] - start[0])
+        + planes[plane, 1] * (stop[1] - start[1])
+        + planes[plane, 2] * (stop[2] - start[2])
+    )

@@ -2,13 +2,12 @@
 
 from bcppl.distributions.episodes.covariances import Hypothesis
 from bcppl.distributions.episodes.likelihood import ContactEpisodes
-from bcppl.distributions.episodes.linear_errors import (
+from bcppl.distributions.episodes.linear_errors import LinearError, LinearErrors
+from bcppl.distributions.episodes.nuisances import (
     ArmCompliance,
     Delay,
     Grasp,
     KinematicError,
-    LinearError,
-    LinearErrors,
     PartSlides,
     Size,
 )

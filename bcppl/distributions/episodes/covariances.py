@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bcppl.distributions.episodes.branches import Segments
 from bcppl.distributions.episodes.rows import EPISODE, FELT, FORCE, NOISE, TIME
-from bcppl.distributions.episodes.switching_filter import Segments
 
 
 class Hypothesis(NamedTuple):

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.checks import Check, chi_square
+from bcppl.distributions.episodes.branches import Branches, Prior, begun
 from bcppl.distributions.episodes.covariances import Hypothesis, RowErrors, segments_of
 from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.posterior import drawn, moments, probable_jumps
@@ -29,10 +30,9 @@ from bcppl.distributions.episodes.rows import (
     given_and_all,
     is_cut,
     is_predicted,
-    late,
     padded,
 )
-from bcppl.distributions.episodes.switching_filter import Branches, Prior, begun, filtered
+from bcppl.distributions.episodes.switching_filter import filtered
 from bcppl.distributions.manifold import FARTHEST, ContactManifold, Gaps, Quadratic
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 
@@ -294,17 +294,13 @@ class ContactEpisodes(ContactManifold):
 
     def _late(self, gaps: Gaps, rows: Tensor) -> tuple[Tensor, Tensor]:
         """The gaps' changes (N, D, R) by each delay, and (N, D, R, M) by the shared errors' parameters."""
-        count, delays = len(self.pose), list(self.bench.delays)
-        each = [late(rows, delay) for delay in delays]
-        effect = self.bench.effect(torch.cat([moved for moved, _ in each]))
-        offset, twist = (
-            part.unflatten(0, (len(delays), len(rows))) for part in (effect.offset, effect.twist)
-        )
+        by_delay, effect = self.bench.late_effects(rows)
         if not self.bench.errors:
-            return rows.new_zeros(count, 1, len(rows)), offset.expand(count, *offset.shape)
+            nothing = rows.new_zeros(len(self.pose), 1, len(rows))
+            return nothing, effect.offset.expand(len(self.pose), *effect.offset.shape)
         slope = _by_twist_of_peg(gaps.gradient(self.pose), self.pose, rows[:, :7])
-        by_errors = torch.einsum("nra,dram->ndrm", slope, twist) + offset
-        return torch.einsum("nra,dra->ndr", slope, torch.stack([twist for _, twist in each])), by_errors
+        by_errors = torch.einsum("nra,dram->ndrm", slope, effect.twist) + effect.offset
+        return torch.einsum("nra,dra->ndr", slope, by_delay), by_errors
 
     def _shift(self, gaps: Gaps, rows: Tensor, branches: Branches) -> Tensor:
         """The gaps' changes (N, R) by the delay and the shared errors, on average over hypotheses."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from bcppl.distributions.episodes.switching_filter import OUTLIER, Branches
+from bcppl.distributions.episodes.branches import OUTLIER, Branches
 
 
 def drawn(branches: Branches, draws: int) -> Tensor:

@@ -16,125 +16,17 @@ given that (assumed density filtering).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from bcppl.arrays import Array, Indices
-from bcppl.compiled import compiled
+from bcppl.arrays import Array
+from bcppl.compiled import compiled, summed
+from bcppl.distributions.episodes.branches import INLIER, KEPT, OUTLIER, Branches, Prior, Segments
 from bcppl.threads import parallel_sum, thread_count
 
-KEPT = 8  # hypotheses of a particle
-INLIER, OUTLIER = 0, 1  # what an episode is; from 2 on, after which jump
 _FAINT = 12.0  # nats below the most probable hypothesis, from which on one is dropped
 _CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
 _SURPRISING = 3.0  # standard deviations of a chi-square
-
-
-class Segments(NamedTuple):
-    """S segments of consecutive rows: an episode of contact, or one row without contact.
-
-    Attributes:
-        first, last: (S,) the index of a segment's first row, and that after its last.
-        contact: (S,) 1 for an episode.
-        factor: (H, R, n) of each hypothesis, rows of the Cholesky factors of the episodes' covariances, each
-            within its own segment; for a row without contact the first number is its standard deviation.
-    """
-
-    first: Indices
-    last: Indices
-    contact: Indices
-    factor: Array
-
-
-class Prior(NamedTuple):
-    """What holds before the first row.
-
-    Attributes:
-        log_weight, compliance, scale: (H,) of each hypothesis: its log-probability, the compliance of a
-            contact in m/N, and the factor of the shared errors' standard deviations.
-        delay: (H,) the place of its delay among those for which gaps are given.
-        mean, variance: (M,) of the parameters.
-        jump_log_probability: (J,) at each episode.
-        jump_variance: (J, M).
-        outlier: the probability that an episode, or a row without contact, is one.
-        farthest: m, the range over which an outlier's gap is spread evenly.
-    """
-
-    log_weight: Array
-    compliance: Array
-    scale: Array
-    delay: Indices
-    mean: Array
-    variance: Array
-    jump_log_probability: Array
-    jump_variance: Array
-    outlier: float
-    farthest: float
-
-
-class Branches(NamedTuple):
-    """The hypotheses of N particles after some rows.
-
-    Attributes:
-        number: (N,) how many there are; others are not used.
-        log_weight: (N, B) unnormalised: their sum is the likelihood of the rows so far.
-        which: (N, B) the hypothesis of the prior.
-        mean: (N, B, M) of the parameters.
-        covariance: (N, B, M, M).
-        event: (N, B, S) of each segment so far: `INLIER`, `OUTLIER`, or 2 plus the number of a jump.
-        squared: (N, B, S) squared whitened errors of an episode, as predicted; 0 without contact.
-    """
-
-    number: Indices
-    log_weight: Array
-    which: Indices
-    mean: Array
-    covariance: Array
-    event: Indices
-    squared: Array
-
-    @property
-    def log_evidence(self) -> Array:
-        """(N,) the log-likelihood of the rows so far."""
-        used = np.arange(self.log_weight.shape[1]) < self.number[:, None]
-        return np.asarray(np.logaddexp.reduce(np.where(used, self.log_weight, -np.inf), axis=1))
-
-    @property
-    def weights(self) -> Array:
-        """(N, B) normalised, 0 for those that are not used."""
-        used = np.arange(self.log_weight.shape[1]) < self.number[:, None]
-        shifted = np.where(used, self.log_weight, -np.inf) - self.log_evidence[:, None]
-        return np.asarray(np.exp(shifted))
-
-    @property
-    def trimmed(self) -> Branches:
-        """The same without what no particle uses."""
-        most = int(self.number.max(initial=1))
-        return Branches._make([self.number, *(np.ascontiguousarray(each[:, :most]) for each in self[1:])])
-
-
-def begun(prior: Prior, particles: int) -> Branches:
-    """The hypotheses of N particles before the first row."""
-    hypotheses, parameters = len(prior.log_weight), len(prior.mean)
-    size = max(KEPT, hypotheses)
-    count = np.full(particles, hypotheses)
-    log_weight, which = np.zeros((particles, size)), np.zeros((particles, size), dtype=np.int64)
-    log_weight[:, :hypotheses], which[:, :hypotheses] = prior.log_weight, np.arange(hypotheses)
-    mean = np.zeros((particles, size, parameters))
-    covariance = np.zeros((particles, size, parameters, parameters))
-    mean[:, :hypotheses] = prior.mean
-    for h in range(hypotheses):
-        covariance[:, h] = np.diag(prior.variance * prior.scale[h] ** 2)
-    none = np.zeros((particles, size, 0))
-    return Branches(count, log_weight, which, mean, covariance, none.astype(np.int64), none)
-
-
-def _with_room(each: Array | Indices, *sizes: int) -> Array | Indices:
-    """A copy of (N, B, ...) with the axes after the particles' grown to `sizes`; what is added is 0."""
-    grown: Array | Indices = np.zeros((len(each), *sizes, *each.shape[1 + len(sizes) :]), each.dtype)
-    grown[tuple(slice(size) for size in each.shape)] = each
-    return grown
 
 
 def filtered(
@@ -159,17 +51,26 @@ def filtered(
     """
     trust = np.ones_like(distance) if trust is None else trust
     new = len(segments.first)
-    branches = max(KEPT, before.log_weight.shape[1])
-    grown = [_with_room(each, branches) for each in before[1:-2]]
-    grown += [_with_room(each, branches, each.shape[2] + new) for each in before[-2:]]
-    after = Branches._make([before.number.copy(), *grown])
+    if not new:
+        return before
+    particles, (_, branches, known) = len(before.number), before.event.shape
+    size, parameters = (particles, max(KEPT, branches)), before.mean.shape[2]
+    # Memory that is only asked for: what no branch uses is never touched.
+    after = Branches(
+        before.number.copy(),
+        np.zeros(size),
+        np.zeros(size, np.int64),
+        np.zeros((*size, parameters)),
+        np.zeros((*size, parameters, parameters)),
+        np.zeros((*size, known + new), np.int64),
+        np.zeros((*size, known + new)),
+    )
 
     def work(begin: int, end: int) -> int:
-        _filter(begin, end, *after, prior, segments, distance, force, columns, trust)
+        _filter(begin, end, before, after, prior, segments, distance, force, columns, trust)
         return 0
 
-    if new:
-        parallel_sum(work, 0, len(before.number), 8, thread_count())
+    parallel_sum(work, 0, particles, 8, thread_count())
     return after
 
 
@@ -193,29 +94,30 @@ def _log_sum(a: float, b: float) -> float:
     return high + math.log1p(math.exp(low - high)) if low > -np.inf else high
 
 
-@compiled
+@summed
 def _times(covariance: Array, column: Array, product: Array) -> float:
     """Set `product` (M,) to a symmetric matrix times a column (M,); returns the column's square by it.
 
-    The inner loop is over neighbouring numbers, which the processor takes several at a time.
+    Of the matrix the lower triangle is read.
     """
     parameters, square = len(column), 0.0
     product[:] = 0.0
-    for b in range(parameters):
-        share = column[b]
-        if share != 0.0:
-            for a in range(parameters):
-                product[a] += share * covariance[b, a]
+    for a in range(parameters):
+        share, dot = column[a], 0.0
+        for b in range(a):
+            product[b] += share * covariance[a, b]
+            dot += covariance[a, b] * column[b]
+        product[a] += dot + share * covariance[a, a]
     for a in range(parameters):
         square += column[a] * product[a]
     return square
 
 
-@compiled
+@summed
 def _update(
     error: Array, columns: Array, factor: Array, mean: Array, covariance: Array, pull: Array
 ) -> tuple[float, float]:
-    """Condition the parameters on an episode's rows, in place.
+    """Condition the parameters on an episode's rows, in place; of the covariance the lower triangle.
 
     `error` (n,) and `columns` (n, M) are whitened in place by `factor` (n, n).
 
@@ -226,17 +128,20 @@ def _update(
     log_density, squared = 0.0, 0.0
     for i in range(count):
         for j in range(i):
-            error[i] -= factor[i, j] * error[j]
-            columns[i] -= factor[i, j] * columns[j]
+            share = factor[i, j]
+            error[i] -= share * error[j]
+            for a in range(parameters):
+                columns[i, a] -= share * columns[j, a]
         error[i] /= factor[i, i]
-        columns[i] /= factor[i, i]
+        for a in range(parameters):
+            columns[i, a] /= factor[i, i]
         innovation, variance = error[i], 1.0 + _times(covariance, columns[i], pull)
         for a in range(parameters):
             innovation += columns[i, a] * mean[a]
         for a in range(parameters):
             share = pull[a] / variance
             mean[a] -= share * innovation
-            for b in range(parameters):
+            for b in range(a + 1):
                 covariance[a, b] -= share * pull[b]
         squared += innovation * innovation / variance
         log_density -= 0.5 * math.log(variance) + math.log(factor[i, i])
@@ -247,13 +152,8 @@ def _update(
 def _filter(
     begin: int,
     end: int,
-    number: Indices,
-    log_weight: Array,
-    which: Indices,
-    mean: Array,
-    covariance: Array,
-    event: Indices,
-    squared: Array,
+    before: Branches,
+    after: Branches,
     prior: Prior,
     segments: Segments,
     distance: Array,
@@ -261,6 +161,7 @@ def _filter(
     columns: Array,
     trust: Array,
 ) -> None:
+    number, log_weight, which, mean, covariance, event, squared = after
     parameters, jumps, size = columns.shape[3], len(prior.jump_log_probability), log_weight.shape[1]
     new, longest = len(segments.first), segments.factor.shape[2]
     offset = event.shape[2] - new
@@ -275,9 +176,14 @@ def _filter(
     weight, source, kind = np.empty(most), np.empty(most, np.int64), np.empty(most, np.int64)
     square, means = np.empty(most), np.empty((most, parameters))
     covariances = np.empty((most, parameters, parameters))
-    error, column, pull = np.empty(longest), np.empty((longest, parameters)), np.empty(parameters)
+    error, whitened, pull = np.empty(longest), np.empty((longest, parameters)), np.empty(parameters)
     old_which, old_event, old_squared = which[0].copy(), event[0].copy(), squared[0].copy()
     for n in range(begin, end):
+        own = n if len(before.mean) > 1 else 0
+        for b in range(number[n]):
+            log_weight[n, b], which[n, b] = before.log_weight[own, b], before.which[own, b]
+            mean[n, b], covariance[n, b] = before.mean[own, b], before.covariance[own, b]
+            event[n, b, :offset], squared[n, b, :offset] = before.event[own, b], before.squared[own, b]
         for s in range(new):
             first, last = segments.first[s], segments.last[s]
             if segments.contact[s] == 0:
@@ -285,12 +191,12 @@ def _filter(
                     delay = prior.delay[which[n, b]]
                     if distance[n, delay, first] > _CLEAR:
                         continue
-                    own = columns[n, delay, first]
+                    column = columns[n, delay, first]
                     spread = segments.factor[which[n, b], first, 0]
                     gap, variance = distance[n, delay, first], spread * spread
-                    variance += _times(covariance[n, b], own, pull)
+                    variance += _times(covariance[n, b], column, pull)
                     for a in range(parameters):
-                        gap += own[a] * mean[n, b, a]
+                        gap += column[a] * mean[n, b, a]
                     root = math.sqrt(variance)
                     score = gap / root
                     positive = _log_ndtr(score)
@@ -301,7 +207,7 @@ def _filter(
                         bend = hazard * (hazard + score) / variance
                         for a in range(parameters):
                             mean[n, b, a] += pull[a] / root * hazard
-                            for c in range(parameters):
+                            for c in range(a + 1):
                                 covariance[n, b, a, c] -= pull[a] * pull[c] * bend
                 continue
             rows, found = last - first, 0
@@ -320,10 +226,11 @@ def _filter(
                         sunk = prior.compliance[h] * force[first + i]
                         share = trust[n, delay, first + i]
                         error[i] = share * (distance[n, delay, first + i] + sunk)
-                        column[i] = share * columns[n, delay, first + i]
+                        for a in range(parameters):
+                            whitened[i, a] = share * columns[n, delay, first + i, a]
                     log_density, square[found] = _update(
                         error[:rows],
-                        column[:rows],
+                        whitened[:rows],
                         segments.factor[h, first:last],
                         means[found],
                         covariances[found],
@@ -366,3 +273,7 @@ def _filter(
                 weight[c] = -np.inf
                 left += 1
             number[n] = left
+        for b in range(number[n]):
+            for a in range(parameters):
+                for c in range(a):
+                    covariance[n, b, c, a] = covariance[n, b, a, c]

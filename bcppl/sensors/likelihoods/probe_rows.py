@@ -15,8 +15,8 @@ from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, cell_ends
 from bcppl.contact.sensing.location import ContactSensing
+from bcppl.distributions.episodes.branches import Branches
 from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FELT, GIVEN, SECONDS, padded
-from bcppl.distributions.episodes.switching_filter import Branches
 from bcppl.distributions.manifold import Gaps, MeasuresGap
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors.measurements import Measurement

@@ -1,0 +1,112 @@
+"""The hypotheses that the filter over a probe's episodes carries for each particle, and what it is given."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bcppl.arrays import Array, Indices
+
+KEPT = 8  # hypotheses of a particle
+INLIER, OUTLIER = 0, 1  # what an episode is; from 2 on, after which jump
+
+
+class Segments(NamedTuple):
+    """S segments of consecutive rows: an episode of contact, or one row without contact.
+
+    Attributes:
+        first, last: (S,) the index of a segment's first row, and that after its last.
+        contact: (S,) 1 for an episode.
+        factor: (H, R, n) of each hypothesis, rows of the Cholesky factors of the episodes' covariances, each
+            within its own segment; for a row without contact the first number is its standard deviation.
+    """
+
+    first: Indices
+    last: Indices
+    contact: Indices
+    factor: Array
+
+
+class Prior(NamedTuple):
+    """What holds before the first row.
+
+    Attributes:
+        log_weight, compliance, scale: (H,) of each hypothesis: its log-probability, the compliance of a
+            contact in m/N, and the factor of the shared errors' standard deviations.
+        delay: (H,) the place of its delay among those for which gaps are given.
+        mean, variance: (M,) of the parameters.
+        jump_log_probability: (J,) at each episode.
+        jump_variance: (J, M).
+        outlier: the probability that an episode, or a row without contact, is one.
+        farthest: m, the range over which an outlier's gap is spread evenly.
+    """
+
+    log_weight: Array
+    compliance: Array
+    scale: Array
+    delay: Indices
+    mean: Array
+    variance: Array
+    jump_log_probability: Array
+    jump_variance: Array
+    outlier: float
+    farthest: float
+
+
+class Branches(NamedTuple):
+    """The hypotheses of N particles after some rows.
+
+    Attributes:
+        number: (N,) how many there are; others are not used.
+        log_weight: (N, B) unnormalised: their sum is the likelihood of the rows so far.
+        which: (N, B) the hypothesis of the prior.
+        mean: (N, B, M) of the parameters.
+        covariance: (N, B, M, M).
+        event: (N, B, S) of each segment so far: `INLIER`, `OUTLIER`, or 2 plus the number of a jump.
+        squared: (N, B, S) squared whitened errors of an episode, as predicted; 0 without contact.
+    """
+
+    number: Indices
+    log_weight: Array
+    which: Indices
+    mean: Array
+    covariance: Array
+    event: Indices
+    squared: Array
+
+    @property
+    def log_evidence(self) -> Array:
+        """(N,) the log-likelihood of the rows so far."""
+        used = np.arange(self.log_weight.shape[1]) < self.number[:, None]
+        return np.asarray(np.logaddexp.reduce(np.where(used, self.log_weight, -np.inf), axis=1))
+
+    @property
+    def weights(self) -> Array:
+        """(N, B) normalised, 0 for those that are not used."""
+        used = np.arange(self.log_weight.shape[1]) < self.number[:, None]
+        shifted = np.where(used, self.log_weight, -np.inf) - self.log_evidence[:, None]
+        return np.asarray(np.exp(shifted))
+
+    @property
+    def trimmed(self) -> Branches:
+        """The same without what no particle uses, and each particle's own."""
+        count, most = len(self.number), int(self.number.max(initial=1))
+        own = (np.broadcast_to(each[:, :most], (count, most, *each.shape[2:])) for each in self[1:])
+        return Branches._make([self.number, *map(np.ascontiguousarray, own)])
+
+
+def begun(prior: Prior, particles: int) -> Branches:
+    """The hypotheses of N particles before the first row."""
+    hypotheses, parameters = len(prior.log_weight), len(prior.mean)
+    size = max(KEPT, hypotheses)
+    # The same for all particles, and held once: an axis of one in place of theirs.
+    log_weight, which = np.zeros((1, size)), np.zeros((1, size), dtype=np.int64)
+    mean, covariance = np.zeros((1, size, parameters)), np.zeros((1, size, parameters, parameters))
+    log_weight[0, :hypotheses], which[0, :hypotheses] = prior.log_weight, np.arange(hypotheses)
+    mean[:, :hypotheses] = prior.mean
+    for h in range(hypotheses):
+        covariance[0, h] = np.diag(prior.variance * prior.scale[h] ** 2)
+    none = np.zeros((1, size, 0))
+    count = np.full(particles, hypotheses)
+    return Branches(count, log_weight, which, mean, covariance, none.astype(np.int64), none)
