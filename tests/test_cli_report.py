@@ -5,14 +5,16 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from bcppl import poses
 from bcppl.beliefs import Belief
-from bcppl.cli.report import result
+from bcppl.cli.report import relative_to_peg, result
 from tests.command_line import short
 from tests.made_recordings import assert_one_sentence
+from tests.test_contact_episodes import probed
 
 TRUTH = torch.as_tensor(short(1).truth, dtype=torch.float64)
 
@@ -51,3 +53,19 @@ def test_without_the_truth_the_standard_deviations() -> None:
 def test_too_few_particles_have_no_region() -> None:
     line = result(around(TRUTH, 0.001, 4), replace(short(1), truth=TRUTH.numpy()))
     assert "too few for a 90 % credible region" in line and "inf" not in line
+
+
+def test_the_pose_relative_to_the_held_peg_is_that_at_its_last_measured_pose() -> None:
+    """A peg that is off in the hand by as much as the belief is wide: relative to it the part is sure."""
+    recording, belief = probed(100), around(TRUTH, 0.001)
+    pegs = np.concatenate([m.observation.world_from_peg for m in recording.measurements])
+    last = torch.from_numpy(pegs[-1])
+
+    def sure(at: torch.Tensor, draws: int) -> torch.Tensor:
+        assert torch.equal(at, last)
+        return TRUTH.expand(len(belief), draws, 7)
+
+    relative = relative_to_peg(replace(belief, apparent=sure), recording)
+    assert relative is not None and float(relative.spread.max()) < 1e-9
+    assert relative_to_peg(belief, recording) is None
+    assert relative_to_peg(replace(belief, apparent=sure), short(1)) is None, "no peg is held"

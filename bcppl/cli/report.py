@@ -116,6 +116,11 @@ class Report:
             )
         return found
 
+    def relative_deviations(self) -> list[float] | None:
+        """Standard deviations (6,) of the part's pose relative to the held peg, m and rad, if others."""
+        relative = relative_to_peg(self.steps[-1].belief, self.recording)
+        return None if relative is None else relative.spread.tolist()
+
     def _warn(self, sentence: str) -> None:
         self.console.print(sentence, style="yellow", markup=False)
 
@@ -136,13 +141,18 @@ class Report:
             box=None,
             pad_edge=False,
         )
-        for name in ("axis", "mean", "standard deviation"):
+        spreads = {"standard deviation": spread}
+        if (relative := self.relative_deviations()) is not None:
+            spreads["relative to the held peg"] = relative
+        for name in ("axis", "mean", *spreads):
             table.add_column(name, justify="left" if name == "axis" else "right")
         for k, axis in enumerate("xyz"):
-            table.add_row(axis, f"{1e3 * mean[k]:.3f} mm", f"{1e3 * spread[k]:.3f} mm")
-        for k, axis in enumerate("xyz"):
+            each = [f"{1e3 * values[k]:.3f} mm" for values in spreads.values()]
+            table.add_row(axis, f"{1e3 * mean[k]:.3f} mm", *each)
+        for k, axis in enumerate("xyz", 3):
             name = f"turn about the part's {axis}, from the guess"
-            table.add_row(name, f"{turned[k]:.3f}°", f"{math.degrees(spread[3 + k]):.3f}°")
+            each = [f"{math.degrees(values[k]):.3f}°" for values in spreads.values()]
+            table.add_row(name, f"{turned[k - 3]:.3f}°", *each)
         return table
 
     def _effort(self) -> str:
@@ -153,6 +163,13 @@ class Report:
             simulated = f", {sum(e.amount for e in efforts):.0f} s simulated" if name == "physics" else ""
             spent.append(f"{name} {seconds:.2f} s ({items} {UNITS.get(name, 'items')}{simulated})")
         return ", ".join(spent)
+
+
+def relative_to_peg(belief: Belief, recording: Recording) -> Belief | None:
+    """The belief as seen from the held peg at its last pose; None where the peg is where it is measured."""
+    each = (getattr(m.observation, "world_from_peg", ()) for m in recording.measurements)
+    stood = [poses_of_window[-1] for poses_of_window in each if len(poses_of_window)]
+    return None if belief.apparent is None or not stood else belief.relative(stood[-1])
 
 
 def result(belief: Belief, recording: Recording) -> str:

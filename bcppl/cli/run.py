@@ -84,7 +84,7 @@ def run(
     finally:
         # Whatever stopped the run, what was computed is shown and kept.
         if report.steps:
-            folder.note(warnings=report.finish())
+            folder.note(warnings=report.finish(), relative_to_peg=report.relative_deviations())
             folder.draw(report.steps)
             console.print(f"beliefs and figures are in {path}")
     if explain:

@@ -93,7 +93,7 @@ class Branches(NamedTuple):
         """The same without what no particle uses, and each particle's own."""
         count, most = len(self.number), int(self.number.max(initial=1))
         own = (np.broadcast_to(each[:, :most], (count, most, *each.shape[2:])) for each in self[1:])
-        return Branches._make([self.number, *map(np.ascontiguousarray, own)])
+        return Branches._make([self.number, *(np.array(each, order="C") for each in own)])
 
 
 def begun(prior: Prior, particles: int) -> Branches:
