@@ -167,8 +167,8 @@ class Report:
 
 def relative_to_peg(belief: Belief, recording: Recording) -> Belief | None:
     """The belief as seen from the held peg at its last pose; None where the peg is where it is measured."""
-    each = (getattr(m.observation, "world_from_peg", ()) for m in recording.measurements)
-    stood = [poses_of_window[-1] for poses_of_window in each if len(poses_of_window)]
+    each = (getattr(m.observation, "world_from_peg", None) for m in recording.measurements)
+    stood = [window[-1] for window in each if window is not None and len(window)]
     return None if belief.apparent is None or not stood else belief.relative(stood[-1])
 
 
