@@ -23,6 +23,7 @@ _MOVED = 0.001  # m between rows without one
 _FORCE, _SHARE = 1.5, 0.3  # N, and of the force, by which it changes within a row
 _RESTING, _SLIDING = 0.01, 0.02  # m/s: below the one a peg rests, above the other it slides
 _FRICTION = 0.5  # a peg that slides moves across its force by so much more than along it
+_ASKEW = 0.3  # of an acceleration may be felt in any direction: the tool turns, and its mass lies elsewhere
 _SMOOTH = 0.01  # s to either side of a stamp, over which velocity and acceleration are estimated
 # s without contact that end an episode. Where a peg comes to rest or begins to slide another begins, and in
 # each cell: an episode is an outlier as a whole.
@@ -171,9 +172,9 @@ class EpisodeExtractor:
         breaks = np.flatnonzero(np.diff(time) > 1.5 * self.step) + 1
         for part in np.split(np.arange(len(time)), breaks):
             velocity, acceleration = self._derivatives(pose[part, :3])
-            inertial = self._largest_since(np.linalg.norm(acceleration, axis=1))
-            felt[part] = self.detector(torch.from_numpy(force[part]), inertial, self.step).numpy()
             world = Rotation.from_quat(pose[part][:, [4, 5, 6, 3]]).apply(np.nan_to_num(force[part]))
+            inertial = self._inertial(acceleration, world)
+            felt[part] = self.detector(torch.from_numpy(force[part]), inertial, self.step).numpy()
             size = np.linalg.norm(world, axis=1)
             pace[part] = whole = np.linalg.norm(velocity, axis=1)
             along = np.abs(np.einsum("ij,ij->i", velocity, world)) / np.maximum(size, 1e-9)
@@ -181,11 +182,22 @@ class EpisodeExtractor:
             speed[part] = np.where(felt[part] == 1.0, np.maximum(along - _FRICTION * across, 0.0), whole)
         return felt, speed, pace
 
-    def _largest_since(self, acceleration: Array) -> Tensor:
-        """(T,) the largest of the accelerations that may be felt at each stamp: the wrench may be late."""
-        late = round(self.delays[-1] / self.step) if self.delays else 0
-        seen = np.pad(acceleration, (late, 0), mode="edge")
-        return torch.from_numpy(np.lib.stride_tricks.sliding_window_view(seen, late + 1).max(axis=1))
+    def _inertial(self, acceleration: Array, force: Array) -> Tensor:
+        """(T,) the largest acceleration (m/s^2) that may be felt at each stamp, of (T, 3) in the world.
+
+        A wrench that may be late feels one of those before, against which the tool's inertia acts: the force
+        (T, 3) has a direction, and only what it opposes counts in full.
+        """
+        size = np.linalg.norm(acceleration, axis=1)
+        if not self.delays:
+            return torch.from_numpy(size)
+        late = round(self.delays[-1] / self.step)
+        seen = np.pad(acceleration, ((late, 0), (0, 0)), mode="edge")
+        windows = np.lib.stride_tricks.sliding_window_view(seen, late + 1, axis=0)  # (T, 3, K)
+        direction = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-9)
+        opposed = -np.einsum("tak,ta->tk", windows, direction)
+        largest = np.linalg.norm(windows, axis=1).max(axis=1)
+        return torch.from_numpy(np.maximum(opposed.max(axis=1), _ASKEW * largest))
 
     def _derivatives(self, place: Array) -> tuple[Array, Array]:
         """Velocity and acceleration (T, 3) of a peg at (T, 3), by parabolas."""
