@@ -172,8 +172,8 @@ class Bench:
         return moved_by(population, shipped("part"), POSTERIOR, 20).population
 
 
-def simulated() -> tuple[Truth, Tensor]:
-    """A truth from the prior, and the rows of the design where it is touched."""
+def simulated(jumps: bool = True) -> tuple[Truth, Tensor]:
+    """A truth from the prior, with or without what slips and slides, and the rows where it is touched."""
     bench = Bench()
     pose = NormalPose(CENTER, SPREAD).sample()
     site = bench.site(pose[None], ROWS)
@@ -185,7 +185,7 @@ def simulated() -> tuple[Truth, Tensor]:
     each, now = [], value
     for _ in range(len(ROWS) // len(FORCES)):
         which = int(torch.multinomial(torch.cat([probabilities, 1.0 - probabilities.sum()[None]]), 1))
-        if which < len(probabilities):
+        if jumps and which < len(probabilities):
             jumped = hypothesis.scale * errors.jumps[which].variances.sqrt()
             now = now + jumped * torch.randn(len(now), dtype=torch.float64)
         each.append(now)
