@@ -18,6 +18,7 @@ from scenes import (
     default_run,
     every,
     followed,
+    model,
     moment_of,
     one_line,
     quantile,
@@ -35,7 +36,7 @@ from bcppl.inference.proposals import drift
 from bcppl.inference.proposals.coordinates import continuous_addresses
 from bcppl.inference.proposals.walk import joint_drift
 from bcppl.inference.resampling import adaptive, systematic
-from bcppl.models import look_and_touch, peg_in_hole
+from bcppl.models import peg_in_hole
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.sensors import Recording, View
 
@@ -71,7 +72,6 @@ def walked(pose: str) -> Kernel:
 
 def by_walks(recording: Recording, particles: int, seed: int) -> Iterator[Step]:
     """The same model, its likelihoods tempered, its particles moved by random walks alone."""
-    model = look_and_touch.model
     step = tempered(walked(model.pose), sweeps=SWEEPS, resample=adaptive(systematic, 0.5))
     return smc(model, recording, step=step, particles=particles, seed=seed)
 
@@ -92,7 +92,7 @@ def by_contacts(recording: Recording, particles: int, seed: int) -> Iterator[Ste
 
 def without_free_space(recording: Recording, particles: int, seed: int) -> Iterator[Step]:
     """Stamps without contact do not count."""
-    scene = look_and_touch.prepare(recording, free_space=False)
+    scene = model.prepare(recording, free_space=False)
     return default_run(recording, particles, seed, scene)
 
 

@@ -27,6 +27,7 @@ from foreign_world import CONTACTS, MANNERS, RATES, kept, scene_of
 from jobs import each
 from kept import added, recorded
 from report import Row, finish, options, show
+from scenes import model
 
 import bcppl
 from bcppl.beliefs import Belief, rotation_deviation, translation_deviation
@@ -104,9 +105,7 @@ def inferred(case: Case, particles: int, folder: Path | None) -> Result:
     try:
         with warnings.catch_warnings(record=True) as given:
             warnings.simplefilter("always", RuntimeWarning)
-            run = bcppl.infer(
-                bcppl.models.look_and_touch.model, recording, particles=particles, seed=case.inference
-            )
+            run = bcppl.infer(model, recording, particles=particles, seed=case.inference)
             steps = list(run)
     except Exception as error:  # one scene that fails is one result, not the end of the benchmark
         nothing = (False,) * len(HELD)
@@ -118,7 +117,7 @@ def inferred(case: Case, particles: int, folder: Path | None) -> Result:
     seconds = time.perf_counter() - begun
     checks = PredictiveChecks()
     marked = [checks.cell(step).endswith(MARK) for step in steps]
-    warned = any(marked) or bool(checks.warnings(steps[-1], bcppl.models.look_and_touch.model.pose))
+    warned = any(marked) or bool(checks.warnings(steps[-1], model.pose))
     warned |= any(issubclass(warning.category, RuntimeWarning) for warning in given)
     views = [step for step in steps if step.info.label.startswith("view")]
     seen, end = views[-1].belief, steps[-1].belief

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from foreign_faults import part_mirrored, part_moved, part_turned, truth_outside
 from report import Row, finish, options, show
-from scenes import PARTICLES, followed
+from scenes import PARTICLES, followed, model
 from touches import LOGS, pushes
 
 from bcppl import poses
@@ -31,14 +31,14 @@ from bcppl.geometry.parts import Piece
 from bcppl.inference.criticism.hypotheses import DECISIVE
 from bcppl.inference.filters.default import infer
 from bcppl.inference.filters.smc import Step
-from bcppl.models import load_recording, look_and_touch, part_in_view, point_probe
+from bcppl.models import load_recording, part_in_view, point_probe
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.recordings import Recording
 from bcppl.traces import Model
 
 SYMMETRIC = 0.001  # m: a mesh that is so near to the part's is the part's
 SILENT = 0.03  # the largest share of scenes without a fault that are warned of
-SHIPPED = {"peg_probe": look_and_touch.model, "point_probe_10_pushes": point_probe.model}
+SHIPPED = {"peg_probe": model, "point_probe_10_pushes": point_probe.model}
 
 
 class Outcome(NamedTuple):
@@ -143,7 +143,7 @@ def main() -> None:
         if recording is None:
             continue
         truth = recording.truth
-        good = judged(steps, look_and_touch.model, recording, truth)
+        good = judged(steps, model, recording, truth)
         note("no fault", seed, good)
         for name, (fault, _) in FAULTS.items():
             if name not in arguments.only:
@@ -155,7 +155,7 @@ def main() -> None:
                 continue
             if symmetric(recording, faulty):
                 continue
-            one = outcome(look_and_touch.model, faulty, truth, seed)
+            one = outcome(model, faulty, truth, seed)
             if name in MESHES and good.log_evidence - one.log_evidence < DECISIVE:
                 name = f"{name}{UNDECIDED}"
             note(name, seed, one)
@@ -171,9 +171,9 @@ def main() -> None:
             )
             decided = apart - one.log_evidence > DECISIVE
             note(PUSHES if decided else f"{PUSHES}{UNDECIDED}", seed, one)
-    for name, model in SHIPPED.items():
+    for name, of in SHIPPED.items():
         shipped = load_recording(name)
-        note(f"shipped {name}", 0, outcome(model, shipped, shipped.truth, 0))
+        note(f"shipped {name}", 0, outcome(of, shipped, shipped.truth, 0))
 
     show("warnings", ["case", "seed", "off mm", "spread mm", "warnings"], lines)
     words = {**{name: said for name, (_, said) in FAULTS.items()}, VIEWS: "moved", PUSHES: "moved"}

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from report import Row, cores, finish, options, show
 from rich.console import Console
-from scenes import PARTICLES, default_run, every, one_line
+from scenes import PARTICLES, default_run, every, model, one_line
 from scipy.stats import binomtest
 
 from bcppl import poses
@@ -28,7 +28,6 @@ from bcppl.inference.planning.candidate_layout import MIXED, plan_candidates
 from bcppl.inference.planning.insertion import insertion_plan
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.inference.planning.success import success_probability
-from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
 from bcppl.sensors.candidates import Candidate

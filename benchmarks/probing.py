@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from report import Row, cores, finish, options, show
 from rich.console import Console
-from scenes import PARTICLES, default_run, every, one_line, quantile
+from scenes import PARTICLES, default_run, every, model, one_line, quantile
 
 from bcppl.beliefs import Belief
 from bcppl.contact.touch import Touch
@@ -37,7 +37,6 @@ from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.candidate_layout import MIXED, plan_candidates
 from bcppl.inference.planning.faces import points_on_top, sides
 from bcppl.inference.planning.touching import SurfacePoint, touch
-from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
 from bcppl.sensors.candidates import Candidate, name_of

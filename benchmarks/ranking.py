@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from report import Row, cores, finish, options, show
+from scenes import model
 from scipy.stats import spearmanr
 from torch import Tensor
 
@@ -29,7 +30,6 @@ from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import systematic
-from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import bench_scene
 from bcppl.robot.plan import Plan, probe_of
 from bcppl.sensors.candidates import action_of

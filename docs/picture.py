@@ -11,7 +11,8 @@ import bcppl
 PICTURE = Path(__file__).with_name("belief.png")
 
 recording = bcppl.models.load_recording("peg_probe")
-steps = list(bcppl.infer(bcppl.models.look_and_touch.model, recording, particles=75, seed=0))
+model = bcppl.models.look_and_touch.model.with_settings(profile="perfect")  # of this simulated bench
+steps = list(bcppl.infer(model, recording, particles=75, seed=0))
 shown = {"prior": steps[0], "after two depth images": steps[2], "after 6 s of contact": steps[-1]}
 beliefs = [
     (title, step.belief.world_from_part.numpy(), step.belief.log_weights.numpy())

@@ -16,7 +16,6 @@ from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.planning.metrology import three_two_one
-from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench import bench_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
@@ -63,7 +62,7 @@ def test_touches_after_vision_are_those_of_one_run_to_the_bit(seen):
     whole = scene.probe(three_two_one(vision[-1].belief, scene.part, scene.peg))
     felt = replace(whole, measurements=whole.measurements[:9])  # 3.5 s: the first contacts are among them
     touched = list(scenes.default_run(felt, FEW, 0, start=vision[-1]))
-    straight = list(infer(model, felt, particles=FEW, seed=0))
+    straight = list(infer(scenes.model, felt, particles=FEW, seed=0))
     assert len(vision) + len(touched) == len(straight)
     for one, other in zip([*vision, *touched], straight, strict=True):
         assert torch.equal(one.belief.world_from_part, other.belief.world_from_part)

@@ -137,6 +137,7 @@ def test_quadratic_of_an_uncertain_compliance_has_the_likelihood_s_own_moments()
 
 # ---------------------------------------------------------------- rows of a probe
 
+PERFECT = look_and_touch.model.with_settings(profile="perfect")
 LONG, HIGH = 0.05, 0.025
 
 
@@ -224,7 +225,7 @@ def test_the_likelihood_does_not_depend_on_how_a_probe_is_cut(rate: int) -> None
 
 
 def information_at(rate: int) -> Tensor:
-    sensor, values = values_of(probed(rate))
+    sensor, values = values_of(probed(rate), PERFECT)
     pose = poses.identity(1)
     every = sum((sensor.site(action, pose).quadratic(value).information[0] for action, value in values))
     assert isinstance(every, Tensor)

@@ -21,7 +21,7 @@ from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.inference.planning.insertion import insertion_plan
-from bcppl.models.look_and_touch import model
+from bcppl.models import look_and_touch
 from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
 from bcppl.models.worlds.bench_arm import BenchArm
 from bcppl.recordings import Recording, View, problems
@@ -29,6 +29,7 @@ from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.candidates import Candidate, duration_of, name_of
 from tests.made_recordings import assert_one_sentence
 
+model = look_and_touch.model.with_settings(profile="perfect")
 PARTICLES = 30
 
 

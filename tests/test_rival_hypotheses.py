@@ -18,7 +18,7 @@ from bcppl.geometry.parts import Part
 from bcppl.inference.criticism import explanations
 from bcppl.inference.criticism.hypotheses import VERY_STRONG
 from bcppl.inference.criticism.rival_hypotheses import approximated, log_evidence
-from bcppl.models.look_and_touch import model
+from bcppl.models import look_and_touch
 from bcppl.recordings import Guess, Measurement, Probe, ProbeWindow, Recording
 from bcppl.sensors.altered import (
     with_peg_along,
@@ -28,6 +28,7 @@ from bcppl.sensors.altered import (
     with_wrench_reversed,
 )
 
+model = look_and_touch.model.with_settings(profile="perfect")
 PART, PEG = block((0.05, 0.04, 0.02)), box_peg(0.014, 0.06, 0.010)
 RATE, STEP = 0.01, 50
 # Where the peg's tip is pressed against the block: a point and the outward normal; twice on two sides.

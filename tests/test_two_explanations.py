@@ -31,6 +31,7 @@ from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.scene import Scene
 from tests.checked_pairs import run_checked
 
+MODEL = look_and_touch.model.with_settings(profile="perfect")
 APART, THICK, HIGH, WIDE = 0.012, 0.004, 0.01, 0.004  # m: of the ridges, and of the peg
 LENGTH, DEEP = 0.05, 0.006  # m: the peg, and how far below the ridges' tops its tip is
 TOUCHED, SPEED = 0.3, 0.007  # s from which the peg, moving along x at so many m/s, is held up
@@ -76,7 +77,7 @@ def shares(world_from_part: Tensor, weights: Tensor) -> tuple[float, float]:
 
 def window_of(recording: Recording) -> tuple[Any, Approximated]:
     """The likelihood of touches, and the window with its observed value."""
-    scene = look_and_touch.prepare(recording)
+    scene = MODEL.prepare(recording)
     value = scene.observed(recording.measurements)["touch_0"]
     return scene.likelihoods["window"], Approximated(0, recording.measurements[0].action, value)
 
@@ -203,7 +204,7 @@ def test_the_contact_may_be_elsewhere_where_the_part_is_not_known_to_half_a_mill
 def test_the_belief_holds_both_alike() -> None:
     held = []
     for seed in range(6):
-        *_, last = infer(look_and_touch.model, touched(), particles=75, seed=seed)
+        *_, last = infer(MODEL, touched(), particles=75, seed=seed)
         held.append(shares(last.belief.world_from_part, last.belief.weights))
     inner, outer = np.array(held).T
     assert float(np.min(inner + outer)) > 0.9, held
@@ -212,5 +213,5 @@ def test_the_belief_holds_both_alike() -> None:
 
 
 def test_the_backward_kernel_leads_back_from_both() -> None:
-    *_, last = run_checked(look_and_touch.model, touched(), particles=20)
+    *_, last = run_checked(MODEL, touched(), particles=20)
     assert np.isfinite(last.info.log_evidence)

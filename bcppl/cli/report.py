@@ -166,10 +166,18 @@ class Report:
 
 
 def relative_to_peg(belief: Belief, recording: Recording) -> Belief | None:
-    """The belief as seen from the held peg at its last pose; None where the peg is where it is measured."""
+    """The belief as seen from the held peg, turned as it was last, with its tip at the part's frame.
+
+    None where the peg is where it is measured, or has touched nothing.
+    """
     each = (getattr(m.observation, "world_from_peg", None) for m in recording.measurements)
     stood = [window[-1] for window in each if window is not None and len(window)]
-    return None if belief.apparent is None or not stood else belief.relative(stood[-1])
+    if belief.apparent is None or recording.peg is None or not stood:
+        return None
+    peg = torch.as_tensor(stood[-1], dtype=torch.float64).clone()
+    tip = torch.tensor([0.0, 0.0, recording.peg.vertices[:, 2].min()], dtype=torch.float64)
+    peg[:3] = belief.mean[:3] - poses.rotation_matrix(peg) @ tip
+    return belief.relative(peg)
 
 
 def result(belief: Belief, recording: Recording) -> str:

@@ -45,5 +45,5 @@ class Model:
     inference: tuple[str, Mapping[str, Any]] = ("tempered_smc", MappingProxyType({}))
 
     def with_settings(self, **settings: Any) -> Model:
-        """The model whose scenes are prepared with settings, such as `profile="ur5e"` of `look_and_touch`."""
+        """The model with settings of its scenes, such as `profile="panda"` of `look_and_touch`."""
         return replace(self, prepare=partial(self.prepare, **settings))

@@ -77,7 +77,7 @@ class TouchSettings:
     gap_outlier: float = 0.001
     contact_detector: ContactDetector = field(default_factory=ContactDetector)
     free_space: bool = True
-    profile: str = "perfect"
+    profile: str = "ur5e"
     bench: tuple[LinearError, ...] | None = None
 
     def __post_init__(self) -> None:
