@@ -17,6 +17,7 @@ from bcppl import poses
 from bcppl.distributions.checks import Check, chi_square
 from bcppl.distributions.episodes.branches import Branches, Prior, begun
 from bcppl.distributions.episodes.covariances import Hypothesis, RowErrors, segments_of
+from bcppl.distributions.episodes.displaced import displaced
 from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.posterior import drawn, moments, probable_jumps
 from bcppl.distributions.episodes.rows import (
@@ -293,14 +294,7 @@ class ContactEpisodes(ContactManifold):
         )
 
     def _late(self, gaps: Gaps, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """The gaps' changes (N, D, R) by each delay, and (N, D, R, M) by the shared errors' parameters."""
-        by_delay, effect = self.bench.late_effects(rows)
-        if not self.bench.errors:
-            nothing = rows.new_zeros(len(self.pose), 1, len(rows))
-            return nothing, effect.offset.expand(len(self.pose), *effect.offset.shape)
-        slope = _by_twist_of_peg(gaps.gradient(self.pose), self.pose, rows[:, :7])
-        by_errors = torch.einsum("nra,dram->ndrm", slope, effect.twist) + effect.offset
-        return torch.einsum("nra,dra->ndr", slope, by_delay), by_errors
+        return displaced(gaps, self.pose, rows, self.bench)
 
     def _shift(self, gaps: Gaps, rows: Tensor, branches: Branches) -> Tensor:
         """The gaps' changes (N, R) by the delay and the shared errors, on average over hypotheses."""
@@ -363,21 +357,3 @@ class ContactEpisodes(ContactManifold):
         if self.blur:
             prior = prior._replace(outlier=0.0)
         return moments(self._filtered(begun(prior, len(self.pose)), prior, rows, free=True))
-
-
-def _by_twist_of_peg(gradient: Tensor, part: Tensor, peg: Tensor) -> Tensor:
-    """Derivatives (N, R, 6) of gaps by the peg's displacement along its axes and rotation about them.
-
-    Args:
-        gradient: (N, R, 6) by those of the part, as of `Gap.gradient`.
-        part: (N, 7) world_from_part.
-        peg: (R, 7) world_from_peg.
-    """
-    rotation = poses.rotation_matrix(part)
-    normal = -gradient[..., :3]
-    # The moment of the normal at the witness point, about the peg's origin, along the world's axes.
-    about_part = -(gradient[..., 3:] @ rotation.transpose(-1, -2))
-    apart = part[:, None, :3] - peg[:, :3]
-    moment = about_part + torch.linalg.cross(apart, normal)
-    into_peg = poses.rotation_matrix(peg)
-    return torch.cat([torch.einsum("nra,rab->nrb", each, into_peg) for each in (normal, moment)], dim=-1)

@@ -1,0 +1,45 @@
+"""Gaps of a peg that is not where it was measured: by a late clock, and by what all touches share."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.distributions.episodes.linear_errors import LinearErrors
+from bcppl.distributions.manifold import Gaps
+
+
+def displaced(gaps: Gaps, pose: Tensor, rows: Tensor, bench: LinearErrors) -> tuple[Tensor, Tensor]:
+    """The gaps' changes (N, D, R) by each delay, m, and (N, D, R, M) by the shared errors' parameters.
+
+    Args:
+        gaps: (N, R), at the pegs as measured.
+        pose: (N, 7) world_from_part.
+        rows: (R, COLUMNS).
+        bench: the errors that all touches share.
+    """
+    by_delay, effect = bench.late_effects(rows)
+    if not bench.errors:
+        return rows.new_zeros(len(pose), 1, len(rows)), effect.offset.expand(len(pose), *effect.offset.shape)
+    slope = _by_twist_of_peg(gaps.gradient(pose), pose, rows[:, :7])
+    by_errors = torch.einsum("nra,dram->ndrm", slope, effect.twist) + effect.offset
+    return torch.einsum("nra,dra->ndr", slope, by_delay), by_errors
+
+
+def _by_twist_of_peg(gradient: Tensor, part: Tensor, peg: Tensor) -> Tensor:
+    """Derivatives (N, R, 6) of gaps by the peg's displacement along its axes and rotation about them.
+
+    Args:
+        gradient: (N, R, 6) by those of the part, as of `Gap.gradient`.
+        part: (N, 7) world_from_part.
+        peg: (R, 7) world_from_peg.
+    """
+    rotation = poses.rotation_matrix(part)
+    normal = -gradient[..., :3]
+    # The moment of the normal at the witness point, about the peg's origin, along the world's axes.
+    about_part = -(gradient[..., 3:] @ rotation.transpose(-1, -2))
+    apart = part[:, None, :3] - peg[:, :3]
+    moment = about_part + torch.linalg.cross(apart, normal)
+    into_peg = poses.rotation_matrix(peg)
+    return torch.cat([torch.einsum("nra,rab->nrb", each, into_peg) for each in (normal, moment)], dim=-1)
