@@ -11,14 +11,15 @@ their errors are correlated: a bias common to all of them is one draw, not many.
 twenty lies beyond two standard errors by chance: --confirm runs those without a stated reason again, with
 other seeds, and prints both. With --file cells are written as they are done, and a later call adds those that
 are missing. With --limit a cell is left out, and its row says so, where a run with fewer particles took
-longer than that.
+longer than that. With --recorded nothing is run: each cell of the file is shown with as many runs as it has.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from itertools import chain
 from pathlib import Path
@@ -212,8 +213,44 @@ def with_more(file: Path | None, limit: float, cells: list[Cell]) -> list[Outcom
     return outcomes
 
 
-def reason(cell: Cell, file: Path | None) -> str:
-    """Why a kernel is biased: as stated, or what a cell with other seeds, if any, gives."""
+@cache
+def cells_of(file: Path) -> Mapping[tuple[str, str, int], Mapping[tuple[int, ...], Outcome]]:
+    """What a file holds, by problem, kernel and number of particles, and by seeds."""
+    held: dict[tuple[str, str, int], dict[tuple[int, ...], Outcome]] = {}
+    for line in file.read_text(encoding="utf-8").splitlines():
+        (problem, kernel, particles, seeds), outcome = json.loads(line)
+        held.setdefault((problem, kernel, particles), {})[tuple(seeds)] = Outcome(*outcome)
+    return held
+
+
+def as_recorded(file: Path, cells: list[Cell]) -> list[Outcome | float]:
+    """As `with_more`, from a file alone: of each cell the most runs that begin with its first seed."""
+    outcomes: list[Outcome | float] = []
+    longest = 0.0
+    for cell in cells:
+        runs = cells_of(file).get(cell[:3], {})
+        own = [outcome for seeds, outcome in runs.items() if seeds[0] == cell.seeds[0]]
+        if not own:
+            outcomes.append(longest)
+            continue
+        most = max(own, key=lambda outcome: len(outcome.errors))
+        longest = max(longest, most.seconds / len(most.errors))
+        outcomes.append(most)
+    return outcomes
+
+
+def second_opinion(cell: Cell, file: Path | None, first: int) -> Outcome | None:
+    """The cell with its own seeds; without any, the most runs of a file that do not begin with the first."""
+    if cell.seeds:
+        known = recorded(file, cell)
+        return Outcome(*(known or added(file, cell, partial(measured, cell))))
+    runs = {} if file is None or not file.exists() else cells_of(file).get(cell[:3], {})
+    others = [outcome for seeds, outcome in runs.items() if seeds[0] != first]
+    return max(others, key=lambda outcome: len(outcome.errors), default=None)
+
+
+def reason(cell: Cell, file: Path | None, first: int) -> str:
+    """Why a kernel is biased: as stated, or what a cell with other seeds than the first ones gives."""
     if cell.kernel in REASONS:
         return REASONS[cell.kernel]
     axes = problem_named(cell.problem).dimension
@@ -224,11 +261,12 @@ def reason(cell: Cell, file: Path | None) -> str:
         return WIDE
     if cell.particles < 1000:
         return FEW
-    if not cell.seeds:
+    opinion = second_opinion(cell, file, first)
+    if opinion is None:
         return "unexplained"
-    again = summary(Outcome(*(recorded(file, cell) or added(file, cell, partial(measured, cell)))))
+    again = summary(opinion)
     found = {"": "chance, ", "variance": "variance, ", "biased": "unexplained, "}[again.verdict]
-    return f"{found}{len(cell.seeds)} other seeds give {again.bias:+.3f} ± {again.error:.3f}"
+    return f"{found}{len(opinion.errors)} other seeds give {again.bias:+.3f} ± {again.error:.3f}"
 
 
 def main() -> None:
@@ -243,7 +281,10 @@ def main() -> None:
         "--limit", type=float, default=math.inf, help="seconds that a run with fewer particles may take"
     )
     parser.add_argument("--file", type=Path, help="where the outcome of each cell is kept")
+    parser.add_argument("--recorded", action="store_true", help="show what --file holds, and run nothing")
     arguments = parser.parse_args()
+    if arguments.recorded and not (arguments.file and arguments.file.exists()):
+        parser.error("--recorded shows what --file holds; give a file that exists.")
     torch.set_num_threads(1)
     problems, kernels, counts, runs = (
         (list(PROBLEMS)[:4], ["drift", "hmc"], [75], 5)
@@ -253,7 +294,10 @@ def main() -> None:
     seeds = tuple(range(arguments.seed, arguments.seed + runs))
     others = tuple(range(arguments.seed + runs, arguments.seed + runs + arguments.confirm))
     kernels_on = [[Cell(p, k, n, seeds) for n in sorted(counts)] for p in problems for k in kernels]
-    outcomes = each(partial(with_more, arguments.file, arguments.limit), kernels_on, arguments.jobs)
+    if arguments.recorded:
+        outcomes = [as_recorded(arguments.file, cells) for cells in kernels_on]
+    else:
+        outcomes = each(partial(with_more, arguments.file, arguments.limit), kernels_on, arguments.jobs)
     done = dict(zip(chain(*kernels_on), chain(*outcomes), strict=True))
     rows: list[Row] = []
     for problem in problems:
@@ -261,7 +305,7 @@ def main() -> None:
         for cell in (Cell(problem, k, n, seeds) for n in sorted(counts) for k in kernels):
             outcome = done[cell]
             if isinstance(outcome, float):
-                lines.append([cell.kernel, cell.particles, *"-----", f"> {outcome:.1f}", "not run"])
+                lines.append([cell.kernel, cell.particles, 0, *"-----", f"> {outcome:.1f}", "not run"])
                 continue
             figures = summary(outcome)
             name = f"{problem}, {cell.kernel}, N = {cell.particles}"
@@ -284,6 +328,7 @@ def main() -> None:
                 [
                     cell.kernel,
                     cell.particles,
+                    len(outcome.errors),
                     f"{figures.bias:+.3f} ± {figures.error:.3f}",
                     f"{figures.deviation:.3f}",
                     f"{figures.log_mean:+.3f}",
@@ -296,6 +341,7 @@ def main() -> None:
         columns = [
             "kernel",
             "N",
+            "runs",
             "bias of log Z",
             "sd",
             "log mean Zhat/Z",
@@ -304,10 +350,10 @@ def main() -> None:
             "s",
             "",
         ]
-        show(f"{problem}: {runs} runs of each kernel", columns, lines)
+        show(problem, columns, lines)
         for kernel, particles, *_, verdict in lines:
             if verdict == "biased":
-                why = reason(Cell(problem, kernel, particles, others), arguments.file)
+                why = reason(Cell(problem, kernel, particles, others), arguments.file, seeds[0])
                 print(f"biased, {kernel}, N = {particles}: {why}", flush=True)
     finish(rows, arguments.json)
 
