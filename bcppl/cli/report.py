@@ -117,7 +117,7 @@ class Report:
         return found
 
     def relative_deviations(self) -> list[float] | None:
-        """Standard deviations (6,) of the part's pose relative to the held peg, m and rad, if others."""
+        """Standard deviations (6,) of the part's pose relative to the held peg, m and rad."""
         relative = relative_to_peg(self.steps[-1].belief, self.recording)
         return None if relative is None else relative.spread.tolist()
 

@@ -164,7 +164,7 @@ def _solids(peg: Part) -> _Solids:
 
 
 @compiled
-def relative(part: Frames, n: int, peg: Frames, own: int, t: int, turn: Array, shift: Array) -> None:
+def _relative(part: Frames, n: int, peg: Frames, own: int, t: int, turn: Array, shift: Array) -> None:
     """Set `turn` (3, 3) and `shift` (3,) to the peg's frame in the part's.
 
     Written out: numpy's product of two small matrices takes longer than all that is looked up there.
@@ -181,14 +181,14 @@ def relative(part: Frames, n: int, peg: Frames, own: int, t: int, turn: Array, s
 
 
 @compiled
-def placed(point: Array, turn: Array, shift: Array, result: Array) -> None:
+def _placed(point: Array, turn: Array, shift: Array, result: Array) -> None:
     """Set `result` (3,) to a point of the peg's frame in the part's."""
     for axis in range(3):
         result[axis] = dot(turn[axis], point) + shift[axis]
 
 
 @compiled
-def interpolated_at(points: Array, p: int, turn: Array, shift: Array, grid: DistanceGrid) -> float:
+def _interpolated_at(points: Array, p: int, turn: Array, shift: Array, grid: DistanceGrid) -> float:
     """The interpolated distance to the part at one of some points (P, 3) of the peg's frame."""
     a, b, c = points[p, 0], points[p, 1], points[p, 2]
     x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + shift[0]
@@ -219,10 +219,10 @@ def _evaluate(
         own = n if len(peg.rotation) > 1 else 0
         for t in range(peg.rotation.shape[1]):
             # part_from_peg
-            relative(part, n, peg, own, t, turn, shift)
-            lowest = np.inf
+            _relative(part, n, peg, own, t, turn, shift)
+            lowest, first_group = np.inf, 0
             for g in range(len(spheres)):
-                bound[g] = interpolated_at(spheres, g, turn, shift, grid) - _STEEPEST * spheres[g, 3]
+                bound[g] = _interpolated_at(spheres, g, turn, shift, grid) - _STEEPEST * spheres[g, 3]
                 if bound[g] < lowest:
                     lowest, first_group = bound[g], g
             least, which = np.inf, 0
@@ -232,10 +232,10 @@ def _evaluate(
                 if k == first_group or bound[g] > least:
                     continue
                 for c in range(stops[g - 1] if g else 0, stops[g]):
-                    here = interpolated_at(corners, c, turn, shift, grid)
+                    here = _interpolated_at(corners, c, turn, shift, grid)
                     if here < least:
                         least, which = here, c
-            placed(corners[which], turn, shift, witness[n, t])
+            _placed(corners[which], turn, shift, witness[n, t])
             rounded[n, t] = not plane_gradient(witness[n, t], grid, gradient) and abs(least) < _NEAR
             normal[n, t] = gradient
             # A farther edge cannot be in contact.
