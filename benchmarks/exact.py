@@ -229,16 +229,8 @@ def main() -> None:
         for cell in (Cell(problem, k, n, seeds) for n in sorted(counts) for k in kernels):
             outcome = done[cell]
             if isinstance(outcome, float):
-                lines.append(
-                    [
-                        cell.kernel,
-                        cell.particles,
-                        0,
-                        *"-----",
-                        f"> {outcome:.1f}" if outcome else "",
-                        "not run",
-                    ]
-                )
+                took = f"> {outcome:.1f}" if outcome else ""
+                lines.append([cell.kernel, cell.particles, 0, *"-----", took, "not run"])
                 continue
             figures = summary(outcome)
             name = f"{problem}, {cell.kernel}, N = {cell.particles}"
