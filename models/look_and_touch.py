@@ -1,8 +1,10 @@
 """A part is seen by depth cameras whose stated poses are in error, then touched with a held peg.
 
 The default model. A camera's extrinsic error and range bias are latent (`ErringCamera`). A touch is explained
-by the measured pose of the peg, which robots know to hundredths of a millimetre: while the wrench shows
-contact the peg's distance to the part is zero, otherwise positive (`ContactProbe`).
+by the measured pose of the peg, which robots repeat to hundredths of a millimetre: while the wrench shows
+contact the peg's distance to the part is zero, otherwise positive (`ContactProbe`). What all touches share,
+the grasp, the arm and the clock, is integrated out; how large it may be is the bench's `profile`, by default
+"ur5e".
 """
 
 from __future__ import annotations
