@@ -1,8 +1,8 @@
 """Touches of a bench with everything off: part, grasp, arm, clock and sizes drawn from the model's priors.
 
 A block is touched at its top and at two of its sides by a peg that leans, so that a corner touches. Rows are
-where the gap of the displaced solids themselves is what was drawn; inference has the shipped likelihood,
-which is linear in the errors and integrates them out, with a few hypotheses of what is not linear.
+where the gap is what was drawn: that of the model, linear in the errors, or that of the displaced solids
+themselves. Inference has the shipped likelihood, which integrates the errors out.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from bcppl.distributions.episodes import (
     LinearErrors,
 )
 from bcppl.distributions.episodes.covariances import segments_of
+from bcppl.distributions.episodes.displaced import displaced
 from bcppl.distributions.episodes.rows import (
     COLUMNS,
     EARLIER,
@@ -172,8 +173,12 @@ class Bench:
         return moved_by(population, shipped("part"), POSTERIOR, 20).population
 
 
-def simulated(jumps: bool = True) -> tuple[Truth, Tensor]:
-    """A truth from the prior, with or without what slips and slides, and the rows where it is touched."""
+def simulated(jumps: bool = True, solids: bool = False) -> tuple[Truth, Tensor]:
+    """A truth from the prior, with or without what slips and slides, and the rows where it is touched.
+
+    The gap is linear in the errors, as the model's, or that of the displaced solids.
+    """
+    gap_of = _gap if solids else _linear_gap
     bench = Bench()
     pose = NormalPose(CENTER, SPREAD).sample()
     site = bench.site(pose[None], ROWS)
@@ -203,7 +208,7 @@ def simulated(jumps: bool = True) -> tuple[Truth, Tensor]:
     for _ in range(40):  # the gap falls along the direction in which the peg comes
         middle = 0.5 * (below + above)
         rows[:, :3] = ROWS[:, :3] + middle[:, None] * ALONG
-        over = _gap(pose, rows, errors, values, hypothesis.delay) > wanted
+        over = gap_of(pose, rows, errors, values, hypothesis.delay) > wanted
         below, above = torch.where(over, middle, below), torch.where(over, above, middle)
     return Truth(pose, values[-1], hypothesis), rows
 
@@ -217,6 +222,15 @@ def _gap(pose: Tensor, rows: Tensor, errors: LinearErrors, values: Tensor, delay
     along = (turn @ twist[:, :3, None])[..., 0]
     true = poses.retract(rows[:, :7], torch.cat([along, twist[:, 3:]], dim=1))
     return GAP(pose[None], true).distance[0] + (effect.offset * values).sum(dim=1)
+
+
+def _linear_gap(pose: Tensor, rows: Tensor, errors: LinearErrors, values: Tensor, delay: int) -> Tensor:
+    """Gaps (R,) as the model has them."""
+    gaps = GAP(pose[None], rows[:, :7])
+    moved, columns = (
+        each[0, list(errors.delays).index(delay)] for each in displaced(gaps, pose[None], rows, errors)
+    )
+    return gaps.distance[0] + moved + (columns * values).sum(dim=1)
 
 
 DELAY = "the delay"
@@ -251,10 +265,10 @@ def measured(pose: Tensor, errors: Tensor, which: Sequence[Hypothesis], log_like
     )
 
 
-def rank(bench: Bench, seed: int) -> Tensor:
+def rank(bench: Bench, seed: int, solids: bool = False) -> Tensor:
     """One round: draw, infer, rank (Q,); what a mutant leaves out is drawn from its prior."""
     torch.manual_seed(seed)
-    truth, rows = simulated()
+    truth, rows = simulated(solids=solids)
     population = bench.infer(rows)
     chosen = systematic(population.log_weights)[torch.randperm(len(population))[:DRAWS]]
     pose = population.trace["part"][chosen]
@@ -302,6 +316,7 @@ def pulled() -> Bench:
     )
 
 
+SOLIDS = "displaced solids"
 BENCHES: dict[str, Callable[[], Bench]] = {
     "sound": Bench,
     "the arm yields towards the force": pulled,
@@ -311,5 +326,5 @@ BENCHES: dict[str, Callable[[], Bench]] = {
 
 
 def round_of(name: str, seed: int) -> Tensor:
-    """The ranks of one round with a bench by name."""
-    return rank(BENCHES[name](), seed)
+    """The ranks of one round with a bench by name, or of a sound one where displaced solids touch."""
+    return rank(BENCHES.get(name, Bench)(), seed, solids=name == SOLIDS)
