@@ -61,7 +61,7 @@ CENTER = poses.identity()
 NOISE_OF_ROW, SHARED, DRIFT = 6e-5, 1e-5, 2e-5  # m
 STRAY = 1e-9  # of an episode: none is drawn
 PARTICLES = 150
-PROFILE = BenchProfile(slips=0.01, slides=0.01)
+STILL, SUDDEN = BenchProfile(slips=0.0, slides=0.0), BenchProfile(slips=0.01, slides=0.01)
 COMPLIANCE = 5e-6  # m/N
 
 
@@ -113,9 +113,9 @@ def _twist(turn: Tensor) -> Tensor:
 ROWS, ALONG = design()
 
 
-def errors_of() -> tuple[LinearError, ...]:
+def errors_of(profile: BenchProfile = STILL) -> tuple[LinearError, ...]:
     """The shipped errors of a profile."""
-    return PROFILE.errors((0.0, 0.0, 0.0), (0.0, 0.0, LENGTH))
+    return profile.errors((0.0, 0.0, 0.0), (0.0, 0.0, LENGTH))
 
 
 class Truth(NamedTuple):
@@ -140,7 +140,7 @@ class Bench:
 
     def site(self, pose: Tensor, rows: Tensor) -> ContactEpisodes:
         """The likelihood of rows at poses (N, 7)."""
-        hypotheses = PROFILE.hypotheses(COMPLIANCE)
+        hypotheses = STILL.hypotheses(COMPLIANCE)
         return ContactEpisodes(
             GAP,
             pose,
@@ -173,13 +173,13 @@ class Bench:
         return moved_by(population, shipped("part"), POSTERIOR, 20).population
 
 
-def simulated(jumps: bool = True, solids: bool = False) -> tuple[Truth, Tensor]:
-    """A truth from the prior, with or without what slips and slides, and the rows where it is touched.
+def simulated(profile: BenchProfile = STILL, solids: bool = False) -> tuple[Truth, Tensor]:
+    """A truth from a profile's prior, and the rows of the design where it is touched.
 
     The gap is linear in the errors, as the model's, or that of the displaced solids.
     """
     gap_of = _gap if solids else _linear_gap
-    bench = Bench()
+    bench = Bench(errors_of(profile))
     pose = NormalPose(CENTER, SPREAD).sample()
     site = bench.site(pose[None], ROWS)
     every, errors = site._every, site.bench
@@ -190,7 +190,7 @@ def simulated(jumps: bool = True, solids: bool = False) -> tuple[Truth, Tensor]:
     each, now = [], value
     for _ in range(len(ROWS) // len(FORCES)):
         which = int(torch.multinomial(torch.cat([probabilities, 1.0 - probabilities.sum()[None]]), 1))
-        if jumps and which < len(probabilities):
+        if which < len(probabilities):
             jumped = hypothesis.scale * errors.jumps[which].variances.sqrt()
             now = now + jumped * torch.randn(len(now), dtype=torch.float64)
         each.append(now)
@@ -265,10 +265,10 @@ def measured(pose: Tensor, errors: Tensor, which: Sequence[Hypothesis], log_like
     )
 
 
-def rank(bench: Bench, seed: int, solids: bool = False) -> Tensor:
+def rank(bench: Bench, seed: int, profile: BenchProfile = STILL, solids: bool = False) -> Tensor:
     """One round: draw, infer, rank (Q,); what a mutant leaves out is drawn from its prior."""
     torch.manual_seed(seed)
-    truth, rows = simulated(solids=solids)
+    truth, rows = simulated(profile, solids)
     population = bench.infer(rows)
     chosen = systematic(population.log_weights)[torch.randperm(len(population))[:DRAWS]]
     pose = population.trace["part"][chosen]
@@ -285,7 +285,7 @@ def rank(bench: Bench, seed: int, solids: bool = False) -> Tensor:
     errors = whole.means + whole.variances.sqrt() * torch.randn(DRAWS, len(whole.means), dtype=torch.float64)
     for name, place in LinearErrors(bench.errors).slices.items():
         errors[:, whole.slices[name]] = own[:, place]
-    exact = Bench().site(torch.cat([truth.pose[None], pose]), rows).log_prob(rows)
+    exact = Bench(errors_of(profile)).site(torch.cat([truth.pose[None], pose]), rows).log_prob(rows)
     columns = measured(
         torch.cat([truth.pose[None], pose]),
         torch.cat([truth.errors[None], errors]),
@@ -316,7 +316,7 @@ def pulled() -> Bench:
     )
 
 
-SOLIDS = "displaced solids"
+SLIPS, SOLIDS = "slips and slides", "slips and slides, displaced solids"
 BENCHES: dict[str, Callable[[], Bench]] = {
     "sound": Bench,
     "the arm yields towards the force": pulled,
@@ -326,5 +326,7 @@ BENCHES: dict[str, Callable[[], Bench]] = {
 
 
 def round_of(name: str, seed: int) -> Tensor:
-    """The ranks of one round with a bench by name, or of a sound one where displaced solids touch."""
-    return rank(BENCHES.get(name, Bench)(), seed, solids=name == SOLIDS)
+    """The ranks of one round: of a mutant by name, or of inference as shipped in a world by name."""
+    if name in BENCHES:
+        return rank(BENCHES[name](), seed)
+    return rank(Bench(errors_of(SUDDEN)), seed, SUDDEN, solids=name == SOLIDS)
