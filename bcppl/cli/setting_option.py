@@ -11,6 +11,6 @@ Settings = Annotated[
     typer.Option(
         "--set",
         metavar="NAME=VALUE",
-        help="A setting of the model, such as profile=ur5e; may be repeated. A belief has those of its run.",
+        help="A setting of the model, such as profile=panda; may be repeated. A belief has those of its run.",
     ),
 ]

@@ -128,7 +128,7 @@ class Truth(NamedTuple):
 
 @dataclass(frozen=True)
 class Bench:
-    """What inference takes the bench to be; the world is always the default.
+    """What inference takes the bench to be; a world has errors of a profile, and noise as stated.
 
     Attributes:
         errors: that all touches share.
@@ -199,12 +199,8 @@ def simulated(profile: BenchProfile = STILL, solids: bool = False) -> tuple[Trut
     blocks = factor.unflatten(0, (-1, len(FORCES)))[..., : len(FORCES)]
     noise = (blocks @ torch.randn(len(blocks), len(FORCES), 1, dtype=torch.float64)).flatten()
     wanted = noise - hypothesis.compliance * ROWS[:, FORCE]
-    rows, below, above = (
-        ROWS.clone(),
-        torch.full((len(ROWS),), -0.01).double(),
-        torch.full((len(ROWS),), 0.01),
-    )
-    above = above.double()
+    rows, above = ROWS.clone(), torch.full((len(ROWS),), 0.01, dtype=torch.float64)
+    below = -above
     for _ in range(40):  # the gap falls along the direction in which the peg comes
         middle = 0.5 * (below + above)
         rows[:, :3] = ROWS[:, :3] + middle[:, None] * ALONG
@@ -233,8 +229,7 @@ def _linear_gap(pose: Tensor, rows: Tensor, errors: LinearErrors, values: Tensor
     return gaps.distance[0] + moved + (columns * values).sum(dim=1)
 
 
-DELAY = "the delay"
-OTHERS = (DELAY, "the contact's compliance", "the noise", "the scale of the errors")
+OTHERS = ("the delay", "the contact's compliance", "the noise", "the scale of the errors")
 
 
 def quantities(errors: tuple[LinearError, ...]) -> list[str]:
