@@ -211,15 +211,20 @@ def log_abs_det_jacobian(
         read = torch.cat([outputs[k].chart.read(reached[k]) for k in rows], dim=1)
         if check:
             _refuse_mixing(read, leaves)
-        rows_of_jacobian = [_gradient(read[:, k].sum(), leaves) for k in range(high)]
-    jacobian = torch.stack(rows_of_jacobian, dim=1)
-    bad = (~torch.isfinite(jacobian)).flatten(1).any(dim=1).nonzero().flatten().tolist()
-    if bad:
+        # One output each, of all particles: (high, N, high), the rows of the Jacobians first.
+        each = torch.eye(high, dtype=torch.float64)[:, None].expand(high, *read.shape)
+        jacobian = _gradient(read, leaves, each)
+    finite = torch.isfinite(jacobian.sum(dim=(0, 2)))  # a sum of finite derivatives is taken not to overflow
+    if not bool(finite.all()):
+        bad = (~finite).nonzero().flatten().tolist()
         raise InferenceError(
             f"the Jacobian from {_listed(inputs, columns)} to {_listed(outputs, rows)} is not finite for "
             f"{len(bad)} of {len(value)} particles (first: {', '.join(map(str, bad[:5]))})."
         )
-    log_determinant = torch.linalg.slogdet(jacobian).logabsdet
+    # An affine map has the same for all.
+    if bool((jacobian == jacobian[:, :1]).all()):
+        jacobian = jacobian[:, :1]
+    log_determinant = torch.linalg.slogdet(jacobian.movedim(0, 1)).logabsdet.expand(len(value))
     if bool((log_determinant == -torch.inf).all()):
         raise InputError(
             f"a map from {_listed(inputs, columns)} to {_listed(outputs, rows)} is not one-to-one for any "
@@ -283,16 +288,19 @@ def _remaining(inputs: Point, outputs: Point) -> tuple[list[Key], list[Key]]:
     return [k for k in columns if columns[k].chart.dimension], [k for k in rows if outputs[k].chart.dimension]
 
 
-def _gradient(total: Tensor, leaves: list[Tensor]) -> Tensor:
-    """Derivatives (N, D) of a sum over particles whose terms depend on one particle each."""
-    gradients = torch.autograd.grad(total, leaves, retain_graph=True, allow_unused=True)
-    return torch.cat(
-        [torch.zeros_like(x) if g is None else g for g, x in zip(gradients, leaves, strict=True)], dim=1
+def _gradient(read: Tensor, leaves: list[Tensor], each: Tensor) -> Tensor:
+    """Derivatives (K, N, D) of K weighted sums of the coordinates read; the weights `each` are (K, N, D)."""
+    gradients = torch.autograd.grad(
+        read, leaves, each, retain_graph=True, allow_unused=True, is_grads_batched=True
     )
+    pairs = zip(gradients, leaves, strict=True)
+    return torch.cat([x.new_zeros(len(each), *x.shape) if g is None else g for g, x in pairs], dim=2)
 
 
 def _refuse_mixing(read: Tensor, leaves: list[Tensor]) -> None:
-    if len(read) > 1 and bool((_gradient(read[0].sum(), leaves)[1:] != 0).any()):
+    first = torch.zeros_like(read)[None]
+    first[:, 0] = 1.0
+    if bool((_gradient(read, leaves, first)[:, 1:] != 0).any()):
         raise InputError(
             "a map mixes particles: its output for one depends on the values of another; "
             "let it act on every particle alone."
