@@ -37,7 +37,7 @@ from bcppl.inference.proposals.coordinates import continuous_addresses
 from bcppl.inference.proposals.walk import joint_drift
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.models import peg_in_hole
-from bcppl.models.worlds.bench import bench_scene
+from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.sensors import Recording, View
 
 DEFAULT, SEEN, FREE_SPACE = "default", "vision only", "no free-space evidence"

@@ -19,7 +19,7 @@ from report import Row, finish, options, show
 from scenes import END, MASSES, PARTICLES, REGIONS, VISION, Probed, every, probed, quantile
 from scipy.stats import binomtest
 
-from bcppl.models.worlds.bench import BenchParameters
+from bcppl.models.worlds.bench.parameters import BenchParameters
 
 CONFIDENCE = 0.99  # of the intervals of a share
 WITHIN = {0.9: (84.0, 95.0), 0.5: (41.0, 59.0)}  # %, what 200 scenes of true regions stay within

@@ -32,7 +32,7 @@ from bcppl.inference.criticism.hypotheses import DECISIVE
 from bcppl.inference.filters.default import infer
 from bcppl.inference.filters.smc import Step
 from bcppl.models import load_recording, part_in_view, point_probe
-from bcppl.models.worlds.bench import bench_scene
+from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.recordings import Recording
 from bcppl.traces import Model
 

@@ -28,8 +28,9 @@ from bcppl.inference.planning.candidate_layout import MIXED, plan_candidates
 from bcppl.inference.planning.insertion import insertion_plan
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.inference.planning.success import success_probability
-from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
-from bcppl.models.worlds.bench_arm import BenchArm
+from bcppl.models.worlds.bench.arm import BenchArm
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.sensors.candidates import Candidate
 
 CLEARANCES = BenchParameters().clearances

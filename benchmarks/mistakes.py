@@ -31,7 +31,7 @@ from bcppl.geometry.turns import turns_freely
 from bcppl.inference.criticism import explanations
 from bcppl.inference.planning.metrology import ROCKED, three_two_one
 from bcppl.models.look_and_touch import model
-from bcppl.models.worlds.bench import bench_scene
+from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.sensors.likelihoods.bench_profiles import PROFILES
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.probe import ProbeWindow, Touch

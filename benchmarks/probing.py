@@ -37,8 +37,8 @@ from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.candidate_layout import MIXED, plan_candidates
 from bcppl.inference.planning.faces import points_on_top, sides
 from bcppl.inference.planning.touching import SurfacePoint, touch
-from bcppl.models.worlds.bench import BenchScene, bench_scene
-from bcppl.models.worlds.bench_arm import BenchArm
+from bcppl.models.worlds.bench.arm import BenchArm
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.sensors.candidates import Candidate, name_of
 
 SCENES, PROBES = 50, 3

@@ -30,7 +30,7 @@ from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import systematic
-from bcppl.models.worlds.bench import bench_scene
+from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.robot.plan import Plan, probe_of
 from bcppl.sensors.candidates import action_of
 from bcppl.sensors.likelihoods.contact_probe import PREDICTED

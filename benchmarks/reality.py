@@ -35,8 +35,9 @@ from bcppl.distributions.episodes.rows import COLUMNS
 from bcppl.inference.planning.insertion import insertion_plan
 from bcppl.inference.planning.metrology import ROCKED, three_two_one
 from bcppl.models.look_and_touch import model
-from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
-from bcppl.models.worlds.bench_errors import FAULTS, BenchErrors
+from bcppl.models.worlds.bench.errors import FAULTS, BenchErrors
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.sensors.likelihoods.bench_profiles import PROFILES
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.probe import ProbeWindow

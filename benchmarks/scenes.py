@@ -40,7 +40,8 @@ from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models import look_and_touch
-from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.sensors.measurements import Recording
 
 # Where a bench is perfect the model is given that: the peg is where it is measured.

@@ -16,7 +16,7 @@ from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.planning.metrology import three_two_one
-from bcppl.models.worlds.bench import bench_scene
+from bcppl.models.worlds.bench.scene import bench_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import ablations

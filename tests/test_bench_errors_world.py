@@ -13,8 +13,9 @@ from bcppl.beliefs import Belief
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.turns import turns_freely
 from bcppl.inference.planning.metrology import three_two_one
-from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
-from bcppl.models.worlds.bench_errors import BenchErrors
+from bcppl.models.worlds.bench.errors import BenchErrors
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.sensors.likelihoods.bench_profiles import profile_named
 
 SEED = 5

@@ -15,8 +15,9 @@ from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
 from bcppl.errors import InputError
 from bcppl.geometry.outlines import check_fit
-from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
-from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, bench_part
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.parts import PARTS, PEG_LENGTH, bench_part
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.models.worlds.guarded_motion import Execution, command_of
 from bcppl.recordings import Recording
 from bcppl.rendering.ray_casting import RayCaster

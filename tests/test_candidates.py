@@ -34,7 +34,7 @@ from bcppl.inference.planning.motion_constraints import (
 from bcppl.inference.planning.motions import expected_contacts, pressing_force
 from bcppl.inference.planning.touching import SurfacePoint, TouchParameters, face_name, slide, touch
 from bcppl.models.robots import load_robot
-from bcppl.models.worlds.bench import BenchScene, bench_scene
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.recordings.action_file import load_actions, save_actions
 from bcppl.robot.inverse_kinematics import joint_paths
 from bcppl.robot.plan import Plan

@@ -23,7 +23,8 @@ from bcppl.cli.predictive_checks import (
 )
 from bcppl.geometry.parts import Piece
 from bcppl.inference.criticism.predictive import Check
-from bcppl.models.worlds.bench import BenchParameters, bench_scene
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.recordings import save
 from tests.command_line import Ran, short
 from tests.made_recordings import assert_one_sentence

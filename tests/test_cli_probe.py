@@ -19,7 +19,7 @@ from bcppl.cli import probe
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.planning.candidate_layout import MIXED
 from bcppl.models.look_and_touch import model
-from bcppl.models.worlds.bench import bench_scene
+from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.recordings import save
 from bcppl.recordings.action_file import load_actions, save_actions
 from bcppl.recordings.beliefs import load_belief, load_latent, save_belief

@@ -14,7 +14,8 @@ from bcppl.distributions.manifold import ContactManifold
 from bcppl.inference import infer
 from bcppl.inference.design import rules
 from bcppl.models.look_and_touch import model
-from bcppl.models.worlds.bench import BenchParameters, bench_scene
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.recordings import save
 from bcppl.recordings.beliefs import save_belief
 from tests.command_line import Ran

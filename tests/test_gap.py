@@ -19,7 +19,7 @@ from bcppl.geometry.extrusion import block, block_with_hole, box_peg, peg_for
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.outlines import round_outline
 from bcppl.geometry.parts import Part
-from bcppl.models.worlds.bench_parts import bench_part
+from bcppl.models.worlds.bench.parts import bench_part
 
 SIZE = np.array([0.06, 0.06, 0.025])  # of the block, m; its top is z = 0
 BASE = np.array([-0.5 * SIZE[0], -0.5 * SIZE[1], -SIZE[2]])

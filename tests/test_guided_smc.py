@@ -32,7 +32,7 @@ from bcppl.inference.proposals import Program
 from bcppl.inference.resampling import never
 from bcppl.inference.targets import POSTERIOR
 from bcppl.models import look_and_touch
-from bcppl.models.worlds.bench import bench_scene
+from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.poses import Freedom
 from bcppl.sensors.measurements import Recording
 from bcppl.traces import Model, Trace, generate

@@ -20,7 +20,7 @@ from bcppl.inference.criticism import hypotheses
 from bcppl.inference.criticism.hypotheses import alternatives, displaced, edges, likeliest
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded
-from bcppl.models.worlds.bench import bench_scene
+from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import generate
 from tests.made_recordings import assert_one_sentence

@@ -22,8 +22,8 @@ from bcppl.geometry.parts import Part
 from bcppl.inference.planning.insertion import InsertionParameters, insertion_plan
 from bcppl.inference.planning.success import success_probability
 from bcppl.inference.resampling import systematic
-from bcppl.models.worlds.bench import BenchScene, bench_scene
-from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, bench_part
+from bcppl.models.worlds.bench.parts import PARTS, PEG_LENGTH, bench_part
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.models.worlds.guarded_motion import command_of
 from bcppl.robot.plan import InsertionPlan
 

@@ -50,8 +50,9 @@ from bcppl.inference.criticism.nuisances import SuddenChange, shared_errors, sud
 from bcppl.inference.filters.default import infer
 from bcppl.inference.planning.metrology import ROCKED, three_two_one
 from bcppl.models import look_and_touch
-from bcppl.models.worlds.bench import BenchParameters, bench_scene
-from bcppl.models.worlds.bench_errors import BenchErrors
+from bcppl.models.worlds.bench.errors import BenchErrors
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.likelihoods.bench_profiles import PROFILES
 from bcppl.sensors.measurements import Measurement, Recording

@@ -11,7 +11,7 @@ from bcppl.distributions.pose_normals import transport
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models.look_and_touch import model
-from bcppl.models.worlds.bench import bench_scene
+from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.sensors import View
 
 

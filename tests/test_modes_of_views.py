@@ -29,7 +29,7 @@ from bcppl.inference.planning.metrology import three_two_one
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import systematic
 from bcppl.models.look_and_touch import model
-from bcppl.models.worlds.bench import BenchScene, bench_scene
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.sensors.likelihoods.erring_camera import with_bias
 from bcppl.traces import generate
 

@@ -21,7 +21,8 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.inference.criticism.predictive import THRESHOLD, Check, surprise
 from bcppl.inference.population import Population
-from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.recordings import DepthImage
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import Series, generate, simulate

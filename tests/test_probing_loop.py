@@ -22,8 +22,9 @@ from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.inference.planning.insertion import insertion_plan
 from bcppl.models import look_and_touch
-from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
-from bcppl.models.worlds.bench_arm import BenchArm
+from bcppl.models.worlds.bench.arm import BenchArm
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.recordings import Recording, View, problems
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.candidates import Candidate, duration_of, name_of

@@ -19,7 +19,7 @@ from bcppl.distributions.manifold import ContactManifold
 from bcppl.geometry.extrusion import block, block_with_hole, box_peg, peg_for
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.outlines import round_outline
-from bcppl.models.worlds.bench import BenchScene, bench_scene
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.robot.plan import Plan, probe_of
 from bcppl.sensors import View

@@ -12,7 +12,7 @@ import torch
 from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.inference.planning.metrology import ROCKED, MetrologyParameters, three_two_one
-from bcppl.models.worlds.bench import bench_scene
+from bcppl.models.worlds.bench.scene import bench_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import reality

@@ -29,7 +29,8 @@ from bcppl.models import (
     point_probe,
     which_hole,
 )
-from bcppl.models.worlds.bench import BenchParameters, bench_scene
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.recordings import Recording, load
 from bcppl.sensors.scene import Scene
 from bcppl.traces import Model, generate, update

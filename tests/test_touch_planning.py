@@ -20,7 +20,7 @@ from bcppl.geometry.gap import PegGap
 from bcppl.inference.planning.faces import boundary_points, points_on_top, section, sides
 from bcppl.inference.planning.metrology import ROCKED, MetrologyParameters, three_two_one
 from bcppl.models.parts import insert_peg, insert_tray
-from bcppl.models.worlds.bench import BenchScene, bench_scene
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.models.worlds.guarded_motion import Execution
 from bcppl.robot.plan import Plan
 from tests.made_recordings import assert_one_sentence

@@ -15,7 +15,7 @@ from bcppl.geometry.extrusion import block
 from bcppl.inference.design.rules import by_linearised_gain
 from bcppl.inference.population import Population
 from bcppl.models.look_and_touch import model
-from bcppl.models.worlds.bench import bench_scene
+from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.rendering.information import pixel_information
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors import View

@@ -14,7 +14,8 @@ from bcppl import poses
 from bcppl.inference.filters import guided_smc, view_search
 from bcppl.inference.population import Population
 from bcppl.models.look_and_touch import model
-from bcppl.models.worlds.bench import BenchParameters, BenchScene, bench_scene
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors.measurements import Recording
 from bcppl.traces import generate

@@ -46,7 +46,7 @@ CandidatesFrom = Callable[[Belief, int], Sequence[Candidate]]
 
 
 class World(Protocol):
-    """A robot, or a simulation of one such as `bcppl.models.worlds.bench_arm.BenchArm`."""
+    """A robot, or a simulation of one such as `bcppl.models.worlds.bench.arm.BenchArm`."""
 
     def execute(self, candidate: Candidate) -> Sequence[Measurement]:
         """Execute a candidate and return its measurements.

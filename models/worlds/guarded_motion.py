@@ -17,7 +17,7 @@ from bcppl.contact.mujoco_model import ContactParameters, build_model, interpola
 from bcppl.contact.stepping import POSE, WRENCH, SimulationState, Stepper
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
-from bcppl.models.worlds.bench_reality import BenchReality, held
+from bcppl.models.worlds.bench.reality import BenchReality, held
 from bcppl.robot.motion import Probe
 from bcppl.robot.plan import Manner, Plan
 

@@ -11,7 +11,7 @@ from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.geometry.parts import Part
-from bcppl.models.worlds.bench_reality import BenchReality
+from bcppl.models.worlds.bench.reality import BenchReality
 from bcppl.models.worlds.guarded_motion import TARE, execute, stamps_of
 from bcppl.robot.plan import InsertionPlan
 

@@ -19,10 +19,10 @@ from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors import DepthImage, Measurement
 
 if TYPE_CHECKING:
-    from bcppl.models.worlds.bench import BenchParameters
-    from bcppl.models.worlds.bench_reality import BenchReality
+    from bcppl.models.worlds.bench.parameters import BenchParameters
+    from bcppl.models.worlds.bench.reality import BenchReality
 
-_WRENCH, _DRIFT, _POSE = range(5, 8)  # streams of random numbers, after those of `bcppl.models.worlds.bench`
+_WRENCH, _DRIFT, _POSE = range(5, 8)  # streams of random numbers, after those of `bench.scene`
 STEP = 0.005  # s between the command's poses
 _ROUNDED = 12  # steps over which corners are rounded: 60 ms
 

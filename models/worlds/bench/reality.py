@@ -17,8 +17,8 @@ import torch
 from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.geometry.parts import Part
-from bcppl.models.worlds.bench_errors import BenchErrors, DrawnErrors, drawn_errors
-from bcppl.models.worlds.six_joint_arm import (
+from bcppl.models.worlds.bench.errors import BenchErrors, DrawnErrors, drawn_errors
+from bcppl.models.worlds.bench.six_joint_arm import (
     NOMINAL,
     SixJointArm,
     chain_compliance,

@@ -16,7 +16,7 @@ import numpy as np
 from bcppl.arguments import number_within
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.models.worlds import six_joint_arm
+from bcppl.models.worlds.bench import six_joint_arm
 
 _STREAM = 20  # of random numbers, with a number for each error; those before are of `bench`
 _GRASP, _SLIP, _SLIDE, _KINEMATIC, _BENDING, _DELAY, _GAIN, _ZERO, _DIMENSIONS = range(9)

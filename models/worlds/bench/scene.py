@@ -9,14 +9,14 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
 from bcppl import poses
-from bcppl.arguments import number_within, seed_number
+from bcppl.arguments import seed_number
 from bcppl.arrays import Array
 from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.distributions.poses import SwingTwistPose
@@ -24,95 +24,26 @@ from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.extrusion import block, peg_for
 from bcppl.geometry.parts import Guess, Part
 from bcppl.geometry.turns import turns_freely
-from bcppl.models.worlds.bench_errors import BenchErrors, DrawnErrors, drawn_errors
-from bcppl.models.worlds.bench_parts import PARTS, PEG_LENGTH, BenchPart, bench_part
-from bcppl.models.worlds.bench_reality import BenchReality
+from bcppl.models.worlds.bench.errors import DrawnErrors, drawn_errors
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.parts import PARTS, PEG_LENGTH, BenchPart, bench_part
+from bcppl.models.worlds.bench.reality import BenchReality
 from bcppl.models.worlds.guarded_motion import Execution, execute, stamps_of
 from bcppl.models.worlds.inserting import InsertionResult, insert, samples_of
 from bcppl.models.worlds.occlusion import occluder
 from bcppl.models.worlds.simulated_sensors import (
-    ProbeErrors,
     SensorErrors,
     depth_image,
     draw_pose,
     per_axis,
     windows,
 )
-from bcppl.rendering.depth_noise import DepthNoise
 from bcppl.rendering.scene import SceneRenderer
 from bcppl.robot.plan import InsertionPlan, Plan
 from bcppl.sensors import DepthImage, Measurement, Recording, View
 
 # Streams of random numbers: a given part or plan changes no other draw of a scene.
 _CHOICE, _POSE, _CAMERAS, _CONTACT, _IMAGES = range(5)  # those after are in simulated_sensors
-
-
-@dataclass(frozen=True)
-class BenchParameters(ProbeErrors):
-    """Parameters of the bench: metres, radians, newtons, seconds; standard deviations where not stated.
-
-    Attributes:
-        clearances: diametral; one is drawn per scene.
-        top: (3,) guessed centre of the part's top face; the table's top is z = 0.
-        translation, tilt, yaw: limits of the prior of the part's pose.
-        distance, height, around: of a camera: from the guessed top; elevation above the table, seen from
-            there; and between the headings of the two.
-        width, rows, focal: of the images, pixels.
-        depth_noise: of the depth images.
-        camera_shift, camera_turn: errors of the cameras' stated poses, along and about each axis.
-        camera_error_factor: by which they are larger, for cameras worse than stated.
-        range_bias: of a camera's ranges.
-        occluder: whether a box that is in no recording hides some of the part from one camera.
-        hidden: the share of the part's pixels that it hides.
-        force_drift, torque_drift: of the wrench sensor's bias after `drift_time` (s), N and N m.
-        window: the length of a probe's windows, s.
-        time_step: of the physics.
-        friction: limits between which the coefficient is drawn.
-        time_constant, damping_ratio: medians of the contacts'; drawn per scene, log-uniformly.
-        contact_factor: the largest factor from the median.
-        errors: of the robot, the grasp and the parts, all off by default.
-    """
-
-    clearances: tuple[float, ...] = (0.0001, 0.0002, 0.0005, 0.001)
-    top: tuple[float, float, float] = (0.5, 0.0, 0.15)
-    translation: float = 0.02
-    tilt: float = math.radians(10.0)
-    yaw: float = math.radians(30.0)
-    distance: tuple[float, float] = (0.35, 0.6)
-    height: tuple[float, float] = (math.radians(30.0), math.radians(60.0))
-    around: float = math.radians(90.0)
-    width: int = 160
-    rows: int = 120
-    focal: float = 160.0
-    depth_noise: DepthNoise = field(
-        default_factory=lambda: DepthNoise(scale=0.002, step=0.001, dropout=0.05, flying=0.5)
-    )
-    camera_shift: float = 0.002
-    camera_turn: float = math.radians(0.5)
-    camera_error_factor: float = 1.0
-    range_bias: float = 0.002
-    occluder: bool = False
-    hidden: float = 1.0 / 3.0
-    force_drift: float = 0.3
-    torque_drift: float = 0.015
-    drift_time: float = 6.0
-    window: float = 0.5
-    time_step: float = 0.0005
-    friction: tuple[float, float] = (0.1, 0.5)
-    time_constant: float = 0.004
-    damping_ratio: float = 1.0
-    contact_factor: float = 2.0
-    errors: BenchErrors = field(default_factory=BenchErrors)
-
-    @classmethod
-    def real(cls) -> BenchParameters:
-        """A bench with all the errors of a real one."""
-        return cls(errors=BenchErrors.real())
-
-    def __post_init__(self) -> None:
-        number_within("the bench has camera_error_factor {}", self.camera_error_factor, least=0.0)
-        number_within("the bench hides a share {} of the part", self.hidden, above=0.0, most=1.0)
-        number_within("the bench has windows of {} s", self.window, above=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +225,7 @@ def bench_scene(
     Args:
         seed: same seed, same scene; a given part or clearance changes nothing else of it.
         bench: parameters that it is drawn from; the default ones unless given.
-        part: a name in `bench_parts.PARTS`; drawn unless given.
+        part: a name in `parts.PARTS`; drawn unless given.
         clearance: diametral, metres; drawn unless given.
 
     Raises:

@@ -10,7 +10,7 @@ import torch
 from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.geometry.camera import Camera
-from bcppl.models.worlds.bench import BenchScene
+from bcppl.models.worlds.bench.scene import BenchScene
 from bcppl.models.worlds.inserting import InsertionResult
 from bcppl.models.worlds.simulated_sensors import depth_image, per_axis
 from bcppl.robot.plan import InsertionPlan
