@@ -99,3 +99,8 @@ def _put(mine: Any, rows: Rows, theirs: Any) -> Any:
     copy = mine.copy()
     copy[rows] = theirs
     return copy
+
+
+def spanned(times: Array) -> str:
+    """How many times there are, and from when to when: `50 stamps, 0.000 to 0.490 s`."""
+    return f"{len(times)} stamps" + (f", {times[0]:.3f} to {times[-1]:.3f} s" if len(times) else "")

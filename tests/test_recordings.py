@@ -47,6 +47,15 @@ def test_everything_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     ]
 
 
+def test_each_is_printed_on_a_line() -> None:
+    recording = full()
+    printed = [recording, recording.part, recording.peg]
+    printed += [each for m in recording.measurements for each in (m.action, m.observation)]
+    lines = [repr(each) for each in printed]
+    assert max(map(len, lines)) < 400 and not any("\n" in line for line in lines)
+    assert "3 ProbeWindow" in lines[0] and "Push" in lines[0]
+
+
 def test_a_camera_keeps_its_lens_and_its_wrist(tmp_path: Path) -> None:
     """What version 1 did not know makes the file one of version 2; without it, it stays one of version 1."""
     hand = dataclasses.replace(

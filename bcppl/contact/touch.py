@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bcppl.arrays import Array
+from bcppl.arrays import Array, spanned
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Touch:
     """Observation: the raw wrench, and the measured pose of the grasped peg.
 
@@ -21,3 +21,6 @@ class Touch:
     times: Array
     wrench: Array
     world_from_peg: Array
+
+    def __repr__(self) -> str:
+        return f"Touch({spanned(self.times)})"

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Camera:
     """A camera with its optical frame: x right, y down, z forward; depth is along z, metres.
 
@@ -55,6 +55,11 @@ class Camera:
     def __post_init__(self) -> None:
         given = () if self.distortion is None else self.distortion
         object.__setattr__(self, "distortion", tuple(float(k) for k in np.ravel(np.asarray(given))))
+
+    def __repr__(self) -> str:
+        at = ", ".join(f"{x:.3f}" for x in np.ravel(np.asarray(self.world_from_camera))[:3])
+        size, lens = f"{self.width} x {self.height}", f"focal lengths {self.fx:.5g} and {self.fy:.5g} pixels"
+        return f"Camera({self.name!r}, {size}, {lens}, at ({at}) m)"
 
     @property
     def is_distorted(self) -> bool:

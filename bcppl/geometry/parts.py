@@ -39,7 +39,7 @@ class Piece:
     center: Array = field(default_factory=lambda: np.zeros(3))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Part:
     """A rigid part: a closed triangle mesh and, for contact, convex pieces.
 
@@ -56,6 +56,10 @@ class Part:
     faces: Indices
     pieces: Sequence[Piece] = ()
     source: str = ""
+
+    def __repr__(self) -> str:
+        sides = " x ".join(f"{1000.0 * side:.3g}" for side in self.extent)
+        return f"Part({self.name!r}, {sides} mm, faces {len(self.faces)}, convex pieces {len(self.pieces)})"
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bcppl.arrays import Array
+from bcppl.arrays import Array, spanned
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Probe:
     """A compliant motion: the peg follows a commanded trajectory under Cartesian impedance control.
 
@@ -28,11 +28,17 @@ class Probe:
     damping: Array
     stamps: Array
 
+    def __repr__(self) -> str:
+        return f"Probe({self.name!r}, {spanned(self.stamps)})"
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class ProbeWindow:
     """Action: a window of a probe, stamps `first` to `last` (exclusive) of `probe.stamps`."""
 
     probe: Probe
     first: int
     last: int
+
+    def __repr__(self) -> str:
+        return f"ProbeWindow({self.probe.name!r}, {spanned(self.probe.stamps[self.first : self.last])})"

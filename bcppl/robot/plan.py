@@ -6,6 +6,7 @@ from the wrench where guarded motions end.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -27,7 +28,7 @@ WIDEST = 5.0  # m between knots, and
 FARTHEST = 100.0  # m from the world's origin: beyond either the poses are in millimetres
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Plan:
     """Straight motions of a held peg between knots.
 
@@ -64,6 +65,10 @@ class Plan:
     damping: Array
     rate: float = 100.0
     sink: float = 0.0
+
+    def __repr__(self) -> str:
+        motions = ", ".join(f"{count} {manner}" for manner, count in Counter(self.manners).items())
+        return f"Plan({self.name!r}, {float(self.times[-1]):.3g} s, {motions})"
 
     def __post_init__(self) -> None:
         for name in ("times", "world_from_peg", "stiffness", "damping"):

@@ -36,12 +36,18 @@ class View:
     camera: Camera
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DepthImage:
     """Observation: depth along the optical axis, (H, W) metres, NaN where missing; colour (H, W, 3)."""
 
     depth: Array
     rgb: npt.NDArray[np.uint8] | None = None
+
+    def __repr__(self) -> str:
+        depth = np.asarray(self.depth)
+        known = depth[np.isfinite(depth)]
+        depths = f"{known.min():.3f} to {known.max():.3f} m" if known.size else "no depth"
+        return f"DepthImage({' x '.join(map(str, depth.shape))}, {depths}, {depth.size - known.size} missing)"
 
 
 CAMERA = Layout(

@@ -6,6 +6,7 @@ Units are SI throughout: metres, radians, newtons, newton metres, seconds. Poses
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -32,7 +33,7 @@ class Measurement:
         return sensor_of(self.action).kind
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Recording:
     """One scene: the part that is sought, the prior for its pose, and the measurements.
 
@@ -55,3 +56,9 @@ class Recording:
     truth: Array | None = None
     model: str = "peg_in_hole"
     source: str = ""
+
+    def __repr__(self) -> str:
+        counts = Counter(type(m.action).__name__ for m in self.measurements)
+        measured = ", ".join(f"{count} {name}" for name, count in counts.items()) or "no measurements"
+        held = "" if self.peg is None else f", peg {self.peg.name!r}"
+        return f"Recording(part {self.part.name!r}{held}, {measured}, model {self.model!r})"

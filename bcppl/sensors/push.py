@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from bcppl.arrays import Array
+from bcppl.arrays import Array, spanned
 from bcppl.contact.touch import Touch
 from bcppl.sensors import checks, touches
 from bcppl.sensors.layout import POSE_UNITS, Layout, numbers
@@ -13,7 +13,7 @@ from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.protocol import Indexed, register
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Push:
     """Action: a point finger is moved along a path until, and beyond where, it touches.
 
@@ -24,6 +24,9 @@ class Push:
 
     times: Array
     world_from_tip: Array
+
+    def __repr__(self) -> str:
+        return f"Push({spanned(self.times)})"
 
 
 class PushSensor:
