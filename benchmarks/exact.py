@@ -19,7 +19,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from itertools import chain
 from pathlib import Path
@@ -122,19 +122,27 @@ def summary(outcome: Outcome) -> Summary:
     )
 
 
-def with_more(file: Path | None, limit: float, cells: list[Cell]) -> list[Outcome | float]:
-    """The outcomes with more and more particles; instead of it the seconds of a run that took too long."""
+def in_turn(outcome_of: Callable[[Cell, float], Outcome | None], cells: list[Cell]) -> list[Outcome | float]:
+    """The outcomes with more and more particles, given the seconds of the longest run before each.
+
+    Where there is no outcome, these seconds stand in its place.
+    """
     outcomes: list[Outcome | float] = []
     longest = 0.0
     for cell in cells:
-        known = recorded(file, cell)
-        if known is None and longest > limit:
-            outcomes.append(longest)
-            continue
-        outcome = Outcome(*(known or added(file, cell, partial(measured, cell))))
-        longest = max(longest, outcome.seconds / len(cell.seeds))
-        outcomes.append(outcome)
+        outcome = outcome_of(cell, longest)
+        if outcome is not None:
+            longest = max(longest, outcome.seconds / len(outcome.errors))
+        outcomes.append(longest if outcome is None else outcome)
     return outcomes
+
+
+def run_within(file: Path | None, limit: float, cell: Cell, longest: float) -> Outcome | None:
+    """A cell as the file holds it, or else run; None where a run before it took longer than the limit."""
+    known = recorded(file, cell)
+    if known is None and longest > limit:
+        return None
+    return Outcome(*(known or added(file, cell, partial(measured, cell))))
 
 
 @cache
@@ -147,27 +155,17 @@ def cells_of(file: Path) -> Mapping[tuple[str, str, int], Mapping[tuple[int, ...
     return held
 
 
-def as_recorded(file: Path, cells: list[Cell]) -> list[Outcome | float]:
-    """As `with_more`, from a file alone: of each cell the most runs that begin with its first seed."""
-    outcomes: list[Outcome | float] = []
-    longest = 0.0
-    for cell in cells:
-        runs = cells_of(file).get(cell[:3], {})
-        own = [outcome for seeds, outcome in runs.items() if seeds[0] == cell.seeds[0]]
-        if not own:
-            outcomes.append(longest)
-            continue
-        most = max(own, key=lambda outcome: len(outcome.errors))
-        longest = max(longest, most.seconds / len(most.errors))
-        outcomes.append(most)
-    return outcomes
+def as_recorded(file: Path, cell: Cell, _: float) -> Outcome | None:
+    """Of a cell in a file the most runs that begin with its first seed."""
+    runs = cells_of(file).get(cell[:3], {})
+    own = [outcome for seeds, outcome in runs.items() if seeds[0] == cell.seeds[0]]
+    return max(own, key=lambda outcome: len(outcome.errors), default=None)
 
 
 def second_opinion(cell: Cell, file: Path | None, first: int) -> Outcome | None:
     """The cell with its own seeds; without any, the most runs of a file that do not begin with the first."""
     if cell.seeds:
-        known = recorded(file, cell)
-        return Outcome(*(known or added(file, cell, partial(measured, cell))))
+        return run_within(file, math.inf, cell, 0.0)
     runs = {} if file is None or not file.exists() else cells_of(file).get(cell[:3], {})
     others = [outcome for seeds, outcome in runs.items() if seeds[0] != first]
     return max(others, key=lambda outcome: len(outcome.errors), default=None)
@@ -218,10 +216,12 @@ def main() -> None:
     seeds = tuple(range(arguments.seed, arguments.seed + runs))
     others = tuple(range(arguments.seed + runs, arguments.seed + runs + arguments.confirm))
     kernels_on = [[Cell(p, k, n, seeds) for n in sorted(counts)] for p in problems for k in kernels]
-    if arguments.recorded:
-        outcomes = [as_recorded(arguments.file, cells) for cells in kernels_on]
-    else:
-        outcomes = each(partial(with_more, arguments.file, arguments.limit), kernels_on, arguments.jobs)
+    outcome_of = (
+        partial(as_recorded, arguments.file)
+        if arguments.recorded
+        else partial(run_within, arguments.file, arguments.limit)
+    )
+    outcomes = each(partial(in_turn, outcome_of), kernels_on, 1 if arguments.recorded else arguments.jobs)
     done = dict(zip(chain(*kernels_on), chain(*outcomes), strict=True))
     rows: list[Row] = []
     for problem in problems:
