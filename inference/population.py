@@ -40,9 +40,9 @@ class Population:
             its own. What `bcppl.inference.summaries` reads.
         log_pairs: sum over the first population and every resampling since of log M / (M - 1), M the
             particles that were then drawn independently of one another.
-        families: (N,) int64, the family of each particle: those that descend from one since the population
-            was last split into halves (`bcppl.inference.ancestry`); empty before.
-        sides: (N,) bool, the half to which each particle's family belongs; empty before.
+        families: (N, G) int64, the ancestor of each particle at G resamplings, the oldest first, since the
+            population was split into halves (`bcppl.inference.ancestry`); empty before.
+        sides: (N,) bool, the half to which each particle's oldest family belongs; empty before.
         approximation: the filter's approximation of the posterior, an immutable value that guides proposals
             and that the target never depends on (`bcppl.inference.approximations`); None where there is none.
     """
@@ -52,7 +52,7 @@ class Population:
     log_evidence: float = math.nan
     founders: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64), repr=False)
     log_pairs: float = math.nan
-    families: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64), repr=False)
+    families: Tensor = field(default_factory=lambda: torch.empty(0, 1, dtype=torch.int64), repr=False)
     sides: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.bool), repr=False)
     approximation: Any = field(default=None, repr=False)
 

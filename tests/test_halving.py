@@ -78,8 +78,8 @@ def test_a_population_that_leans_to_one_side_is_split_by_families() -> None:
     many, few = halves(start)
     ancestors = torch.cat([many.repeat(3), few[:2]])
     again = shifted(start).selected(ancestors)
-    assert torch.equal(again.families, start.families[ancestors])
-    assert not set.intersection(*sides_of(again.families, again.sides))
+    assert torch.equal(again.families[:, :1], start.families[ancestors])
+    assert not set.intersection(*sides_of(again.families[:, 0], again.sides))
     assert 0.25 <= float(again.sides.double().mean()) <= 0.75
 
 
@@ -94,11 +94,26 @@ def test_few_families_are_split_by_copies_and_only_as_they_are_resampled() -> No
         population = weighed.selected(ancestors)
         split_again += not torch.equal(population.sides, before.sides[ancestors])
         assert not set.intersection(*sides_of(ancestors, population.sides))
-        assert min(len(families) for families in sides_of(population.families, population.sides)) >= 4
+        assert min(len(families) for families in sides_of(population.families[:, 0], population.sides)) >= 4
         moved = halved(shifted(population))
         assert torch.equal(moved.sides, population.sides)
         population = moved
     assert 3 <= split_again <= 27
+
+
+def test_a_family_that_grows_is_split_by_its_oldest_members_that_are_enough() -> None:
+    """Those that were moved apart for longest are shared out; cousins stay on one side, as sisters do."""
+    torch.manual_seed(4)
+    start = halved(with_copies(200, 1))
+    children = shifted(start).selected(torch.cat([torch.zeros(12, dtype=torch.int64), torch.arange(12, 200)]))
+    pairs = torch.cat([torch.arange(12).repeat_interleave(2), torch.arange(24, 200)])
+    grandchildren = shifted(children).selected(pairs)
+    assert torch.equal(grandchildren.sides, children.sides[pairs])
+    fours = torch.cat([torch.arange(24).repeat_interleave(4), torch.arange(96, 200)])
+    most = shifted(grandchildren).selected(fours)
+    assert not torch.equal(most.sides, grandchildren.sides[fours])
+    assert not set.intersection(*sides_of(pairs[fours], most.sides))
+    assert torch.equal(most.families, torch.stack([pairs[fours], fours], dim=1))
 
 
 def test_a_single_family_is_split_by_values_and_equal_particles_are_not() -> None:
@@ -113,7 +128,7 @@ def test_a_single_family_is_split_by_values_and_equal_particles_are_not() -> Non
 def at_random(population: Population) -> Population:
     """The mutant: halves that ignore ancestry."""
     sides = torch.randperm(len(population)) < len(population) // 2
-    return replace(population, sides=sides, families=torch.arange(len(population)))
+    return replace(population, sides=sides, families=torch.arange(len(population))[:, None])
 
 
 def by_sweeps(population: Population, kernel: Kernel) -> Tensor:

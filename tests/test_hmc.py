@@ -16,7 +16,7 @@ from bcppl import poses
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
-from bcppl.inference.kernels import delayed_acceptance, hamiltonian, hmc, moved_by
+from bcppl.inference.kernels import delayed_acceptance, fitted, hamiltonian, hmc, moved_by
 from bcppl.inference.kernels.kernel import Kernel
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace, carried, generate, simulate
@@ -209,6 +209,34 @@ def test_gaussian_chain() -> None:
     assert float(mean_error.abs().max()) < 3.5
     assert float(precision_error.abs().max()) < 3.5
     torch.testing.assert_close(1 / x.var(0), vector(1.33, 1.0, 1.33), rtol=0.1, atol=0)
+
+
+def wide() -> None:
+    pyro.sample("x", dist.Normal(torch.zeros(40, dtype=torch.float64), 1.0).to_event(1))
+
+
+def still_on_its_line(kernel: Kernel, seed: int) -> float:
+    """The share of particles that three sweeps leave near the line through the mean on which they began."""
+    torch.manual_seed(seed)
+    start = equal_weights(simulate(wide, (), 2000))
+    moved = moved_by(start, kernel, POSTERIOR, 3).population
+    return float((torch.cosine_similarity(start["x"], moved["x"], dim=1).abs() > 0.8).double().mean())
+
+
+def test_few_particles_stay_on_their_line_through_the_mean() -> None:
+    """After half a period a particle is at its mirror image; some trajectories have to be shorter."""
+    default, half = (sum(still_on_its_line(k, s) for s in range(5)) for k in (hmc("x"), hmc("x", steps=8)))
+    assert default < 0.6 * half
+
+
+def test_each_move_draws_its_number_of_steps() -> None:
+    """Of what has learned once too: its small steps go three times or eight times as far."""
+    torch.manual_seed(0)
+    start = equal_weights(simulate(wide, (), 200))
+    move = fitted(hmc("x", step_size=1e-3, jitter=0.0), start)
+    ends = [move(start.trace, POSTERIOR)[0]["x"] for _ in range(12)]
+    lengths = {round(float((x - start["x"]).norm(dim=1).mean()) / 1e-3 / 40**0.5) for x in ends}
+    assert lengths == {3, 8}
 
 
 def test_units_do_not_matter() -> None:

@@ -26,7 +26,7 @@ def halved(population: Population) -> Population:
     if len(sides) and not bool((sides == sides[0]).all()):
         return population
     families = _copies(population)
-    return replace(population, families=families, sides=split(families))
+    return replace(population, families=families[:, None], sides=split(families))
 
 
 def halves(population: Population) -> list[Tensor]:

@@ -25,7 +25,10 @@ from bcppl.traces.run import inward
 
 
 def hmc(
-    *addresses: str | Sequence[str], step_size: float = 0.5, steps: int = 8, jitter: float = 0.3
+    *addresses: str | Sequence[str],
+    step_size: float = 0.5,
+    steps: int | Sequence[int] = (3, 8),
+    jitter: float = 0.3,
 ) -> Kernel:
     """Hamiltonian Monte Carlo with the leapfrog integrator.
 
@@ -35,10 +38,19 @@ def hmc(
     deviation whatever the units. Constrained values (positive, in an interval, on a simplex) move in
     unconstrained coordinates, the Jacobian included.
 
+    On a normal whose covariance is known, a trajectory is a rotation of position and momentum: after a
+    quarter of a period, pi / 2, the new position is independent of the old one, and after half a period it is
+    its mirror image, as far from the mean. By default some trajectories last about a quarter. Of 8 steps
+    alone, which pass half a period, particles near the mean kept their distance so long that their copies
+    took over: at D = 100 with 10,000 particles one of three runs ended 46 nats off. Of 3 steps alone, axes
+    whose variance is learned too small hardly move: D = 100 with 75 particles was +28.4 +- .4 nats off, and
+    is +.7 +- 1.0 with both.
+
     Args:
         addresses: latent addresses, one by one or as a list, moved together; the other latent values stay.
         step_size: of the leapfrog, in standard deviations.
-        steps: leapfrog steps of a trajectory, each one gradient for all particles.
+        steps: leapfrog steps of a trajectory, each one gradient for all particles; of several numbers each
+            move draws one (Neal, section 5.4.2.2).
         jitter: each trajectory's step size is uniform within this share of `step_size`, so that none is
             periodic.
 
@@ -53,12 +65,12 @@ def hmc(
     """
     named = named_addresses("hmc", addresses)
     step_size = number_within("hmc was given step size {}", step_size, above=0.0)
-    steps = whole_number("hmc was given {} steps", steps)
+    given = steps if isinstance(steps, Sequence) and len(steps) else [steps]
+    lengths = [whole_number("hmc was given {} steps", number) for number in given]
     jitter = number_within("hmc was given jitter {}", jitter, least=0.0, below=1.0)
 
     def kernel(population: Population) -> Move:
-        factor = _factor(named, population)
-        return hamiltonian_move(named, factor, step_size, steps, jitter)
+        return hamiltonian_move(named, _factor(named, population), step_size, lengths, jitter)
 
     return kernel
 
@@ -72,11 +84,15 @@ def named_addresses(kernel: str, addresses: Sequence[str | Sequence[str]]) -> tu
 
 
 def hamiltonian_move(
-    addresses: tuple[str, ...], factor: Tensor, step_size: float, steps: int, jitter: float
+    addresses: tuple[str, ...], factor: Tensor, step_size: float, lengths: Sequence[int], jitter: float
 ) -> Move:
-    """The move of `hmc` with an inverse mass matrix of Cholesky factor `factor` (D, D)."""
+    """The move of `hmc` with an inverse mass matrix of Cholesky factor `factor` (D, D).
+
+    Each time that it is applied, it draws one of `lengths` as the number of leapfrog steps.
+    """
 
     def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
+        steps = lengths[int(torch.randint(len(lengths), ()))] if len(lengths) > 1 else lengths[0]
         space = Unconstrained(addresses, trace)
         exponents = target.exponents if isinstance(target, Target) else {}
         start = space.read(trace)

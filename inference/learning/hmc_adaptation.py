@@ -91,7 +91,7 @@ def adaptive_hmc(
                 size, steps, *_ = tuned(
                     chosen, named, target, factor, acceptance=acceptance, most_steps=most_steps
                 )
-                moves[key] = hamiltonian_move(named, factor, size, steps, jitter)
+                moves[key] = hamiltonian_move(named, factor, size, [steps], jitter)
             return moves[key](trace, target)
 
         return move

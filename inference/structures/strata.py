@@ -212,7 +212,7 @@ def joined(populations: Iterable[Population]) -> Population:
         log_weights=torch.cat([each.log_weights for each in populations]),
         founders=torch.cat([each.founders for each in populations]),
         # Numbers of families that are equal by chance make groups larger than they have to be.
-        families=torch.cat([each.families for each in populations]) if halved else first.families[:0],
+        families=torch.cat([each.families[:, :1] for each in populations]) if halved else first.families[:0],
         sides=torch.cat([each.sides for each in populations]) if halved else first.sides[:0],
     )
 
