@@ -9,9 +9,9 @@ A bias is explained where it is within two standard errors of minus half the var
 kernels that are known to be biased `REASONS` states why. All kernels of a problem have the same seeds, so
 their errors are correlated: a bias common to all of them is one draw, not many. Of so many cells one in
 twenty lies beyond two standard errors by chance: --confirm runs those without a stated reason again, with
-other seeds, and prints both. With --file cells are written as they are done, and a later call adds those that
-are missing. With --limit a cell is left out, and its row says so, where a run with fewer particles took
-longer than that. With --recorded nothing is run: each cell of the file is shown with as many runs as it has.
+other seeds, and prints both. With --file cells are written as they are done, and a later call adds the runs
+that are missing. With --limit a cell is left out, and its row says so, where a run with fewer particles took
+longer than that. With --recorded nothing is run: each cell of the file is shown with the runs that it has.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cache, partial
 from itertools import chain
 from pathlib import Path
@@ -30,9 +30,10 @@ import torch
 from exact_kernels import FEW, KERNELS, REASONS, UNLEARNED, WIDE
 from exact_problems import PROBLEMS, Problem
 from jobs import each
-from kept import added, recorded
+from kept import added
 from report import Row, finish, options, show
 
+from bcppl.arrays import Array
 from bcppl.beliefs import normalised
 from bcppl.inference import tempered_importance_sampling
 
@@ -49,12 +50,31 @@ class Cell(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What came out of a cell's runs: errors of log Z, posterior moments over the exact ones, seconds."""
+    """The figures of a cell."""
 
-    errors: list[float]
-    means: list[list[float]]  # of each run, in exact standard deviations
-    variances: list[float]  # of each run, its mean ratio over the axes
-    seconds: float
+    runs: int
+    bias: float  # of log Z
+    deviation: float  # standard deviation of log Z
+    log_mean: float  # log of the mean of Zhat / Z
+    largest: float  # |z| of the posterior mean, over the axes
+    variance: float  # over the exact one
+    variance_deviation: float
+    seconds: float  # of one run
+
+    @property
+    def error(self) -> float:
+        """The standard error of the bias."""
+        return self.deviation / math.sqrt(self.runs)
+
+    @property
+    def verdict(self) -> str:
+        """Empty where the bias is small; whether it is that of the logarithm of an unbiased estimate."""
+        if abs(self.bias) <= min(0.1, 2.0 * self.error):
+            return ""
+        logarithm = abs(self.bias) <= 2.0 * self.error or (
+            abs(self.bias + 0.5 * self.deviation**2) <= 2.0 * self.error
+        )
+        return "variance" if logarithm else "biased"
 
 
 @cache
@@ -75,104 +95,87 @@ def measured(cell: Cell) -> Outcome:
         weights, x = normalised(done.log_weights), done["x"]
         errors.append(done.log_evidence - problem.log_evidence)
         mean = weights @ x
-        means.append(((mean - problem.mean) / problem.variance.sqrt()).tolist())
+        means.append(((mean - problem.mean) / problem.variance.sqrt()).numpy())
         # About the exact mean: about its own it would be too small by one part in the effective sample size.
         variances.append(float((weights @ (x - problem.mean).square() / problem.variance).mean()))
-    return Outcome(errors, means, variances, time.perf_counter() - begun)
-
-
-class Summary(NamedTuple):
-    """The figures of a cell."""
-
-    bias: float
-    error: float  # standard error of the bias
-    deviation: float  # standard deviation of log Z
-    log_mean: float  # log of the mean of Zhat / Z
-    largest: float  # |z| of the posterior mean, over the axes
-    variance: float
-    variance_error: float
-    seconds: float  # of one run
-
-    @property
-    def verdict(self) -> str:
-        """Empty where the bias is small; whether it is that of the logarithm of an unbiased estimate."""
-        if abs(self.bias) <= min(0.1, 2.0 * self.error):
-            return ""
-        logarithm = abs(self.bias) <= 2.0 * self.error or (
-            abs(self.bias + 0.5 * self.deviation**2) <= 2.0 * self.error
-        )
-        return "variance" if logarithm else "biased"
-
-
-def summary(outcome: Outcome) -> Summary:
-    errors, means, variances = (np.array(v) for v in outcome[:3])
     runs = len(errors)
-    root = math.sqrt(runs)
-    deviation = float(errors.std(ddof=1))
-    spread = means.std(axis=0, ddof=1) / root
-    return Summary(
-        float(errors.mean()),
-        deviation / root,
-        deviation,
-        float(np.logaddexp.reduce(errors) - math.log(runs)),
-        float((np.abs(means.mean(axis=0)) / np.maximum(spread, 1e-12)).max()),
-        float(variances.mean()),
-        float(variances.std(ddof=1)) / root,
-        outcome.seconds / runs,
+    spread = np.std(means, axis=0, ddof=1) / math.sqrt(runs)
+    figures = (
+        np.mean(errors),
+        np.std(errors, ddof=1),
+        np.logaddexp.reduce(errors) - math.log(runs),
+        (np.abs(np.mean(means, axis=0)) / np.maximum(spread, 1e-12)).max(),
+        np.mean(variances),
+        np.std(variances, ddof=1),
+        (time.perf_counter() - begun) / runs,
+    )
+    return Outcome(runs, *(float(f"{figure:.6g}") for figure in figures))
+
+
+def pooled(outcomes: list[Outcome]) -> Outcome:
+    """What a cell's runs give together; of |z| the largest."""
+    runs, *figures = (np.array(each) for each in zip(*outcomes, strict=True))
+    bias, deviation, log_mean, largest, variance, variance_deviation, seconds = figures
+    weights = runs / runs.sum()
+
+    def spread(means: Array, deviations: Array) -> float:
+        between = runs @ (means - weights @ means) ** 2
+        return float(np.sqrt(((runs - 1) @ deviations**2 + between) / (runs.sum() - 1)))
+
+    return Outcome(
+        int(runs.sum()),
+        float(weights @ bias),
+        spread(bias, deviation),
+        float(np.logaddexp.reduce(log_mean + np.log(weights))),
+        float(largest.max()),
+        float(weights @ variance),
+        spread(variance, variance_deviation),
+        float(weights @ seconds),
     )
 
 
-def in_turn(outcome_of: Callable[[Cell, float], Outcome | None], cells: list[Cell]) -> list[Outcome | float]:
-    """The outcomes with more and more particles, given the seconds of the longest run before each.
-
-    Where there is no outcome, these seconds stand in its place.
-    """
-    outcomes: list[Outcome | float] = []
-    longest = 0.0
-    for cell in cells:
-        outcome = outcome_of(cell, longest)
-        if outcome is not None:
-            longest = max(longest, outcome.seconds / len(outcome.errors))
-        outcomes.append(longest if outcome is None else outcome)
-    return outcomes
+def outcome_of(file: Path | None, limit: float, cell: Cell, longest: float = 0.0) -> Outcome | None:
+    """The runs of a cell that the file holds, and those that it lacks where none before took too long."""
+    held = held_by(file).get(cell[:3], {})
+    known = [Outcome(*outcome) for seeds, outcome in held.items() if {*seeds} <= {*cell.seeds}]
+    missing = tuple(sorted({*cell.seeds}.difference(*held)))
+    if missing and longest <= limit:
+        cell = cell._replace(seeds=missing)
+        known.append(added(file, cell, partial(measured, cell)))
+    return pooled(known) if known else None
 
 
-def run_within(file: Path | None, limit: float, cell: Cell, longest: float) -> Outcome | None:
-    """A cell as the file holds it, or else run; None where a run before it took longer than the limit."""
-    known = recorded(file, cell)
-    if known is None and longest > limit:
-        return None
-    return Outcome(*(known or added(file, cell, partial(measured, cell))))
-
-
-@cache
-def cells_of(file: Path) -> Mapping[tuple[str, str, int], Mapping[tuple[int, ...], Outcome]]:
+def held_by(file: Path | None) -> Mapping[tuple[str, str, int], Mapping[tuple[int, ...], list[float]]]:
     """What a file holds, by problem, kernel and number of particles, and by seeds."""
-    held: dict[tuple[str, str, int], dict[tuple[int, ...], Outcome]] = {}
-    for line in file.read_text(encoding="utf-8").splitlines():
+    held: dict[tuple[str, str, int], dict[tuple[int, ...], list[float]]] = {}
+    for line in file.read_text(encoding="utf-8").splitlines() if file and file.exists() else []:
         (problem, kernel, particles, seeds), outcome = json.loads(line)
-        held.setdefault((problem, kernel, particles), {})[tuple(seeds)] = Outcome(*outcome)
+        held.setdefault((problem, kernel, particles), {})[tuple(seeds)] = outcome
     return held
 
 
-def as_recorded(file: Path, cell: Cell, _: float) -> Outcome | None:
-    """Of a cell in a file the most runs that begin with its first seed."""
-    runs = cells_of(file).get(cell[:3], {})
-    own = [outcome for seeds, outcome in runs.items() if seeds[0] == cell.seeds[0]]
-    return max(own, key=lambda outcome: len(outcome.errors), default=None)
+def in_turn(file: Path | None, limit: float, cells: list[Cell]) -> list[Outcome | float]:
+    """The outcomes with more and more particles; where there is none, the longest run before, in seconds."""
+    outcomes: list[Outcome | float] = []
+    longest = 0.0
+    for cell in cells:
+        outcome = outcome_of(file, limit, cell, longest)
+        longest = max(longest, outcome.seconds if outcome else 0.0)
+        outcomes.append(outcome or longest)
+    return outcomes
 
 
-def second_opinion(cell: Cell, file: Path | None, first: int) -> Outcome | None:
-    """The cell with its own seeds; without any, the most runs of a file that do not begin with the first."""
-    if cell.seeds:
-        return run_within(file, math.inf, cell, 0.0)
-    runs = {} if file is None or not file.exists() else cells_of(file).get(cell[:3], {})
-    others = [outcome for seeds, outcome in runs.items() if seeds[0] != first]
-    return max(others, key=lambda outcome: len(outcome.errors), default=None)
+def second_opinion(file: Path | None, cell: Cell, others: tuple[int, ...]) -> Outcome | None:
+    """The cell with other seeds; without any, the runs of the file with none of its own."""
+    if others:
+        return outcome_of(file, math.inf, cell._replace(seeds=others))
+    held = held_by(file).get(cell[:3], {})
+    apart = [Outcome(*outcome) for seeds, outcome in held.items() if not {*seeds} & {*cell.seeds}]
+    return pooled(apart) if apart else None
 
 
-def reason(cell: Cell, file: Path | None, first: int) -> str:
-    """Why a kernel is biased: as stated, or what a cell with other seeds than the first ones gives."""
+def reason(file: Path | None, cell: Cell, others: tuple[int, ...]) -> str:
+    """Why a kernel is biased: as stated, or what other seeds give."""
     if cell.kernel in REASONS:
         return REASONS[cell.kernel]
     axes = problem_named(cell.problem).dimension
@@ -183,12 +186,11 @@ def reason(cell: Cell, file: Path | None, first: int) -> str:
         return WIDE
     if cell.particles < 1000:
         return FEW
-    opinion = second_opinion(cell, file, first)
-    if opinion is None:
+    again = second_opinion(file, cell, others)
+    if again is None:
         return "unexplained"
-    again = summary(opinion)
     found = {"": "chance, ", "variance": "variance, ", "biased": "unexplained, "}[again.verdict]
-    return f"{found}{len(opinion.errors)} other seeds give {again.bias:+.3f} ± {again.error:.3f}"
+    return f"{found}{again.runs} other seeds give {again.bias:+.3f} ± {again.error:.3f}"
 
 
 def main() -> None:
@@ -216,23 +218,18 @@ def main() -> None:
     seeds = tuple(range(arguments.seed, arguments.seed + runs))
     others = tuple(range(arguments.seed + runs, arguments.seed + runs + arguments.confirm))
     kernels_on = [[Cell(p, k, n, seeds) for n in sorted(counts)] for p in problems for k in kernels]
-    outcome_of = (
-        partial(as_recorded, arguments.file)
-        if arguments.recorded
-        else partial(run_within, arguments.file, arguments.limit)
-    )
-    outcomes = each(partial(in_turn, outcome_of), kernels_on, 1 if arguments.recorded else arguments.jobs)
+    limit = -1.0 if arguments.recorded else arguments.limit
+    outcomes = each(partial(in_turn, arguments.file, limit), kernels_on, arguments.jobs)
     done = dict(zip(chain(*kernels_on), chain(*outcomes), strict=True))
     rows: list[Row] = []
     for problem in problems:
         lines = []
         for cell in (Cell(problem, k, n, seeds) for n in sorted(counts) for k in kernels):
-            outcome = done[cell]
-            if isinstance(outcome, float):
-                took = f"> {outcome:.1f}" if outcome else ""
+            figures = done[cell]
+            if isinstance(figures, float):
+                took = f"> {figures:.1f}" if figures else ""
                 lines.append([cell.kernel, cell.particles, 0, *"-----", took, "not run"])
                 continue
-            figures = summary(outcome)
             name = f"{problem}, {cell.kernel}, N = {cell.particles}"
             # Goals where theory promises them: many particles, and not more axes than they can learn.
             goal = cell.particles >= 1000 and "D = 100" not in problem
@@ -253,12 +250,12 @@ def main() -> None:
                 [
                     cell.kernel,
                     cell.particles,
-                    len(outcome.errors),
+                    figures.runs,
                     f"{figures.bias:+.3f} ± {figures.error:.3f}",
                     f"{figures.deviation:.3f}",
                     f"{figures.log_mean:+.3f}",
                     f"{figures.largest:.1f}",
-                    f"{figures.variance:.3f} ± {figures.variance_error:.3f}",
+                    f"{figures.variance:.3f} ± {figures.variance_deviation / math.sqrt(figures.runs):.3f}",
                     figures.seconds,
                     figures.verdict,
                 ]
@@ -278,7 +275,7 @@ def main() -> None:
         show(problem, columns, lines)
         for kernel, particles, *_, verdict in lines:
             if verdict == "biased":
-                why = reason(Cell(problem, kernel, particles, others), arguments.file, seeds[0])
+                why = reason(arguments.file, Cell(problem, kernel, particles, seeds), others)
                 print(f"biased, {kernel}, N = {particles}: {why}", flush=True)
     finish(rows, arguments.json)
 
