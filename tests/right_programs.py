@@ -22,7 +22,9 @@ from bcppl.distributions.switch import Switch
 from bcppl.traces import Series, carried
 from tests.invariance import number
 from tests.small_programs import normal_log
-from tests.wrong_programs import Custom, Rollout, WithoutJacobian, normal
+from tests.wrong_programs.catalogue import normal
+from tests.wrong_programs.dependence import Rollout
+from tests.wrong_programs.numbers_and_supports import Custom, WithoutJacobian
 
 RIGHT: dict[str, Right] = {}
 

@@ -31,7 +31,8 @@ from bcppl.traces import Fault, Model, ProgramError, Series, check_program
 from tests.right_programs import RIGHT
 from tests.test_arm_calibration import arm_and_seating
 from tests.test_arm_in_view import drawn
-from tests.wrong_programs import WRONG, normal
+from tests.wrong_programs import WRONG
+from tests.wrong_programs.catalogue import normal
 
 
 @pytest.mark.parametrize("name", WRONG)

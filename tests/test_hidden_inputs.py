@@ -12,7 +12,7 @@ import torch
 from bcppl.traces import Fault, ProgramError, Trace, check_program, generate, update
 from tests.hidden_inputs import HIDDEN
 from tests.small_programs import normal_log
-from tests.wrong_programs import normal
+from tests.wrong_programs.catalogue import normal
 
 N = 7
 # Nothing that a distribution holds, and no variable that its code names, shows that these have changed.
