@@ -6,12 +6,16 @@ Zhou, Johansen and Aston, Toward automatic model comparison: an adaptive sequent
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from bcppl.beliefs import normalised
 
-SMALLEST_STEP = 1e-6
+# A step is at least this share of the exponent that is reached. The first is as small as a likelihood is
+# sharp: about 1e-12 for a standard deviation of 1e-6 of the prior's.
+LEAST_SHARE, LEAST_STEP = 1e-6, 1e-100
 
 
 def conditional_effective_sample_size(weights: Tensor, log_factor: Tensor) -> float:
@@ -31,14 +35,20 @@ def next_exponent(log_weights: Tensor, log_likelihood: Tensor, exponent: float, 
         return 1.0
     weights, likelihood = normalised(log_weights[finite]), log_likelihood[finite]
     target = share * len(weights)
+
+    def enough(step: float) -> bool:
+        return conditional_effective_sample_size(weights, step * likelihood) >= target
+
+    return exponent_after(exponent, enough)
+
+
+def exponent_after(exponent: float, enough: Callable[[float], bool]) -> float:
+    """The exponent in (exponent, 1] after the largest step that leaves enough, by bisection."""
     low, high = 0.0, 1.0 - exponent
-    if conditional_effective_sample_size(weights, high * likelihood) >= target:
+    if enough(high):
         return 1.0
-    # The sharpest likelihoods need steps of 1e-5 and less; one part in ten thousand of a step is nothing.
-    while high - low > 1e-4 * high and high > SMALLEST_STEP:
+    least = max(LEAST_STEP, LEAST_SHARE * exponent)
+    while high - low > 1e-4 * high and high > least:
         middle = 0.5 * (low + high)
-        if conditional_effective_sample_size(weights, middle * likelihood) >= target:
-            low = middle
-        else:
-            high = middle
-    return min(1.0, exponent + max(low, SMALLEST_STEP))
+        low, high = (middle, high) if enough(middle) else (low, middle)
+    return min(1.0, exponent + max(low, least))

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
+from bcppl.inference.exponents import exponent_after
 from bcppl.inference.filters.step import StepInfo, Stepped
 from bcppl.inference.kernels import Kernel, Until, moved_by
 from bcppl.inference.kernels.kernel import refuse_other, scattered
@@ -22,8 +23,6 @@ from bcppl.inference.population import Population
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import Target
 from bcppl.traces import Trace, generate
-
-SMALLEST_STEP = 1e-6
 
 
 def persistent_sampling(
@@ -119,17 +118,11 @@ def _weighted(
 def _next(log_likelihood: Tensor, log_mixture: Tensor, reached: float, size: float) -> float:
     """The largest exponent above `reached` at which the effective sample size is `size`, or 1."""
 
-    def enough(exponent: float) -> bool:
-        weights = torch.softmax(_tempered(log_likelihood, exponent) - log_mixture, dim=0)
+    def enough(step: float) -> bool:
+        weights = torch.softmax(_tempered(log_likelihood, reached + step) - log_mixture, dim=0)
         return float(1.0 / weights.square().sum()) >= size
 
-    if enough(1.0):
-        return 1.0
-    low, high = reached, 1.0
-    while high - low > max(SMALLEST_STEP, 1e-4 * (high - reached)):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if enough(middle) else (low, middle)
-    return min(1.0, max(low, reached + SMALLEST_STEP))
+    return exponent_after(reached, enough)
 
 
 def _joined(first: Trace, second: Trace) -> Trace:

@@ -15,7 +15,7 @@ from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import Kernel, Move, decided
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Unflattened, VectorCoordinates, coordinates_of
-from bcppl.inference.proposals.spread import FLOOR, weighted_places
+from bcppl.inference.proposals.spread import conditioned, weighted_places
 from bcppl.inference.summaries import weighted_covariance
 from bcppl.inference.targets import Target
 from bcppl.traces import Trace, update
@@ -233,6 +233,7 @@ def _factor(addresses: tuple[str, ...], population: Population) -> Tensor:
     weights = torch.where(torch.isfinite(position).all(dim=1), weights, 0.0)
     position = torch.nan_to_num(position, 0.0, 0.0, 0.0)
     weights = weights / weights.sum().clamp_min(torch.finfo(torch.float64).tiny)
-    covariance = weighted_covariance(position, weights)
-    covariance = covariance + torch.diag(unlearned_variances(addresses, population))
-    return torch.linalg.cholesky(0.9 * covariance + 0.1 * torch.diag(covariance.diagonal() + 10 * FLOOR**2))
+    each = [weighted_places(population, address) for address in addresses]
+    least = torch.cat([fitted.least for fitted in each])
+    covariance = weighted_covariance(position, weights) + torch.diag(least)
+    return torch.linalg.cholesky(conditioned(covariance, max(fitted.effective for fitted in each)))

@@ -140,7 +140,7 @@ def student_t(address: str, degrees: float = 5.0, width: float = 1.3) -> Surroga
     width = number_within("student_t is given a width of {}", width, above=0.0)
 
     def fit(population: Population) -> Callable[[Trace], Tensor]:
-        coordinates, places, weights, _ = weighted_places(population, address)
+        coordinates, places, weights, *_ = weighted_places(population, address)
         center = coordinates.mean(places, weights)
         factor = torch.linalg.cholesky(width * spread_of(address)(population))
 

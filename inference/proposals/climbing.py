@@ -139,7 +139,10 @@ def fitted(
                 continue
             weights = torch.softmax(next_exponent(equal, factor[m], 0.0, KEPT) * factor[m], dim=0)
             center = known.mean(drawn[m], weights)
-            spread = conditioned(weighted_covariance(known.steps(center, drawn[m]), weights))
+            spread = weighted_covariance(known.steps(center, drawn[m]), weights)
+            spread = conditioned(
+                spread + torch.diag(known.rounding(drawn[m]).square()), 1.0 / float(weights.square().sum())
+            )
             centers = centers.index_copy(0, torch.tensor([m]), center[None])
             covariance = covariance.index_copy(0, torch.tensor([m]), spread[None])
     return Modes(centers, covariance, log_mass, scale)

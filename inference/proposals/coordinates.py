@@ -56,6 +56,10 @@ class PoseCoordinates:
         same = (places == places[0]).all(dim=0)
         return self.freedom.coordinates(torch.cat([same[:3], same[3:].all().expand(3)]))
 
+    def rounding(self, places: Tensor) -> Tensor:
+        """Standard deviations (d,) below which differences of places are rounding, metres and radians."""
+        return torch.full((self.dimension,), 1e-6, dtype=torch.float64)
+
     def mean(self, places: Tensor, weights: Tensor) -> Tensor:
         """The weighted mean pose along the free axes; the held ones are those of the first place."""
         mean = Belief(places, weights.log(), self.freedom).mean
@@ -102,6 +106,10 @@ class VectorCoordinates:
     def still(self, places: Tensor) -> Tensor:
         """The axes (d,) along which no two places differ, bool."""
         return (places == places[0]).all(dim=0)
+
+    def rounding(self, places: Tensor) -> Tensor:
+        """Standard deviations (d,) below which differences of places are rounding."""
+        return (1e-12 * places.abs().amax(dim=0)).clamp_min(1e-150)
 
     def mean(self, places: Tensor, weights: Tensor) -> Tensor:
         """The weighted mean."""

@@ -14,7 +14,6 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates
 from bcppl.inference.proposals.proposal import Fitted
 from bcppl.inference.proposals.spread import (
-    FLOOR,
     Places,
     conditioned,
     covariance_about_mean,
@@ -71,13 +70,14 @@ def independent(
     width = number_within(f"{what} width {{}}", width, above=0.0)
 
     def fit(population: Population) -> Callable[[Trace], None]:
-        known, places, weights, unlearned = weighted_places(population, address)
+        fitted = weighted_places(population, address)
         if len(population) > MOST_FITTED:
-            places = places[systematic(weights.log(), MOST_FITTED)]
-            weights = weights.new_full((MOST_FITTED,), 1.0 / MOST_FITTED)
-        fitted = Places(known, places, weights, unlearned)
+            drawn = fitted.places[systematic(fitted.weights.log(), MOST_FITTED)]
+            alike = fitted.weights.new_full((MOST_FITTED,), 1.0 / MOST_FITTED)
+            fitted = fitted._replace(places=drawn, weights=alike)
+        known, places, weights, *_ = fitted
         mixture = _kernel_density(fitted) if components is None else _maximised(fitted, components)
-        whole = covariance_about_mean(*fitted)
+        whole = covariance_about_mean(fitted)
         shares = torch.cat([mixture.log_weights.exp() * (1.0 - share), weights.new_tensor([share])])
         centers = torch.cat([mixture.centers, known.mean(places, weights)[None]])
         covariances = torch.cat([inflation**2 * mixture.covariances, width**2 * whole[None]])
@@ -100,10 +100,10 @@ class Mixture(NamedTuple):
 
 def _kernel_density(fitted: Places) -> Mixture:
     """A kernel density estimate: a normal at every particle, of Silverman's width."""
-    coordinates, places, weights, _ = fitted
+    coordinates, places, weights, *_ = fitted
     dimension, effective = coordinates.dimension, float(1.0 / (weights**2).sum())
     width = (4.0 / (dimension + 2.0)) ** (1.0 / (dimension + 4.0)) * effective ** (-1.0 / (dimension + 4.0))
-    whole = covariance_about_mean(*fitted)
+    whole = covariance_about_mean(fitted)
     return Mixture(weights.log(), places, (width**2 * whole).expand(len(places), -1, -1))
 
 
@@ -113,15 +113,15 @@ def _maximised(fitted: Places, components: int) -> Mixture:
     They are posterior modes under an inverse Wishart prior at the pooled covariance, worth as many particles
     as there are coordinates (Fraley and Raftery, Journal of Classification 24, 2007, section 3).
     """
-    coordinates, places, weights, unlearned = fitted
-    dimension, particles, prior = coordinates.dimension, len(places), torch.diag(unlearned)
+    coordinates, places, weights, *_ = fitted
+    dimension, particles, prior = coordinates.dimension, len(places), torch.diag(fitted.least)
+    effective = fitted.effective
     centers = places[_apart(fitted, components)]
     components = len(centers)
     steps = torch.stack([coordinates.steps(center, places) for center in centers])
-    metric = conditioned(weighted_covariance(steps[0], weights) + prior).diagonal()
+    metric = (weighted_covariance(steps[0], weights) + prior).diagonal()
     nearest = (steps.square() / metric).sum(dim=-1).argmin(dim=0)
     shares = torch.nn.functional.one_hot(nearest, components).T.to(torch.float64)
-    floor = FLOOR**2 * torch.eye(dimension, dtype=torch.float64)
     mixture = None
     for _ in range(ROUNDS if components > 1 else 1):
         masses = (shares * weights).sum(dim=1)
@@ -136,9 +136,9 @@ def _maximised(fitted: Places, components: int) -> Mixture:
                 for center, each in zip(centers, within, strict=True)
             ]
         )
-        pooled = conditioned((masses[:, None, None] * covariances).sum(dim=0))
+        pooled = conditioned((masses[:, None, None] * covariances).sum(dim=0), effective)
         counts = (masses * particles)[:, None, None]
-        covariances = (counts * covariances + dimension * pooled) / (counts + dimension) + floor
+        covariances = (counts * covariances + dimension * pooled) / (counts + dimension)
         mixture = Mixture(masses.log(), centers, covariances)
         if len(masses) == 1:
             break
@@ -162,9 +162,9 @@ def _apart(fitted: Places, count: int) -> Tensor:
 
     Arthur and Vassilvitskii, k-means++: the advantages of careful seeding, SODA 2007.
     """
-    coordinates, places, weights, _ = fitted
+    coordinates, places, weights, *_ = fitted
     chosen = [int(torch.multinomial(weights, 1))]
-    metric = covariance_about_mean(*fitted).diagonal()
+    metric = covariance_about_mean(fitted).diagonal()
     nearest = torch.full_like(weights, torch.inf)
     while len(chosen) < count:
         apart = (coordinates.steps(places[chosen[-1]], places).square() / metric).sum(dim=-1)

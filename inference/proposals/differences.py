@@ -48,7 +48,7 @@ def differential_evolution(
 
     def fit(population: Population) -> Callable[[Trace], None]:
         covariance = noise**2 * spread(population)
-        known, places, weights, _ = weighted_places(population, address)
+        known, places, weights, *_ = weighted_places(population, address)
         drawn = _differences(known, places, weights)
         usual = 2.38 / math.sqrt(2.0 * known.dimension) if scale is None else scale
         sizes = torch.tensor([usual, 1.0], dtype=torch.float64)

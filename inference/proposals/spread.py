@@ -17,8 +17,6 @@ from bcppl.traces import Trace
 from bcppl.traces.series import Stage
 from bcppl.traces.verbs import constrained
 
-# Standard deviations below this are rounding: metres and radians for poses, the value's unit otherwise.
-FLOOR = 1e-6
 # Draws of the prior that give the scale of an axis: its standard deviation is accurate to about 5 %.
 DRAWS = 400
 # The median of the square of a standard normal.
@@ -34,12 +32,25 @@ class Places(NamedTuple):
         weights: (K,) normalised.
         unlearned: (d,) variance of the prior along the axes on which no two particles differ, 0 on the
             others.
+        rounding: (d,) variance below which differences are rounding.
     """
 
     coordinates: Coordinates
     places: Tensor
     weights: Tensor
     unlearned: Tensor
+    rounding: Tensor
+
+    @property
+    def least(self) -> Tensor:
+        """The variance (d,) that is added to that of the particles."""
+        return self.unlearned + self.rounding
+
+    @property
+    def effective(self) -> float:
+        """How many particles there are, copies and those without weight not counted."""
+        distinct = len(self.places.flatten(1).sum(dim=1).unique())
+        return min(float(distinct), 1.0 / float(self.weights.square().sum()))
 
 
 def spread_of(address: str) -> Callable[[Population], Tensor]:
@@ -49,7 +60,7 @@ def spread_of(address: str) -> Callable[[Population], Tensor]:
     value that of its unbounded coordinates (`bcppl.inference.proposals.coordinates`). Along an axis on which
     no two particles differ (a chain by itself, chains from one point) it has the variance of the prior.
     """
-    return lambda population: covariance_about_mean(*weighted_places(population, address))
+    return lambda population: covariance_about_mean(weighted_places(population, address))
 
 
 def weighted_places(population: Population, address: str) -> Places:
@@ -74,7 +85,7 @@ def weighted_places(population: Population, address: str) -> Places:
     unlearned = torch.zeros(coordinates.dimension, dtype=torch.float64)
     if bool(still.any()):
         unlearned = torch.where(still, _prior_variance(population.trace, address), unlearned)
-    return Places(coordinates, places, weights, unlearned)
+    return Places(coordinates, places, weights, unlearned, coordinates.rounding(places).square())
 
 
 def _prior_variance(trace: Trace, address: str) -> Tensor:
@@ -96,15 +107,19 @@ def _prior_variance(trace: Trace, address: str) -> Tensor:
     return steps.square().median(dim=0).values / (2.0 * MEDIAN)
 
 
-def covariance_about_mean(
-    coordinates: Coordinates, places: Tensor, weights: Tensor, unlearned: Tensor
-) -> Tensor:
-    """The conditioned weighted covariance (d, d) of `Places` about their mean."""
+def covariance_about_mean(fitted: Places) -> Tensor:
+    """The conditioned weighted covariance (d, d) of particles about their mean."""
+    coordinates, places, weights, *_ = fitted
     steps = coordinates.steps(coordinates.mean(places, weights), places)
-    return conditioned(weighted_covariance(steps, weights) + torch.diag(unlearned))
+    return conditioned(weighted_covariance(steps, weights) + torch.diag(fitted.least), fitted.effective)
 
 
-def conditioned(covariance: Tensor) -> Tensor:
-    """A covariance from few, partly equal particles, made positive definite by shrinking correlations."""
-    diagonal = torch.diag(covariance.diagonal() + FLOOR**2)
-    return 0.9 * covariance + 0.1 * diagonal
+def conditioned(covariance: Tensor, count: float) -> Tensor:
+    """A covariance (d, d) from `count` particles, its correlations shrunk where they are few.
+
+    By a tenth for d of them or fewer, by a hundredth of that for ten times as many. More would make moves
+    along a narrow ridge too wide: by a tenth always, `hmc` left the evidence of 30 correlated axes, the
+    narrowest a sixtieth of the widest, 3 to 46 nats off with 1000 particles.
+    """
+    share = 0.1 * min(1.0, (len(covariance) / count) ** 2)
+    return (1.0 - share) * covariance + share * torch.diag(covariance.diagonal())

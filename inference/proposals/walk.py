@@ -16,12 +16,9 @@ from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import FLOOR, spread_of, weighted_places
+from bcppl.inference.proposals.spread import conditioned, spread_of, weighted_places
 from bcppl.inference.summaries import weighted_covariance
 from bcppl.traces import Trace
-
-# Shrinkage of correlations: a ridge a tenth as wide as it is long is still followed.
-SHRUNK = 0.01
 
 
 def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fitted:
@@ -112,25 +109,27 @@ class _Link(NamedTuple):
 
 
 def _links(population: Population, addresses: tuple[str, ...]) -> list[_Link]:
-    steps, known, unlearned = [], [], []
+    steps, known, least, effective = [], [], [], 0.0
     for address in addresses:
-        coordinates, places, weights, still = weighted_places(population, address)
+        fitted = weighted_places(population, address)
+        coordinates, places, weights, *_ = fitted
         if len(places) < len(population):
             raise InputError(
                 f"joint_drift moves {address!r}, of which some particles are at the edge of the support, "
                 "0 or infinite; give its prior less spread."
             )
         known.append(coordinates)
-        unlearned.append(still)
+        least.append(fitted.least)
+        effective = max(effective, fitted.effective)
         steps.append(coordinates.steps(coordinates.mean(places, weights), places))
     together = torch.cat(steps, dim=1)
-    covariance = weighted_covariance(together, weights) + torch.diag(torch.cat(unlearned))
-    diagonal = torch.diag(covariance.diagonal() + FLOOR**2)
-    covariance = ((1.0 - SHRUNK) * covariance + SHRUNK * diagonal) * (2.38**2 / together.shape[1])
+    covariance = weighted_covariance(together, weights) + torch.diag(torch.cat(least))
+    covariance = conditioned(covariance, effective) * (2.38**2 / together.shape[1])
     links, end = [], 0
     for address, coordinates in zip(addresses, known, strict=True):
         before, own = slice(0, end), slice(end, end + coordinates.dimension)
-        gain = torch.linalg.solve(covariance[before, before], covariance[before, own]).T
+        factor = torch.linalg.cholesky(covariance[before, before])
+        gain = torch.cholesky_solve(covariance[before, own], factor).T
         left = covariance[own, own] - gain @ covariance[before, own]
         links.append(_Link(address, coordinates, gain, 0.5 * (left + left.T)))
         end += coordinates.dimension
