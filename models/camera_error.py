@@ -36,18 +36,21 @@ def camera_error(scene: Scene, actions: Sequence[Any]) -> None:
 
 
 def first_views(trace: Trace) -> dict[str, Any]:
-    """Each instrument's first view."""
+    """Each viewpoint's first view."""
     scene, actions = trace.args
     first: dict[str, Any] = {}
     for view in actions:
-        first.setdefault(scene.sensor(view).instrument(view), view)
+        first.setdefault(scene.sensor(view).viewpoint(view), view)
     return first
 
 
 def conditional(trace: Trace, values: Mapping[str, Tensor]) -> NormalPose:
     """The approximate conditional of the part's pose, given where its cameras measure it and their biases."""
     scene = trace.args[0]
-    factors = [scene.sensor(view).factor(view, values) for view in first_views(trace).values()]
+    instruments: dict[str, list[Any]] = {}
+    for view in first_views(trace).values():
+        instruments.setdefault(scene.sensor(view).instrument(view), []).append(view)
+    factors = [scene.sensor(views[0]).factor(views, values) for views in instruments.values()]
     return product_of_factors(scene.prior, factors)
 
 

@@ -122,8 +122,7 @@ def test_several_views_share_one_error() -> None:
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_beliefs_hold_the_truth_and_are_as_wide_as_the_cameras_errors(seed: int) -> None:
     recording = simulate_recording(seed)
-    # Fewer moves than the default's: a belief that is not quite there is wide, not sure.
-    *_, last = infer(camera_error.model, recording, seed=seed, sweeps=(4, 4), share=(0.6, 0.6))
+    *_, last = infer(camera_error.model, recording, seed=seed)
     belief = last.belief
     off = poses.local(belief.mean, torch.as_tensor(recording.truth))
     assert float(off @ torch.linalg.solve(belief.covariance, off)) < float(chi2.ppf(0.999, 6))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -10,7 +11,7 @@ from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.extrusion import block_with_square_hole
-from bcppl.rendering.extrinsics_error import apparent_covariance, apparent_pose, line_of_sight
+from bcppl.rendering.extrinsics_error import apparent_covariance, apparent_motion, line_of_sight
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.rendering.region_of_interest import region_of_interest
 
@@ -53,11 +54,11 @@ def test_a_part_farther_along_the_line_of_sight_stays_in_its_pixel_and_is_deeper
     assert abs(far[2] - near[2] - 0.1) < 1e-12
 
 
-def test_one_error_is_carried_to_another_place() -> None:
-    error = torch.tensor([0.004, -0.003, 0.002, 0.02, -0.01, 0.03], dtype=torch.float64)
-    other = camera((-0.1, 0.4, 0.3), "elsewhere")
-    computed = apparent_pose(CAMERA, other, PART, seen(CAMERA, error))
-    assert float(poses.local(computed, seen(other, error)).abs().max()) < 1e-12
+@pytest.mark.parametrize("by", [CAMERA, camera((-0.1, 0.4, 0.3), "elsewhere")], ids=lambda by: by.name)
+def test_an_error_along_and_about_the_camera_s_axes_moves_what_it_sees(by: Camera) -> None:
+    error = 1e-5 * torch.tensor([0.4, -0.3, 0.2, 2.0, -1.0, 3.0], dtype=torch.float64)
+    computed = apparent_motion(by, PART, 0.5, 2.0) @ (error / torch.tensor([0.5] * 3 + [2.0] * 3))
+    assert float((computed - poses.local(PART, seen(by, error))).abs().max()) < 1e-8
 
 
 def test_a_part_that_may_be_anywhere_within_reach_stays_in_its_region() -> None:

@@ -105,7 +105,7 @@ def shipped_or(smaller: Smaller) -> pytest.MarkDecorator:
 @shipped_or(
     {
         "recording": [NEAR],
-        "vision": [("particles=75, seed=0", "particles=12, seed=0, sweeps=(6, 3), share=(0.6, 0.4)")],
+        "vision": [("particles=75, seed=0", "particles=24, seed=0, sweeps=(6, 3), share=(0.6, 0.4)")],
     }
 )
 def test_first_belief_runs_and_finds_the_part(kernel: Any, smaller: Smaller) -> None:
@@ -120,7 +120,7 @@ def test_first_belief_runs_and_finds_the_part(kernel: Any, smaller: Smaller) -> 
     )
     adds = {label: float(add) for label, add, _ in rows}
     assert len(rows) == len(adds) == 15
-    # Twelve particles are few: where they end depends on the seed.
+    # Two dozen particles are few: where they end depends on the seed.
     assert adds["window 14"] < (adds["prior"] if smaller else 0.5 * adds["view 2"])
     assert smaller or (adds["view 2"] < 0.5 * adds["prior"] and adds["window 14"] < 0.3 * adds["view 2"])
     (final,) = re.findall(r"^ADD ([\d.]+) mm$", printed["answer"], flags=re.MULTILINE)

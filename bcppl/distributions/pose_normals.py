@@ -51,6 +51,7 @@ class PoseFactor(NamedTuple):
 
     pose: Tensor  # (N, 7) its mean
     covariance: Callable[[Tensor], Tensor]  # (N, 6, 6) in the tangent space at a centre (N, 7)
+    log_weight: Tensor | float = 0.0  # (N,)
 
 
 def product_of_factors(prior: Any, factors: Sequence[PoseFactor]) -> NormalPose:
@@ -65,7 +66,7 @@ def product_of_factors(prior: Any, factors: Sequence[PoseFactor]) -> NormalPose:
     for _ in range(2):  # the first centre is a few millimetres off, which changes the covariances by 1 %
         precision: Any = 0.0
         pull: Any = 0.0
-        for pose, covariance_at in factors:
+        for pose, covariance_at, _ in factors:
             own = torch.linalg.inv(covariance_at(center))[..., axes, :]
             precision = precision + own[..., axes]
             pull = pull + own @ poses.local(center, pose)[..., None]
@@ -77,11 +78,11 @@ def product_of_factors(prior: Any, factors: Sequence[PoseFactor]) -> NormalPose:
 def log_overlap(product: NormalPose, factors: Sequence[PoseFactor]) -> Tensor:
     """The log of the integral (N,) of factors' product, given the Gaussian that it is, but for a constant."""
     log_mass = 0.5 * torch.linalg.slogdet(product.covariance)[1]
-    for pose, covariance_at in factors:
+    for pose, covariance_at, log_weight in factors:
         own = covariance_at(product.center)
         away = poses.local(product.center, pose)
         squared = (away * torch.linalg.solve(own, away[..., None])[..., 0]).sum(dim=-1)
-        log_mass = log_mass - 0.5 * (squared + torch.linalg.slogdet(own)[1])
+        log_mass = log_mass + log_weight - 0.5 * (squared + torch.linalg.slogdet(own)[1])
     return log_mass
 
 

@@ -29,39 +29,32 @@ def line_of_sight(camera: Camera, part: Tensor) -> Tensor:
     return away / (away @ forward)[..., None]
 
 
-def apparent_covariance(camera: Camera, part: Tensor, shift: float, turn: float) -> Tensor:
-    """Covariances (..., 6, 6) of the apparent poses of parts under an error of a camera's extrinsics.
+def apparent_motion(camera: Camera, part: Tensor, shift: float, turn: float) -> Tensor:
+    """How the apparent poses of parts change with an error of a camera's extrinsics, (..., 6, 6).
 
     An extrinsic error of v along and w about the camera's axes moves a part at p in them by -v + p x w and
-    turns it by -w. The error is isotropic, so the camera's orientation does not matter.
+    turns it by -w.
 
     Args:
         camera: with its nominal extrinsics.
-        part: (..., 7) world_from_part, in whose tangent space the covariance is: m^2, m rad, rad^2.
-        shift: standard deviation of the error along each of the camera's axes, metres.
-        turn: standard deviation of the error about each of them, radians.
+        part: (..., 7) world_from_part, in whose tangent space the rows are: metres, radians.
+        shift: the error along each of the camera's axes, metres, of the first three columns.
+        turn: the error about each of them, radians, of the last three.
     """
-    away = part[..., :3] - _nominal(camera)[0]
-    unit = torch.eye(3, dtype=torch.float64).expand(*away.shape, 3)
-    # Columns are away x unit.
-    across = turn * torch.linalg.cross(away[..., None, :].expand_as(unit), unit, dim=-1).transpose(-1, -2)
-    moved = shift**2 * unit + across @ across.transpose(-1, -2)
-    mixed = -turn * across @ poses.rotation_matrix(part)
-    upper = torch.cat([moved, mixed], dim=-1)
-    lower = torch.cat([mixed.transpose(-1, -2), turn**2 * unit], dim=-1)
-    return torch.cat([upper, lower], dim=-2)
+    stated = torch.as_tensor(camera.world_from_camera, dtype=torch.float64)
+    axes = poses.rotation_matrix(stated).expand(*part.shape[:-1], 3, 3)
+    away = part[..., :3] - stated[:3]
+    across = torch.linalg.cross(away[..., None].expand_as(axes), axes, dim=-2)
+    moved = torch.cat([-shift * axes, turn * across], dim=-1)
+    turned = -turn * poses.rotation_matrix(part).transpose(-1, -2) @ axes
+    return torch.cat([moved, torch.cat([torch.zeros_like(turned), turned], dim=-1)], dim=-2)
 
 
-def apparent_pose(first: Camera, second: Camera, part: Tensor, apparent: Tensor) -> Tensor:
-    """Apparent poses (..., 7) of a part from a second viewpoint, under the extrinsic error of the first.
+def apparent_covariance(camera: Camera, part: Tensor, shift: float, turn: float) -> Tensor:
+    """Covariances (..., 6, 6) of the apparent poses of parts (..., 7) under a camera's extrinsic error.
 
-    Args:
-        first: the instrument at the first viewpoint, with its nominal extrinsics.
-        second: the same instrument at the second viewpoint.
-        part: (..., 7) the part's true pose in the world.
-        apparent: (..., 7) its apparent pose from the first viewpoint.
+    `shift` and `turn` are its standard deviations along and about each of the camera's axes, metres and
+    radians.
     """
-    there, here = (torch.as_tensor(c.world_from_camera, dtype=torch.float64) for c in (second, first))
-    through = poses.compose(there, poses.inverse(here))
-    moved = poses.compose(apparent, poses.inverse(part))
-    return poses.compose(poses.compose(through, poses.compose(moved, poses.inverse(through))), part)
+    motion = apparent_motion(camera, part, shift, turn)
+    return motion @ motion.transpose(-1, -2)

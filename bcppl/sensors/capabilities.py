@@ -30,7 +30,10 @@ class FitsPose(Protocol):
     """An instrument with nuisance parameters: a measurement is approximated by a Gaussian over both."""
 
     def instrument(self, action: Any) -> str:
-        """The name of the instrument; all its measurements share its nuisance parameters."""
+        """The name of the instrument; the errors of its measurements are correlated."""
+
+    def viewpoint(self, action: Any) -> str:
+        """The name of a place of the instrument; all measurements from there share nuisance parameters."""
 
     def fit(
         self, number: int, action: Any, observations: Mapping[str, Tensor], near: Tensor | None = None
@@ -40,22 +43,38 @@ class FitsPose(Protocol):
         `near` are poses (K, 7) about which the part may be too, and which are followed as well.
         """
 
-    def factor(self, action: Any, values: Mapping[str, Tensor]) -> PoseFactor:
-        """The Gaussian over the part's pose (N, 7), given the nuisance parameters' values by address."""
+    def factor(self, actions: Sequence[Any], values: Mapping[str, Tensor]) -> PoseFactor:
+        """The Gaussian over the part's pose (N, 7), given an instrument's nuisance parameters by address.
 
-    def marginal_factor(self, action: Any, fit: Any) -> PoseFactor:
-        """The Gaussian over the part's pose (1, 7), the nuisance parameters integrated out."""
+        There is an action for each viewpoint.
+        """
+
+    def marginal_factor(self, actions: Sequence[Any], fits: Sequence[Any]) -> PoseFactor:
+        """The Gaussian over the part's pose (1, 7), an instrument's nuisance parameters integrated out."""
 
     def brings_nuisances(self, action: Any, trace: Any) -> bool:
         """Whether the measurement comes with nuisance parameters that a trace does not yet have."""
 
-    def propose(self, action: Any, fit: Any, part: NormalPose | None) -> Mapping[str, Tensor]:
-        """Sample the nuisance parameters, given the part's pose (N, 7); None where it is known by nothing."""
+    def propose(self, action: Any, fit: Any, part: NormalPose | None, values: Any) -> Mapping[str, Tensor]:
+        """Sample new nuisance parameters, given the part's pose (N, 7); None where it is known by nothing.
+
+        `values` are those that there are already, by address.
+        """
 
     def accompany(
-        self, action: Any, fit: Any, trace: Any, old: Tensor, new: Tensor, correlation: float
-    ) -> None:
-        """Sample the nuisance parameters that fit a part that moves from (N, 7) to (N, 7)."""
+        self,
+        action: Any,
+        fit: Any,
+        trace: Any,
+        old: Tensor,
+        new: Tensor,
+        correlation: float,
+        values: Mapping[str, Tensor],
+    ) -> Mapping[str, Tensor]:
+        """Sample the nuisance parameters that fit a part that moves from (N, 7) to (N, 7).
+
+        `values` are those that were sampled before, by address.
+        """
 
 
 @runtime_checkable

@@ -47,7 +47,7 @@ UNSURE = 0.0005  # m: beyond this standard deviation the contact may be with ano
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """The action of an instrument's first measurement, and the Gaussian fitted to that."""
+    """The action of a viewpoint's first measurement, and the Gaussian fitted to that."""
 
     action: Any
     fit: Any
@@ -59,7 +59,7 @@ class GaussianApproximation:
 
     pose: str  # the address of the part's pose
     scene: Any  # of the model; it has the prior and the sensors' likelihoods
-    fits: Mapping[str, Fitted] = field(default_factory=dict)  # by instrument
+    fits: Mapping[str, Fitted] = field(default_factory=dict)  # by viewpoint
     contacts: tuple[Approximated, ...] = ()  # measurements with a quadratic approximation
     quadratic: QuadraticApproximation | None = None  # of the contacts' likelihood; None before the first
     # by number of the measurement, whether it is informative near the fits' estimate
@@ -93,7 +93,7 @@ class GaussianApproximation:
         """The same with a measurement that changes little; the quadratic approximation is updated later."""
         sensor = scene.sensor(action)
         if isinstance(sensor, FitsPose):
-            name = sensor.instrument(action)
+            name = sensor.viewpoint(action)
             if name in self.fits:
                 return replace(self, scene=scene)
             fits = {**self.fits, name: Fitted(action, sensor.fit(number, action, observations, self.near))}
@@ -145,6 +145,13 @@ class GaussianApproximation:
             groups.setdefault(id(sensor), (sensor, []))[1].append(contact)
         yield from groups.values()
 
+    def _by_instrument(self) -> list[list[int]]:
+        """The places of each instrument's own among the fits."""
+        groups: dict[str, list[int]] = {}
+        for k, each in enumerate(self.fits.values()):
+            groups.setdefault(self.scene.sensor(each.action).instrument(each.action), []).append(k)
+        return list(groups.values())
+
     def _is_unsure(self) -> bool:
         """Whether the part may be at several places so far, or at one that is not known well."""
         covariances = self.mixture.covariances
@@ -164,10 +171,10 @@ class GaussianApproximation:
             -1, len(fits)
         )
         chosen = [f.fit.chosen(index) for f, index in zip(fits, each.T, strict=True)]
-        factors = [
-            self.scene.sensor(f.action).marginal_factor(f.action, fit)
-            for f, fit in zip(fits, chosen, strict=True)
-        ]
+        factors = []
+        for own in self._by_instrument():
+            actions, sensor = [fits[k].action for k in own], self.scene.sensor(fits[own[0]].action)
+            factors.append(sensor.marginal_factor(actions, [chosen[k] for k in own]))
         normal = product_of_factors(prior, factors)
         log_weights = torch.stack([fit.log_weights for fit in chosen]).sum(dim=0)
         kept = torch.zeros(1, dtype=torch.int64)
@@ -230,8 +237,10 @@ class GaussianApproximation:
         `values` has those that the trace lacks, by address.
         """
         looked_up: Any = ChainMap(dict(values or {}), trace)
+        fits = list(self.fits.values())
         factors: list[PoseFactor] = [
-            self.scene.sensor(each.action).factor(each.action, looked_up) for each in self.fits.values()
+            self.scene.sensor(fits[own[0]].action).factor([fits[k].action for k in own], looked_up)
+            for own in self._by_instrument()
         ]
         prior = self.scene.prior
         given = product_of_factors(prior, factors) if factors else None

@@ -42,8 +42,8 @@ def forward_kernel(before: GaussianApproximation, after: GaussianApproximation, 
             return
         values = {}
         if sensor.brings_nuisances(action, trace):
-            fit = after.fits[sensor.instrument(action)].fit
-            values = dict(sensor.propose(action, fit, before.predicted(trace)))
+            fit = after.fits[sensor.viewpoint(action)].fit
+            values = dict(sensor.propose(action, fit, before.predicted(trace), trace))
         pyro.sample(after.pose, after.conditional(trace, values))
 
     return program
@@ -67,8 +67,9 @@ def independent_proposal(approximation: GaussianApproximation) -> Callable[..., 
     def program(*args: Any) -> None:
         part = pyro.sample(approximation.pose, widened_mixture(approximation.mixture))
         known = NormalPose(part, part.new_zeros(6, 6) + _KNOWN * torch.eye(6, dtype=torch.float64))
+        values: dict[str, Tensor] = {}
         for each in approximation.fits.values():
-            approximation.scene.sensor(each.action).propose(each.action, each.fit, known)
+            values |= approximation.scene.sensor(each.action).propose(each.action, each.fit, known, values)
 
     return program
 
@@ -98,9 +99,10 @@ def joint_random_walk(approximation: GaussianApproximation) -> Program:
 def _follow(trace: Trace, approximation: GaussianApproximation, proposed: Any, correlation: float) -> None:
     """Sample the part's pose from a proposal, and the instruments' nuisance parameters to match it."""
     old, new = trace[approximation.pose], pyro.sample(approximation.pose, proposed)
+    values: dict[str, Tensor] = {}
     for each in approximation.fits.values():
         sensor = approximation.scene.sensor(each.action)
-        sensor.accompany(each.action, each.fit, trace, old, new, correlation)
+        values |= sensor.accompany(each.action, each.fit, trace, old, new, correlation, values)
 
 
 def _transported(trace: Trace, source: GaussianApproximation, target: GaussianApproximation) -> MixturePose:

@@ -74,7 +74,7 @@ def approximation_of(content: Content | None, trace: Trace) -> GaussianApproxima
 def _fitted(name: str, scene: Any, actions: Sequence[Any], trace: Trace) -> Fitted:
     for number, action in enumerate(actions):
         sensor = scene.sensor(action)
-        if isinstance(sensor, FitsPose) and sensor.instrument(action) == name:
+        if isinstance(sensor, FitsPose) and sensor.viewpoint(action) == name:
             return Fitted(action, sensor.fit(number, action, trace.observations))
     raise LookupError(f"no measurement by {name!r}")
 

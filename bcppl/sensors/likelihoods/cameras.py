@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,17 @@ import pyro
 import torch
 from torch import Tensor
 
+from bcppl import poses
 from bcppl.distributions.depth import ClutteredDepth, RobustDepth
 from bcppl.distributions.pose_normals import PoseFactor
 from bcppl.distributions.poses import NormalPose
 from bcppl.effort import Effort
 from bcppl.geometry.camera import Camera
-from bcppl.rendering.extrinsics_error import apparent_pose, line_of_sight
+from bcppl.rendering.extrinsics_error import line_of_sight
 from bcppl.rendering.part_renderer import PartRenderer
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors.depth import View
+from bcppl.sensors.likelihoods.viewpoints import InstrumentError, Sighting, viewpoints_of
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Numbered
 from bcppl.traces.carried import once
@@ -62,8 +65,9 @@ class ClutteredCamera(CalibratedCamera):
     """The same of a part among things that nobody has modelled (`ClutteredDepth`).
 
     A mesh is not quite the part, images are registered to a pixel or two, and ranges are biased: all pixels
-    of a part share these errors. Where an instrument's first image sees the part, `seen_by_*`, is therefore
-    another pose than where it is, and normal about it.
+    of a part share these errors. Where images from a viewpoint see the part, `seen_by_*`, is therefore
+    another pose than where it is, and normal about it; half of its variance is common to all viewpoints of an
+    instrument (`InstrumentError`).
 
     Args:
         recording: its part and the backgrounds of its cameras; where a background was measured, pixels off
@@ -95,38 +99,42 @@ class ClutteredCamera(CalibratedCamera):
         super().__init__(recording, renderer, **noise)
         self.stride, self.temperature, self.clutter = stride, temperature, clutter
         self.shift, self.turn, self.bias = shift, turn, bias
+        self.error = InstrumentError(self._effect, math.sqrt(0.5))
+        self.viewpoints = viewpoints_of(recording)
 
     def observe(self, number: int, action: View, world_from_part: Tensor) -> None:
-        """Sample `depth_*`, and with an instrument's first image its `seen_by_*`."""
+        """Sample `depth_*`, and with a viewpoint's first image its `seen_by_*`."""
         camera, seen = action.camera, world_from_part
         if self.shift:
-            name = f"instrument {self.instrument(action)}"
-            first, seen = once(name, partial(self._seen, camera, world_from_part))
-            if first.name != camera.name:
-                seen = apparent_pose(first, camera, world_from_part, seen)
+            sightings: dict[str, Sighting] = once(f"instrument {self.instrument(action)}", dict)
+            viewpoint = self.viewpoint(action)
+            if viewpoint not in sightings:
+                before = list(sightings.values())
+                mean, covariance, _ = self.error.predicted(camera, seen, before, [seen] * len(before))
+                around = NormalPose(poses.retract(seen, mean), covariance)
+                sightings[viewpoint] = Sighting(camera, pyro.sample(f"seen_by_{viewpoint}", around))
+            seen = sightings[viewpoint].seen
         pyro.sample(f"depth_{number}", self.image(camera, seen))
 
-    def _seen(self, camera: Camera, part: Tensor) -> tuple[Camera, Tensor]:
-        """The camera, and where its image sees the part (N, 7)."""
-        around = NormalPose(part, self._covariance(camera, part))
-        return camera, pyro.sample(f"seen_by_{camera.instrument}", around)
-
-    def _covariance(self, camera: Camera, part: Tensor) -> Tensor:
-        """Covariances (N, 6, 6) of where an image sees parts at poses (N, 7), in their tangent space."""
+    def _effect(self, camera: Camera, part: Tensor) -> Tensor:
+        """Changes (N, 6, 7) of where an image sees parts at poses (N, 7), by errors of one deviation."""
         ray = self.bias * line_of_sight(camera, part)
-        variance = part.new_tensor([self.shift**2] * 3 + [self.turn**2] * 3)
-        covariance = torch.diag(variance).expand(*part.shape[:-1], 6, 6).clone()
-        covariance[..., :3, :3] += ray[..., :, None] * ray[..., None, :]
-        return covariance
+        along = torch.cat([ray, torch.zeros_like(ray)], dim=-1)[..., None]
+        own = torch.diag(part.new_tensor([self.shift] * 3 + [self.turn] * 3))
+        return torch.cat([own.expand(*part.shape[:-1], 6, 6), along], dim=-1)
 
     def instrument(self, action: View) -> str:
-        """The name of the instrument, which has one error for all its images."""
+        """The name of the instrument, whose images' errors are correlated."""
         return action.camera.instrument
 
-    def factor(self, action: View, values: Mapping[str, Tensor]) -> PoseFactor:
-        """The Gaussian over the part's pose, given where its camera sees it (N, 7)."""
-        seen = values[f"seen_by_{self.instrument(action)}"]
-        return PoseFactor(seen, partial(self._covariance, action.camera))
+    def viewpoint(self, action: View) -> str:
+        """The name of the viewpoint, from which all images see the part at the same pose."""
+        return self.viewpoints.get(action.camera.name, action.camera.name)
+
+    def factor(self, actions: Sequence[View], values: Mapping[str, Tensor]) -> PoseFactor:
+        """The Gaussian over the part's pose, given where one camera sees it (N, 7)."""
+        seen = [Sighting(a.camera, values[f"seen_by_{self.viewpoint(a)}"]) for a in actions]
+        return self.error.factor(seen)
 
     def image(self, camera: Camera, part: Tensor) -> Any:
         """The likelihood of an image of a part that is seen at poses (N, 7)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.arguments import whole_number
+from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import FittedMixture, fitted_mixture
 from bcppl.distributions.pose_normals import (
@@ -31,11 +32,12 @@ from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, bin_depth
 from bcppl.geometry.turns import box_turns
-from bcppl.rendering.extrinsics_error import apparent_covariance, apparent_pose, line_of_sight
+from bcppl.rendering.extrinsics_error import apparent_motion, line_of_sight
 from bcppl.rendering.information import pixel_information
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.rendering.region_of_interest import region_of_interest
 from bcppl.sensors.depth import View
+from bcppl.sensors.likelihoods.viewpoints import InstrumentError, Sighting, place_of, viewpoints_of
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Numbered, require_positive
 from bcppl.traces.carried import once
@@ -53,6 +55,8 @@ class CameraSettings:
     Attributes:
         camera_shift, camera_turn: standard deviations of the error of a camera's stated pose, along and about
             each of its axes, metres and radians: those that an extrinsic calibration reports.
+        viewpoint: the share of these that is each viewpoint's own, of a camera on a wrist: by 0.15 the arm
+            places it .3 mm and .08 degrees off.
         bias: standard deviation of the bias of a camera's range, metres.
         scale: of the Laplace noise of a pixel, metres.
         outlier: the probability that a pixel does not show the part that is rendered there.
@@ -64,6 +68,7 @@ class CameraSettings:
 
     camera_shift: float = 0.002
     camera_turn: float = math.radians(0.5)
+    viewpoint: float = 0.15
     bias: float = 0.002
     scale: float = 0.002
     outlier: float = 0.1
@@ -73,6 +78,7 @@ class CameraSettings:
 
     def __post_init__(self) -> None:
         require_positive(self, "camera_shift", "camera_turn", "bias", "scale")
+        number_within("each viewpoint's own share of the errors is {}", self.viewpoint, above=0.0, most=1.0)
         whole_number("a camera's images are read with bins {}", self.bins)
 
 
@@ -89,17 +95,16 @@ class Look(NamedTuple):
 
 
 class Instrument(NamedTuple):
-    """One camera, which has the same errors in all its images, also of one on a wrist.
+    """One camera, also of one on a wrist, in a run of the program.
 
     Attributes:
-        camera: where it took its first image.
-        apparent: (N, 7) where it measures the part, range bias included, if its stated pose is taken as true.
         bias: (N,) of its range, metres.
+        sightings: by viewpoint, where it measures the part (N, 7), range bias included, if its stated pose
+            there is taken as true.
     """
 
-    camera: Camera
-    apparent: Tensor
     bias: Tensor
+    sightings: dict[str, Sighting]
 
 
 class ErringCamera:
@@ -107,8 +112,8 @@ class ErringCamera:
 
     A camera's error is not sampled as such but as the pose at which the camera, were its stated pose true,
     sees the part (`seen_by_*`). The image determines that pose whatever the error is, so particles need not
-    follow a ridge; both parametrisations are the same model. One error and one bias (`bias_*`) is shared by
-    all images of an instrument.
+    follow a ridge; both parametrisations are the same model. All images from one viewpoint share that pose,
+    all of one instrument its bias (`bias_*`) and most of its error (`InstrumentError`).
 
     Args:
         recording: its part, guess and views.
@@ -123,6 +128,9 @@ class ErringCamera:
         self.settings, self.prior = settings, prior
         self.renderer = RayCaster(recording.part)
         self.looks: dict[str, Look] = {}
+        self.viewpoints = viewpoints_of(recording)
+        motion = partial(apparent_motion, shift=settings.camera_shift, turn=settings.camera_turn)
+        self.error = InstrumentError(motion, settings.viewpoint)
         within = float(np.linalg.norm(recording.guess.translation))
         guess, bins = recording.guess.world_from_part, settings.bins
         for camera in (m.action.camera for m in recording.measurements if isinstance(m.action, View)):
@@ -151,27 +159,30 @@ class ErringCamera:
     # ---- the program's sites
 
     def observe(self, number: int, action: View, world_from_part: Tensor) -> None:
-        """Sample `depth_*`, and with an instrument's first image its `bias_*` and `seen_by_*`."""
-        camera = self.camera(action)
-        name = action.camera.instrument
-        first = once(f"instrument {name}", partial(self._instrument, name, camera, world_from_part))
-        there = without_bias(first.camera, first.apparent, first.bias)
-        if camera.name != first.camera.name:
-            there = apparent_pose(first.camera, camera, world_from_part, there)
-        pyro.sample(f"depth_{number}", self.image(camera, there, first.bias))
+        """Sample `depth_*`, with an instrument's first image `bias_*`, with a viewpoint's `seen_by_*`."""
+        camera, name, viewpoint = self.camera(action), action.camera.instrument, self.viewpoint(action)
+        bias, sightings = once(f"instrument {name}", partial(self._instrument, name))
+        if viewpoint not in sightings:
+            apparent = self._apparent(camera, world_from_part, bias, list(sightings.values()))[0]
+            sightings[viewpoint] = Sighting(camera, pyro.sample(f"seen_by_{viewpoint}", apparent))
+        there = without_bias(camera, sightings[viewpoint].seen, bias)
+        pyro.sample(f"depth_{number}", self.image(camera, there, bias))
 
-    def _instrument(self, name: str, camera: Camera, part: Tensor) -> Instrument:
-        bias = pyro.sample(
-            f"bias_{name}", dist.Normal(torch.zeros((), dtype=torch.float64), self.settings.bias)
-        )
-        apparent = pyro.sample(f"seen_by_{name}", self._apparent(camera, part, bias))
-        return Instrument(camera, apparent, bias)
+    def _instrument(self, name: str) -> Instrument:
+        none = torch.zeros((), dtype=torch.float64)
+        return Instrument(pyro.sample(f"bias_{name}", dist.Normal(none, self.settings.bias)), {})
 
-    def _apparent(self, camera: Camera, part: Tensor, bias: Tensor) -> NormalPose:
-        """The distribution of where a camera with a bias (N,) measures a part at poses (N, 7)."""
-        settings = self.settings
-        error = apparent_covariance(camera, part, settings.camera_shift, settings.camera_turn)
-        return NormalPose(with_bias(camera, part, bias), error)
+    def _apparent(
+        self, camera: Camera, part: Tensor, bias: Tensor, before: Sequence[Sighting] = ()
+    ) -> tuple[NormalPose, Tensor]:
+        """The distribution of where a camera with a bias (N,) measures a part at poses (N, 7).
+
+        Given where its instrument measured it before; and how far that distribution follows the part
+        (N, 6, 6).
+        """
+        expected = [with_bias(each.camera, part, bias) for each in before]
+        mean, covariance, follows = self.error.predicted(camera, part, before, expected)
+        return NormalPose(poses.retract(with_bias(camera, part, bias), mean), covariance), follows
 
     def image(self, camera: Camera, there: Tensor, bias: Tensor | float) -> RobustDepth:
         """The likelihood of an image by a camera with a bias (N,) of a part at poses (N, 7)."""
@@ -201,8 +212,13 @@ class ErringCamera:
     # ---- a Gaussian approximation of an image's likelihood (`bcppl.sensors.capabilities.FitsPose`)
 
     def instrument(self, action: View) -> str:
-        """The name of the instrument, which has one error for all its measurements."""
+        """The name of the instrument, whose measurements' errors are correlated."""
         return action.camera.instrument
+
+    def viewpoint(self, action: View) -> str:
+        """The name of the viewpoint, whose measurements share all nuisance parameters."""
+        self.camera(action)
+        return self.viewpoints[action.camera.name]
 
     def fit(
         self, number: int, action: View, observations: Mapping[str, Tensor], near: Tensor | None = None
@@ -245,40 +261,39 @@ class ErringCamera:
     def _errors(self, camera: Camera) -> Tensor:
         """Standard deviations (6,) of the apparent pose of a part at the prior's mean."""
         center, settings = self.prior.center, self.settings
-        error = apparent_covariance(camera, center, settings.camera_shift, settings.camera_turn).diagonal()
+        error = self.error.covariance([camera], center).diagonal()
         along = settings.bias * line_of_sight(camera, center)
         return (error + torch.cat([along, torch.zeros_like(along)]).square()).sqrt()
 
-    def factor(self, action: View, values: Mapping[str, Tensor]) -> PoseFactor:
-        """The Gaussian over the part's pose, given where its camera measures it (N, 7) and its bias (N,)."""
-        name, camera = action.camera.instrument, self.camera(action)
-        there = without_bias(camera, values[f"seen_by_{name}"], values[f"bias_{name}"])
-        return PoseFactor(there, self._covariance(camera))
+    def factor(self, actions: Sequence[View], values: Mapping[str, Tensor]) -> PoseFactor:
+        """The Gaussian over the part's pose, given where one camera measures it (N, 7) and its bias (N,)."""
+        bias = values[f"bias_{self.instrument(actions[0])}"]
+        sightings = []
+        for action in actions:
+            camera, seen = self.camera(action), values[f"seen_by_{self.viewpoint(action)}"]
+            sightings.append(Sighting(camera, without_bias(camera, seen, bias)))
+        return self.error.factor(sightings)
 
-    def marginal_factor(self, action: View, fit: FittedMixture) -> PoseFactor:
-        """The Gaussian over the part's pose (M, 7), given each component of a fit of an image."""
-        camera, points = self.camera(action), torch.stack([each.sigma_points() for each in fit.components])
-        seen, bias = poses.retract(self.prior.center, points[..., :6]), points[..., 6]
-        # Where the image leaves the part's pose open, so does the approximation.
-        parts = without_bias(camera, seen, bias)
-        away = poses.local(parts[:, :1], parts[:, 1:])
-        return PoseFactor(parts[:, 0], self._covariance(camera, 0.5 * away.transpose(1, 2) @ away))
-
-    def _covariance(self, camera: Camera, more: Tensor | float = 0.0) -> Any:
-        settings = self.settings
-
-        def covariance(center: Tensor) -> Tensor:
-            error = apparent_covariance(camera, center, settings.camera_shift, settings.camera_turn)
-            return error + more
-
-        return covariance
+    def marginal_factor(self, actions: Sequence[View], fits: Sequence[FittedMixture]) -> PoseFactor:
+        """The Gaussian over the part's pose (M, 7), given each component of fits of one camera's images."""
+        sightings, more = [], []
+        for action, fit in zip(actions, fits, strict=True):
+            camera = self.camera(action)
+            points = torch.stack([each.sigma_points() for each in fit.components])
+            seen, bias = poses.retract(self.prior.center, points[..., :6]), points[..., 6]
+            # Where the image leaves the part's pose open, so does the approximation.
+            parts = without_bias(camera, seen, bias)
+            away = poses.local(parts[:, :1], parts[:, 1:])
+            sightings.append(Sighting(camera, parts[:, 0]))
+            more.append(0.5 * away.transpose(1, 2) @ away)
+        return self.error.factor(sightings, more)
 
     def information(self, done: Sequence[Any], action: View, part: Tensor) -> Tensor:
         """The information (N, 6, 6) that an image adds to the part's pose (N, 7) after `done`.
 
         Pixels are weighted as by `RobustDepth`; range bias and extrinsic error are integrated out. Images of
-        one instrument share both, so the tenth adds less than the first. It is information about one mode:
-        it does not discriminate between modes.
+        one instrument share the bias and most of the error, so the tenth adds less than the first. It is
+        information about one mode: it does not discriminate between modes.
         """
         views = [a.camera for a in done if isinstance(a, View)]
         before = [camera for camera in views if camera.instrument == action.camera.instrument]
@@ -287,59 +302,92 @@ class ErringCamera:
     def _information(self, cameras: Sequence[Camera], part: Tensor) -> Tensor:
         """The information (N, 6, 6) of images of one instrument together."""
         settings = self.settings
-        whole = torch.zeros(len(part), 7, 7, dtype=torch.float64)
         if not cameras:
-            return whole[:, :6, :6]
+            return torch.zeros(len(part), 6, 6, dtype=torch.float64)
         weight = (1.0 - settings.outlier) / settings.scale**2 / (settings.temperature or 1.0)
+        places = {place_of(camera): camera for camera in cameras}
+        size = 6 * len(places)
+        whole = torch.zeros(len(part), size + 1, size + 1, dtype=torch.float64)
         for camera in cameras:
-            whole = whole + weight * pixel_information(self.renderer, camera, part, settings.bins)
-        both = whole[:, :6, 6:]
-        own = whole[:, 6:, 6:] + 1.0 / settings.bias**2
-        seen = whole[:, :6, :6] - both @ both.transpose(-1, -2) / own
-        error = apparent_covariance(cameras[0], part, settings.camera_shift, settings.camera_turn)
-        # (seen^-1 + error)^-1, also where the image leaves an axis open.
-        eye = torch.eye(6, dtype=torch.float64)
-        left = torch.linalg.solve(eye + seen @ error, seen)
+            first = 6 * list(places).index(place_of(camera))
+            rows = torch.tensor([*range(first, first + 6), size])
+            pixels = pixel_information(self.renderer, camera, part, settings.bins)
+            whole[:, rows[:, None], rows] += weight * pixels
+        both = whole[:, :size, size:]
+        own = whole[:, size:, size:] + 1.0 / settings.bias**2
+        seen = whole[:, :size, :size] - both @ both.transpose(-1, -2) / own
+        error = self.error.covariance(list(places.values()), part)
+        # (seen^-1 + error)^-1, also where an image leaves an axis open.
+        left = torch.linalg.solve(torch.eye(size, dtype=torch.float64) + seen @ error, seen)
+        left = left.unflatten(1, (-1, 6)).sum(dim=1).unflatten(2, (-1, 6)).sum(dim=2)
         return 0.5 * (left + left.transpose(-1, -2))
 
     # ---- proposals of the nuisance parameters
 
     def brings_nuisances(self, action: View, trace: Any) -> bool:
-        """Whether this is the first image of its instrument."""
-        return f"seen_by_{action.camera.instrument}" not in trace
+        """Whether this is the first image from its viewpoint."""
+        return f"seen_by_{self.viewpoint(action)}" not in trace
 
-    def propose(self, action: View, fit: FittedMixture, part: NormalPose | None) -> Mapping[str, Tensor]:
+    def propose(
+        self, action: View, fit: FittedMixture, part: NormalPose | None, values: Mapping[str, Tensor]
+    ) -> Mapping[str, Tensor]:
         """Sample the nuisance parameters from their approximate conditional, given their first image's fit.
 
-        `part` is the part's pose (N, 7) given all measurements before; None where there are none.
+        `part` is the part's pose (N, 7) given all measurements before, None where there are none; `values`
+        are the nuisance parameters that these brought.
         """
-        name, camera = action.camera.instrument, self.camera(action)
-        bias = pyro.sample(f"bias_{name}", self._bias(fit))
+        camera, address = self.camera(action), f"bias_{self.instrument(action)}"
+        new = {} if address in values else {address: pyro.sample(address, self._bias(fit))}
+        bias = new[address] if new else values[address]
         around = self._given_bias(fit, bias)
         if part is not None:
-            seen = self._apparent(camera, part.center, bias)
-            around = around.times(NormalPose(seen.center, part.covariance + seen.covariance))
-        seen_by = pyro.sample(f"seen_by_{name}", widened_mixture(around))
-        return {f"bias_{name}": bias, f"seen_by_{name}": seen_by}
+            seen, follows = self._apparent(camera, part.center, bias, self._before(action, values))
+            moved = follows @ part.covariance @ follows.transpose(-1, -2)
+            around = around.times(NormalPose(seen.center, moved + seen.covariance))
+        address = f"seen_by_{self.viewpoint(action)}"
+        return {**new, address: pyro.sample(address, widened_mixture(around))}
 
     def accompany(
-        self, action: View, fit: FittedMixture, trace: Any, old: Tensor, new: Tensor, correlation: float
-    ) -> None:
+        self,
+        action: View,
+        fit: FittedMixture,
+        trace: Any,
+        old: Tensor,
+        new: Tensor,
+        correlation: float,
+        values: Mapping[str, Tensor],
+    ) -> Mapping[str, Tensor]:
         """Sample the apparent pose for a part that moves, at the same quantile of its conditional.
 
         Contacts move the part by more than a camera's error; what the image leaves open has to follow.
-        `correlation` is that of the standardised deviations from the conditional mean, before and after.
+        `correlation` is that of the standardised deviations from the conditional mean, before and after;
+        `values` has the nuisance parameters that were sampled before this.
         """
-        name, camera = action.camera.instrument, self.camera(action)
-        bias = trace[f"bias_{name}"]
+        camera, address = self.camera(action), f"seen_by_{self.viewpoint(action)}"
+        bias, moved = trace[f"bias_{self.instrument(action)}"], ChainMap(dict(values), trace)
         seen = self._given_bias(fit, bias)
-        before, after = (seen.times(self._apparent(camera, part, bias)) for part in (old, new))
+        before, after = (
+            seen.times(self._apparent(camera, part, bias, self._before(action, known))[0])
+            for part, known in ((old, trace), (new, moved))
+        )
         # The deviation is from the component that it most probably came of, and is kept in all others.
-        at, own = trace[f"seen_by_{name}"], torch.arange(len(old))
+        at, own = trace[address], torch.arange(len(old))
         away = poses.local(before.centers[own, before.component(at)], at)
         centers = poses.retract(after.centers, correlation * away[:, None])
         covariances = (1.0 - correlation**2) * after.covariances
-        pyro.sample(f"seen_by_{name}", mixture_of(GaussianMixture(centers, covariances, after.log_weights)))
+        following = mixture_of(GaussianMixture(centers, covariances, after.log_weights))
+        return {address: pyro.sample(address, following)}
+
+    def _before(self, action: View, values: Any) -> list[Sighting]:
+        """Where the camera of a view measured the part before, from other viewpoints, of what is known."""
+        name, here, before = self.instrument(action), self.viewpoint(action), []
+        for viewpoint in dict.fromkeys(self.viewpoints.values()):
+            if viewpoint == here:
+                break
+            camera = self.looks[viewpoint].camera
+            if camera.instrument == name and f"seen_by_{viewpoint}" in values:
+                before.append(Sighting(camera, values[f"seen_by_{viewpoint}"]))
+        return before
 
     def _bias(self, fit: FittedMixture) -> Any:
         """The bias given an image, wider."""
