@@ -19,7 +19,8 @@ from bcppl import poses
 from bcppl.distributions.pose_normals import product_of_factors
 from bcppl.distributions.poses import NormalPose, prior_from_guess
 from bcppl.models.shipped import simulated_in
-from bcppl.sensors.likelihoods.erring_camera import CameraSettings, ErringCamera
+from bcppl.sensors.likelihoods.camera_settings import CameraSettings
+from bcppl.sensors.likelihoods.erring_camera import ErringCamera
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Scene, chosen, likelihoods_for
 from bcppl.traces import Model, Trace

@@ -17,8 +17,9 @@ import pyro
 
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.models.shipped import simulated_in
+from bcppl.sensors.likelihoods.camera_settings import CameraSettings
 from bcppl.sensors.likelihoods.contact_probe import ContactProbe, TouchSettings
-from bcppl.sensors.likelihoods.erring_camera import CameraSettings, ErringCamera
+from bcppl.sensors.likelihoods.erring_camera import ErringCamera
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Prepare, Scene, chosen, likelihoods_for
 from bcppl.traces import Model

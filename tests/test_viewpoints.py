@@ -18,6 +18,7 @@ from bcppl.models.look_and_touch import model
 from bcppl.recordings import DepthImage, Guess, Measurement, Recording, View
 from bcppl.rendering.extrinsics_error import apparent_motion
 from bcppl.rendering.scene import SceneRenderer
+from bcppl.sensors.likelihoods.camera_settings import CameraSettings
 from bcppl.sensors.likelihoods.viewpoints import InstrumentError, Sighting
 
 SHIFT, TURN, OWN = 0.002, 0.009, 0.15
@@ -137,5 +138,18 @@ def test_a_view_from_the_same_place_shares_what_it_sees() -> None:
         model.program, (scene, actions), scene.observed(recording.measurements), 3
     )
     assert [a for a in trace.choices if a.startswith("seen_by")] == ["seen_by_view 0", "seen_by_view 1"]
-    assert [a for a in trace.choices if a.startswith("bias")] == ["bias_d405"]
+    assert [a for a in trace.choices if a.startswith("bias")] == ["bias_view 0", "bias_view 1"]
     torch.testing.assert_close(trace.distributions["depth_0"].pose, trace.distributions["depth_2"].pose)
+
+
+def test_biases_one_after_another_have_their_joint_density() -> None:
+    torch.manual_seed(1)
+    settings = CameraSettings()
+    common = 1.0 - settings.viewpoint**2
+    covariance = settings.bias**2 * (common + (1.0 - common) * torch.eye(3, dtype=torch.float64))
+    joint = torch.distributions.MultivariateNormal(torch.zeros(3).double(), covariance)
+    value, before, log_density = joint.sample(), [], 0.0
+    for bias in value:
+        log_density += float(torch.distributions.Normal(*settings.expected_bias(before)).log_prob(bias))
+        before.append(Sighting(wrist_cameras(1)[0], poses.identity(1), bias))
+    assert log_density == pytest.approx(float(joint.log_prob(value)), abs=1e-9)

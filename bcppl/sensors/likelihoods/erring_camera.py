@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections import ChainMap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,7 +14,6 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import FittedMixture, fitted_mixture
 from bcppl.distributions.pose_normals import (
@@ -33,53 +30,20 @@ from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, bin_depth
 from bcppl.geometry.turns import box_turns
 from bcppl.rendering.extrinsics_error import apparent_motion, line_of_sight
-from bcppl.rendering.information import pixel_information
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.rendering.region_of_interest import region_of_interest
 from bcppl.sensors.depth import View
-from bcppl.sensors.likelihoods.viewpoints import InstrumentError, Sighting, place_of, viewpoints_of
+from bcppl.sensors.likelihoods.camera_information import information_of_images
+from bcppl.sensors.likelihoods.camera_settings import CameraSettings
+from bcppl.sensors.likelihoods.viewpoints import InstrumentError, Sighting, viewpoints_of
 from bcppl.sensors.measurements import Recording
-from bcppl.sensors.scene import Numbered, require_positive
+from bcppl.sensors.scene import Numbered
 from bcppl.traces.carried import once
 
 # The Gaussian fit of an image is no sharper than this: metres, radians, metres of bias.
 SHARPEST = torch.tensor([5e-5] * 3 + [1e-3] * 3 + [1e-4], dtype=torch.float64)
 _OUTSIDE = 4.0  # standard deviations of a camera's errors: an apparent pose is so far off the prior at most
 _WIDER = 1.3  # standard deviations of a proposed bias, in those of the fit
-
-
-@dataclass(frozen=True)
-class CameraSettings:
-    """Prior standard deviations of a camera's errors, and the noise of its pixels.
-
-    Attributes:
-        camera_shift, camera_turn: standard deviations of the error of a camera's stated pose, along and about
-            each of its axes, metres and radians: those that an extrinsic calibration reports.
-        viewpoint: the share of these that is each viewpoint's own, of a camera on a wrist: by 0.15 the arm
-            places it .3 mm and .08 degrees off.
-        bias: standard deviation of the bias of a camera's range, metres.
-        scale: of the Laplace noise of a pixel, metres.
-        outlier: the probability that a pixel does not show the part that is rendered there.
-        bins: the side of the square of pixels that is replaced by its median.
-        effective_pixels: number of independent pixels that an image is worth; None for all of them. The
-            errors carry what all pixels have in common, not what neighbours at an edge have.
-        temperature: the divisor of an image's log-likelihood, instead of `effective_pixels`.
-    """
-
-    camera_shift: float = 0.002
-    camera_turn: float = math.radians(0.5)
-    viewpoint: float = 0.15
-    bias: float = 0.002
-    scale: float = 0.002
-    outlier: float = 0.1
-    bins: int = 3
-    effective_pixels: float | None = 100.0
-    temperature: float | None = None
-
-    def __post_init__(self) -> None:
-        require_positive(self, "camera_shift", "camera_turn", "bias", "scale")
-        number_within("each viewpoint's own share of the errors is {}", self.viewpoint, above=0.0, most=1.0)
-        whole_number("a camera's images are read with bins {}", self.bins)
 
 
 class Look(NamedTuple):
@@ -94,26 +58,13 @@ class Look(NamedTuple):
     camera: Camera
 
 
-class Instrument(NamedTuple):
-    """One camera, also of one on a wrist, in a run of the program.
-
-    Attributes:
-        bias: (N,) of its range, metres.
-        sightings: by viewpoint, where it measures the part (N, 7), range bias included, if its stated pose
-            there is taken as true.
-    """
-
-    bias: Tensor
-    sightings: dict[str, Sighting]
-
-
 class ErringCamera:
     """Depth images by cameras whose stated poses are in error and whose ranges are biased.
 
     A camera's error is not sampled as such but as the pose at which the camera, were its stated pose true,
     sees the part (`seen_by_*`). The image determines that pose whatever the error is, so particles need not
-    follow a ridge; both parametrisations are the same model. All images from one viewpoint share that pose,
-    all of one instrument its bias (`bias_*`) and most of its error (`InstrumentError`).
+    follow a ridge; both parametrisations are the same model. All images from one viewpoint share that pose
+    and a bias (`bias_*`); of both all viewpoints of one instrument share most (`InstrumentError`).
 
     Args:
         recording: its part, guess and views.
@@ -159,18 +110,17 @@ class ErringCamera:
     # ---- the program's sites
 
     def observe(self, number: int, action: View, world_from_part: Tensor) -> None:
-        """Sample `depth_*`, with an instrument's first image `bias_*`, with a viewpoint's `seen_by_*`."""
-        camera, name, viewpoint = self.camera(action), action.camera.instrument, self.viewpoint(action)
-        bias, sightings = once(f"instrument {name}", partial(self._instrument, name))
+        """Sample `depth_*`, and with a viewpoint's first image its `bias_*` and `seen_by_*`."""
+        camera, viewpoint = self.camera(action), self.viewpoint(action)
+        sightings: dict[str, Sighting] = once(f"instrument {self.instrument(action)}", dict)
         if viewpoint not in sightings:
-            apparent = self._apparent(camera, world_from_part, bias, list(sightings.values()))[0]
-            sightings[viewpoint] = Sighting(camera, pyro.sample(f"seen_by_{viewpoint}", apparent))
-        there = without_bias(camera, sightings[viewpoint].seen, bias)
-        pyro.sample(f"depth_{number}", self.image(camera, there, bias))
-
-    def _instrument(self, name: str) -> Instrument:
-        none = torch.zeros((), dtype=torch.float64)
-        return Instrument(pyro.sample(f"bias_{name}", dist.Normal(none, self.settings.bias)), {})
+            before = list(sightings.values())
+            bias = pyro.sample(f"bias_{viewpoint}", dist.Normal(*self.settings.expected_bias(before)))
+            apparent, _ = self._apparent(camera, world_from_part, bias, before)
+            sightings[viewpoint] = Sighting(camera, pyro.sample(f"seen_by_{viewpoint}", apparent), bias)
+        sighting = sightings[viewpoint]
+        there = without_bias(camera, sighting.seen, sighting.bias)
+        pyro.sample(f"depth_{number}", self.image(camera, there, sighting.bias))
 
     def _apparent(
         self, camera: Camera, part: Tensor, bias: Tensor, before: Sequence[Sighting] = ()
@@ -180,7 +130,7 @@ class ErringCamera:
         Given where its instrument measured it before; and how far that distribution follows the part
         (N, 6, 6).
         """
-        expected = [with_bias(each.camera, part, bias) for each in before]
+        expected = [with_bias(each.camera, part, each.bias) for each in before]
         mean, covariance, follows = self.error.predicted(camera, part, before, expected)
         return NormalPose(poses.retract(with_bias(camera, part, bias), mean), covariance), follows
 
@@ -266,13 +216,13 @@ class ErringCamera:
         return (error + torch.cat([along, torch.zeros_like(along)]).square()).sqrt()
 
     def factor(self, actions: Sequence[View], values: Mapping[str, Tensor]) -> PoseFactor:
-        """The Gaussian over the part's pose, given where one camera measures it (N, 7) and its bias (N,)."""
-        bias = values[f"bias_{self.instrument(actions[0])}"]
-        sightings = []
-        for action in actions:
-            camera, seen = self.camera(action), values[f"seen_by_{self.viewpoint(action)}"]
-            sightings.append(Sighting(camera, without_bias(camera, seen, bias)))
-        return self.error.factor(sightings)
+        """The Gaussian over the part's pose, given where a camera measures it (N, 7) and its biases (N,)."""
+        sightings = (self._sighting(self.viewpoint(action), values) for action in actions)
+        return self.error.factor([s._replace(seen=without_bias(*s)) for s in sightings])
+
+    def _sighting(self, viewpoint: str, values: Any) -> Sighting:
+        camera = self.looks[viewpoint].camera
+        return Sighting(camera, values[f"seen_by_{viewpoint}"], values[f"bias_{viewpoint}"])
 
     def marginal_factor(self, actions: Sequence[View], fits: Sequence[FittedMixture]) -> PoseFactor:
         """The Gaussian over the part's pose (M, 7), given each component of fits of one camera's images."""
@@ -297,30 +247,11 @@ class ErringCamera:
         """
         views = [a.camera for a in done if isinstance(a, View)]
         before = [camera for camera in views if camera.instrument == action.camera.instrument]
-        return self._information([*before, action.camera], part) - self._information(before, part)
-
-    def _information(self, cameras: Sequence[Camera], part: Tensor) -> Tensor:
-        """The information (N, 6, 6) of images of one instrument together."""
-        settings = self.settings
-        if not cameras:
-            return torch.zeros(len(part), 6, 6, dtype=torch.float64)
-        weight = (1.0 - settings.outlier) / settings.scale**2 / (settings.temperature or 1.0)
-        places = {place_of(camera): camera for camera in cameras}
-        size = 6 * len(places)
-        whole = torch.zeros(len(part), size + 1, size + 1, dtype=torch.float64)
-        for camera in cameras:
-            first = 6 * list(places).index(place_of(camera))
-            rows = torch.tensor([*range(first, first + 6), size])
-            pixels = pixel_information(self.renderer, camera, part, settings.bins)
-            whole[:, rows[:, None], rows] += weight * pixels
-        both = whole[:, :size, size:]
-        own = whole[:, size:, size:] + 1.0 / settings.bias**2
-        seen = whole[:, :size, :size] - both @ both.transpose(-1, -2) / own
-        error = self.error.covariance(list(places.values()), part)
-        # (seen^-1 + error)^-1, also where an image leaves an axis open.
-        left = torch.linalg.solve(torch.eye(size, dtype=torch.float64) + seen @ error, seen)
-        left = left.unflatten(1, (-1, 6)).sum(dim=1).unflatten(2, (-1, 6)).sum(dim=2)
-        return 0.5 * (left + left.transpose(-1, -2))
+        both, alone = (
+            information_of_images(self.renderer, each, part, self.settings, self.error)
+            for each in ([*before, action.camera], before)
+        )
+        return both - alone
 
     # ---- proposals of the nuisance parameters
 
@@ -336,16 +267,15 @@ class ErringCamera:
         `part` is the part's pose (N, 7) given all measurements before, None where there are none; `values`
         are the nuisance parameters that these brought.
         """
-        camera, address = self.camera(action), f"bias_{self.instrument(action)}"
-        new = {} if address in values else {address: pyro.sample(address, self._bias(fit))}
-        bias = new[address] if new else values[address]
+        camera, viewpoint, before = self.camera(action), self.viewpoint(action), self._before(action, values)
+        bias = pyro.sample(f"bias_{viewpoint}", self._bias(fit, before))
         around = self._given_bias(fit, bias)
         if part is not None:
-            seen, follows = self._apparent(camera, part.center, bias, self._before(action, values))
+            seen, follows = self._apparent(camera, part.center, bias, before)
             moved = follows @ part.covariance @ follows.transpose(-1, -2)
             around = around.times(NormalPose(seen.center, moved + seen.covariance))
-        address = f"seen_by_{self.viewpoint(action)}"
-        return {**new, address: pyro.sample(address, widened_mixture(around))}
+        seen_by = pyro.sample(f"seen_by_{viewpoint}", widened_mixture(around))
+        return {f"bias_{viewpoint}": bias, f"seen_by_{viewpoint}": seen_by}
 
     def accompany(
         self,
@@ -364,7 +294,7 @@ class ErringCamera:
         `values` has the nuisance parameters that were sampled before this.
         """
         camera, address = self.camera(action), f"seen_by_{self.viewpoint(action)}"
-        bias, moved = trace[f"bias_{self.instrument(action)}"], ChainMap(dict(values), trace)
+        bias, moved = trace[f"bias_{self.viewpoint(action)}"], ChainMap(dict(values), trace)
         seen = self._given_bias(fit, bias)
         before, after = (
             seen.times(self._apparent(camera, part, bias, self._before(action, known))[0])
@@ -384,17 +314,22 @@ class ErringCamera:
         for viewpoint in dict.fromkeys(self.viewpoints.values()):
             if viewpoint == here:
                 break
-            camera = self.looks[viewpoint].camera
-            if camera.instrument == name and f"seen_by_{viewpoint}" in values:
-                before.append(Sighting(camera, values[f"seen_by_{viewpoint}"]))
+            if self.looks[viewpoint].camera.instrument == name and f"seen_by_{viewpoint}" in values:
+                before.append(self._sighting(viewpoint, values))
         return before
 
-    def _bias(self, fit: FittedMixture) -> Any:
-        """The bias given an image, wider."""
-        each = dist.Normal(fit.means[:, 6], _WIDER * fit.covariances[:, 6, 6].sqrt())
+    def _bias(self, fit: FittedMixture, before: Sequence[Sighting]) -> Any:
+        """The bias given an image, and those of the instrument's other viewpoints; wider."""
+        mean, variance, log_weights = fit.means[:, 6], fit.covariances[:, 6, 6], fit.log_weights
+        if before:
+            expected, deviation = self.settings.expected_bias(before)
+            away, both = expected[:, None] - mean, variance + deviation**2
+            log_weights = log_weights - 0.5 * (away.square() / both + both.log())
+            mean, variance = mean + variance / both * away, variance * deviation**2 / both
+        each = dist.Normal(mean, _WIDER * variance.sqrt())
         if len(fit.means) == 1:
-            return dist.Normal(each.mean[0], each.stddev[0])
-        return dist.MixtureSameFamily(dist.Categorical(logits=fit.log_weights), each)
+            return dist.Normal(each.mean[..., 0], each.stddev[..., 0])
+        return dist.MixtureSameFamily(dist.Categorical(logits=log_weights), each)
 
     def _given_bias(self, fit: FittedMixture, bias: Tensor) -> GaussianMixture:
         """The apparent pose, given an image and the bias (N,): M components for each."""
@@ -409,12 +344,13 @@ class ErringCamera:
         )
 
 
-def with_bias(camera: Camera, part: Tensor, bias: Tensor) -> Tensor:
+def with_bias(camera: Camera, part: Tensor, bias: Tensor | float) -> Tensor:
     """The apparent pose (..., 7) of a part (..., 7) when a bias (...,) in metres is added to the ranges."""
+    bias = torch.as_tensor(bias, dtype=torch.float64)
     moved = part[..., :3] + bias[..., None] * line_of_sight(camera, part)
     return torch.cat([moved, part[..., 3:]], dim=-1)
 
 
-def without_bias(camera: Camera, seen: Tensor, bias: Tensor) -> Tensor:
+def without_bias(camera: Camera, seen: Tensor, bias: Tensor | float) -> Tensor:
     """The pose (..., 7) of a part that is measured at (..., 7) with a bias (...,) in metres."""
     return with_bias(camera, seen, -bias)

@@ -39,10 +39,12 @@ class Sighting(NamedTuple):
     Attributes:
         camera: at the viewpoint.
         seen: (..., 7) the part's apparent pose.
+        bias: (...,) of the camera's range there, metres.
     """
 
     camera: Camera
     seen: Tensor
+    bias: Tensor | float = 0.0
 
 
 class Prediction(NamedTuple):
