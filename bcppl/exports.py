@@ -13,20 +13,39 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from importlib.resources import files
-from importlib.util import LazyLoader, find_spec, module_from_spec
+from importlib.util import find_spec, module_from_spec
 from types import ModuleType
 from typing import Any
 
+# What a module's code makes, and where imports of its submodules look. Another double-underscored name must
+# not execute it: `import torch` asks everything in `sys.modules` for `__file__` (`inspect.getmodule`), and a
+# module that was executed there would find torch half imported.
+MADE_BY_CODE = frozenset({"__all__", "__dict__", "__doc__", "__path__"})
+
+
+class _WhenUsed(ModuleType):
+    """A module that is executed when something in it is first asked for."""
+
+    def __getattribute__(self, name: str) -> Any:
+        if name.startswith("__") and name.endswith("__") and name not in MADE_BY_CODE:
+            return super().__getattribute__(name)
+        self.__class__ = ModuleType  # type: ignore[assignment]
+        self.__spec__.loader.exec_module(self)  # type: ignore[union-attr]
+        return getattr(self, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name != "__class__":
+            vars(self)  # executes it, which would otherwise undo what is set here
+        object.__setattr__(self, name, value)
+
 
 def _when_used(name: str) -> ModuleType:
-    """A module that is executed when something in it is first asked for."""
     spec = find_spec(name)
     if name in sys.modules or spec is None or spec.loader is None:
         return import_module(name)
-    spec.loader = LazyLoader(spec.loader)
     module = module_from_spec(spec)
+    module.__class__ = _WhenUsed
     sys.modules[name] = module
-    spec.loader.exec_module(module)
     return module
 
 

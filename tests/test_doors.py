@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pkgutil
+import random
 import subprocess
 import sys
 from importlib import import_module
@@ -22,7 +23,8 @@ DOORS += ("bcppl.models", "bcppl.models.worlds", "bcppl.contact.sensing")
 def imported(code: str) -> set[str]:
     """The modules in a process of its own after some code."""
     code += "\nimport sys; print('modules:', *sys.modules)"
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ran.returncode == 0, f"{code}\n{ran.stderr}"
     return set(ran.stdout.rpartition("modules:")[2].split())
 
 
@@ -46,6 +48,43 @@ def test_no_export_imports_the_compiler_of_torch() -> None:
     modules = imported(code)
     assert "bcppl.inference.filters.smc" in modules
     assert modules.isdisjoint({"torch._dynamo", "roma", "sympy"})
+
+
+def in_any_order(seed: int) -> str:
+    """Imports of modules behind the doors, torch and Pyro in random order, then a use of each module."""
+    chosen = random.Random(seed)
+    behind = [
+        (door, info.name)
+        for door in ("bcppl", "bcppl.inference", "bcppl.models")
+        for info in pkgutil.iter_modules(import_module(door).__path__)
+        if info.name in import_module(door).__all__
+    ]
+    found = chosen.sample(behind, 6)
+    lines = [f"from {door} import {name}" for door, name in found] + ["import torch", "import pyro"]
+    chosen.shuffle(lines)
+    return "\n".join([*lines, *(f"dir({name})" for _, name in found)])
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "from bcppl.inference import saved; import torch; saved.save",
+        "import bcppl; from bcppl.inference import saved; bcppl.models.look_and_touch.model; saved.save",
+        "from bcppl.inference import kernels; import pyro; kernels.metropolis_hastings",
+        "from bcppl.inference import saved, tempered_smc; from bcppl.models.point_probe import model",
+        *map(in_any_order, range(4)),
+    ],
+)
+def test_modules_are_imported_in_any_order(code: str) -> None:
+    assert {"torch", "pyro"} <= imported(code)
+
+
+def test_what_is_set_in_a_module_before_its_use_stays() -> None:
+    imported("from bcppl import poses\nposes.compose = 3\nassert poses.compose == 3 and poses.inverse")
+
+
+def test_a_submodule_is_imported_after_its_package() -> None:
+    assert "bcppl.traces.model" in imported("from bcppl import traces; import bcppl.traces.faults")
 
 
 @pytest.mark.parametrize("door", DOORS)
