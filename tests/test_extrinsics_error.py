@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -14,6 +16,7 @@ from bcppl.geometry.extrusion import block_with_square_hole
 from bcppl.rendering.extrinsics_error import apparent_covariance, apparent_motion, line_of_sight
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.rendering.region_of_interest import region_of_interest
+from tests.made_recordings import assert_one_sentence
 
 PART = poses.as_pose([0.03, -0.02, 0.04, 0.5, 0.5, -0.5, 0.5])
 SHIFT, TURN = 0.002, 0.009
@@ -98,6 +101,18 @@ def test_a_part_at_the_image_s_edge_fills_as_many_pixels_as_asked_for_and_none_b
         assert ((top <= rows) & (rows < top + height)).all()
         edge += width == 9
     assert hidden > 5 and edge > 0
+
+
+def test_a_part_that_stays_behind_the_camera_is_refused_with_the_convention() -> None:
+    part = block_with_square_hole(hole=0.016)
+    expected = torch.tensor([0.01, 0.0, 0.02, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    half_a_turn = poses.as_pose([0, 0, 0, 0, 1, 0, 0])
+    averted = poses.compose(poses.as_pose(CAMERA.world_from_camera), half_a_turn).numpy()
+    camera = dataclasses.replace(CAMERA, world_from_camera=averted)
+    with pytest.raises(InputError, match=r"behind it; .* z forward \(OpenGL") as refused:
+        region_of_interest(camera, part, expected, within=0.02)
+    assert_one_sentence(str(refused.value))
+    assert region_of_interest(camera, part, expected, within=1.0) == (0, 0, 160, 120)
 
 
 def test_the_whole_image_where_the_part_may_be_behind_the_camera() -> None:

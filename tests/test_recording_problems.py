@@ -102,6 +102,10 @@ WRONG: dict[str, tuple[Recording, str]] = {
         with_measurement(2, world_from_camera=np.array([0.0, 0, 600, 0, 1, 0, 0])),
         "measurement 2: camera .* wrong units",
     ),
+    "camera in OpenGL's convention": (
+        with_measurement(2, world_from_camera=np.array([0.0, 0, 0.6, 1, 0, 0, 0])),
+        "measurement 2: camera .* 0.6 m behind it; .* z forward",
+    ),
     "camera of nine coefficients": (
         with_measurement(2, distortion=[0.1] * 8),
         "measurement 2: camera .* not Brown's k1 k2 p1 p2",
@@ -251,6 +255,14 @@ def test_a_camera_is_inside_a_long_part_as_the_guess_turns_it(turn: float) -> No
         return any("inside it" in each for each in problems(replace(recording, measurements=measurements)))
 
     assert named(turn) and not named(-turn)
+
+
+def test_a_camera_may_have_the_part_partly_behind_it() -> None:
+    near = with_measurement(2, world_from_camera=np.array([0.0, 0, 0.08, 1, 0, 0, 0]))
+    assert not any("behind" in each for each in problems(near))
+    wide = replace(near, guess=replace(near.guess, translation=np.array([0.1, 0.1, 0.7])))
+    high = with_measurement(2, world_from_camera=np.array([0.0, 0, 0.6, 1, 0, 0, 0]))
+    assert not any("behind" in each for each in problems(replace(high, guess=wide.guess)))
 
 
 def test_a_short_path_in_millimetres_is_named() -> None:

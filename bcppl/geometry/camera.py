@@ -18,6 +18,12 @@ from bcppl.geometry.distortion import LARGEST, Optics, distorted, undistorted_ra
 if TYPE_CHECKING:
     from torch import Tensor
 
+# Advice where a part is behind a camera.
+OPTICAL = (
+    "give its world_from_camera with x right, y down and z forward (OpenGL's convention, y up and z "
+    "backward, is turned by half a turn about x)"
+)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Camera:

@@ -10,7 +10,7 @@ import torch
 
 from bcppl import poses
 from bcppl.errors import InputError
-from bcppl.geometry.camera import Camera
+from bcppl.geometry.camera import OPTICAL, Camera
 from bcppl.geometry.parts import Part
 
 
@@ -27,7 +27,7 @@ def region_of_interest(
         least: lower bound of each side's pixels, where the image has so many.
 
     Returns:
-        Numbers of pixels; the whole image where the part may be beside or behind the camera.
+        Numbers of pixels; the whole image where the part may be partly behind the camera.
 
     Raises:
         InputError: the camera's pose or intrinsics are invalid, or no pixel can show the part.
@@ -40,13 +40,17 @@ def region_of_interest(
     # All corners of the cube that it may fill: off the axis, the far face reaches farthest inwards.
     corners = there + reach * np.array(list(product((-1, 1), repeat=3)))
     pixel = camera.project(corners)
+    unseen = (
+        f"camera {camera.name!r} cannot see part {part.name!r} within {within:.3g} m of where it is expected"
+    )
+    if (corners[:, 2] <= 0.0).all():
+        raise InputError(f"{unseen}: that is behind it; {OPTICAL}, or leave its views out.")
     if not np.isfinite(pixel).all():
         return 0, 0, camera.width, camera.height
     size = np.array([camera.width, camera.height])
     if (pixel.max(axis=0) < -0.5).any() or (pixel.min(axis=0) > size - 0.5).any():
         raise InputError(
-            f"camera {camera.name!r} cannot see part {part.name!r} within {within:.3g} m of where it is "
-            "expected: that is beside its image; correct its world_from_camera or the guess, or leave its "
+            f"{unseen}: that is beside its image; correct its world_from_camera or the guess, or leave its "
             "views out."
         )
     low = np.clip(np.floor(pixel.min(axis=0)), 0, np.maximum(size - least, 0)).astype(int)

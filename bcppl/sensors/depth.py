@@ -13,7 +13,7 @@ import numpy.typing as npt
 from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.geometry.camera import Camera, looking_at
+from bcppl.geometry.camera import OPTICAL, Camera, looking_at
 from bcppl.geometry.distortion import coefficients
 from bcppl.geometry.parts import Part
 from bcppl.sensors import checks
@@ -228,13 +228,10 @@ def _camera(what: str, camera: Camera, recording: Recording) -> Iterator[str]:
 
 
 def _stands_off(what: str, camera: Camera, recording: Recording) -> Iterator[str]:
-    """Problems of the camera's place relative to the part at its guess: inside it, or out of its range."""
+    """Problems of the camera's pose relative to the part at its guess: inside it, out of range, averted."""
     guess = np.asarray(recording.guess.world_from_part, dtype=float)
-    place = np.asarray(camera.world_from_camera, dtype=float)[:3] - guess[:3]
-    # Rotated by the guess's inverse quaternion; without torch, so that a recording is checked at once.
-    w, axis = guess[3], -guess[4:]
-    turned = 2.0 * np.cross(axis, place)
-    eye = place + w * turned + np.cross(axis, turned)
+    pose = np.asarray(camera.world_from_camera, dtype=float)
+    eye = _turned_back(guess[3:], pose[:3] - guess[:3])
     low, high = recording.part.vertices.min(axis=0), recording.part.vertices.max(axis=0)
     radius, middle = np.linalg.norm(high - low) / 2, (low + high) / 2
     away = np.linalg.norm(eye - middle)
@@ -250,6 +247,22 @@ def _stands_off(what: str, camera: Camera, recording: Recording) -> Iterator[str
             f"{what} stands {away:.4g} m from the part at its guess but sees only to {camera.far:.4g} m: "
             "probably wrong units; give its world_from_camera in metres."
         )
+    else:
+        ahead = float(_turned_back(pose[3:], guess[:3] - pose[:3])[2])
+        # However the part is turned about its origin there.
+        reach = np.linalg.norm(recording.part.vertices, axis=1).max()
+        if ahead + reach + np.linalg.norm(recording.guess.translation) <= 0.0:
+            yield (
+                f"{what} looks away from the part, which at its guess is {-ahead:.4g} m behind it; "
+                f"{OPTICAL}, or leave its views out."
+            )
+
+
+def _turned_back(quaternion: Array, vector: Array) -> Array:
+    """A vector (3,) rotated by the inverse of a quaternion; without torch: a recording is checked at once."""
+    w, axis = quaternion[0], -quaternion[1:]
+    turned = 2.0 * np.cross(axis, vector)
+    return np.asarray(vector + w * turned + np.cross(axis, turned))
 
 
 register(DepthSensor())
