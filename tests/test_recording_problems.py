@@ -19,6 +19,7 @@ from bcppl.recordings import (
     problems,
     validate,
 )
+from bcppl.sensors import checks
 from tests.made_recordings import assert_one_sentence, block, camera, full
 
 
@@ -255,6 +256,31 @@ def test_a_camera_is_inside_a_long_part_as_the_guess_turns_it(turn: float) -> No
         return any("inside it" in each for each in problems(replace(recording, measurements=measurements)))
 
     assert named(turn) and not named(-turn)
+
+
+@pytest.mark.parametrize(
+    ("scale", "named"),
+    [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"), (1e-4, "scaled twice")],
+)
+def test_times_in_another_unit_are_named_once_for_each_clock(scale: float, named: str) -> None:
+    def in_unit(each: Any) -> Any:
+        """The same object with all its times scaled, those of a probe's windows too."""
+        times = [f for f in ("times", "command_times", "stamps") if hasattr(each, f)]
+        changes = {f: scale * getattr(each, f) for f in times}
+        if isinstance(each, ProbeWindow):
+            changes["probe"] = in_unit(each.probe)
+        return replace(each, **changes)
+
+    measurements = [Measurement(in_unit(m.action), in_unit(m.observation)) for m in full().measurements]
+    found = problems(replace(full(), measurements=measurements))
+    assert len(found) == 3 and all(named in each for each in found), found  # two probes, a push
+    for problem in found:
+        assert_one_sentence(problem)
+
+
+def test_clocks_may_begin_anywhere_and_be_as_fast_or_slow_as_sensors_are() -> None:
+    for step in (2e-5, 2e-3, 0.4):
+        assert not list(checks.readings("stamps", 1.8e9 * (step > 1e-3) + step * np.arange(50)))
 
 
 def test_a_camera_may_have_the_part_partly_behind_it() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,6 +17,8 @@ from bcppl.robot.plan import FARTHEST, WIDEST
 from bcppl.sensors.layout import same
 
 LEAVE_OUT, FILL = "leave that row out", "fill it by interpolation, or cut the recording there"
+SLOWEST, FASTEST = 0.5, 1e-5  # s: medians of a sensor's intervals beyond these are in another unit
+UNITS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
 POSE_COLUMNS = "x y z qw qx qy qz"
 
 
@@ -43,6 +46,16 @@ def times(what: str, values: Array, remedy: str = LEAVE_OUT) -> Iterator[str]:
             f"{what} has times that {verb} at row {row} ({values[row]:.6f} s after {values[row - 1]:.6f} s); "
             "sort the rows and drop doubles."
         )
+
+
+def readings(what: str, values: Array) -> Iterator[str]:
+    """A problem of the unit of times (T,) at which a sensor was read: any start will do, no interval will."""
+    step = float(np.median(np.diff(values))) if np.ndim(values) == 1 and np.size(values) > 1 else math.nan
+    if step > SLOWEST:
+        unit, scale = next((each for each in UNITS if step * each[1] <= SLOWEST), UNITS[-1])
+        yield f"{what} are {step:.4g} s apart, probably {unit}; scale the times by {scale:g} to seconds."
+    elif 0 < step < FASTEST:
+        yield f"{what} are {step:.4g} s apart, as of no sensor, probably scaled twice; give times in seconds."
 
 
 def rows(what: str, values: Array, at: Array, columns: str, remedy: str = LEAVE_OUT) -> Iterator[str]:

@@ -150,6 +150,7 @@ def _probe(what: str, probe: Probe) -> Iterator[str]:
     yield from checks.times(f"{what}'s command", probe.command_times)
     yield from checks.poses(f"{what}'s command (world_from_peg)", probe.command, probe.command_times)
     yield from checks.times(f"{what}'s stamps", probe.stamps, checks.FILL)
+    yield from checks.readings(f"{what}'s stamps", probe.stamps)
     for name, values in (("stiffness", probe.stiffness), ("damping", probe.damping)):
         if np.shape(values) != (6,) or not np.isfinite(values).all() or (values < 0).any():
             yield f"{what} has a {name} that is not six finite numbers of at least 0; give one for each axis."

@@ -55,6 +55,7 @@ def _problems(where: str, push: Push, touch: Touch) -> Iterator[str]:
     yield from checks.times(f"{where}'s finger path", push.times)
     yield from checks.poses(f"{where}'s finger path (world_from_tip)", push.world_from_tip, push.times)
     yield from touches.problems(where, touch, checks.LEAVE_OUT)
+    yield from checks.readings(f"{where}'s wrench readings", touch.times)
     if push.times.ndim != 1 or touch.times.ndim != 1 or 0 in (push.times.size, touch.times.size):
         return
     if touch.times[-1] < push.times[0] or touch.times[0] > push.times[-1]:
