@@ -222,6 +222,29 @@ def test_each_problem_is_one_sentence_that_names_the_place(case: str) -> None:
     assert describe(recording)
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "pattern"),
+    [
+        ("part", block("block").mesh, "part is of type Trimesh; give a bcppl.Part .*load_mesh"),
+        ("part", "x.stl", "part is of type str; give a bcppl.Part"),
+        ("peg", "x.stl", "peg is of type str; .* None where nothing is held"),
+        ("guess", np.eye(7)[3], "guess is of type ndarray; give a bcppl.Guess"),
+        ("measurements", None, "measurements is None; give a list"),
+        ("measurements", [View(camera("left"))], "measurement 0 is of type View; give a bcppl.Measurement"),
+        ("background", None, "background is None; give images"),
+        ("model", None, "model is None; give the name"),
+        ("truth", "here", "truth .* is of type str; a pose is seven numbers"),
+    ],
+)
+def test_what_is_of_another_type_is_one_sentence(field: str, value: Any, pattern: str) -> None:
+    wrong = replace(full(), **{field: value})
+    (found,) = problems(wrong)
+    assert re.search(pattern, found)
+    assert_one_sentence(found)
+    with pytest.raises(InputError, match=re.escape(found)):
+        validate(wrong)
+
+
 def test_an_open_mesh_may_be_looked_at() -> None:
     recording = full()
     seen = replace(recording, part=opened(recording.part), measurements=[recording.measurements[0]], peg=None)

@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from bcppl.errors import InputError
 from bcppl.geometry.parts import LARGEST_EXTENT, Guess, Part
 from bcppl.sensors import checks
-from bcppl.sensors.measurements import Recording
+from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.protocol import by_sensor, sensor_for, sensors
+
+PART = "a bcppl.Part (`load_mesh` in bcppl.geometry.parts makes one of a mesh file)"
+# What a recording's fields have to be, in types and in words.
+TYPES: dict[str, tuple[Any, str]] = {
+    "part": (Part, PART),
+    "guess": (Guess, "a bcppl.Guess"),
+    "measurements": (Sequence, "a list of bcppl.Measurement"),
+    "peg": (Part | None, f"{PART}, or None where nothing is held"),
+    "background": (Mapping, "images of depth by camera name, {} for none"),
+    "model": (str, "the name of a model"),
+}
 
 
 def problems(recording: Recording) -> list[str]:
@@ -42,6 +54,9 @@ def _touched(recording: Recording) -> bool:
 
 
 def _problems(recording: Recording) -> Iterator[str]:
+    if wrong_types := list(_types(recording)):
+        yield from wrong_types
+        return
     yield from checks.part(recording.part, closed=_touched(recording))
     if recording.peg is not None:
         yield from checks.part(recording.peg, closed=True)
@@ -61,6 +76,22 @@ def _problems(recording: Recording) -> Iterator[str]:
         wrong += sensor.problems(measurements, recording)
     for _, problem in sorted(wrong, key=lambda each: each[0]):
         yield problem
+
+
+def _types(recording: Recording) -> Iterator[str]:
+    """What is of another type than the rest of the checks, and everything after them, can read."""
+    for name, (type_, wanted) in TYPES.items():
+        if not isinstance(value := getattr(recording, name), type_):
+            yield f"the recording's {name} is {_kind(value)}; give {wanted}."
+    if isinstance(recording.measurements, Sequence):
+        for index, each in enumerate(recording.measurements):
+            if not isinstance(each, Measurement):
+                pair = "give a bcppl.Measurement of an action and its observation"
+                yield f"measurement {index} is {_kind(each)}; {pair}."
+
+
+def _kind(value: object) -> str:
+    return "None" if value is None else f"of type {type(value).__name__}"
 
 
 def _strays(recording: Recording) -> Iterator[tuple[int, str]]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bcppl.arguments import pose_problem
+from bcppl.arguments import POSE_NUMBERS, pose_problem
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
@@ -29,7 +29,12 @@ def first(where: npt.ArrayLike) -> int:
 
 def pose(what: str, values: object) -> Iterator[str]:
     """Problems of one pose (7,)."""
-    if problem := pose_problem(what, np.asarray(values, dtype=float)):
+    try:
+        numbers = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        yield f"{what} is of type {type(values).__name__}; a pose is seven numbers {POSE_NUMBERS}."
+        return
+    if problem := pose_problem(what, numbers):
         yield problem
 
 
