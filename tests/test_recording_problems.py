@@ -15,7 +15,6 @@ from bcppl.recordings import (
     Recording,
     View,
     describe,
-    notes,
     problems,
     validate,
 )
@@ -243,14 +242,6 @@ def test_what_is_of_another_type_is_one_sentence(field: str, value: Any, pattern
     assert_one_sentence(found)
     with pytest.raises(InputError, match=re.escape(found)):
         validate(wrong)
-
-
-def test_an_open_mesh_may_be_looked_at() -> None:
-    recording = full()
-    seen = replace(recording, part=opened(recording.part), measurements=[recording.measurements[0]], peg=None)
-    assert problems(seen) == []
-    assert len(notes(seen)) == 1 and "open mesh" in notes(seen)[0]
-    assert notes(recording) == []
 
 
 def test_describe_lists_what_is_there() -> None:

@@ -12,7 +12,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.parts import LARGEST_EXTENT, Guess, Part
 from bcppl.sensors import checks
 from bcppl.sensors.measurements import Measurement, Recording
-from bcppl.sensors.protocol import by_sensor, sensor_for, sensors
+from bcppl.sensors.protocol import HasNotes, by_sensor, sensor_for, sensors
 
 PART = "a bcppl.Part (`load_mesh` in bcppl.geometry.parts makes one of a mesh file)"
 # What a recording's fields have to be, in types and in words.
@@ -43,10 +43,16 @@ def validate(recording: Recording) -> None:
 
 def notes(recording: Recording) -> list[str]:
     """Remarks on a recording that do not stop inference, one sentence each."""
+    return [] if list(_types(recording)) else list(_notes(recording))
+
+
+def _notes(recording: Recording) -> Iterator[str]:
     part = recording.part
-    if _touched(recording) or list(checks.part(part, closed=False)) or part.is_closed:
-        return []
-    return [f"part {part.name!r} has an open mesh: it can be looked at, as here, but not touched."]
+    if not (_touched(recording) or list(checks.part(part, closed=False)) or part.is_closed):
+        yield f"part {part.name!r} has an open mesh: it can be looked at, as here, but not touched."
+    for sensor, measurements in by_sensor(recording.measurements):
+        if isinstance(sensor, HasNotes):
+            yield from sensor.notes([measurement for _, measurement in measurements], recording)
 
 
 def _touched(recording: Recording) -> bool:

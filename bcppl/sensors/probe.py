@@ -91,6 +91,10 @@ class ProbeSensor:
                 yield index, f"{where} is a probe window but the recording has no peg; add the held peg."
             yield from ((index, problem) for problem in wrong)
 
+    def notes(self, measurements: Sequence[Measurement], recording: Recording) -> Iterator[str]:
+        """A remark where no wrench was measured."""
+        yield from touches.notes([m.observation for m in measurements])
+
     def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:
         """Each probe's length and rate, and those of all windows together."""
         probes = {m.action.probe.name: m.action.probe.stamps for m in measurements}

@@ -57,6 +57,14 @@ class Sensor(Protocol):
 
 
 @runtime_checkable
+class HasNotes(Protocol):
+    """A sensor that remarks on measurements which may be right but rarely are."""
+
+    def notes(self, measurements: Sequence[Measurement], recording: Recording) -> Iterator[str]:
+        """Remarks on a recording's measurements of this kind, one sentence each; they may have problems."""
+
+
+@runtime_checkable
 class Plannable(Protocol):
     """A sensor whose measurements can be planned: a candidate is a measurement that may be made next.
 

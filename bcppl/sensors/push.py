@@ -44,6 +44,10 @@ class PushSensor:
             wrong = _problems(f"measurement {index}", measurement.action, measurement.observation)
             yield from ((index, problem) for problem in wrong)
 
+    def notes(self, measurements: Sequence[Measurement], recording: Recording) -> Iterator[str]:
+        """A remark where no wrench was measured."""
+        yield from touches.notes([m.observation for m in measurements])
+
     def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:
         """How long was pushed, and at which rates."""
         paths = touches.rate([m.action.times for m in measurements])

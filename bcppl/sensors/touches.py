@@ -31,6 +31,17 @@ def problems(where: str, touch: Touch, remedy: str) -> Iterator[str]:
         yield f"{where} has a wrench of {largest[row]:.3g} at row {row}; give newtons and newton metres."
 
 
+def notes(touches: Sequence[Touch]) -> Iterator[str]:
+    """A remark on wrenches that never change: noise alone would change a sensor's last digit."""
+    wrenches = [np.asarray(touch.wrench) for touch in touches]
+    rows = np.concatenate([np.empty((0, 6)), *(each for each in wrenches if each.shape[1:] == (6,))])
+    if len(rows) > 1 and (rows == rows[0]).all():
+        yield (
+            f"no force was measured: the wrench is {' '.join(f'{value:g}' for value in rows[0])} in all "
+            f"{len(rows)} rows of all touches; see whether the sensor was on and which columns were read."
+        )
+
+
 def span(times: Array) -> float:
     """Seconds from the first time to the last."""
     return float(times[-1] - times[0]) if times.size else 0.0
