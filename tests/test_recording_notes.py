@@ -1,6 +1,7 @@
 """Recordings that may be right but rarely are: a sentence each, and inference goes on."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,3 +44,36 @@ def test_a_wrench_that_never_changes_is_noted(value: float) -> None:
     one_felt = [*dead[:-2], full().measurements[-2], dead[-1]]
     assert len(notes(replace(full(), measurements=one_felt))) == 1
     assert notes(replace(full(), measurements=[full().measurements[0], None])) == []
+
+
+def noted(**changes: Any) -> list[str]:
+    """The notes on `full()` with some fields replaced, each checked to be one sentence."""
+    changed = replace(full(), **changes)
+    assert problems(changed) == []
+    found = notes(changed)
+    for note in found:
+        assert_one_sentence(note)
+    return found
+
+
+def test_a_background_of_no_camera_is_noted() -> None:
+    (found,) = noted(background={"lefd": full().background["left"]})
+    assert "background of 'lefd' is not used" in found and "'left', 'wrist/right.2'" in found
+
+
+def test_a_model_that_is_not_installed_is_noted_with_the_one_meant() -> None:
+    (found,) = noted(model="look_and_tuch")
+    assert "'look_and_tuch', which is not installed ('look_and_touch' is)" in found
+    (found,) = noted(model="mine")
+    assert "'mine', which is not installed: give your own file" in found
+
+
+def test_a_calibration_of_another_image_size_is_noted_with_both_sizes() -> None:
+    def seen_by(**intrinsics: float) -> list[Measurement]:
+        first, *others = full().measurements[:-1]  # the last view is of the first one's camera
+        there = replace(first.action, camera=replace(first.action.camera, **intrinsics))
+        return [replace(first, action=there), *others]
+
+    (found,) = noted(measurements=seen_by(fx=18.0, fy=19.0, cx=7.5, cy=5.5))
+    assert "camera 'left'" in found and "16×12 pixels, but its images are 8×6" in found
+    assert noted(measurements=seen_by(cx=5.0, cy=1.0)) == []

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from importlib.util import find_spec
+from pkgutil import iter_modules
 from typing import Any
 
 import numpy as np
@@ -50,9 +53,23 @@ def _notes(recording: Recording) -> Iterator[str]:
     part = recording.part
     if not (_touched(recording) or list(checks.part(part, closed=False)) or part.is_closed):
         yield f"part {part.name!r} has an open mesh: it can be looked at, as here, but not touched."
+    known = _installed_models()
+    if recording.model not in known:
+        close = get_close_matches(recording.model, known, 1)
+        yield (
+            f"the recording names the model {recording.model!r}, which is not installed"
+            f"{f' ({close[0]!r} is)' if close else ''}: give your own file with --model where it is run."
+        )
     for sensor, measurements in by_sensor(recording.measurements):
         if isinstance(sensor, HasNotes):
             yield from sensor.notes([measurement for _, measurement in measurements], recording)
+
+
+def _installed_models() -> list[str]:
+    """The names under which the command line finds models that data names; none of them is imported."""
+    found = find_spec("bcppl.models")
+    folders = found.submodule_search_locations if found is not None else None
+    return [info.name for info in iter_modules(folders) if not info.ispkg]
 
 
 def _touched(recording: Recording) -> bool:

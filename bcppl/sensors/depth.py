@@ -22,6 +22,7 @@ from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.protocol import FAINT, Indexed, Placement, PlannedAsIs, register
 
 MOST_DEPTH = 100.0  # m: beyond it a median depth is in millimetres
+OFF_CENTRE = 0.45  # of an image's side: a lens is centred better, so the calibration is of another size
 COLOUR = "#D55E00"
 USUAL = Camera("camera", 160, 120, 160.0, 160.0, 79.5, 59.5, np.eye(7)[3], near=0.1, far=2.0)
 DISTANCE = 0.45  # m from the part, of a camera like no other
@@ -106,6 +107,18 @@ class DepthSensor(PlannedAsIs):
                 what = f"{where}: the colour image is {image.rgb.shape}"
                 wrong.append(f"{what}, its camera {_frame(camera)} pixels.")
             yield from ((index, problem) for problem in wrong)
+
+    def notes(self, measurements: Sequence[Measurement], recording: Recording) -> Iterator[str]:
+        """Remarks on principal points at an image's edge, and on backgrounds of no camera."""
+        cameras = {m.action.camera.name: m.action.camera for m in measurements}
+        for camera in cameras.values():
+            yield from _off_centre(camera)
+        for name in recording.background:
+            if name not in cameras:
+                yield (
+                    f"the background of {name!r} is not used: no view is of a camera of that name (there are "
+                    f"{', '.join(map(repr, cameras))})."
+                )
 
     def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:
         """Each camera's size and range."""
@@ -225,6 +238,17 @@ def _camera(what: str, camera: Camera, recording: Recording) -> Iterator[str]:
     guessed = not list(checks.pose("the guess", recording.guess.world_from_part))
     if not wrong and guessed and not list(checks.part(recording.part, closed=False)):
         yield from _stands_off(what, camera, recording)
+
+
+def _off_centre(camera: Camera) -> Iterator[str]:
+    size, centre = np.array([camera.width, camera.height]), np.array([camera.cx, camera.cy])
+    if (np.abs(centre - 0.5 * (size - 1)) > OFF_CENTRE * size).any():
+        around = "×".join(f"{side:.0f}" for side in np.maximum(2 * centre + 1, 0))
+        yield (
+            f"camera {camera.name!r} has its principal point at ({camera.cx:g}, {camera.cy:g}), the middle "
+            f"of an image of {around} pixels, but its images are {_frame(camera)}: unless they are cropped, "
+            "scale fx, fy, cx and cy with the image."
+        )
 
 
 def _stands_off(what: str, camera: Camera, recording: Recording) -> Iterator[str]:
