@@ -11,6 +11,7 @@ import re
 import shlex
 import sys
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -99,6 +100,16 @@ def test_readme_is_short_and_links_every_page() -> None:
     text = README.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= MOST_LINES
     assert [page.name for page in PAGES[1:] if f"(docs/{page.name})" not in text] == []
+
+
+def test_modules_of_inference_are_named_as_they_are_imported() -> None:
+    text = (ROOT / "docs/inference.md").read_text(encoding="utf-8")
+    _, _, table = text.partition("## Modules of `bcppl.inference`")
+    cells = re.findall(r"^\| (`[^|]*) \|", table, flags=re.MULTILINE)
+    names = re.findall(r"`([^`]+)`", " ".join(cells))
+    assert len(names) > 20
+    for name in names:
+        import_module(f"bcppl.inference.{name}")
 
 
 @pytest.mark.long
