@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 import json
@@ -72,7 +73,9 @@ def ranked(ran: Ran) -> list[tuple[str, float]]:
     return [(name, float(gain)) for name, gain in rows]
 
 
-def test_a_recording_is_run_ranked_and_its_best_action_written(bcppl: Callable[..., Ran], here: Path) -> None:
+def test_a_recording_is_run_ranked_and_its_best_action_written(
+    bcppl: Callable[..., Ran], here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     words = ("--candidates", KINDS, "--particles", 12, "--outer-samples", 4, "--top", 3)
     ran = bcppl("probe", "look.h5", *words, "--output", "next.h5")
     assert ran.code == 0, ran.err
@@ -83,10 +86,14 @@ def test_a_recording_is_run_ranked_and_its_best_action_written(bcppl: Callable[.
     assert isinstance(best, Plan) and best.name == table[0][0]
     assert (here / "next.png").stat().st_size > 10_000
     # The belief that a run left ranks as the run does, and a file of one's own is taken.
-    own = bcppl("probe", "runs/belief_002.h5", "--candidates", "next.h5", "--outer-samples", 4)
+    monkeypatch.setenv("COLUMNS", "80")  # as of a pipe; no header is cut
+    long = dataclasses.replace(best, name=f"{best.name}, thought over{' and over' * 4}")
+    save_actions([long], "own.h5")
+    own = bcppl("probe", "runs/belief_002.h5", "--candidates", "own.h5", "--outer-samples", 4)
     assert own.code == 0, own.err
+    assert re.search(r"^rank  what .* time \(s\)  press \(N\)$", own.out, flags=re.MULTILINE), own.out
     ((name, gain),) = ranked(own)
-    assert name == best.name and gain == pytest.approx(table[0][1], abs=0.02)
+    assert name == long.name and gain == pytest.approx(table[0][1], abs=0.02)
     (again,) = load_actions(here / "belief_002_next.json")
     assert np.array_equal(again.world_from_peg, best.world_from_peg)
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from bcppl.inference.design.ranking import Ranking
 
+WIDEST = 1000  # characters of a row of the table
 NUMBERS = "x y z qw qx qy qz"
 
 
@@ -128,8 +129,11 @@ def probe(
     rule = kind(now.model.pose, cost=duration_of, **settings)
     with console.status("ranking"):
         ranking = rule(now.population, listed, scene)
-    console.width = max(console.width, 100)  # no number is cut, also where the output is no terminal
-    console.print(_table(ranking, top))
+    table_of_best = _table(ranking, top)
+    # Nothing in it is cut, also where the output is no terminal.
+    wide = console.measure(table_of_best, options=console.options.update(max_width=WIDEST)).maximum
+    console.width = max(console.width, wide)
+    console.print(table_of_best)
     best = named_apart(ranking.best.candidate, now.recording)
     save_actions([best], output)
     shown = f"next: {name_of(best)}", belief.world_from_part.numpy(), belief.log_weights.numpy()

@@ -36,9 +36,10 @@ def notes(touches: Sequence[Touch]) -> Iterator[str]:
     wrenches = [np.asarray(touch.wrench) for touch in touches]
     rows = np.concatenate([np.empty((0, 6)), *(each for each in wrenches if each.shape[1:] == (6,))])
     if len(rows) > 1 and (rows == rows[0]).all():
+        wrench = " ".join(f"{value:g}" for value in rows[0] + 0.0)  # without a minus before a zero
         yield (
-            f"no force was measured: the wrench is {' '.join(f'{value:g}' for value in rows[0] + 0.0)} in all "
-            f"{len(rows)} rows of all touches; see whether the sensor was on and which columns were read."
+            f"no force was measured: the wrench is {wrench} in all {len(rows)} rows of all touches; see "
+            "whether the sensor was on and which columns were read."
         )
 
 
