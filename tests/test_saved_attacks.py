@@ -227,9 +227,13 @@ def test_another_version_and_another_format_are_refused(path: Path) -> None:
     rewritten(path, lambda content: None, schema_version=9)
     refused(path, "schema version 9, this bcppl reads 1; upgrade")
     rewritten_format = path.with_name("b.h5")
-    with h5py.File(rewritten_format, "w") as file:
-        file.attrs["format"] = "bcppl belief"
-    refused(rewritten_format, "holds no population")
+    for other, match in (
+        ("bcppl recording", "holds no population"),
+        ("bcppl belief", "holds a belief and no population; give a file that `save` or `save_step` wrote"),
+    ):
+        with h5py.File(rewritten_format, "w") as file:
+            file.attrs["format"] = other
+        refused(rewritten_format, match)
     path.with_name("c.h5").write_text("no file of ours")
     refused(path.with_name("c.h5"), "damaged or no file of bcppl")
     with pytest.raises(InputError, match=r"there is no file .*nowhere\.h5"):

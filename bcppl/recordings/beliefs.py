@@ -50,7 +50,8 @@ def save_belief(
         path: where to.
         label: of the last measurement that it has assimilated.
         log_evidence: of all measurements so far.
-        random_state: of torch's generator, so that a run can be resumed.
+        random_state: of torch's generator after the step; a run is resumed from a step, not from a belief
+            (`bcppl.inference.saved.save_step`).
         latent: values (N, *event) at the latent addresses.
         of: the `bcppl.recordings.fingerprint.fingerprint` of the recording's assimilated measurements.
 

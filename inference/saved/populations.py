@@ -19,6 +19,7 @@ from bcppl.inference.population import Population, refuse_no_population
 from bcppl.inference.saved import plain
 from bcppl.inference.saved.approximations import approximation_content, approximation_of
 from bcppl.inference.saved.traces import Arguments, Content, content_of, trace_of
+from bcppl.recordings.beliefs import is_belief
 from bcppl.recordings.file import replacing
 from bcppl.traces import Series
 from bcppl.traces.run import Program
@@ -186,7 +187,8 @@ def opened(path: Location) -> Iterator[Content]:
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("format") != FORMAT:
-                raise InputError("it holds no population; give a file that `save` wrote.")
+                held = "a belief and no population" if is_belief(path) else "no population"
+                raise InputError(f"it holds {held}; give a file that `save` or `save_step` wrote.")
             number = int(file.attrs["schema_version"])
             if not 1 <= number <= SCHEMA_VERSION:
                 raise InputError(
