@@ -18,6 +18,7 @@ from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.proposals import drift
 from bcppl.traces import Series, assess, extend, generate, simulate, update
 from bcppl.traces.anticipated import Anticipated
+from bcppl.traces.differentiation.programs import log_prob_with_grad
 from tests.invariance import number
 from tests.small_programs import normal_log
 
@@ -60,6 +61,60 @@ def test_every_verb_takes_numbers_and_arrays(kind: str) -> None:
     population = importance_sampling(program, (), {"y_0": given, "pair": PAIR}, N)
     torch.testing.assert_close(population.trace["y_0"], trace["y_0"])
     assert assess(program, (), {"x": np.zeros(N), "y_0": given, "pair": PAIR}, N).shape == (N,)
+
+
+SHARES = torch.tensor([0.2, 0.5, 0.3], dtype=torch.float64)
+DISCRETE: dict[str, tuple[Any, Any]] = {
+    "Bernoulli": (dist.Bernoulli(number(0.3)), 1),
+    "Bernoulli of logits": (dist.Bernoulli(logits=number(-0.4)), 0),
+    "masked Bernoulli": (dist.Bernoulli(number(0.3)).mask(torch.tensor(True)), 1),
+    "several Bernoullis": (dist.Bernoulli(SHARES).to_event(1), [1, 0, 1]),
+    "mixture": (dist.MixtureSameFamily(dist.Categorical(SHARES), dist.Bernoulli(SHARES)), 1),
+    "Binomial": (dist.Binomial(number(5.0), number(0.3)), 2),
+    "BetaBinomial": (dist.BetaBinomial(number(2.0), number(1.0), 5), 2),
+    "Categorical": (dist.Categorical(SHARES), 2),
+    "Geometric": (dist.Geometric(number(0.3)), 2),
+    "Poisson": (dist.Poisson(number(3.0)), 255),
+    "GammaPoisson": (dist.GammaPoisson(number(2.0), number(1.0)), 2),
+    "NegativeBinomial": (dist.NegativeBinomial(number(3.0), number(0.2)), 2),
+    "ZeroInflatedPoisson": (dist.ZeroInflatedPoisson(number(3.0), gate=number(0.2)), 0),
+    "OrderedLogistic": (dist.OrderedLogistic(number(0.2), torch.tensor([-1.0, 1.0]).double()), 1),
+    "Multinomial": (dist.Multinomial(3, SHARES), [1, 0, 2]),
+    "DirichletMultinomial": (dist.DirichletMultinomial(1.0 + SHARES, 3), [1, 0, 2]),
+    "OneHotCategorical": (dist.OneHotCategorical(SHARES), [0, 1, 0]),
+}
+
+
+@pytest.mark.parametrize("name", DISCRETE)
+def test_whole_numbers_of_any_type_have_the_density_of_floats(name: str) -> None:
+    distribution, value = DISCRETE[name]
+
+    def counted() -> None:
+        pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        pyro.sample("y", distribution)
+
+    expected = distribution.log_prob(torch.tensor(value, dtype=torch.float64))
+    kinds = [np.array(value), torch.tensor(value), np.array(value, np.uint8), torch.tensor(value).int()]
+    kinds += [value, np.int64(value)] if isinstance(value, int) else []
+    kinds += [torch.tensor(value).bool(), np.array(value, bool)] if set(np.ravel(value)) <= {0, 1} else []
+    for given in kinds:
+        trace, weight = generate(counted, (), {"y": given}, N)
+        torch.testing.assert_close(weight, expected.expand(N), rtol=1e-12, atol=0.0)
+        x = trace["x"].requires_grad_()
+        torch.testing.assert_close(log_prob_with_grad(trace, {"x": x}), trace.log_prob("x"))
+        assert trace["y"].dtype == torch.as_tensor(given).dtype  # the program may take it for an index
+
+
+def test_a_class_of_a_user_gets_whole_numbers_as_they_are() -> None:
+    class Table(dist.Categorical):
+        def log_prob(self, value: Tensor) -> Tensor:
+            return SHARES.log()[value]
+
+    def looked_up() -> None:
+        pyro.sample("y", Table(SHARES))
+
+    _, weight = generate(looked_up, (), {"y": 1}, N)
+    torch.testing.assert_close(weight, SHARES.log()[1].expand(N))
 
 
 def test_steps_and_forward_kernels_take_numbers() -> None:

@@ -98,6 +98,7 @@ def log_prob_inside(distribution: Any, value: Tensor, *, any_turn: bool = True) 
     Pyro's densities continue beyond it without validation: an exponential's grows below 0. Pose distributions
     and lazy ones check their support themselves. NaN is no value, and is passed on.
     """
+    value = density_argument(distribution, value)
     if any_turn if is_of_angles(distribution) else not _is_bounded(distribution):
         return distribution.log_prob(value)
     inside = _inside(distribution, value, masked=True)
@@ -112,6 +113,24 @@ def log_prob_inside(distribution: Any, value: Tensor, *, any_turn: bool = True) 
             safe = safe.reshape(safe.shape + (1,) * len(distribution.event_shape))
             value = torch.where(safe, value, drawn)
     return torch.where(inside, distribution.log_prob(value), -torch.inf)
+
+
+def density_argument(distribution: Any, value: Tensor) -> Tensor:
+    """A value as the density of torch or Pyro takes it: whole numbers and truth values as float64.
+
+    In their own type a Bernoulli refuses them, a geometric distribution negates 2 of uint8 to 254, and a
+    Poisson's gamma function is in single precision. A class of a user gets what its own draws may be.
+    """
+    if value.is_floating_point() or value.is_complex() or not _is_of_torch_or_pyro(distribution):
+        return value
+    return value.to(torch.float64)
+
+
+def _is_of_torch_or_pyro(distribution: Any) -> bool:
+    innermost = base(distribution)
+    return type(innermost).__module__.startswith(("torch.", "pyro.")) and all(
+        map(_is_of_torch_or_pyro, _components(vars(innermost).values()))
+    )
 
 
 def has_probability(distribution: Any, value: int) -> Tensor:

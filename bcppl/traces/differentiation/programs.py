@@ -11,6 +11,7 @@ import pyro
 import torch
 from torch import Tensor
 
+from bcppl.distributions.support import density_argument
 from bcppl.errors import InputError
 from bcppl.traces.dependence.equality import alike, equal
 from bcppl.traces.run import Program, Run, inward, run
@@ -70,9 +71,8 @@ def log_prob_with_grad(
             exponent = 1.0 if exponents is None else exponents.get(address, 1.0)
             if exponent == 0.0:
                 continue
-            density = _refusing(
-                partial(distribution.log_prob, inward(ran.values[address], distribution)), address, values
-            )
+            value = density_argument(distribution, inward(ran.values[address], distribution))
+            density = _refusing(partial(distribution.log_prob, value), address, values)
             if depends and not density.requires_grad:
                 _refuse(address, "passes no gradient on", parameters, values)
             # Plates lie to the left of the particles.
