@@ -67,6 +67,14 @@ def from_rotation_matrix(translation: Tensor, rotation: Tensor) -> Tensor:
     return from_translation_quaternion_xyzw(translation, quaternions.from_rotation_matrix(rotation))
 
 
+def from_rotation_vector(translation: Tensor, vector: Tensor) -> Tensor:
+    """Poses (..., 7) from translations (..., 3) in metres and rotation vectors (..., 3) in radians.
+
+    A rotation vector is the axis times the angle, as controllers log the pose of a tool: not Euler angles.
+    """
+    return from_translation_quaternion_xyzw(translation, quaternions.from_rotation_vector(vector))
+
+
 def rotation_matrix(pose: Tensor) -> Tensor:
     """The rotations of poses (..., 7) as matrices (..., 3, 3)."""
     return quaternions.rotation_matrix(quaternion_xyzw(pose))

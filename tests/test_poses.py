@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from bcppl import poses, quaternions
 from bcppl.distributions.poses import NormalPose, SwingTwistPose, UniformPose, tilt_and_yaw
@@ -54,6 +55,15 @@ PRIORS = {
     "normal, about one axis": (NormalPose(CENTER, [0.01, 1.4], Freedom("x", "y")), 0.08),
     "normal, no rotation": (NormalPose(CENTER, [0.01, 0.02], Freedom("xz", "none")), 0.1),
 }
+
+
+def test_a_pose_of_a_rotation_vector_is_that_of_scipy() -> None:
+    vector = torch.tensor([[3.0, -0.5, 0.1], [0.0, 0.0, 0.0], [0.0, -math.pi, 0.0]], dtype=torch.float64)
+    place = torch.randn(3, 3, dtype=torch.float64)
+    pose = poses.from_rotation_vector(place, vector)
+    expected = torch.from_numpy(Rotation.from_rotvec(vector.numpy()).as_matrix())
+    torch.testing.assert_close(poses.rotation_matrix(pose), expected)
+    assert torch.equal(pose[:, :3], place)
 
 
 @pytest.mark.parametrize("name", PRIORS)

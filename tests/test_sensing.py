@@ -111,6 +111,23 @@ def test_weights_in_no_orientation_are_refused() -> None:
             transform_wrench(np.ones(6), bad)
 
 
+def test_wrenches_of_frames_that_turn_are_each_transformed() -> None:
+    rng = np.random.default_rng(0)
+    wrench = rng.normal(size=(5, 6))
+    turns = Rotation.random(5, rng=rng).as_quat()[:, [3, 0, 1, 2]]
+    pose = np.concatenate([rng.normal(size=(5, 3)), turns], axis=1)
+    each = [transform_wrench(one, to) for one, to in zip(wrench, pose, strict=True)]
+    np.testing.assert_allclose(transform_wrench(wrench, pose), each, atol=1e-14)
+    twist = rng.normal(size=(5, 6))  # the power of a wrench is the same in either frame
+    turn, place = Rotation.from_quat(pose[:, [4, 5, 6, 3]]), pose[:, :3]
+    angular = turn.apply(twist[:, 3:])
+    linear = turn.apply(twist[:, :3]) + np.cross(place, angular)
+    power = (transform_wrench(wrench, pose) * np.concatenate([linear, angular], axis=1)).sum(axis=1)
+    np.testing.assert_allclose(power, (wrench * twist).sum(axis=1), atol=1e-12)
+    with pytest.raises(InputError, match="one for each wrench"):
+        transform_wrench(wrench, pose[:3])
+
+
 def test_the_example_of_the_documentation_runs() -> None:
     page = Path(__file__).parents[1] / "docs/simulators.md"
     failed, tried = doctest.testfile(str(page), module_relative=False)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from bcppl.arguments import number_within
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.poses import as_pose
+from bcppl.poses import as_pose, rotation_matrix
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 FARTHEST_CENTER = 2.0  # m: a centre farther than this from the sensor comes from torques in N mm
@@ -64,16 +64,24 @@ def transform_wrench(wrench: Array, to_from_from: Array) -> Array:
 
     Args:
         wrench: force and torque (..., 6).
-        to_from_from: (7,) the pose from the wrench's frame to the other: `peg_from_sensor`.
+        to_from_from: (7,) the pose from the wrench's frame to the other, `peg_from_sensor`; or (..., 7), one
+            for each wrench, where the frames turn against each other, as those of a log in the base's axes.
 
     Raises:
-        InputError: the pose is not seven finite numbers with a unit quaternion.
+        InputError: a pose is not seven finite numbers with a unit quaternion, or there are neither one nor as
+            many poses as wrenches.
     """
     wrench = np.asarray(wrench, dtype=np.float64)
-    pose = as_pose(to_from_from, "the pose from one wrench's frame to the other").numpy()
-    turn = Rotation.from_quat(pose[[4, 5, 6, 3]]).as_matrix()
-    force = wrench[..., :3] @ turn.T
-    return np.concatenate([force, wrench[..., 3:] @ turn.T + np.cross(pose[:3], force)], axis=-1)
+    pose = as_pose(to_from_from, "the pose from one wrench's frame to the other")
+    if pose.ndim > 1 and pose.shape[:-1] != wrench.shape[:-1]:
+        raise InputError(
+            f"wrenches of shape {wrench.shape} are given poses of shape {tuple(pose.shape)}; give one pose "
+            "(7,), or one for each wrench."
+        )
+    turn = np.swapaxes(rotation_matrix(pose).numpy(), -1, -2)
+    force = (wrench[..., None, :3] @ turn)[..., 0, :]
+    torque = (wrench[..., None, 3:] @ turn)[..., 0, :]
+    return np.concatenate([force, torque + np.cross(pose[..., :3].numpy(), force)], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
