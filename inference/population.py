@@ -81,6 +81,19 @@ class Population:
         return float(1.0 / torch.softmax(self.log_weights, 0).square_().sum())
 
     @cached_property
+    def distinct(self) -> int:
+        """How many particles with weight differ in some latent value; 1 of a program without any."""
+        alive = self.log_weights > -torch.inf
+        count = int(alive.sum())
+        columns = [value[alive].reshape(count, value[0].numel()).double() for value in self.trace.choices.values()]
+        columns = [column for column in columns if column.shape[1]]
+        # Where one number tells all apart, as a continuous one does unless particles are copies: rows take
+        # ten times as long to sort.
+        if any(len(torch.unique(column[:, 0])) == count for column in columns):
+            return count
+        return len(torch.unique(torch.cat(columns, dim=1), dim=0)) if columns else min(count, 1)
+
+    @cached_property
     def log_total(self) -> float:
         """Log of the sum of the weights."""
         # By the operations of `reweighed`, so that a resumed run has the same bits.
@@ -216,8 +229,9 @@ class Population:
             size = f"{self.effective_sample_size:.1f}"
         except InferenceError:
             size = "none"
+        copies = f"{self.distinct} distinct, " if self.distinct < len(self) else ""
         return (
-            f"Population({len(self)} particles, effective sample size {size}, "
+            f"Population({len(self)} particles, {copies}effective sample size {size}, "
             f"log evidence {self.log_evidence:.4f}, latent: {', '.join(self.trace.choices) or 'none'}, "
             f"observed: {', '.join(self.trace.observations) or 'none'})"
         )

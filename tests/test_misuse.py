@@ -206,3 +206,15 @@ def test_a_population_is_told_in_a_line_and_read_by_address() -> None:
     assert shown.endswith("latent: mu, observed: y_0)") and f"{population.log_evidence:.4f}" in shown
     dead = Population(population.trace, torch.full((20,), -torch.inf, dtype=torch.float64))
     assert "effective sample size none" in repr(dead)
+
+
+def test_a_population_of_copies_says_so() -> None:
+    (population, _) = next(steps(tempered(walk), start(), [SEEN]))
+    apart = population.with_trace(population.trace.at({"mu": torch.arange(20).double()}))
+    assert apart.distinct == 20 and "distinct" not in repr(apart)
+    copies = apart.selected(torch.zeros(20, dtype=torch.int64))
+    assert repr(copies).startswith("Population(20 particles, 1 distinct, effective sample size 20.0, ")
+    two = apart.selected(torch.tensor([3] * 5 + [7] * 15))
+    assert repr(two).startswith("Population(20 particles, 2 distinct, effective sample size 20.0, ")
+    dead = Population(two.trace, torch.full((20,), -torch.inf, dtype=torch.float64))
+    assert "0 distinct, effective sample size none" in repr(dead)

@@ -82,9 +82,7 @@ def until(*, distinct: int | None = None, displacement: float | None = None, mos
 
 def distinct(population: Population) -> int:
     """How many particles with weight differ in some latent value."""
-    alive = population.log_weights > -torch.inf
-    columns = [v[alive].reshape(int(alive.sum()), -1).double() for v in population.trace.choices.values()]
-    return len(torch.unique(torch.cat(columns, dim=1), dim=0)) if columns else 1
+    return population.distinct
 
 
 def displacement(start: Population, now: Population) -> Tensor:
