@@ -15,10 +15,16 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner
 
+import bcppl
+from bcppl import poses
 from bcppl.cli import app
+from bcppl.recordings.beliefs import load_belief
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors import protocol
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -110,6 +116,36 @@ def test_modules_of_inference_are_named_as_they_are_imported() -> None:
     assert len(names) > 20
     for name in names:
         import_module(f"bcppl.inference.{name}")
+
+
+def test_a_controllers_log_becomes_the_recording_that_it_is_of() -> None:
+    names = run(ROOT / "docs/own_recording.md", long=False)
+    recording, windows = bcppl.recordings.load("own.h5"), names["windows"]
+    assert bcppl.recordings.problems(recording) == []
+    touched = [m for m in recording.measurements if m.kind == "window"]
+    assert [(m.action.first, m.action.last) for m in touched] == [
+        (m.action.first, m.action.last) for m in windows
+    ]
+    for mine, theirs in zip(touched, windows, strict=True):
+        np.testing.assert_allclose(mine.observation.times, theirs.observation.times, atol=1e-9)
+        np.testing.assert_allclose(mine.observation.wrench, theirs.observation.wrench, atol=1e-4)
+        there = torch.from_numpy(theirs.observation.world_from_peg)
+        apart = poses.local(torch.from_numpy(mine.observation.world_from_peg), there)
+        assert float(apart.abs().max()) < 5e-6  # a log of micrometres and microradians
+    assert recording.part.extent == pytest.approx(names["simulated"].part.extent, abs=1e-8)
+    for view in recording.measurements[:2]:
+        at_truth = RayCaster(recording.part).images(
+            view.action.camera, torch.from_numpy(names["simulated"].truth)[None]
+        )[0]
+        off = np.abs(at_truth - view.observation.depth)[np.isfinite(at_truth)]
+        assert np.nanmedian(off) < 0.003  # the hand-eye calibration is off by millimetres
+
+
+@pytest.mark.long
+def test_an_own_recording_localises_the_part() -> None:
+    names = run(ROOT / "docs/own_recording.md", long=True)
+    belief = load_belief("runs/own/belief_014.h5")
+    assert 1000.0 * belief.weighted_add(names["part"].surface_points(), names["simulated"].truth) < 1.0
 
 
 @pytest.mark.long
