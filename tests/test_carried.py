@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import pyro
@@ -12,8 +13,9 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.lazy import LazyDistribution
-from bcppl.traces import extend, generate, simulate, update
+from bcppl.traces import extend, generate, gradients, simulate, update
 from bcppl.traces.carried import carried
+from bcppl.traces.differentiation.programs import log_prob_with_grad
 from tests.invariance import number
 from tests.small_programs import normal_log
 
@@ -123,3 +125,43 @@ def test_two_windows_of_one_run_share_the_state_that_the_first_began() -> None:
 
     simulate(twice, (), 5)
     assert len(started) == 1
+
+
+class Doubled:
+    """Carried state that passes gradients on."""
+
+    def __init__(self, x: Tensor) -> None:
+        self.twice = 2.0 * x
+
+    def __getitem__(self, index: Tensor) -> Doubled:
+        return Doubled(0.5 * self.twice[index])
+
+    def where(self, mask: Tensor, other: Doubled) -> Doubled:
+        return Doubled(0.5 * torch.where(mask, self.twice, other.twice))
+
+
+def doubled() -> None:
+    x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+    for k in range(2):
+        pyro.sample(f"y_{k}", dist.Normal(carried("doubled", partial(Doubled, x)).twice, 1.0))
+
+
+def test_a_carried_state_passes_the_gradient_on_where_the_trace_is() -> None:
+    torch.manual_seed(0)
+    trace, _ = generate(doubled, (), {"y_0": 1.0, "y_1": 0.5}, N)
+    for x in (trace["x"], trace["x"] + 1.0):
+        x = x.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(log_prob_with_grad(trace, {"x": x}).sum(), x)
+        torch.testing.assert_close(gradient, (3.0 - 9.0 * x).detach())
+        with gradients():
+            moved = update(trace, {"x": x}).trace
+            (kept,) = torch.autograd.grad(moved.log_prob().sum(), x)
+        torch.testing.assert_close(kept, gradient)
+
+
+def test_a_state_that_gradients_do_not_reach_is_gone_on_with() -> None:
+    log: list[str] = []
+    torch.manual_seed(0)
+    trace, _ = generate(carrying(log), (1,), {"w_0": 1.0}, N)
+    log_prob_with_grad(trace, {"z": trace["z"].clone().requires_grad_()})
+    assert log == [f"started {N}", "ran"]  # by `generate` alone

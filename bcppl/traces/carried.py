@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from bcppl.traces.dependence.equality import Array, alike, equal, snapshot
+from bcppl.traces.differentiation.graph import carries
 from bcppl.traces.indexing import beside
 
 
@@ -158,6 +159,9 @@ _frame: ContextVar[_Frame | None] = ContextVar("bcppl_carried", default=None)
 def carried(name: str, start: Callable[[], C]) -> C:
     """The state carried under `name` if `start` would make the same, else a new one from `start()`.
 
+    Where a run keeps gradients and `start` is given a tensor that asks for them, the state is a new one too:
+    that of an earlier run carries none.
+
     Args:
         name: unique within the program.
         start: makes the state for N particles. It is given what the state depends on by
@@ -166,7 +170,9 @@ def carried(name: str, start: Callable[[], C]) -> C:
     frame = _frame.get()
     if frame is None:
         return start()
-    entry = frame.used.get(name) or frame.available.get(name)
+    entry = frame.used.get(name)
+    if entry is None and not (torch.is_grad_enabled() and carries(start)):
+        entry = frame.available.get(name)
     if entry is None or not entry.made_by(start):
         entry = Entry.made(start, frame.particles)
     elif not entry.as_made:
