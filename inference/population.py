@@ -85,7 +85,9 @@ class Population:
         """How many particles with weight differ in some latent value; 1 of a program without any."""
         alive = self.log_weights > -torch.inf
         count = int(alive.sum())
-        columns = [value[alive].reshape(count, value[0].numel()).double() for value in self.trace.choices.values()]
+        columns = [
+            value[alive].reshape(count, value[0].numel()).double() for value in self.trace.choices.values()
+        ]
         columns = [column for column in columns if column.shape[1]]
         # Where one number tells all apart, as a continuous one does unless particles are copies: rows take
         # ten times as long to sort.

@@ -206,3 +206,21 @@ def detached() -> None:
 def detached_scale() -> None:
     x = normal("x")
     normal("y", x, x.detach().exp())
+
+
+@wrong(Fault.GRADIENT)
+def detached_altogether() -> None:
+    x = normal("x")
+    normal("y", torch.tensor(x.detach().numpy()))
+
+
+@wrong(Fault.GRADIENT)
+def listed() -> None:
+    x = normal("x")
+    normal("y", torch.tensor(x.tolist(), dtype=torch.float64))
+
+
+@wrong(Fault.GRADIENT)
+def detached_from_one_of_two() -> None:
+    x, z = normal("x"), normal("z")
+    normal("y", x.detach().sin() + z)

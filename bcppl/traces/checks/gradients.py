@@ -24,11 +24,12 @@ RELATIVE = 0.1
 def check_gradients(trace: Trace) -> None:
     """Check gradients with respect to each real latent value, in double precision, by central differences.
 
-    A site that passes no gradient on at all is refused where one is asked for, and is not looked at.
+    A site that is refused where a gradient is asked for, as one that takes `x.numpy()`, is not looked at. One
+    that is not refused and passes none on, as with `x.detach().numpy()`, would count as a constant.
 
     Raises:
-        ProgramError: the gradient of a site is another (GRADIENT): one of the ways in which it depends on a
-            value is cut.
+        ProgramError: the gradient of a site is another (GRADIENT): one or all of the ways in which it
+            depends on a value are cut.
     """
     for latent, value in trace.choices.items():
         distribution = trace.distributions[latent]
@@ -61,17 +62,20 @@ def _check(trace: Trace, latent: str, value: Tensor, to_support: Transform) -> N
         ) + rounding
         wrong = wrong & torch.isfinite(difference)
         if float(wrong.double().mean()) > 0.5:
+            whole = not bool(gradient.any())
+            remedy = "; for a simulator take the value out by `x.numpy()`, which moves by gradients refuse"
             raise ProgramError(
                 Fault.GRADIENT,
                 site,
-                f"the gradient of site {site!r} with respect to {latent!r} is not that of its "
-                "log-probability, since a part of what it depends on is cut off; compute it with torch "
-                "alone, without `detach`, `item`, `numpy` or `torch.tensor` of a tensor.",
+                f"the gradient of site {site!r} with respect to {latent!r} is {'0, ' * whole}not that of its "
+                f"log-probability, since {'all' if whole else 'a part of what'} it depends on is cut off; "
+                "compute it with torch alone, without `detach`, `item`, `numpy` or `torch.tensor` of a "
+                f"tensor{remedy * whole}.",
             )
 
 
 def _gradient(trace: Trace, latent: str, value: Tensor, site: str) -> Tensor | None:
-    """The gradient of one site's log-probability; None where it passes none on."""
+    """The gradient of one site's log-probability; None where it is refused."""
     leaf = value.detach().clone().requires_grad_()
     others = {address: 0.0 for address in trace.addresses if address != site}
     try:
@@ -79,6 +83,6 @@ def _gradient(trace: Trace, latent: str, value: Tensor, site: str) -> Tensor | N
     except InputError:
         return None
     if not total.requires_grad:
-        return None
-    (gradient,) = torch.autograd.grad(total.sum(), leaf, allow_unused=True)
+        return torch.zeros_like(leaf)
+    (gradient,) = torch.autograd.grad(total.sum(), leaf, materialize_grads=True)
     return gradient
