@@ -64,8 +64,8 @@ UNTIL = (
     "depends on them; repeat the moves, or ask for a larger displacement, as `drift until displaced by 1.5`"
 )
 FEW = (
-    "exponents and resampling that depend on the particles leave a bias of order 1/N (hmc, D = 6: -.2 at 75, "
-    "-.025 +- .010 at 1000); give more particles"
+    "exponents and resampling that depend on the particles leave a bias of order 1/N (hmc, D = 6: -.13 +- "
+    ".05 at 75, -.012 +- .013 at 1000); give more particles"
 )
 UNLEARNED = (
     "D (D + 3) / 2 means and covariances are learnt from half of the particles, 500 for 1325 at D = 50; give "
