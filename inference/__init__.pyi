@@ -17,6 +17,7 @@ from bcppl.inference import (
     targets as targets,
 )
 from bcppl.inference.arviz import to_arviz as to_arviz
+from bcppl.inference.calibration.kernel_check import check_kernel as check_kernel
 from bcppl.inference.chains import Chains as Chains, markov_chains as markov_chains
 from bcppl.inference.collectors import collect as collect
 from bcppl.inference.filters import (

@@ -23,6 +23,7 @@ are kept in a folder: see `calibrate`.
 
 from bcppl.inference.calibration.figure import ranks_figure
 from bcppl.inference.calibration.joint import Densities, Drawn, Joint, Prior, Recorded, Simulator
+from bcppl.inference.calibration.kernel_check import KernelCheck, KernelError, check_kernel
 from bcppl.inference.calibration.result import Averaged, Calibration
 from bcppl.inference.calibration.simulation_based import calibrate
 
@@ -32,9 +33,12 @@ __all__ = [
     "Densities",
     "Drawn",
     "Joint",
+    "KernelCheck",
+    "KernelError",
     "Prior",
     "Recorded",
     "Simulator",
     "calibrate",
+    "check_kernel",
     "ranks_figure",
 ]
