@@ -151,6 +151,9 @@ def test_a_measured_recording_is_read_by_the_same_code() -> None:
     measured = sensing.measure(touches)
     np.testing.assert_array_equal(torch.cat([m[0] for m in measured]), whole[0])
     np.testing.assert_array_equal(torch.cat([m[1] for m in measured]), pose[0])
+    kept = np.r_[0:7, 15:40]
+    lost = Touch(touches[0].times[kept], touches[0].wrench[kept], touches[0].world_from_peg[kept])
+    assert len(sensing.measure([lost])[0][0]) == len(kept)
     with pytest.raises(InputError, match="samples per second"):
         ContactSensing(PEG, rate=500.0).measure(touches)
     with pytest.raises(InputError, match="cutoff"):
