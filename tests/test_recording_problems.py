@@ -102,6 +102,10 @@ WRONG: dict[str, tuple[Recording, str]] = {
         with_measurement(2, world_from_camera=np.array([0.0, 0, 600, 0, 1, 0, 0])),
         "measurement 2: camera .* wrong units",
     ),
+    "focal length in millimetres": (
+        with_measurement(2, fx=0.0193, fy=0.0193),
+        "measurement 2: camera .* nearly half the world; give them in pixels",
+    ),
     "camera in OpenGL's convention": (
         with_measurement(2, world_from_camera=np.array([0.0, 0, 0.6, 1, 0, 0, 0])),
         "measurement 2: camera .* 0.6 m behind it; .* z forward",

@@ -23,6 +23,7 @@ from bcppl.sensors.protocol import FAINT, Indexed, Placement, PlannedAsIs, regis
 
 MOST_DEPTH = 100.0  # m: beyond it a median depth is in millimetres
 OFF_CENTRE = 0.45  # of an image's side: a lens is centred better, so the calibration is of another size
+WIDEST = 0.1  # focal lengths for each width of an image: a shorter one would see 157 degrees and more
 COLOUR = "#D55E00"
 USUAL = Camera("camera", 160, 120, 160.0, 160.0, 79.5, 59.5, np.eye(7)[3], near=0.1, far=2.0)
 DISTANCE = 0.45  # m from the part, of a camera like no other
@@ -223,6 +224,12 @@ def _camera(what: str, camera: Camera, recording: Recording) -> Iterator[str]:
         yield f"{what} has no pixels or no focal length; give its width, height, fx and fy in pixels."
     elif not np.isfinite([camera.fx, camera.fy, camera.cx, camera.cy]).all():
         yield f"{what} has intrinsics that are not finite; give fx, fy, cx and cy in pixels."
+    elif min(camera.fx / camera.width, camera.fy / camera.height) < WIDEST:
+        yield (
+            f"{what} has focal lengths of {camera.fx:.4g} and {camera.fy:.4g} pixels for an image of "
+            f"{camera.width} x {camera.height}, a view of nearly half the world; give them in pixels, not in "
+            "millimetres."
+        )
     elif camera.distortion:
         try:
             coefficients(tuple(camera.distortion))
