@@ -44,8 +44,8 @@ def independent(
 
     D coordinates have D (D + 3) / 2 means and covariances to learn from half of the particles. Where these
     are not several times as many, hardly a move is accepted, the population dies out, and evidence is off by
-    nats: that of a Gaussian of D = 50 by +5.6 +- .4 with 1,000 particles, of D = 100 by +45 +- 2 (hmc: -.06
-    +- .05, +.08 +- .16). Where they are, a normal that is wider along every axis keeps particles near the
+    nats: that of a Gaussian of D = 50 by +5.6 +- .4 with 1,000 particles (hmc: -.12 +- .05), of D = 100 by
+    +45 +- 2. Where they are, a normal that is wider along every axis keeps particles near the
     mode from moving: with 10,000 and one component an inflation of 1.05 leaves -.34 +- .07 at D = 50, and
     1.006 nothing (`benchmarks/exact.py`); give 1.05^(6 / D).
 
@@ -115,7 +115,6 @@ def _maximised(fitted: Places, components: int) -> Mixture:
     """
     coordinates, places, weights, *_ = fitted
     dimension, particles, prior = coordinates.dimension, len(places), torch.diag(fitted.least)
-    effective = fitted.effective
     centers = places[_apart(fitted, components)]
     components = len(centers)
     steps = torch.stack([coordinates.steps(center, places) for center in centers])
@@ -136,7 +135,8 @@ def _maximised(fitted: Places, components: int) -> Mixture:
                 for center, each in zip(centers, within, strict=True)
             ]
         )
-        pooled = conditioned((masses[:, None, None] * covariances).sum(dim=0), effective)
+        # As of few particles whatever their number: the more there are, the less this counts.
+        pooled = conditioned((masses[:, None, None] * covariances).sum(dim=0), dimension)
         counts = (masses * particles)[:, None, None]
         covariances = (counts * covariances + dimension * pooled) / (counts + dimension)
         mixture = Mixture(masses.log(), centers, covariances)
