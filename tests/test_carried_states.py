@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import pyro
@@ -22,15 +23,6 @@ from bcppl.traces.dependence import equality
 from tests.invariance import number
 
 N = 6
-
-
-def t(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
-@dataclass
-class Holder:
-    held: Any
 
 
 class State:
@@ -56,7 +48,7 @@ def held(x: Tensor, y: Any, kind: str, constant: Tensor | None = None) -> Callab
         y = y.numpy()
     constant = torch.arange(4.0) if constant is None else constant
     if kind == "object":
-        return partial(lambda holder, _: State(*holder.held), Holder([x, y]), constant)
+        return partial(lambda holder, _: State(*holder.held), SimpleNamespace(held=[x, y]), constant)
     return lambda: State(x, y) if len(constant) else None  # type: ignore[return-value]
 
 

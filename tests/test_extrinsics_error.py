@@ -13,7 +13,7 @@ from bcppl import poses
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.extrusion import block_with_square_hole
-from bcppl.rendering.extrinsics_error import apparent_covariance, apparent_motion, line_of_sight
+from bcppl.rendering.extrinsics_error import apparent_motion, line_of_sight
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.rendering.region_of_interest import region_of_interest
 from tests.made_recordings import assert_one_sentence
@@ -45,8 +45,8 @@ def test_covariance_is_that_of_small_errors_of_the_stated_pose() -> None:
         for axis in torch.eye(6, dtype=torch.float64)
     ]
     scaled = torch.stack(columns, dim=-1) * torch.tensor([SHIFT] * 3 + [TURN] * 3, dtype=torch.float64)
-    computed = apparent_covariance(CAMERA, PART.expand(2, 7), SHIFT, TURN)
-    torch.testing.assert_close(computed, (scaled @ scaled.T).expand(2, 6, 6), rtol=1e-6, atol=1e-12)
+    motion = apparent_motion(CAMERA, PART.expand(2, 7), SHIFT, TURN)
+    torch.testing.assert_close(motion @ motion.mT, (scaled @ scaled.T).expand(2, 6, 6), rtol=1e-6, atol=1e-12)
 
 
 def test_a_part_farther_along_the_line_of_sight_stays_in_its_pixel_and_is_deeper() -> None:

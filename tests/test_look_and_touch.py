@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
 from bcppl import poses
+from bcppl.contact.touch import Touch
 from bcppl.distributions.fitted import FittedNormal
 from bcppl.distributions.pose_normals import transport
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.planning.metrology import three_two_one
+from bcppl.models import load_recording
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench.scene import bench_scene
+from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors import View
 
 
@@ -61,3 +67,26 @@ def test_images_of_a_small_part_do_not_place_it_surer_than_they_can(seed: int) -
         if manner == "held" and sideways and float(way.norm()) > 0.0031:  # longer than it presses on
             slides.append(way / way.norm())
     assert any(abs(float(one @ other)) < 0.8 for one in slides for other in slides)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("lost", [0.1, 0.3])
+def test_rows_that_a_log_lost_do_no_harm(lost: float) -> None:
+    recording = load_recording("peg_probe")
+    probe = next(m.action.probe for m in recording.measurements if m.kind == "window")
+    kept = np.random.default_rng(0).random(len(probe.stamps)) >= lost
+    kept[330:342] = False
+    whole, measurements = replace(probe, stamps=probe.stamps[kept]), []
+    for each in recording.measurements:
+        if each.kind == "window":
+            first, last = each.action.first, each.action.last
+            own, seen = kept[first:last], each.observation
+            window = ProbeWindow(whole, int(kept[:first].sum()), int(kept[:last].sum()))
+            touch = Touch(seen.times[own], seen.wrench[own], seen.world_from_peg[own])
+            each = replace(each, action=window, observation=touch)
+        measurements.append(each)
+    recording = replace(recording, measurements=measurements)
+    *_, end = infer(model.with_settings(profile="perfect"), recording)
+    add = 1000.0 * end.belief.weighted_add(recording.part.surface_points(), recording.truth)
+    print(f"{lost:.0%} of the rows lost: ADD {add:.2f} mm")
+    assert add < 0.2

@@ -75,10 +75,7 @@ def test_the_cameras_error_bounds_its_information_and_a_second_image_adds_less()
 
 
 def _error(sensor: ErringCamera, camera: Camera, part: torch.Tensor) -> torch.Tensor:
-    from bcppl.rendering.extrinsics_error import apparent_covariance
-
-    settings = sensor.settings
-    return apparent_covariance(camera, part, settings.camera_shift, settings.camera_turn)
+    return sensor.error.covariance([camera], part)
 
 
 def test_views_and_touches_stand_in_one_ranking() -> None:

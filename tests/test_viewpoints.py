@@ -38,10 +38,6 @@ def off(generator: np.random.Generator, size: float = 1.0) -> Tensor:
     return torch.from_numpy(size * generator.normal(size=6) * ([SHIFT] * 3 + [TURN] * 3))
 
 
-def moved(pose: Tensor, tangent: Tensor) -> Tensor:
-    return poses.retract(pose, tangent)
-
-
 def test_errors_have_the_covariance_of_one_mounting_and_each_place() -> None:
     """By errors drawn as they arise: one of the camera on the wrist, one of the wrist at each place."""
     cameras, part, generator = (
@@ -55,7 +51,7 @@ def test_errors_have_the_covariance_of_one_mounting_and_each_place() -> None:
         each = []
         for camera in cameras:
             stated = poses.as_pose(camera.world_from_camera)
-            error = moved(poses.identity(), common + off(generator, OWN))
+            error = poses.retract(poses.identity(), common + off(generator, OWN))
             really = poses.compose(stated, error)
             seen = poses.compose(stated, poses.compose(poses.inverse(really), part))
             each.append(poses.local(part, seen))
@@ -75,7 +71,7 @@ def test_sightings_one_after_another_have_their_joint_density() -> None:
         torch.zeros(18).double(), ERROR.covariance(cameras, part[0])
     )
     value = whole.sample()
-    seen = [moved(part, each[None]) for each in value.split(6)]
+    seen = [poses.retract(part, each[None]) for each in value.split(6)]
     before: list[Sighting] = []
     log_density = 0.0
     for camera, there in zip(cameras, seen, strict=True):
@@ -94,15 +90,34 @@ def test_sightings_one_after_another_have_their_joint_density() -> None:
     assert float((mean / exact.diagonal().sqrt()).abs().max()) < 0.05
 
 
+def test_the_weight_of_a_factor_is_the_density_of_what_sightings_disagree_in() -> None:
+    """So that modes are compared whose images are more and less sharp: contrasts have no part in them."""
+    torch.manual_seed(2)
+    cameras, part = wrist_cameras(2), poses.identity()[None]
+    seen = [poses.retract(part, each[None]) for each in (1e-4 * torch.randn(12).double()).split(6)]
+    sightings = [Sighting(camera, there) for camera, there in zip(cameras, seen, strict=True)]
+    contrast = torch.cat([torch.eye(6), -torch.eye(6)], dim=1).double()
+    apart = contrast @ torch.cat([poses.local(part, there)[0] for there in seen])
+    weights, exact = [], []
+    for scale in (1e-8, 1e-5):
+        more = [scale * torch.eye(6, dtype=torch.float64)[None]] * 2
+        whole = ERROR.covariance(cameras, part[0]) + scale * torch.eye(12, dtype=torch.float64)
+        covariance = contrast @ whole @ contrast.T
+        weights.append(float(ERROR.factor(sightings, more).log_weight))
+        zero = torch.zeros(6, dtype=torch.float64)
+        exact.append(float(torch.distributions.MultivariateNormal(zero, covariance).log_prob(apart)))
+    assert weights[1] - weights[0] == pytest.approx(exact[1] - exact[0], abs=0.01)
+
+
 def on_a_wrist(seed: int, views: int) -> Recording:
     """A camera mounted 1.5 mm and half a degree off, which the arm places a little off at every viewpoint."""
     generator = np.random.default_rng(seed)
-    truth = moved(
+    truth = poses.retract(
         poses.identity(), torch.from_numpy(generator.uniform(-1, 1, 6) * ([0.01] * 3 + [0.05, 0.05, 0.1]))
     )
     mounted, measurements = off(generator, 0.8), []
     for camera in wrist_cameras(views):
-        error = moved(poses.identity(), mounted + off(generator, 0.1))
+        error = poses.retract(poses.identity(), mounted + off(generator, 0.1))
         really = poses.compose(poses.as_pose(camera.world_from_camera), error).numpy()
         true = Camera("true", 160, 120, 150.0, 150.0, 79.5, 59.5, really, 0.1, 2.0)
         depth = SceneRenderer([PART]).images(true, truth[None, None])[0].astype(float)

@@ -13,9 +13,9 @@ from bcppl.geometry.camera import Camera
 
 @lru_cache(maxsize=256)
 def _nominal(camera: Camera) -> tuple[Tensor, Tensor]:
-    """A camera's nominal position and optical axis in the world, (3,) each."""
+    """A camera's nominal position (3,), and its axes (3, 3) in columns, in the world."""
     pose = torch.as_tensor(camera.world_from_camera, dtype=torch.float64)
-    return pose[:3], poses.rotation_matrix(pose)[:, 2]
+    return pose[:3], poses.rotation_matrix(pose)
 
 
 def line_of_sight(camera: Camera, part: Tensor) -> Tensor:
@@ -24,9 +24,9 @@ def line_of_sight(camera: Camera, part: Tensor) -> Tensor:
     They are along the lines of sight to parts at `world_from_part` (..., 7), and one metre along the optical
     axis.
     """
-    origin, forward = _nominal(camera)
+    origin, axes = _nominal(camera)
     away = part[..., :3] - origin
-    return away / (away @ forward)[..., None]
+    return away / (away @ axes[:, 2])[..., None]
 
 
 def apparent_motion(camera: Camera, part: Tensor, shift: float, turn: float) -> Tensor:
@@ -41,20 +41,10 @@ def apparent_motion(camera: Camera, part: Tensor, shift: float, turn: float) -> 
         shift: the error along each of the camera's axes, metres, of the first three columns.
         turn: the error about each of them, radians, of the last three.
     """
-    stated = torch.as_tensor(camera.world_from_camera, dtype=torch.float64)
-    axes = poses.rotation_matrix(stated).expand(*part.shape[:-1], 3, 3)
-    away = part[..., :3] - stated[:3]
+    origin, axes = _nominal(camera)
+    axes = axes.expand(*part.shape[:-1], 3, 3)
+    away = part[..., :3] - origin
     across = torch.linalg.cross(away[..., None].expand_as(axes), axes, dim=-2)
     moved = torch.cat([-shift * axes, turn * across], dim=-1)
     turned = -turn * poses.rotation_matrix(part).transpose(-1, -2) @ axes
     return torch.cat([moved, torch.cat([torch.zeros_like(turned), turned], dim=-1)], dim=-2)
-
-
-def apparent_covariance(camera: Camera, part: Tensor, shift: float, turn: float) -> Tensor:
-    """Covariances (..., 6, 6) of the apparent poses of parts (..., 7) under a camera's extrinsic error.
-
-    `shift` and `turn` are its standard deviations along and about each of the camera's axes, metres and
-    radians.
-    """
-    motion = apparent_motion(camera, part, shift, turn)
-    return motion @ motion.transpose(-1, -2)

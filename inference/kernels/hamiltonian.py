@@ -221,11 +221,6 @@ def _all(mask: Tensor) -> Tensor:
     return mask.reshape(len(mask), -1).all(dim=1)
 
 
-def unlearned_variances(addresses: tuple[str, ...], population: Population) -> Tensor:
-    """The variances (D,) of the prior where no two particles differ (`Places.unlearned`), 0 elsewhere."""
-    return torch.cat([weighted_places(population, address).unlearned for address in addresses])
-
-
 def _factor(addresses: tuple[str, ...], population: Population) -> Tensor:
     """Cholesky factor (D, D) of the weighted covariance, its correlations shrunk."""
     position = Unconstrained(addresses, population.trace).read(population.trace)

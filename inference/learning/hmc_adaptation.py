@@ -16,10 +16,10 @@ from bcppl.inference.kernels.hamiltonian import (
     Unconstrained,
     hamiltonian_move,
     named_addresses,
-    unlearned_variances,
 )
 from bcppl.inference.learning.mass import fisher_covariance
 from bcppl.inference.population import Population
+from bcppl.inference.proposals.spread import weighted_places
 from bcppl.inference.resampling import systematic
 from bcppl.inference.targets import Target
 from bcppl.traces import Trace
@@ -105,7 +105,8 @@ def learned_factor(addresses: tuple[str, ...], population: Population, target: T
     position = space.read(population.trace)
     exponents = target.exponents if isinstance(target, Target) else {}
     _, score = space.density(population.trace, position, exponents)
-    prior, weights = unlearned_variances(addresses, population), normalised(population.log_weights)
+    prior = torch.cat([weighted_places(population, address).unlearned for address in addresses])
+    weights = normalised(population.log_weights)
     return torch.linalg.cholesky(fisher_covariance(position, score, weights, prior))
 
 

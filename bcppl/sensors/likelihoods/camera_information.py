@@ -29,11 +29,10 @@ def information_of_images(
         return torch.zeros(len(part), 6, 6, dtype=torch.float64)
     weight = (1.0 - settings.outlier) / settings.scale**2 / (settings.temperature or 1.0)
     places = {place_of(camera): camera for camera in cameras}
-    count, common = len(places), 1.0 - settings.viewpoint**2
+    count = len(places)
     seen = torch.zeros(len(part), 6 * count, 6 * count, dtype=torch.float64)
     both = torch.zeros(len(part), 6 * count, count, dtype=torch.float64)
-    biases = settings.bias**2 * (common + (1.0 - common) * torch.eye(count, dtype=torch.float64))
-    own = torch.linalg.inv(biases).repeat(len(part), 1, 1)
+    own = torch.linalg.inv(settings.bias_covariance(count)).repeat(len(part), 1, 1)
     for camera in cameras:
         place = list(places).index(place_of(camera))
         rows = slice(6 * place, 6 * place + 6)

@@ -47,10 +47,16 @@ class CameraSettings:
         number_within("each viewpoint's own share of the errors is {}", self.viewpoint, above=0.0, most=1.0)
         whole_number("a camera's images are read with bins {}", self.bins)
 
+    def bias_covariance(self, count: int) -> Tensor:
+        """The covariance (K, K) of the biases at K viewpoints of one instrument, m^2."""
+        common = 1.0 - self.viewpoint**2
+        return self.bias**2 * (common + (1.0 - common) * torch.eye(count, dtype=torch.float64))
+
     def expected_bias(self, before: Sequence[Sighting]) -> tuple[Tensor, float]:
         """Mean (N,) and standard deviation of a viewpoint's bias, given those of its instrument's others."""
-        common, count = 1.0 - self.viewpoint**2, len(before)
-        share = common / (1.0 + (count - 1) * common)
-        biases = [torch.as_tensor(each.bias) for each in before]
-        total = torch.stack(biases).sum(dim=0) if biases else torch.zeros((), dtype=torch.float64)
-        return share * total, self.bias * math.sqrt(1.0 - count * share * common)
+        if not before:
+            return torch.zeros((), dtype=torch.float64), self.bias
+        whole = self.bias_covariance(len(before) + 1)
+        gain = torch.linalg.solve(whole[:-1, :-1], whole[:-1, -1])
+        biases = torch.stack([torch.as_tensor(each.bias) for each in before], dim=-1)
+        return biases @ gain, math.sqrt(whole[-1, -1] - gain @ whole[:-1, -1])

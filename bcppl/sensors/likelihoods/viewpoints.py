@@ -137,4 +137,5 @@ class InstrumentError:
             # How well the sightings agree: what they have in common is in the factor.
             squared = (away * pulls).sum(dim=(-2, -1)) - (middle * (alike.T @ pulls)).sum(dim=(-2, -1))
             center = poses.retract(center, middle[..., 0])
-        return PoseFactor(center, combined, -0.5 * squared)
+        spread = torch.linalg.slogdet(covariance(center))[1] - torch.linalg.slogdet(combined(center))[1]
+        return PoseFactor(center, combined, -0.5 * (squared + spread))
