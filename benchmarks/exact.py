@@ -10,8 +10,9 @@ kernels that are known to be biased `REASONS` states why. All kernels of a probl
 their errors are correlated: a bias common to all of them is one draw, not many. Of so many cells one in
 twenty lies beyond two standard errors by chance: --confirm runs those without a stated reason again, with
 other seeds, and prints both. With --file cells are written as they are done, and a later call adds the runs
-that are missing. With --limit a cell is left out, and its row says so, where a run with fewer particles took
-longer than that. With --recorded nothing is run: each cell of the file is shown with the runs that it has.
+that are missing. All of it takes days: with --seconds a cell is given runs until they took that long, three
+at least, and with --limit it is left out, and its row says so, where a run with fewer particles took longer
+than that. With --recorded nothing is run: each cell of the file is shown with the runs that it has.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from itertools import chain
 from pathlib import Path
@@ -30,7 +31,7 @@ import torch
 from exact_kernels import FEW, KERNELS, REASONS, UNLEARNED, WIDE
 from exact_problems import PROBLEMS, Problem
 from jobs import each
-from kept import added
+from kept import keep
 from report import Row, finish, options, show
 
 from bcppl.arrays import Array
@@ -38,6 +39,7 @@ from bcppl.beliefs import normalised
 from bcppl.inference import tempered_importance_sampling
 
 COUNTS = (75, 1000, 10_000)
+LEAST = 3  # runs of a cell, for a standard error
 
 
 class Cell(NamedTuple):
@@ -77,16 +79,34 @@ class Outcome(NamedTuple):
         return "variance" if logarithm else "biased"
 
 
+class Spend(NamedTuple):
+    """How long the runs of a cell may take, and how many there are at least."""
+
+    seconds: float
+    least: int = LEAST
+
+    def beside(self, known: Sequence[Outcome]) -> Spend | None:
+        """What is left beside runs that there are already; None if nothing."""
+        runs = sum(each.runs for each in known)
+        left = Spend(self.seconds - sum(each.runs * each.seconds for each in known), max(0, LEAST - runs))
+        return left if left.least or left.seconds > 0.0 else None
+
+
+UNLIMITED = Spend(math.inf)
+
+
 @cache
 def problem_named(name: str) -> Problem:
     return PROBLEMS[name]()
 
 
-def measured(cell: Cell) -> Outcome:
-    """The runs of one cell, on one thread."""
+def measured(cell: Cell, spend: Spend = UNLIMITED) -> tuple[tuple[int, ...], Outcome]:
+    """The runs of one cell, on one thread: as many as there is time for, and the seeds of these."""
     problem, errors, means, variances = problem_named(cell.problem), [], [], []
     begun = time.perf_counter()
     for seed in cell.seeds:
+        if len(errors) >= spend.least and time.perf_counter() - begun > spend.seconds:
+            break
         torch.manual_seed(seed)
         step = KERNELS[cell.kernel](problem.dimension, cell.particles)
         done = tempered_importance_sampling(
@@ -99,17 +119,18 @@ def measured(cell: Cell) -> Outcome:
         # About the exact mean: about its own it would be too small by one part in the effective sample size.
         variances.append(float((weights @ (x - problem.mean).square() / problem.variance).mean()))
     runs = len(errors)
-    spread = np.std(means, axis=0, ddof=1) / math.sqrt(runs)
+    fewer = min(1, runs - 1)  # of one run alone the deviation is 0, and counts for nothing where it is pooled
+    spread = np.std(means, axis=0, ddof=fewer) / math.sqrt(runs)
     figures = (
         np.mean(errors),
-        np.std(errors, ddof=1),
+        np.std(errors, ddof=fewer),
         np.logaddexp.reduce(errors) - math.log(runs),
         (np.abs(np.mean(means, axis=0)) / np.maximum(spread, 1e-12)).max(),
         np.mean(variances),
-        np.std(variances, ddof=1),
+        np.std(variances, ddof=fewer),
         (time.perf_counter() - begun) / runs,
     )
-    return Outcome(runs, *(float(f"{figure:.6g}") for figure in figures))
+    return cell.seeds[:runs], Outcome(runs, *(float(f"{figure:.6g}") for figure in figures))
 
 
 def pooled(outcomes: list[Outcome]) -> Outcome:
@@ -134,14 +155,18 @@ def pooled(outcomes: list[Outcome]) -> Outcome:
     )
 
 
-def outcome_of(file: Path | None, limit: float, cell: Cell, longest: float = 0.0) -> Outcome | None:
+def outcome_of(
+    file: Path | None, limit: float, seconds: float, cell: Cell, longest: float = 0.0
+) -> Outcome | None:
     """The runs of a cell that the file holds, and those that it lacks where none before took too long."""
     held = held_by(file).get(cell[:3], {})
     known = [Outcome(*outcome) for seeds, outcome in held.items() if {*seeds} <= {*cell.seeds}]
     missing = tuple(sorted({*cell.seeds}.difference(*held)))
-    if missing and longest <= limit:
-        cell = cell._replace(seeds=missing)
-        known.append(added(file, cell, partial(measured, cell)))
+    spend = Spend(seconds).beside(known)
+    if missing and longest <= limit and spend is not None:
+        seeds, outcome = measured(cell._replace(seeds=missing), spend)
+        known.append(outcome)
+        keep(file, cell._replace(seeds=seeds), outcome)
     return pooled(known) if known else None
 
 
@@ -154,12 +179,12 @@ def held_by(file: Path | None) -> Mapping[tuple[str, str, int], Mapping[tuple[in
     return held
 
 
-def in_turn(file: Path | None, limit: float, cells: list[Cell]) -> list[Outcome | float]:
+def in_turn(file: Path | None, limit: float, seconds: float, cells: list[Cell]) -> list[Outcome | float]:
     """The outcomes with more and more particles; where there is none, the longest run before, in seconds."""
     outcomes: list[Outcome | float] = []
     longest = 0.0
     for cell in cells:
-        outcome = outcome_of(file, limit, cell, longest)
+        outcome = outcome_of(file, limit, seconds, cell, longest)
         longest = max(longest, outcome.seconds if outcome else 0.0)
         outcomes.append(outcome or longest)
     return outcomes
@@ -168,7 +193,7 @@ def in_turn(file: Path | None, limit: float, cells: list[Cell]) -> list[Outcome 
 def second_opinion(file: Path | None, cell: Cell, others: tuple[int, ...]) -> Outcome | None:
     """The cell with other seeds; without any, the runs of the file with none of its own."""
     if others:
-        return outcome_of(file, math.inf, cell._replace(seeds=others))
+        return outcome_of(file, math.inf, math.inf, cell._replace(seeds=others))
     held = held_by(file).get(cell[:3], {})
     apart = [Outcome(*outcome) for seeds, outcome in held.items() if not {*seeds} & {*cell.seeds}]
     return pooled(apart) if apart else None
@@ -204,6 +229,12 @@ def main() -> None:
     parser.add_argument(
         "--limit", type=float, default=math.inf, help="seconds that a run with fewer particles may take"
     )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=math.inf,
+        help="that the runs of a cell may take",
+    )
     parser.add_argument("--file", type=Path, help="where the outcome of each cell is kept")
     parser.add_argument("--recorded", action="store_true", help="show what --file holds, and run nothing")
     arguments = parser.parse_args()
@@ -219,7 +250,7 @@ def main() -> None:
     others = tuple(range(arguments.seed + runs, arguments.seed + runs + arguments.confirm))
     kernels_on = [[Cell(p, k, n, seeds) for n in sorted(counts)] for p in problems for k in kernels]
     limit = -1.0 if arguments.recorded else arguments.limit
-    outcomes = each(partial(in_turn, arguments.file, limit), kernels_on, arguments.jobs)
+    outcomes = each(partial(in_turn, arguments.file, limit, arguments.seconds), kernels_on, arguments.jobs)
     done = dict(zip(chain(*kernels_on), chain(*outcomes), strict=True))
     rows: list[Row] = []
     for problem in problems:

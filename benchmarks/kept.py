@@ -22,7 +22,12 @@ def recorded(file: Path | None, key: Sequence[Any]) -> Any:
 def added(file: Path | None, key: Sequence[Any], evaluate: Callable[[], Any]) -> Any:
     """The result of `evaluate`, added to the file under a key."""
     result = evaluate()
+    keep(file, key, result)
+    return result
+
+
+def keep(file: Path | None, key: Sequence[Any], result: Any) -> None:
+    """Add a result to the file under a key."""
     if file is not None:
         with file.open("a", encoding="utf-8") as lines:
             lines.write(json.dumps([key, result]) + "\n")
-    return result

@@ -13,7 +13,7 @@ from torch import Tensor
 from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised
 from bcppl.beliefs.belief import ApparentPose, SeesPart
-from bcppl.distributions.support import freedom_of, refuse_several_poses
+from bcppl.distributions.support import refuse_several_poses
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.ancestry import inherited
 from bcppl.poses import FREE
@@ -208,9 +208,8 @@ class Population:
             InputError: no latent site has that address, or no pose is there.
         """
         latent_address("a belief over {} was asked for", address, self.trace.choices)
-        poses, site = self.trace[address], self.trace.distributions[address]
-        refuse_several_poses(address, poses, site)
-        freedom = freedom_of(site)
+        poses, freedom = self.trace[address], self.trace.support(address).freedom
+        refuse_several_poses(address, poses, freedom)
         if poses.shape != (len(self), 7):
             raise InputError(
                 f"a belief over {address!r} was asked for, which is no pose: its values have shape "

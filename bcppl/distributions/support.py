@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from pyro.distributions import MixtureSameFamily, SineBivariateVonMises, SineSkewed, VonMises
@@ -56,9 +56,9 @@ def freedom_of(distribution: Any) -> Freedom | None:
     return freedom
 
 
-def refuse_several_poses(address: str, value: Tensor, distribution: Any) -> None:
+def refuse_several_poses(address: str, value: Tensor, freedom: Freedom | None) -> None:
     """Refuse a latent site whose values (N, ..., 7) are several poses for each particle."""
-    if value.ndim != 2 and freedom_of(distribution) is not None:
+    if value.ndim != 2 and freedom is not None:
         raise InputError(
             f"site {address!r} samples poses of shape {tuple(value.shape[1:])} for each particle, in a plate "
             "or an event; sample each pose at its own address, `for k in range(...)`."
@@ -79,6 +79,32 @@ def whole_support(distribution: Any) -> Any:
     if not is_of_angles(distribution):
         return support
     return constraints.independent(TURN, support.event_dim) if support.event_dim else TURN
+
+
+class Support(NamedTuple):
+    """Where the values at a site may lie.
+
+    Attributes:
+        freedom: the free axes of poses, None where values are none.
+        constraint: torch's, with the event dimensions; None of a pose.
+        plates: the number of batch dimensions besides that of the particles.
+        is_fixed: whether it depends on no parameter of the distribution, such as the bounds of a uniform one.
+    """
+
+    freedom: Freedom | None
+    constraint: Any
+    plates: int
+    is_fixed: bool
+
+    @classmethod
+    def of(cls, distribution: Any) -> Support:
+        """That of a distribution; NotImplementedError where it states none."""
+        plates, freedom = len(distribution.batch_shape) - 1, freedom_of(distribution)
+        if freedom is not None:
+            return cls(freedom, None, plates, True)
+        stated = getattr(type(base(distribution)), "support", None)
+        is_fixed = isinstance(stated, constraints.Constraint) and not constraints.is_dependent(stated)
+        return cls(None, whole_support(distribution), plates, is_fixed)
 
 
 def support_of(distribution: Any) -> Any:

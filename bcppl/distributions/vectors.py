@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.shortcuts import centred_normals
 
 
 class NormalStep(LazyDistribution):
@@ -37,7 +38,7 @@ class NormalStep(LazyDistribution):
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """One value for each particle, of the shape of `at`."""
-        noise = torch.randn(len(self.at), len(self.factor), dtype=self.at.dtype, device=self.at.device)
+        noise = centred_normals((len(self.at), len(self.factor)))
         return self.at + (self.size[:, None] * (noise @ self.factor.mT)).reshape(self.at.shape)
 
 
@@ -72,7 +73,7 @@ class NormalMixture(LazyDistribution):
         which = torch.searchsorted(chances.cumsum(-1), torch.rand_like(chances[:, :1])).squeeze(-1)
         which = which.clamp_(max=chances.shape[-1] - 1)
         centers = self.centers.expand(*chances.shape, -1)[torch.arange(len(which)), which]
-        noise = torch.randn_like(centers)
+        noise = centred_normals(centers.shape)
         if self.factors.ndim == 2:
             return centers + noise @ self.factors.mT
         for component in which.unique().tolist():

@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
+from bcppl.distributions.support import Support
 from bcppl.traces.series import SeriesTrace
 from bcppl.traces.trace import Trace, changed
 from bcppl.traces.update import update
@@ -87,6 +88,10 @@ class Anticipated:
     def addresses(self) -> list[str]:
         """All addresses in the order of the program."""
         return self._shown.addresses
+
+    def support(self, address: str) -> Support:
+        """Where the values at a latent address may lie."""
+        return self._shown.support(address)
 
     def log_prob(self, *addresses: str) -> Tensor:
         """Log-probability (N,) of sites, summed; of all sites where none is named."""

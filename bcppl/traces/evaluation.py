@@ -6,11 +6,10 @@ from collections import UserDict
 from collections.abc import Mapping
 from typing import Any
 
-import pyro
 import torch
 from torch import Tensor
 
-from bcppl.distributions.shortcuts import narrowed
+from bcppl.distributions.shortcuts import narrowed, unvalidated
 from bcppl.distributions.support import has_probability, log_prob_inside
 from bcppl.errors import InputError
 from bcppl.traces.dependence.surroundings import changed as surroundings_changed, evaluated, surroundings_of
@@ -39,7 +38,7 @@ def log_probability(
     if address in choices:
         refuse_masked(address, distribution)
     # A value that another one has moved out of the support is impossible, not a mistake.
-    with graph(), pyro.validation_enabled(False):
+    with graph(), unvalidated():
         value = _of_site(ran, address, distribution, address in choices)
     batch = distribution.batch_shape
     if value.shape not in ((), batch):

@@ -24,6 +24,13 @@ def beside(mask: Tensor, values: Tensor | npt.NDArray[Any]) -> Tensor:
     return mask.reshape(-1, *[1] * (values.ndim - 1))
 
 
+def aligned(index: Tensor, particles: int) -> tuple[Tensor, Tensor]:
+    """Where in `index` (K,) each particle is, 0 for those that are not, and a mask of those that are (N,)."""
+    rows, mask = torch.zeros(particles, dtype=torch.int64), torch.zeros(particles, dtype=torch.bool)
+    rows[index], mask[index] = torch.arange(len(index)), True
+    return rows, mask
+
+
 def composed(first: Tensor | None, then: Tensor | None) -> Tensor | None:
     """Choosing by `first`, then by `then`, in one; None chooses all."""
     return then if first is None else first if then is None else first.index_select(0, then)

@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import pyro
 import torch
 from pyro.distributions.torch_distribution import TorchDistributionMixin
 from pyro.poutine.indep_messenger import IndepMessenger
@@ -23,7 +22,7 @@ from torch import Tensor
 
 from bcppl.arguments import whole_number
 from bcppl.distributions.lazy import LazyDistribution
-from bcppl.distributions.shortcuts import drawn
+from bcppl.distributions.shortcuts import drawn, unvalidated
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry, carrying
 from bcppl.traces.dependence.surroundings import surroundings
@@ -96,7 +95,7 @@ def run(
     particles = whole_number("a program was to be run for {} particles", particles)
     given = tensors(given)
     recorder = _Recorder(particles, given, draws_lazy)
-    with carrying(carried, particles) as used, graph(), pyro.validation_enabled(False):
+    with carrying(carried, particles) as used, graph(), unvalidated():
         try:
             with _apart(), recorder, _Particles(PARTICLES, particles, dim=-1) as plate:
                 result = program(*args)
@@ -289,7 +288,7 @@ def _draw(address: str, distribution: Any) -> Any:
 
 
 def _is_no_choice(message: Any) -> bool:
-    return isinstance(message["fn"], _Subsample) or bool(message["infer"].get("_deterministic"))
+    return type(message["fn"]) is _Subsample or bool(message["infer"].get("_deterministic"))
 
 
 def _scaled(scale: Any) -> bool:

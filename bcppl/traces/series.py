@@ -34,7 +34,7 @@ from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.differentiation.graph import kept
-from bcppl.traces.indexing import Index, composed, indexed
+from bcppl.traces.indexing import Index, aligned, composed, indexed
 from bcppl.traces.run import Program, Run
 from bcppl.traces.trace import Trace
 
@@ -250,8 +250,7 @@ class SeriesTrace(Trace):
         whole, first = (self, None) if self.origin is None else self.origin
         both = composed(first, index)
         assert both is not None
-        return replace(
-            whole,
+        return whole._like(
             program=self.stage.take(index),
             particles=len(index),
             choices=Chosen(whole.choices, both),
@@ -267,7 +266,7 @@ class SeriesTrace(Trace):
             return self
         whole, index = self.origin
         known = {a: v.index_select(0, index) for a, v in whole.known.items() if a not in self.known}
-        return replace(self, choices=dict(self.choices), known={**known, **self.known}, origin=None)
+        return self._like(choices=dict(self.choices), known={**known, **self.known}, origin=None)
 
     def where(self, mask: Tensor, other: Trace) -> SeriesTrace:
         """This trace where `mask` (N,) is true, the other (of the same step and past) elsewhere.
@@ -278,7 +277,11 @@ class SeriesTrace(Trace):
         assert isinstance(other, SeriesTrace)
         first, second = self.settled(), other.settled()
         merged = super(SeriesTrace, first).where(mask, second)
-        return replace(merged, program=first.stage.where(mask, second.stage))  # type: ignore[return-value]
+        return merged._like(program=first.stage.where(mask, second.stage))
+
+    def replaced(self, index: Tensor, source: Trace) -> SeriesTrace:  # noqa: D102
+        rows, mask = aligned(index, self.particles)
+        return source.chosen(rows).where(mask, self)
 
     def revised(self, *args: Any, **options: Any) -> Trace:  # noqa: D102
         return super(SeriesTrace, self.settled()).revised(*args, **options)

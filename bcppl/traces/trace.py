@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bcppl.distributions.support import support_of
+from bcppl.distributions.support import Support, support_of
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.dependence.equality import comparison, equal
@@ -20,10 +20,23 @@ from bcppl.traces.dependence.surroundings import changed as surroundings_changed
 from bcppl.traces.differentiation.graph import kept
 from bcppl.traces.evaluation import Hiding, log_probability
 from bcppl.traces.explained import hidden_site, other_addresses, refuse_masked
-from bcppl.traces.indexing import Index, beside, particles_at
+from bcppl.traces.indexing import Index, aligned, beside, particles_at
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.structural import Structure
 from bcppl.traces.values import Value, tensors
+
+
+@dataclass(eq=False)
+class Common:
+    """What a program has at any values of the same addresses: it need not be run again to find out.
+
+    Attributes:
+        addresses: in the order of the program, if they were asked for.
+        supports: of latent addresses, where they depend on no value.
+    """
+
+    addresses: tuple[str, ...] | None = None
+    supports: dict[str, Support] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,6 +65,16 @@ class Trace:
     carried: dict[str, Entry] = field(default_factory=dict)
     known: dict[str, Tensor] = field(default_factory=dict, repr=False)
     hidden: frozenset[str] = frozenset()
+
+    @cached_property
+    def _common(self) -> Common:
+        return Common()
+
+    def _like(self, **changed: Any) -> Any:
+        """The trace of the same program and arguments with other particles or values."""
+        other = replace(self, **changed)
+        other.__dict__["_common"] = self._common
+        return other
 
     @cached_property
     def _run(self) -> Run:
@@ -110,7 +133,18 @@ class Trace:
     @property
     def addresses(self) -> list[str]:
         """All addresses in the order of the program."""
-        return list(self._run.distributions)
+        if self._common.addresses is None:
+            self._common.addresses = tuple(self._run.distributions)
+        return list(self._common.addresses)
+
+    def support(self, address: str) -> Support:
+        """Where the values at a latent address may lie."""
+        if address not in self._common.supports:
+            support = Support.of(self.distributions[address])
+            if not support.is_fixed:
+                return support
+            self._common.supports[address] = support
+        return self._common.supports[address]
 
     @property
     def structure(self) -> Structure:
@@ -163,8 +197,7 @@ class Trace:
 
     def chosen(self, index: Tensor) -> Any:
         """The trace of the particles at an index (K,) int64 that is known to be in range."""
-        return replace(
-            self,
+        return self._like(
             particles=len(index),
             choices={a: v[index] for a, v in self.choices.items()},
             carried={a: e.take(index) for a, e in self.carried.items()},
@@ -189,11 +222,14 @@ class Trace:
         latent, observed = shapes(self.choices), shapes(self.observations)
         return f"{type(self).__name__}({self.particles} particles, latent: {latent}, observed: {observed})"
 
+    def settled(self) -> Trace:
+        """The same trace, with nothing left to gather from another."""
+        return self
+
     def where(self, mask: Tensor, other: Trace) -> Trace:
         """This trace where `mask` (N,) is true, the other (same program, same addresses) elsewhere."""
         shared = self.known.keys() & other.known.keys()
-        return replace(
-            self,
+        return self._like(
             choices={a: torch.where(beside(mask, v), v, other.choices[a]) for a, v in self.choices.items()},
             carried={
                 a: merged
@@ -204,6 +240,24 @@ class Trace:
             hidden=self.hidden | other.hidden,
         )
 
+    def replaced(self, index: Tensor, source: Trace) -> Trace:
+        """This trace with the particles at `index` (K,) int64, each once, replaced by a trace of K particles.
+
+        The other trace is of the same program and has the same addresses.
+        """
+        shared = self.known.keys() & source.known.keys()
+        rows, mask = aligned(index, self.particles)
+        return self._like(
+            choices={a: v.index_copy(0, index, source.choices[a]) for a, v in self.choices.items()},
+            carried={
+                a: merged
+                for a, e in source.carried.items()
+                if a in self.carried and (merged := e.take(rows).where(mask, self.carried[a])) is not None
+            },
+            known={a: self.known[a].index_copy(0, index, source.known[a]) for a in shared},
+            hidden=self.hidden | source.hidden,
+        )
+
     def hiding(self, addresses: Iterable[str]) -> Trace:
         """The same trace for a proposal to read, with some sites hidden.
 
@@ -212,7 +266,7 @@ class Trace:
         """
         hidden = frozenset(addresses)
         self._run.refuse_unvisited(hidden)
-        secret = replace(self, known=dict(self.known), hidden=self.hidden | hidden)
+        secret = self._like(known=dict(self.known), hidden=self.hidden | hidden)
         secret._keep_run(self._ran)
         return secret
 
@@ -266,7 +320,12 @@ class Trace:
         ran = run(self.program, args, self.particles, given, self.carried, draws_lazy=draws_lazy)
         observed = {a: v for a, v in observed.items() if a in ran.distributions}
         revised = type(self).of_run(self.program, args, self.particles, ran, observed, self.hidden)
+        if args is self.args and tuple(ran.distributions) == self._common.addresses and not ran.structural:
+            revised.__dict__["_common"] = self._common
         refuse_masked_latents(revised)
+        if "_run" not in self.__dict__ and self.choices and self.choices.keys() <= values.keys():
+            # Hardly a site stays as it was: to run the program again for these values would be in vain.
+            return revised
         known = [a for a in self.known if a in ran.distributions]
         lost = set(changed(self, revised, known))
         revised.known.update({a: self.known[a] for a in known if a not in lost})

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bcppl.distributions.support import refuse_several_poses
+from bcppl.distributions.support import freedom_of, refuse_several_poses
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.differentiation.graph import kept
@@ -194,7 +194,7 @@ def refuse_unfit(trace: Trace, observations: Mapping[str, Tensor], old: Collecti
             )
     for address, value in trace.choices.items():
         if value.shape[-1:] == (7,) and value.ndim != 2 and address not in old:
-            refuse_several_poses(address, value, ran.distributions[address])
+            refuse_several_poses(address, value, freedom_of(ran.distributions[address]))
 
 
 def _refuse_coincidence(

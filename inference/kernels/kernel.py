@@ -105,10 +105,4 @@ def decided(target: Target, trace: Trace, proposed: Trace, log_ratio: Tensor) ->
 
 def scattered(trace: Trace, index: Tensor, source: Trace) -> Trace:
     """A trace with the particles at `index` (K,) replaced by those of a trace of K particles."""
-    if len(index) == 0:
-        return trace
-    rows = torch.zeros(len(trace), dtype=torch.int64)
-    rows[index] = torch.arange(len(index))
-    mask = torch.zeros(len(trace), dtype=torch.bool)
-    mask[index] = True
-    return source[rows].where(mask, trace)
+    return trace.replaced(index, source) if len(index) else trace

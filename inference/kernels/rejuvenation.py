@@ -145,6 +145,9 @@ def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int
 
 def _sweep(population: Population, kernel: Kernel, target: Target) -> tuple[Population, Tensor]:
     population = halved(population)
+    if isinstance(target, Target):
+        # What is known of all particles is known of each half, and stays known of those that do not move.
+        target(population.trace)
     parts, shares = halves(population), []
     for mine, others in zip(parts, parts[::-1], strict=True):
         move = fitted(kernel, population[others])

@@ -21,7 +21,7 @@ from bcppl import poses
 from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief
 from bcppl.distributions.poses import MixturePose, NormalPose
-from bcppl.distributions.support import freedom_of, refuse_several_poses, whole_support
+from bcppl.distributions.support import Support, refuse_several_poses
 from bcppl.distributions.vectors import NormalMixture, NormalStep
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
@@ -105,7 +105,8 @@ class VectorCoordinates:
 
     def still(self, places: Tensor) -> Tensor:
         """The axes (d,) along which no two places differ, bool."""
-        return (places == places[0]).all(dim=0)
+        same = places[0] == places[-1]  # where the first and the last differ, no others need be compared
+        return (places == places[0]).all(dim=0) if bool(same.any()) else same
 
     def rounding(self, places: Tensor) -> Tensor:
         """Standard deviations (d,) below which differences of places are rounding."""
@@ -151,10 +152,10 @@ class Unflattened(Transform):
     bijective = True
     domain = constraints.real_vector
 
-    def __init__(self, distribution: Any, values: Tensor) -> None:
+    def __init__(self, support: Support, values: Tensor) -> None:
         super().__init__(cache_size=0)
-        self.to_support = biject_to(whole_support(distribution))
-        self.plates = len(distribution.batch_shape) - 1
+        self.to_support = biject_to(support.constraint)
+        self.plates = support.plates
         self.unbounded = _is_identity(self.to_support)
         self._set(values)
 
@@ -214,19 +215,17 @@ def _is_identity(transform: Transform) -> bool:
 def coordinates_of(trace: Trace, address: str) -> Coordinates:
     """The coordinates of a latent address of a trace; InputError where it has none."""
     latent_address("a proposal moves {}", address, trace.choices)
-    distribution = trace.distributions[address]
-    freedom = freedom_of(distribution)
-    value = trace[address]
-    if freedom is not None:
-        refuse_several_poses(address, value, distribution)
-        return PoseCoordinates(freedom)
-    if distribution.support.is_discrete or not value.is_floating_point():
+    support, value = trace.support(address), trace[address]
+    if support.freedom is not None:
+        refuse_several_poses(address, value, support.freedom)
+        return PoseCoordinates(support.freedom)
+    if support.constraint.is_discrete or not value.is_floating_point():
         raise InputError(f"address {address!r} is discrete and has no coordinates; use prior({address!r}).")
     try:
-        return VectorCoordinates(address, Unflattened(distribution, value))
+        return VectorCoordinates(address, Unflattened(support, value))
     except NotImplementedError as error:
         raise InputError(
-            f"the support of address {address!r}, {distribution.support}, has no unbounded coordinates; "
+            f"the support of address {address!r}, {support.constraint}, has no unbounded coordinates; "
             f"use prior({address!r}) or a proposal of your own."
         ) from error
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -72,14 +73,14 @@ def weighted_places(population: Population, address: str) -> Places:
     coordinates = coordinates_of(population.trace, address)
     values = population.trace[address]
     places, weights = coordinates.places(values), normalised(population.log_weights)
-    finite = torch.isfinite(places).all(dim=-1)
-    total = float(weights[finite].sum())
-    if not total > 0.0:
-        raise InferenceError(
-            f"no proposal can be fitted at {address!r}: all values are 0 or infinite in {values.dtype}, at "
-            "the edge of the support; give the prior less spread."
-        )
-    if not bool(finite.all()):
+    if not math.isfinite(float(places.sum())):  # one pass, and finite only where all are
+        finite = torch.isfinite(places).all(dim=-1)
+        total = float(weights[finite].sum())
+        if not total > 0.0:
+            raise InferenceError(
+                f"no proposal can be fitted at {address!r}: all values are 0 or infinite in {values.dtype}, "
+                "at the edge of the support; give the prior less spread."
+            )
         places, weights = places[finite], weights[finite] / total
     still = coordinates.still(places[weights > 0.0])
     unlearned = torch.zeros(coordinates.dimension, dtype=torch.float64)

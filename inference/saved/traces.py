@@ -97,7 +97,7 @@ def name_of(program: Program | Series) -> str:
 
 def _evaluated(trace: Trace, particles: Tensor) -> dict[str, Tensor]:
     """The log-probability (K,) of every site of a few particles, evaluated from nothing but their values."""
-    few = replace(trace.chosen(particles), carried={}, known={})
+    few = replace(trace.chosen(particles).settled(), carried={}, known={})
     return {address: few.log_prob(address) for address in few.addresses}
 
 

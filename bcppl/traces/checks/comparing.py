@@ -23,7 +23,7 @@ COARSE = 1e-3
 
 def rerun(trace: Trace) -> Trace:
     """The trace of a new run at the same values, with nothing kept."""
-    return replace(trace, carried={}, known={})
+    return replace(trace.settled(), carried={}, known={})
 
 
 def log_probs(trace: Trace) -> dict[str, Tensor]:

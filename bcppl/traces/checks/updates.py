@@ -69,8 +69,8 @@ def check_simulated(trace: Trace) -> None:
 def _check_late(trace: Trace, other: Trace) -> None:
     """Check that a trace may be evaluated after the program was run at other values."""
     expected, late = log_probs(trace), rerun(trace)
-    late.addresses  # noqa: B018
-    rerun(other).addresses  # noqa: B018
+    late.distributions  # noqa: B018
+    rerun(other).distributions  # noqa: B018
     if (where := first_differing(expected, log_probs(late))) is not None:
         raise ProgramError(
             Fault.DEPENDENCE,
