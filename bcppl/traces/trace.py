@@ -15,6 +15,7 @@ from torch import Tensor
 from bcppl.distributions.support import Support, support_of
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
+from bcppl.traces.common import Common
 from bcppl.traces.dependence.equality import comparison, equal
 from bcppl.traces.dependence.surroundings import changed as surroundings_changed
 from bcppl.traces.differentiation.graph import kept
@@ -24,19 +25,6 @@ from bcppl.traces.indexing import Index, aligned, beside, particles_at
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.structural import Structure
 from bcppl.traces.values import Value, tensors
-
-
-@dataclass(eq=False)
-class Common:
-    """What a program has at any values of the same addresses: it need not be run again to find out.
-
-    Attributes:
-        addresses: in the order of the program, if they were asked for.
-        supports: of latent addresses, where they depend on no value.
-    """
-
-    addresses: tuple[str, ...] | None = None
-    supports: dict[str, Support] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
