@@ -61,7 +61,7 @@ class Outcome(NamedTuple):
     largest: float  # |z| of the posterior mean, over the axes
     variance: float  # over the exact one
     variance_deviation: float
-    seconds: float  # of one run
+    seconds: float  # of one run, of the processor
 
     @property
     def error(self) -> float:
@@ -103,9 +103,9 @@ def problem_named(name: str) -> Problem:
 def measured(cell: Cell, spend: Spend = UNLIMITED) -> tuple[tuple[int, ...], Outcome]:
     """The runs of one cell, on one thread: as many as there is time for, and the seeds of these."""
     problem, errors, means, variances = problem_named(cell.problem), [], [], []
-    begun = time.perf_counter()
+    begun = time.process_time()
     for seed in cell.seeds:
-        if len(errors) >= spend.least and time.perf_counter() - begun > spend.seconds:
+        if len(errors) >= spend.least and time.process_time() - begun > spend.seconds:
             break
         torch.manual_seed(seed)
         step = KERNELS[cell.kernel](problem.dimension, cell.particles)
@@ -128,7 +128,7 @@ def measured(cell: Cell, spend: Spend = UNLIMITED) -> tuple[tuple[int, ...], Out
         (np.abs(np.mean(means, axis=0)) / np.maximum(spread, 1e-12)).max(),
         np.mean(variances),
         np.std(variances, ddof=fewer),
-        (time.perf_counter() - begun) / runs,
+        (time.process_time() - begun) / runs,
     )
     return cell.seeds[:runs], Outcome(runs, *(float(f"{figure:.6g}") for figure in figures))
 
@@ -233,7 +233,7 @@ def main() -> None:
         "--seconds",
         type=float,
         default=math.inf,
-        help="that the runs of a cell may take",
+        help="of the processor that the runs of a cell may take",
     )
     parser.add_argument("--file", type=Path, help="where the outcome of each cell is kept")
     parser.add_argument("--recorded", action="store_true", help="show what --file holds, and run nothing")
