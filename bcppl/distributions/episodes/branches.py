@@ -105,8 +105,8 @@ def begun(prior: Prior, particles: int) -> Branches:
     mean, covariance = np.zeros((1, size, parameters)), np.zeros((1, size, parameters, parameters))
     log_weight[0, :hypotheses], which[0, :hypotheses] = prior.log_weight, np.arange(hypotheses)
     mean[:, :hypotheses] = prior.mean
-    for h in range(hypotheses):
-        covariance[0, h] = np.diag(prior.variance * prior.scale[h] ** 2)
+    own = np.arange(parameters)
+    covariance[0, :hypotheses, own, own] = prior.variance[:, None] * prior.scale**2
     none = np.zeros((1, size, 0))
     count = np.full(particles, hypotheses)
     return Branches(count, log_weight, which, mean, covariance, none.astype(np.int64), none)

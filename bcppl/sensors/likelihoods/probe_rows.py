@@ -43,6 +43,7 @@ def _ends(probe: Probe) -> Indices:
     return cell_ends(probe.stamps)
 
 
+@lru_cache(maxsize=64)
 def step_of(probe: Probe) -> float:
     """Seconds between a probe's stamps; of one with a single stamp, one."""
     return float(np.median(np.diff(probe.stamps))) if len(probe.stamps) > 1 else 1.0
