@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -158,7 +159,7 @@ class Freedom:
                 "a pose with no free axis needs no belief; leave a translation or rotation free."
             )
 
-    @property
+    @cached_property
     def axes(self) -> tuple[int, ...]:
         """Indices into the tangent (6,) of the free coordinates."""
         turns = {"all": (3, 4, 5), "none": ()}.get(self.rotation)

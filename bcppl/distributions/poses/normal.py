@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -38,9 +39,10 @@ class NormalPose(PoseDistribution):
         matrix = torch.as_tensor(covariance, dtype=torch.float64)
         if matrix.ndim == 1:
             matrix = torch.diag(matrix**2)
-        if matrix.shape[-2:] != (freedom.dimension, freedom.dimension):
+        size = freedom.dimension
+        if matrix.shape[-2:] != (size, size):
             raise InputError(
-                f"NormalPose over {freedom.dimension} free axes has a covariance of shape "
+                f"NormalPose over {size} free axes has a covariance of shape "
                 f"{tuple(matrix.shape)}; give one row and column for each free axis."
             )
         scale, failed = torch.linalg.cholesky_ex(matrix)
@@ -49,9 +51,7 @@ class NormalPose(PoseDistribution):
                 "the covariance of NormalPose is not positive definite; "
                 "give every free axis a standard deviation above 0 (metres, radians)."
             )
-        self._normal = MultivariateNormal(
-            torch.zeros(freedom.dimension, dtype=torch.float64), scale_tril=scale, validate_args=False
-        )
+        self._scale = scale
         turns = [k for k, axis in enumerate(freedom.axes) if axis >= 3]
         widest = float(matrix.detach().diagonal(dim1=-2, dim2=-1)[..., turns].max().sqrt()) if turns else 0.0
         # Beyond half a radian the neighbouring windings carry more than 1e-16 of the mass.
@@ -67,14 +67,19 @@ class NormalPose(PoseDistribution):
     @property
     def covariance(self) -> Tensor:
         """Over the free coordinates, (d, d) or (N, d, d), in m^2, m rad and rad^2."""
-        scale = self._normal.scale_tril
-        return scale @ scale.transpose(-1, -2)
+        return self._scale @ self._scale.transpose(-1, -2)
+
+    @cached_property
+    def _normal(self) -> MultivariateNormal:
+        """Of the free coordinates: many are only drawn from, or multiplied by others."""
+        zero = self._scale.new_zeros(self.freedom.dimension)
+        return MultivariateNormal(zero, scale_tril=self._scale, validate_args=False)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Poses (*sample_shape, *batch_shape, 7)."""
         shape = torch.Size(sample_shape) + self.batch_shape
         noise = torch.randn(*shape, self.freedom.dimension, 1, dtype=torch.float64)
-        tangent = self.freedom.embed((self._normal.scale_tril @ noise)[..., 0])
+        tangent = self.freedom.embed((self._scale @ noise)[..., 0])
         return poses.retract(self.center.expand(*shape, 7), tangent)
 
     def log_prob(self, value: Tensor) -> Tensor:
