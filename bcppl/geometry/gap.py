@@ -191,7 +191,7 @@ def _placed(point: Array, turn: Array, shift: Array, result: Array) -> None:
 def _interpolate(
     points: Array, first: int, last: int, turn: Array, shift: Array, grid: DistanceGrid, distance: Array
 ) -> None:
-    """Set `distance` from `first` on to interpolated ones to the part, at points (P, 3) of the peg's frame."""
+    """Set `distance` from `first` to `last` to interpolated ones, at points (P, 3) of the peg's frame."""
     # The rotation is looked up once: arrays given to a function for each point take longer than all of it.
     ax, ay, az = turn[0, 0], turn[0, 1], turn[0, 2]
     bx, by, bz = turn[1, 0], turn[1, 1], turn[1, 2]

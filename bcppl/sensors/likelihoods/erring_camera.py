@@ -125,10 +125,10 @@ class ErringCamera:
     def _apparent(
         self, camera: Camera, part: Tensor, bias: Tensor, before: Sequence[Sighting] = ()
     ) -> tuple[NormalPose, Tensor]:
-        """The distribution of where a camera with a bias (N,) measures a part at poses (N, 7).
+        """The distribution of where a camera with a bias (N,) measures a part at poses (..., N, 7).
 
         Given where its instrument measured it before; and how far that distribution follows the part
-        (N, 6, 6).
+        (..., N, 6, 6).
         """
         expected = [with_bias(each.camera, part, each.bias) for each in before]
         mean, covariance, follows = self.error.predicted(camera, part, before, expected)
@@ -295,11 +295,14 @@ class ErringCamera:
         """
         camera, address = self.camera(action), f"seen_by_{self.viewpoint(action)}"
         bias, moved = trace[f"bias_{self.viewpoint(action)}"], ChainMap(dict(values), trace)
-        seen = self._given_bias(fit, bias)
-        before, after = (
-            seen.times(self._apparent(camera, part, bias, self._before(action, known))[0])
-            for part, known in ((old, trace), (new, moved))
-        )
+        # The conditionals of both at once, (2, N): a small batch costs by operations.
+        sightings = [
+            Sighting(one.camera, torch.stack([one.seen, other.seen]), torch.stack([one.bias, other.bias]))
+            for one, other in zip(self._before(action, trace), self._before(action, moved), strict=True)
+        ]
+        apparent, _ = self._apparent(camera, torch.stack([old, new]), bias, sightings)
+        both = self._given_bias(fit, bias).times(apparent)
+        before, after = (GaussianMixture(*each) for each in zip(*both, strict=True))
         # The deviation is from the component that it most probably came of, and is kept in all others.
         at, own = trace[address], torch.arange(len(old))
         away = poses.local(before.centers[own, before.component(at)], at)
