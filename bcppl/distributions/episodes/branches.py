@@ -92,8 +92,8 @@ class Branches(NamedTuple):
     def trimmed(self) -> Branches:
         """The same without what no particle uses, and each particle's own."""
         count, most = len(self.number), int(self.number.max(initial=1))
-        own = (np.broadcast_to(each[:, :most], (count, most, *each.shape[2:])) for each in self[1:])
-        return Branches._make([self.number, *(np.array(each, order="C") for each in own)])
+        own = (each if len(each) == count else np.repeat(each, count, axis=0) for each in self[1:])
+        return Branches._make([self.number, *(each[:, :most].copy() for each in own)])
 
 
 def begun(prior: Prior, particles: int) -> Branches:

@@ -57,7 +57,6 @@ def given_and_all(value: Tensor) -> tuple[Tensor, Tensor]:
     """The rows that are given, and these and the new ones; both are marked as new."""
     rows = value[~torch.isnan(value[:, FELT])]
     count = int((rows[:, GIVEN] == 1.0).sum())
-    rows = rows.clone()
     rows[:, GIVEN] = 0.0
     return rows[:count], rows
 

@@ -187,6 +187,7 @@ def _filter(
         for s in range(new):
             first, last = segments.first[s], segments.last[s]
             if segments.contact[s] == 0:
+                score, positive, either = np.nan, 0.0, 0.0
                 for b in range(number[n]):
                     delay = prior.delay[which[n, b]]
                     if distance[n, delay, first] > _CLEAR:
@@ -198,10 +199,13 @@ def _filter(
                     for a in range(parameters):
                         gap += column[a] * mean[n, b, a]
                     root = math.sqrt(variance)
-                    score = gap / root
-                    positive = _log_ndtr(score)
+                    # Hypotheses that differ in the compliance alone are the same without contact.
+                    if gap / root != score:
+                        score = gap / root
+                        positive = _log_ndtr(score)
+                        either = _log_sum(log_in + positive, log_out)
                     inside = log_in + positive
-                    log_weight[n, b] += _log_sum(inside, log_out)
+                    log_weight[n, b] += either
                     if parameters and inside > log_out and score < 5.0:
                         hazard = math.exp(-0.5 * score**2 - 0.5 * math.log(2.0 * math.pi) - positive)
                         bend = hazard * (hazard + score) / variance

@@ -182,9 +182,12 @@ class ErringCamera:
         errors = self._errors(camera)
 
         def log_density(point: Tensor) -> Tensor:
-            seen, bias = poses.retract(prior.center, point[:, :6]), point[:, 6]
-            image_here = self.image(camera, without_bias(camera, seen, bias), bias).log_prob(image)
-            return torch.where(allowed(prior, seen, _OUTSIDE * errors), image_here, -torch.inf)
+            seen = poses.retract(prior.center, point[:, :6])
+            inside = allowed(prior, seen, _OUTSIDE * errors)
+            seen, bias = seen[inside], point[inside, 6]
+            density = point.new_full(inside.shape, -torch.inf)
+            density[inside] = self.image(camera, without_bias(camera, seen, bias), bias).log_prob(image)
+            return density
 
         def alike(point: Tensor) -> Tensor:
             here = poses.retract(prior.center, point[:, :6])
@@ -296,10 +299,8 @@ class ErringCamera:
         camera, address = self.camera(action), f"seen_by_{self.viewpoint(action)}"
         bias, moved = trace[f"bias_{self.viewpoint(action)}"], ChainMap(dict(values), trace)
         # The conditionals of both at once, (2, N): a small batch costs by operations.
-        sightings = [
-            Sighting(one.camera, torch.stack([one.seen, other.seen]), torch.stack([one.bias, other.bias]))
-            for one, other in zip(self._before(action, trace), self._before(action, moved), strict=True)
-        ]
+        known = zip(self._before(action, trace), self._before(action, moved), strict=True)
+        sightings = [one.beside(other) for one, other in known]
         apparent, _ = self._apparent(camera, torch.stack([old, new]), bias, sightings)
         both = self._given_bias(fit, bias).times(apparent)
         before, after = (GaussianMixture(*each) for each in zip(*both, strict=True))
