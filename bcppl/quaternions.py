@@ -77,7 +77,8 @@ def rotation_vector(quaternion: Tensor) -> Tensor:
 
 def rotation_matrix(quaternion: Tensor) -> Tensor:
     """The rotation matrix (..., 3, 3) of a unit quaternion (..., 4)."""
-    return (_outer(quaternion, quaternion) @ _ROTATION.to(quaternion.dtype)).unflatten(-1, (3, 3))
+    rows = _outer(quaternion, quaternion) @ _ROTATION.to(quaternion.dtype)
+    return rows.reshape(*quaternion.shape[:-1], 3, 3)
 
 
 def from_rotation_matrix(rotation: Tensor) -> Tensor:

@@ -46,16 +46,12 @@ class NormalPose(PoseDistribution):
                 f"{tuple(matrix.shape)}; give one row and column for each free axis."
             )
         scale, failed = torch.linalg.cholesky_ex(matrix)
-        if bool(failed.any()) or not bool(torch.isfinite(scale).all()):
+        if bool(failed.any()) or not math.isfinite(scale.detach().sum()):
             raise InputError(
                 "the covariance of NormalPose is not positive definite; "
                 "give every free axis a standard deviation above 0 (metres, radians)."
             )
         self._scale = scale
-        turns = [k for k, axis in enumerate(freedom.axes) if axis >= 3]
-        widest = float(matrix.detach().diagonal(dim1=-2, dim2=-1)[..., turns].max().sqrt()) if turns else 0.0
-        # Beyond half a radian the neighbouring windings carry more than 1e-16 of the mass.
-        self._windings = (0.0,) if widest < 0.5 else (0.0, -2.0 * math.pi, 2.0 * math.pi)
         middle = torch.as_tensor(center, dtype=torch.float64)
         if bool(((middle[..., 3:].square().sum(dim=-1) - 1.0).abs() > 2e-3).any()):
             raise InputError(
@@ -69,9 +65,20 @@ class NormalPose(PoseDistribution):
         """Over the free coordinates, (d, d) or (N, d, d), in m^2, m rad and rad^2."""
         return self._scale @ self._scale.transpose(-1, -2)
 
+    # Most are only drawn from or multiplied by others: what their density takes is made when it is asked for.
+
+    @cached_property
+    def _windings(self) -> tuple[float, ...]:
+        """By how much the angles of the rotations that are summed over differ, radians."""
+        turns = sum(axis >= 3 for axis in self.freedom.axes)
+        variances = self._scale.detach()[..., self.freedom.dimension - turns :, :].square().sum(dim=-1)
+        # Beyond half a radian the neighbouring windings carry more than 1e-16 of the mass.
+        wide = turns > 0 and float(variances.max().sqrt()) >= 0.5
+        return (0.0, -2.0 * math.pi, 2.0 * math.pi) if wide else (0.0,)
+
     @cached_property
     def _normal(self) -> MultivariateNormal:
-        """Of the free coordinates: many are only drawn from, or multiplied by others."""
+        """Of the free coordinates."""
         zero = self._scale.new_zeros(self.freedom.dimension)
         return MultivariateNormal(zero, scale_tril=self._scale, validate_args=False)
 
