@@ -63,8 +63,8 @@ class Branches(NamedTuple):
         which: (N, B) the hypothesis of the prior.
         mean: (N, B, M) of the parameters.
         covariance: (N, B, M, M).
-        event: (N, B, S) of each segment so far: `INLIER`, `OUTLIER`, or 2 plus the number of a jump.
-        squared: (N, B, S) squared whitened errors of an episode, as predicted; 0 without contact.
+        event: (N, B, E) of each episode so far: `INLIER`, `OUTLIER`, or 2 plus the number of a jump.
+        squared: (N, B, E) its squared whitened errors, as predicted.
     """
 
     number: Indices

@@ -180,7 +180,7 @@ class ContactEpisodes(ContactManifold):
         if not len(rows):
             return []
         segments = segments_of(rows, self._row_errors, self._every)
-        times = rows[segments.first, TIME].tolist()
+        times = rows[segments.first[segments.contact == 1], TIME].tolist()
         return probable_jumps(self.branches(rows), [jump.name for jump in self.bench.jumps], times)
 
     def shared_moments(self, value: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
