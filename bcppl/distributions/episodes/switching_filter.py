@@ -27,6 +27,8 @@ from bcppl.threads import parallel_sum, thread_count
 _FAINT = 12.0  # nats below the most probable hypothesis, from which on one is dropped
 _CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
 _SURPRISING = 3.0  # standard deviations of a chi-square
+# Particles of a chunk of work, and rows of all of them, at least: fewer take less than a thread's beginning.
+_CHUNK, _ROWS = 8, 2000
 
 
 def filtered(
@@ -70,7 +72,8 @@ def filtered(
         _filter(begin, end, before, after, prior, segments, distance, force, columns, trust)
         return 0
 
-    parallel_sum(work, 0, particles, 8, thread_count())
+    rows = max(1, len(force))
+    parallel_sum(work, 0, particles, max(_CHUNK, _ROWS // rows), thread_count())
     return after
 
 
