@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor
-from torch.distributions import MultivariateNormal, constraints
+from torch.distributions import constraints
 
 from bcppl import poses
 from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
@@ -77,10 +77,8 @@ class NormalPose(PoseDistribution):
         return (0.0, -2.0 * math.pi, 2.0 * math.pi) if wide else (0.0,)
 
     @cached_property
-    def _normal(self) -> MultivariateNormal:
-        """Of the free coordinates."""
-        zero = self._scale.new_zeros(self.freedom.dimension)
-        return MultivariateNormal(zero, scale_tril=self._scale, validate_args=False)
+    def _half_log_determinant(self) -> Tensor:
+        return self._scale.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Poses (*sample_shape, *batch_shape, 7)."""
@@ -88,6 +86,12 @@ class NormalPose(PoseDistribution):
         noise = torch.randn(*shape, self.freedom.dimension, 1, dtype=torch.float64)
         tangent = self.freedom.embed((self._scale @ noise)[..., 0])
         return poses.retract(self.center.expand(*shape, 7), tangent)
+
+    def _log_normal(self, coordinates: Tensor) -> Tensor:
+        """The log-density (...,) of the free coordinates (..., d)."""
+        white = torch.linalg.solve_triangular(self._scale, coordinates[..., None], upper=False)
+        size = self.freedom.dimension * math.log(2.0 * math.pi)
+        return -0.5 * (size + white[..., 0].square().sum(dim=-1)) - self._half_log_determinant
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density (...,) with respect to the base measure; -inf where a held axis differs."""
@@ -100,7 +104,7 @@ class NormalPose(PoseDistribution):
                 stretch = 1.0 + winding / angle.clamp_min(1e-12)
                 wound = torch.cat([tangent[..., :3], tangent[..., 3:] * stretch[..., None]], dim=-1)
             terms.append(
-                self._normal.log_prob(self.freedom.coordinates(wound))
+                self._log_normal(self.freedom.coordinates(wound))
                 - self.freedom.log_base_density(angle + winding)
             )
         density = terms[0] if len(terms) == 1 else torch.logsumexp(torch.stack(terms), dim=0)

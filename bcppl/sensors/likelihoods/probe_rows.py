@@ -49,6 +49,7 @@ def step_of(probe: Probe) -> float:
     return float(np.median(np.diff(probe.stamps))) if len(probe.stamps) > 1 else 1.0
 
 
+@lru_cache(maxsize=1024)
 def cells_of(window: ProbeWindow) -> Indices:
     """The ends of cells (C,), in stamps, that lie in a window."""
     ends = _ends(window.probe)
