@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -27,7 +28,8 @@ from bcppl.errors import InputError
 LOG_8_PI_SQUARED = math.log(8.0 * math.pi**2)
 
 
-_XYZW = torch.tensor([4, 5, 6, 3])
+_XYZW = torch.tensor([4, 5, 6, 3])  # of a pose
+_WXYZ = torch.tensor([3, 0, 1, 2])  # of a quaternion as scipy orders it
 
 
 def identity(*batch: int) -> Tensor:
@@ -56,10 +58,10 @@ def quaternion_xyzw(pose: Tensor) -> Tensor:
 
 def from_translation_quaternion_xyzw(translation: Tensor, quaternion: Tensor) -> Tensor:
     """Poses (..., 7) from translations (..., 3) and quaternions in order x y z w (..., 4)."""
-    translation, quaternion = torch.broadcast_tensors(
-        torch.nn.functional.pad(translation, (0, 1)), quaternion
-    )
-    return torch.cat([translation[..., :3], quaternion[..., [3, 0, 1, 2]]], dim=-1)
+    if translation.shape[:-1] != quaternion.shape[:-1]:
+        batch = torch.broadcast_shapes(translation.shape[:-1], quaternion.shape[:-1])
+        translation, quaternion = translation.expand(*batch, 3), quaternion.expand(*batch, 4)
+    return torch.cat([translation, quaternion.index_select(-1, _WXYZ)], dim=-1)
 
 
 def from_rotation_matrix(translation: Tensor, rotation: Tensor) -> Tensor:
@@ -105,14 +107,14 @@ def retract(pose: Tensor, tangent: Tensor) -> Tensor:
 
 def local(pose: Tensor, other: Tensor) -> Tensor:
     """The tangent (..., 6) from `pose` to `other`: the inverse of `retract`, rotation angle at most pi."""
-    turn = quaternions.product(quaternions.conjugate(quaternion_xyzw(pose)), quaternion_xyzw(other))
+    turn = quaternions.relative(quaternion_xyzw(pose), quaternion_xyzw(other))
     return torch.cat([other[..., :3] - pose[..., :3], quaternions.rotation_vector(turn)], dim=-1)
 
 
 def _turned(pose: Tensor, shift: Tensor, turn: Tensor) -> Tensor:
     """A pose (..., 7) moved by (..., 3) in its outer frame and turned by (..., 4) in its inner one."""
     product = quaternions.product(quaternion_xyzw(pose), turn)
-    product = product / product.norm(dim=-1, keepdim=True)
+    product = product / torch.linalg.vector_norm(product, dim=-1, keepdim=True)
     return from_translation_quaternion_xyzw(pose[..., :3] + shift, product)
 
 
@@ -158,7 +160,7 @@ class Freedom:
                 "a pose with no free axis needs no belief; leave a translation or rotation free."
             )
 
-    @property
+    @cached_property
     def axes(self) -> tuple[int, ...]:
         """Indices into the tangent (6,) of the free coordinates."""
         turns = {"all": (3, 4, 5), "none": ()}.get(self.rotation)

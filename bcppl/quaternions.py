@@ -37,19 +37,28 @@ _ROTATION = torch.tensor(
 )
 
 
+_CONJUGATE = torch.tensor([-1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
+_RELATIVE = _CONJUGATE.repeat_interleave(4)[:, None] * _PRODUCT  # the same of the first one's conjugate
+
+
 def product(first: Tensor, second: Tensor) -> Tensor:
     """The quaternion (..., 4) of the rotation `second` followed by the rotation `first`."""
     return _outer(first, second) @ _PRODUCT.to(first.dtype)
 
 
+def relative(first: Tensor, second: Tensor) -> Tensor:
+    """The quaternion (..., 4) of the rotation that is followed by `first` to give the rotation `second`."""
+    return _outer(first, second) @ _RELATIVE.to(first.dtype)
+
+
 def _outer(first: Tensor, second: Tensor) -> Tensor:
     """The products (..., 16) of every entry of the first with every entry of the second."""
-    return (first[..., :, None] * second[..., None, :]).flatten(-2)
+    return (first.unsqueeze(-1) * second.unsqueeze(-2)).flatten(-2)
 
 
 def conjugate(quaternion: Tensor) -> Tensor:
     """The quaternion (..., 4) of the inverse rotation."""
-    return quaternion * quaternion.new_tensor([-1.0, -1.0, -1.0, 1.0])
+    return quaternion * _CONJUGATE.to(quaternion.dtype)
 
 
 def from_rotation_vector(vector: Tensor) -> Tensor:
@@ -68,7 +77,8 @@ def rotation_vector(quaternion: Tensor) -> Tensor:
 
 def rotation_matrix(quaternion: Tensor) -> Tensor:
     """The rotation matrix (..., 3, 3) of a unit quaternion (..., 4)."""
-    return (_outer(quaternion, quaternion) @ _ROTATION.to(quaternion.dtype)).unflatten(-1, (3, 3))
+    rows = _outer(quaternion, quaternion) @ _ROTATION.to(quaternion.dtype)
+    return rows.reshape(*quaternion.shape[:-1], 3, 3)
 
 
 def from_rotation_matrix(rotation: Tensor) -> Tensor:

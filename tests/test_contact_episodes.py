@@ -21,7 +21,7 @@ from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, Rows
 from bcppl.contact.touch import Touch
 from bcppl.distributions.episodes import ContactEpisodes, Grasp, Hypothesis, LinearErrors
-from bcppl.distributions.episodes.likelihood import _WIDE
+from bcppl.distributions.episodes.prior import WIDE
 from bcppl.distributions.episodes.rows import COLUMNS, GIVEN, new_rows
 from bcppl.distributions.manifold import FARTHEST
 from bcppl.geometry.extrusion import block, box_peg
@@ -331,5 +331,5 @@ def test_part_and_grasp_move_together_in_the_joint_covariance() -> None:
     apart = of_part - of_peg
     assert float(of_part @ covariance @ of_part) > 0.5e-6
     assert float(apart @ covariance @ apart) < 1e-8
-    given = torch.linalg.inv(likelihood.quadratic(MIXED).information[0] + torch.diag(_WIDE**-2))
+    given = torch.linalg.inv(likelihood.quadratic(MIXED).information[0] + torch.diag(WIDE**-2))
     torch.testing.assert_close(covariance[:6, :6], given, rtol=1e-6, atol=1e-14)

@@ -88,9 +88,9 @@ def fitted_mixture(
     tried = normal.sigma_points()
     images = alike(tried)
     if len(images):
-        best = torch.stack([log_density(image).max() for image in images])
+        here, best = log_density(tried).max(), torch.stack([log_density(image).max() for image in images])
         for k in best.argsort(descending=True).tolist():
-            if not best[k] > log_density(tried).max() - _NEAR:
+            if not best[k] > here - _NEAR:
                 break
             away = images[k][1:] - images[k][0]
             there = FittedNormal(images[k][0], 0.5 * away.T @ away)

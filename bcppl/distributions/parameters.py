@@ -45,8 +45,9 @@ class Range:
             return value
         if self.whole:
             return whole_number(what, value, least=int(self.least))
-        bounds = {"above": self.above, "least": self.least, "below": self.below, "most": self.most}
-        return number_within(what, value, **bounds)
+        return number_within(
+            what, value, above=self.above, least=self.least, below=self.below, most=self.most
+        )
 
 
 def within(**bounds: Any) -> Mapping[str, Range]:

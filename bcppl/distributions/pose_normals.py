@@ -37,12 +37,19 @@ class GaussianMixture(NamedTuple):
 
     def times(self, factor: NormalPose) -> GaussianMixture:
         """The mixture that approximates its product with a Gaussian (...,)."""
-        other = NormalPose(factor.center[..., None, :], factor.covariance[..., None, :, :])
-        whole = product(NormalPose(self.centers, self.covariances), other)
-        both = self.covariances + other.covariance
-        away = poses.local(self.centers, other.center)
-        squared = (away * torch.linalg.solve(both, away[..., None])[..., 0]).sum(dim=-1)
+        center, spread = factor.center[..., None, :], factor.covariance[..., None, :, :]
+        second = NormalPose(center, spread).covariance
+        own = torch.linalg.inv(NormalPose(self.centers, self.covariances).covariance)
+        other = torch.linalg.inv(second)
+        covariance = torch.linalg.inv(own + other)
+        away = poses.local(self.centers, center)[..., None]
+        both = self.covariances + second
+        squared = (away[..., 0] * torch.linalg.solve(both, away)[..., 0]).sum(dim=-1)
         overlap = -0.5 * (squared + torch.linalg.slogdet(both)[1])
+        whole = NormalPose(
+            poses.retract(self.centers, (covariance @ other @ away)[..., 0]),
+            0.5 * (covariance + covariance.transpose(-1, -2)),
+        )
         return GaussianMixture(whole.center, whole.covariance, self.log_weights + overlap)
 
 
@@ -187,15 +194,6 @@ def _stepped_moments(
     middle = (weight * away).sum(dim=-1)
     spread = (weight * (share + (away - middle[..., None]) ** 2)).sum(dim=-1)
     return mean + deviation * middle, variance * spread.clamp(_NARROWEST, 1.0)
-
-
-def product(first: NormalPose, second: NormalPose) -> NormalPose:
-    """The Gaussian that approximates the product of two."""
-    own, other = torch.linalg.inv(first.covariance), torch.linalg.inv(second.covariance)
-    covariance = torch.linalg.inv(own + other)
-    away = poses.local(first.center, second.center)
-    center = poses.retract(first.center, (covariance @ other @ away[..., None])[..., 0])
-    return NormalPose(center, 0.5 * (covariance + covariance.transpose(-1, -2)))
 
 
 def transport(first: Tensor, second: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ _NEAR = 0.002  # m: below this gap edges are evaluated, and distances exactly wh
 _MARGIN = 0.012  # m around the part that the grid covers
 _STEEPEST = 3.0**0.5  # slope of a distance that is interpolated axis by axis, at most
 _CHUNK = 8  # particles of a chunk of work, at least
-_PAIRS = 256  # pairs of poses of a chunk, at least
+_PAIRS = 2000  # pairs of poses of a chunk, at least: they take milliseconds, and a thread's beginning a tenth
 
 
 class Gap(NamedTuple):
@@ -188,13 +188,22 @@ def _placed(point: Array, turn: Array, shift: Array, result: Array) -> None:
 
 
 @compiled
-def _interpolated_at(points: Array, p: int, turn: Array, shift: Array, grid: DistanceGrid) -> float:
-    """The interpolated distance to the part at one of some points (P, 3) of the peg's frame."""
-    a, b, c = points[p, 0], points[p, 1], points[p, 2]
-    x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + shift[0]
-    y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c + shift[1]
-    z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c + shift[2]
-    return interpolated(x, y, z, grid)
+def _interpolate(
+    points: Array, first: int, last: int, turn: Array, shift: Array, grid: DistanceGrid, distance: Array
+) -> None:
+    """Set `distance` from `first` to `last` to interpolated ones, at points (P, 3) of the peg's frame."""
+    # The rotation is looked up once: arrays given to a function for each point take longer than all of it.
+    ax, ay, az = turn[0, 0], turn[0, 1], turn[0, 2]
+    bx, by, bz = turn[1, 0], turn[1, 1], turn[1, 2]
+    cx, cy, cz = turn[2, 0], turn[2, 1], turn[2, 2]
+    for p in range(first, last):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        distance[p] = interpolated(
+            ax * x + ay * y + az * z + shift[0],
+            bx * x + by * y + bz * z + shift[1],
+            cx * x + cy * y + cz * z + shift[2],
+            grid,
+        )
 
 
 @compiled
@@ -212,7 +221,7 @@ def _evaluate(
     rounded: Mask,
 ) -> None:
     corners, stops, spheres = solids.corners, solids.stops, solids.spheres
-    planes, box, bound = solids.planes, solids.box, np.empty(len(spheres))
+    planes, box, bound, here = solids.planes, solids.box, np.empty(len(spheres)), np.empty(len(corners))
     gradient, start, stop, middle = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     turn, shift = np.empty((3, 3)), np.empty(3)
     for n in range(first, last):
@@ -221,8 +230,9 @@ def _evaluate(
             # part_from_peg
             _relative(part, n, peg, own, t, turn, shift)
             lowest, first_group = np.inf, 0
+            _interpolate(spheres, 0, len(spheres), turn, shift, grid, bound)
             for g in range(len(spheres)):
-                bound[g] = _interpolated_at(spheres, g, turn, shift, grid) - _STEEPEST * spheres[g, 3]
+                bound[g] -= _STEEPEST * spheres[g, 3]
                 if bound[g] < lowest:
                     lowest, first_group = bound[g], g
             least, which = np.inf, 0
@@ -231,10 +241,11 @@ def _evaluate(
                 # The closest group comes first, so that hardly any other has to be looked into.
                 if k == first_group or bound[g] > least:
                     continue
-                for c in range(stops[g - 1] if g else 0, stops[g]):
-                    here = _interpolated_at(corners, c, turn, shift, grid)
-                    if here < least:
-                        least, which = here, c
+                begin = stops[g - 1] if g else 0
+                _interpolate(corners, begin, stops[g], turn, shift, grid, here)
+                for c in range(begin, stops[g]):
+                    if here[c] < least:
+                        least, which = here[c], c
             _placed(corners[which], turn, shift, witness[n, t])
             rounded[n, t] = not plane_gradient(witness[n, t], grid, gradient) and abs(least) < _NEAR
             normal[n, t] = gradient

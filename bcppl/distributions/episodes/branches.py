@@ -63,8 +63,8 @@ class Branches(NamedTuple):
         which: (N, B) the hypothesis of the prior.
         mean: (N, B, M) of the parameters.
         covariance: (N, B, M, M).
-        event: (N, B, S) of each segment so far: `INLIER`, `OUTLIER`, or 2 plus the number of a jump.
-        squared: (N, B, S) squared whitened errors of an episode, as predicted; 0 without contact.
+        event: (N, B, E) of each episode so far: `INLIER`, `OUTLIER`, or 2 plus the number of a jump.
+        squared: (N, B, E) its squared whitened errors, as predicted.
     """
 
     number: Indices
@@ -92,8 +92,8 @@ class Branches(NamedTuple):
     def trimmed(self) -> Branches:
         """The same without what no particle uses, and each particle's own."""
         count, most = len(self.number), int(self.number.max(initial=1))
-        own = (np.broadcast_to(each[:, :most], (count, most, *each.shape[2:])) for each in self[1:])
-        return Branches._make([self.number, *(np.array(each, order="C") for each in own)])
+        own = (each if len(each) == count else np.repeat(each, count, axis=0) for each in self[1:])
+        return Branches._make([self.number, *(each[:, :most].copy() for each in own)])
 
 
 def begun(prior: Prior, particles: int) -> Branches:
@@ -105,8 +105,8 @@ def begun(prior: Prior, particles: int) -> Branches:
     mean, covariance = np.zeros((1, size, parameters)), np.zeros((1, size, parameters, parameters))
     log_weight[0, :hypotheses], which[0, :hypotheses] = prior.log_weight, np.arange(hypotheses)
     mean[:, :hypotheses] = prior.mean
-    for h in range(hypotheses):
-        covariance[0, h] = np.diag(prior.variance * prior.scale[h] ** 2)
+    own = np.arange(parameters)
+    covariance[0, :hypotheses, own, own] = prior.variance[:, None] * prior.scale**2
     none = np.zeros((1, size, 0))
     count = np.full(particles, hypotheses)
     return Branches(count, log_weight, which, mean, covariance, none.astype(np.int64), none)

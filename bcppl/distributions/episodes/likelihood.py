@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from bcppl.distributions.episodes.covariances import Hypothesis, RowErrors, segm
 from bcppl.distributions.episodes.displaced import displaced
 from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.posterior import drawn, moments, probable_jumps
+from bcppl.distributions.episodes.prior import WIDE, nodes_of, prior_of, with_delays
 from bcppl.distributions.episodes.rows import (
     COLUMNS,
     EPISODE,
@@ -39,11 +39,6 @@ from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 
 _FAR = 4.0  # standard deviations
 _REMEMBERED = 3  # windows: the last one's rows are those that the next one is given
-# Nodes of the compliance, in decades from its median: they are closer than `varying` is wide.
-_DECADES = torch.linspace(-1.25, 1.25, 11, dtype=torch.float64)
-# Prior standard deviations, m and rad, of the pose about which a likelihood is approximated: far wider than
-# what any touch leaves.
-_WIDE = torch.tensor([0.1] * 3 + [1.0] * 3, dtype=torch.float64)
 
 
 @dataclass(eq=False, repr=False)
@@ -185,7 +180,7 @@ class ContactEpisodes(ContactManifold):
         if not len(rows):
             return []
         segments = segments_of(rows, self._row_errors, self._every)
-        times = rows[segments.first, TIME].tolist()
+        times = rows[segments.first[segments.contact == 1], TIME].tolist()
         return probable_jumps(self.branches(rows), [jump.name for jump in self.bench.jumps], times)
 
     def shared_moments(self, value: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
@@ -252,46 +247,17 @@ class ContactEpisodes(ContactManifold):
         return own + (columns**2 * self.bench.variances).sum(dim=-1)
 
     @property
-    def _nodes(self) -> list[Hypothesis]:
-        weights = (-0.5 * (_DECADES / self.uncertain) ** 2).log_softmax(dim=0).tolist()
-        nodes = (self.compliance * 10.0**_DECADES).tolist()
-        return [Hypothesis(w, c) for w, c in zip(weights, nodes, strict=True)]
-
-    @cached_property
     def _every(self) -> tuple[Hypothesis, ...]:
-        return self._with_delays(self.hypotheses or self._nodes)
+        return with_delays(self.hypotheses or nodes_of(self.compliance, self.uncertain), self.bench)
 
-    @cached_property
+    @property
     def _few(self) -> tuple[Hypothesis, ...]:
         """Those of an approximation to second order, which needs fewer nodes."""
-        return self._with_delays(self.hypotheses or self._nodes[::2])
-
-    def _with_delays(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
-        return tuple(
-            each._replace(log_weight=each.log_weight + math.log(probability), delay=interval)
-            for interval, probability in self.bench.delays.items()
-            for each in hypotheses
-        )
+        return with_delays(self.hypotheses or nodes_of(self.compliance, self.uncertain, 2), self.bench)
 
     def _prior(self, pose: int) -> Prior:
         """With so many parameters of the pose before the others."""
-        bench, jumps = self.bench, self.bench.jumps
-        own = np.zeros(pose)
-        hypotheses = self._few if pose else self._every
-        log_weight, compliance, _, scale, delay = np.array(hypotheses).T.copy()
-        changed = np.array([np.concatenate([own, j.variances.numpy()]) for j in jumps])
-        return Prior(
-            log_weight=log_weight,
-            compliance=compliance,
-            scale=scale,
-            delay=np.searchsorted(list(bench.delays), delay),
-            mean=np.concatenate([own, bench.means.numpy()]),
-            variance=np.concatenate([_WIDE.numpy()[:pose] ** 2, bench.variances.numpy()]),
-            jump_log_probability=np.array([math.log(j.probability) for j in jumps]),
-            jump_variance=changed.reshape(len(jumps), pose + len(bench.means)),
-            outlier=self.outlier,
-            farthest=FARTHEST,
-        )
+        return prior_of(self.bench, self._few if pose else self._every, self.outlier, pose)
 
     def _late(self, gaps: Gaps, rows: Tensor) -> tuple[Tensor, Tensor]:
         return displaced(gaps, self.pose, rows, self.bench)
@@ -348,7 +314,7 @@ class ContactEpisodes(ContactManifold):
         mean, covariance = self._joint_moments(rows)
         precision = torch.linalg.inv(covariance[:, :6, :6])
         pull = (precision @ mean[:, :6, None])[..., 0]
-        information = precision - torch.diag(_WIDE**-2)
+        information = precision - torch.diag(WIDE**-2)
         return Quadratic(-pull, 0.5 * (information + information.transpose(-1, -2)))
 
     def _joint_moments(self, rows: Tensor) -> tuple[Tensor, Tensor]:

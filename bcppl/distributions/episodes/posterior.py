@@ -37,9 +37,9 @@ def probable_jumps(
     """The jumps that any hypothesis holds, by name and time, in their order, with their probabilities (N,).
 
     Args:
-        branches: after S segments.
+        branches: after E episodes.
         names: of the jumps.
-        times: (S,) of the segments' first rows, s.
+        times: (E,) of the episodes' first rows, s.
     """
     weights, held = branches.weights[..., None], []
     for number, name in enumerate(names, OUTLIER + 1):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,7 +27,8 @@ def padded(rows: Tensor, stamps: int) -> Tensor:
 
 def is_predicted(value: Tensor) -> bool:
     """Whether a value holds rows that a `motion` predicts, which have no times."""
-    return value.ndim == 3 or bool((torch.isnan(value[:, TIME]) & ~torch.isnan(value[:, FELT])).any())
+    rows = value.numpy()
+    return rows.ndim == 3 or bool((np.isnan(rows[:, TIME]) & ~np.isnan(rows[:, FELT])).any())
 
 
 def late(rows: Tensor, interval: int) -> tuple[Tensor, Tensor]:
@@ -50,16 +52,17 @@ def late(rows: Tensor, interval: int) -> tuple[Tensor, Tensor]:
 
 def new_rows(value: Tensor) -> Tensor:
     """The rows (R, COLUMNS) of a value that no earlier window has used."""
-    return value[~torch.isnan(value[:, FELT]) & (value[:, GIVEN] != 1.0)]
+    rows = value.numpy()
+    return torch.from_numpy(rows[~np.isnan(rows[:, FELT]) & (rows[:, GIVEN] != 1.0)])
 
 
 def given_and_all(value: Tensor) -> tuple[Tensor, Tensor]:
     """The rows that are given, and these and the new ones; both are marked as new."""
-    rows = value[~torch.isnan(value[:, FELT])]
+    rows = value.numpy()
+    rows = rows[~np.isnan(rows[:, FELT])]
     count = int((rows[:, GIVEN] == 1.0).sum())
-    rows = rows.clone()
     rows[:, GIVEN] = 0.0
-    return rows[:count], rows
+    return torch.from_numpy(rows[:count]), torch.from_numpy(rows)
 
 
 def is_cut(rows: Tensor, place: int) -> bool:

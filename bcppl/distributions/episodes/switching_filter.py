@@ -27,6 +27,8 @@ from bcppl.threads import parallel_sum, thread_count
 _FAINT = 12.0  # nats below the most probable hypothesis, from which on one is dropped
 _CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
 _SURPRISING = 3.0  # standard deviations of a chi-square
+# Particles of a chunk of work, and rows of all of them, at least: fewer take less than a thread's beginning.
+_CHUNK, _ROWS = 8, 2000
 
 
 def filtered(
@@ -50,11 +52,11 @@ def filtered(
         trust: (N, D, R) factors of the errors and columns of contacts; 1 unless given.
     """
     trust = np.ones_like(distance) if trust is None else trust
-    new = len(segments.first)
-    if not new:
+    if not len(segments.first):
         return before
     particles, (_, branches, known) = len(before.number), before.event.shape
     size, parameters = (particles, max(KEPT, branches)), before.mean.shape[2]
+    episodes = known + int(segments.contact.sum())
     # Memory that is only asked for: what no branch uses is never touched.
     after = Branches(
         before.number.copy(),
@@ -62,15 +64,16 @@ def filtered(
         np.zeros(size, np.int64),
         np.zeros((*size, parameters)),
         np.zeros((*size, parameters, parameters)),
-        np.zeros((*size, known + new), np.int64),
-        np.zeros((*size, known + new)),
+        np.zeros((*size, episodes), np.int64),
+        np.zeros((*size, episodes)),
     )
 
     def work(begin: int, end: int) -> int:
         _filter(begin, end, before, after, prior, segments, distance, force, columns, trust)
         return 0
 
-    parallel_sum(work, 0, particles, 8, thread_count())
+    rows = max(1, len(force))
+    parallel_sum(work, 0, particles, max(_CHUNK, _ROWS // rows), thread_count())
     return after
 
 
@@ -163,9 +166,7 @@ def _filter(
 ) -> None:
     number, log_weight, which, mean, covariance, event, squared = after
     parameters, jumps, size = columns.shape[3], len(prior.jump_log_probability), log_weight.shape[1]
-    new, longest = len(segments.first), segments.factor.shape[2]
-    offset = event.shape[2] - new
-    most = size * (2 + jumps)
+    known, longest, most = before.event.shape[2], segments.factor.shape[2], size * (2 + jumps)
     log_in = math.log1p(-prior.outlier)
     log_out = math.log(prior.outlier) if prior.outlier > 0.0 else -np.inf
     kept = 1.0
@@ -183,10 +184,12 @@ def _filter(
         for b in range(number[n]):
             log_weight[n, b], which[n, b] = before.log_weight[own, b], before.which[own, b]
             mean[n, b], covariance[n, b] = before.mean[own, b], before.covariance[own, b]
-            event[n, b, :offset], squared[n, b, :offset] = before.event[own, b], before.squared[own, b]
-        for s in range(new):
+            event[n, b, :known], squared[n, b, :known] = before.event[own, b], before.squared[own, b]
+        episode = known
+        for s in range(len(segments.first)):
             first, last = segments.first[s], segments.last[s]
             if segments.contact[s] == 0:
+                score, positive, either = np.nan, 0.0, 0.0
                 for b in range(number[n]):
                     delay = prior.delay[which[n, b]]
                     if distance[n, delay, first] > _CLEAR:
@@ -198,10 +201,13 @@ def _filter(
                     for a in range(parameters):
                         gap += column[a] * mean[n, b, a]
                     root = math.sqrt(variance)
-                    score = gap / root
-                    positive = _log_ndtr(score)
+                    # Hypotheses that differ in the compliance alone are the same without contact.
+                    if gap / root != score:
+                        score = gap / root
+                        positive = _log_ndtr(score)
+                        either = _log_sum(log_in + positive, log_out)
                     inside = log_in + positive
-                    log_weight[n, b] += _log_sum(inside, log_out)
+                    log_weight[n, b] += either
                     if parameters and inside > log_out and score < 5.0:
                         hazard = math.exp(-0.5 * score**2 - 0.5 * math.log(2.0 * math.pi) - positive)
                         bend = hazard * (hazard + score) / variance
@@ -259,9 +265,7 @@ def _filter(
                         )
                         found += 1
             best, left = weight[:found].max(), 0
-            old_which[:] = which[n]
-            old_event[:] = event[n]
-            old_squared[:] = squared[n]
+            old_which[:], old_event[:], old_squared[:] = which[n], event[n], squared[n]
             while left < min(size, found):
                 c = int(weight[:found].argmax())
                 if weight[c] < best - _FAINT:
@@ -269,10 +273,10 @@ def _filter(
                 log_weight[n, left], which[n, left] = weight[c], old_which[source[c]]
                 mean[n, left], covariance[n, left] = means[c], covariances[c]
                 event[n, left], squared[n, left] = old_event[source[c]], old_squared[source[c]]
-                event[n, left, offset + s], squared[n, left, offset + s] = kind[c], square[c]
+                event[n, left, episode], squared[n, left, episode] = kind[c], square[c]
                 weight[c] = -np.inf
                 left += 1
-            number[n] = left
+            number[n], episode = left, episode + 1
         for b in range(number[n]):
             for a in range(parameters):
                 for c in range(a):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import Any
 
 import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor
-from torch.distributions import MultivariateNormal, constraints
+from torch.distributions import constraints
 
 from bcppl import poses
 from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
@@ -38,24 +39,19 @@ class NormalPose(PoseDistribution):
         matrix = torch.as_tensor(covariance, dtype=torch.float64)
         if matrix.ndim == 1:
             matrix = torch.diag(matrix**2)
-        if matrix.shape[-2:] != (freedom.dimension, freedom.dimension):
+        size = freedom.dimension
+        if matrix.shape[-2:] != (size, size):
             raise InputError(
-                f"NormalPose over {freedom.dimension} free axes has a covariance of shape "
+                f"NormalPose over {size} free axes has a covariance of shape "
                 f"{tuple(matrix.shape)}; give one row and column for each free axis."
             )
         scale, failed = torch.linalg.cholesky_ex(matrix)
-        if bool(failed.any()) or not bool(torch.isfinite(scale).all()):
+        if bool(failed.any()) or not math.isfinite(scale.detach().sum()):
             raise InputError(
                 "the covariance of NormalPose is not positive definite; "
                 "give every free axis a standard deviation above 0 (metres, radians)."
             )
-        self._normal = MultivariateNormal(
-            torch.zeros(freedom.dimension, dtype=torch.float64), scale_tril=scale, validate_args=False
-        )
-        turns = [k for k, axis in enumerate(freedom.axes) if axis >= 3]
-        widest = float(matrix.detach().diagonal(dim1=-2, dim2=-1)[..., turns].max().sqrt()) if turns else 0.0
-        # Beyond half a radian the neighbouring windings carry more than 1e-16 of the mass.
-        self._windings = (0.0,) if widest < 0.5 else (0.0, -2.0 * math.pi, 2.0 * math.pi)
+        self._scale = scale
         middle = torch.as_tensor(center, dtype=torch.float64)
         if bool(((middle[..., 3:].square().sum(dim=-1) - 1.0).abs() > 2e-3).any()):
             raise InputError(
@@ -67,15 +63,35 @@ class NormalPose(PoseDistribution):
     @property
     def covariance(self) -> Tensor:
         """Over the free coordinates, (d, d) or (N, d, d), in m^2, m rad and rad^2."""
-        scale = self._normal.scale_tril
-        return scale @ scale.transpose(-1, -2)
+        return self._scale @ self._scale.transpose(-1, -2)
+
+    # Most are only drawn from or multiplied by others: what their density takes is made when it is asked for.
+
+    @cached_property
+    def _windings(self) -> tuple[float, ...]:
+        """By how much the angles of the rotations that are summed over differ, radians."""
+        turns = sum(axis >= 3 for axis in self.freedom.axes)
+        variances = self._scale.detach()[..., self.freedom.dimension - turns :, :].square().sum(dim=-1)
+        # Beyond half a radian the neighbouring windings carry more than 1e-16 of the mass.
+        wide = turns > 0 and float(variances.max().sqrt()) >= 0.5
+        return (0.0, -2.0 * math.pi, 2.0 * math.pi) if wide else (0.0,)
+
+    @cached_property
+    def _half_log_determinant(self) -> Tensor:
+        return self._scale.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Poses (*sample_shape, *batch_shape, 7)."""
         shape = torch.Size(sample_shape) + self.batch_shape
         noise = torch.randn(*shape, self.freedom.dimension, 1, dtype=torch.float64)
-        tangent = self.freedom.embed((self._normal.scale_tril @ noise)[..., 0])
+        tangent = self.freedom.embed((self._scale @ noise)[..., 0])
         return poses.retract(self.center.expand(*shape, 7), tangent)
+
+    def _log_normal(self, coordinates: Tensor) -> Tensor:
+        """The log-density (...,) of the free coordinates (..., d)."""
+        white = torch.linalg.solve_triangular(self._scale, coordinates[..., None], upper=False)
+        size = self.freedom.dimension * math.log(2.0 * math.pi)
+        return -0.5 * (size + white[..., 0].square().sum(dim=-1)) - self._half_log_determinant
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density (...,) with respect to the base measure; -inf where a held axis differs."""
@@ -88,7 +104,7 @@ class NormalPose(PoseDistribution):
                 stretch = 1.0 + winding / angle.clamp_min(1e-12)
                 wound = torch.cat([tangent[..., :3], tangent[..., 3:] * stretch[..., None]], dim=-1)
             terms.append(
-                self._normal.log_prob(self.freedom.coordinates(wound))
+                self._log_normal(self.freedom.coordinates(wound))
                 - self.freedom.log_base_density(angle + winding)
             )
         density = terms[0] if len(terms) == 1 else torch.logsumexp(torch.stack(terms), dim=0)

@@ -125,10 +125,10 @@ class ErringCamera:
     def _apparent(
         self, camera: Camera, part: Tensor, bias: Tensor, before: Sequence[Sighting] = ()
     ) -> tuple[NormalPose, Tensor]:
-        """The distribution of where a camera with a bias (N,) measures a part at poses (N, 7).
+        """The distribution of where a camera with a bias (N,) measures a part at poses (..., N, 7).
 
         Given where its instrument measured it before; and how far that distribution follows the part
-        (N, 6, 6).
+        (..., N, 6, 6).
         """
         expected = [with_bias(each.camera, part, each.bias) for each in before]
         mean, covariance, follows = self.error.predicted(camera, part, before, expected)
@@ -182,9 +182,12 @@ class ErringCamera:
         errors = self._errors(camera)
 
         def log_density(point: Tensor) -> Tensor:
-            seen, bias = poses.retract(prior.center, point[:, :6]), point[:, 6]
-            image_here = self.image(camera, without_bias(camera, seen, bias), bias).log_prob(image)
-            return torch.where(allowed(prior, seen, _OUTSIDE * errors), image_here, -torch.inf)
+            seen = poses.retract(prior.center, point[:, :6])
+            inside = allowed(prior, seen, _OUTSIDE * errors)
+            seen, bias = seen[inside], point[inside, 6]
+            density = point.new_full(inside.shape, -torch.inf)
+            density[inside] = self.image(camera, without_bias(camera, seen, bias), bias).log_prob(image)
+            return density
 
         def alike(point: Tensor) -> Tensor:
             here = poses.retract(prior.center, point[:, :6])
@@ -295,11 +298,12 @@ class ErringCamera:
         """
         camera, address = self.camera(action), f"seen_by_{self.viewpoint(action)}"
         bias, moved = trace[f"bias_{self.viewpoint(action)}"], ChainMap(dict(values), trace)
-        seen = self._given_bias(fit, bias)
-        before, after = (
-            seen.times(self._apparent(camera, part, bias, self._before(action, known))[0])
-            for part, known in ((old, trace), (new, moved))
-        )
+        # The conditionals of both at once, (2, N): a small batch costs by operations.
+        known = zip(self._before(action, trace), self._before(action, moved), strict=True)
+        sightings = [one.beside(other) for one, other in known]
+        apparent, _ = self._apparent(camera, torch.stack([old, new]), bias, sightings)
+        both = self._given_bias(fit, bias).times(apparent)
+        before, after = (GaussianMixture(*each) for each in zip(*both, strict=True))
         # The deviation is from the component that it most probably came of, and is kept in all others.
         at, own = trace[address], torch.arange(len(old))
         away = poses.local(before.centers[own, before.component(at)], at)

@@ -43,11 +43,13 @@ def _ends(probe: Probe) -> Indices:
     return cell_ends(probe.stamps)
 
 
+@lru_cache(maxsize=64)
 def step_of(probe: Probe) -> float:
     """Seconds between a probe's stamps; of one with a single stamp, one."""
     return float(np.median(np.diff(probe.stamps))) if len(probe.stamps) > 1 else 1.0
 
 
+@lru_cache(maxsize=1024)
 def cells_of(window: ProbeWindow) -> Indices:
     """The ends of cells (C,), in stamps, that lie in a window."""
     ends = _ends(window.probe)

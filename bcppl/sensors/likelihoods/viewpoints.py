@@ -46,6 +46,11 @@ class Sighting(NamedTuple):
     seen: Tensor
     bias: Tensor | float = 0.0
 
+    def beside(self, other: Sighting) -> Sighting:
+        """This sighting and another from the same viewpoint in one batch, (2, ...)."""
+        bias = torch.stack([torch.as_tensor(each.bias) for each in (self, other)])
+        return Sighting(self.camera, torch.stack([self.seen, other.seen]), bias)
+
 
 class Prediction(NamedTuple):
     """The next sighting given those before: a normal about where it would be without errors.

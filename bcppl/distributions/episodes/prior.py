@@ -1,0 +1,59 @@
+"""What holds before the first row of a probe: the compliance of contacts, and errors that touches share."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import torch
+
+from bcppl.distributions.episodes.branches import Prior
+from bcppl.distributions.episodes.covariances import Hypothesis
+from bcppl.distributions.episodes.linear_errors import LinearErrors
+from bcppl.distributions.manifold import FARTHEST
+
+# Nodes of the compliance, in decades from its median: they are closer than `varying` is wide.
+_DECADES = torch.linspace(-1.25, 1.25, 11, dtype=torch.float64)
+# Standard deviations, m and rad, of the pose about which a likelihood is approximated: far wider than what
+# any touch leaves.
+WIDE = torch.tensor([0.1] * 3 + [1.0] * 3, dtype=torch.float64)
+
+
+# The same for all windows and poses, which are many.
+@lru_cache(maxsize=64)
+def nodes_of(compliance: float, uncertain: float, every: int = 1) -> tuple[Hypothesis, ...]:
+    """Each `every`-th node of a compliance with a median, m/N, and a deviation of its decimal logarithm."""
+    weights = (-0.5 * (_DECADES / uncertain) ** 2).log_softmax(dim=0).tolist()
+    nodes = (compliance * 10.0**_DECADES).tolist()
+    return tuple(Hypothesis(w, c) for w, c in zip(weights, nodes, strict=True))[::every]
+
+
+@lru_cache(maxsize=64)
+def with_delays(hypotheses: tuple[Hypothesis, ...], bench: LinearErrors) -> tuple[Hypothesis, ...]:
+    """Each of some hypotheses with each delay of the wrench."""
+    return tuple(
+        each._replace(log_weight=each.log_weight + math.log(probability), delay=interval)
+        for interval, probability in bench.delays.items()
+        for each in hypotheses
+    )
+
+
+@lru_cache(maxsize=64)
+def prior_of(bench: LinearErrors, hypotheses: tuple[Hypothesis, ...], outlier: float, pose: int) -> Prior:
+    """The prior of hypotheses with delays, with so many parameters of the pose before the shared errors'."""
+    own, jumps = np.zeros(pose), bench.jumps
+    log_weight, compliance, _, scale, delay = np.array(hypotheses).T.copy()
+    changed = np.array([np.concatenate([own, j.variances.numpy()]) for j in jumps])
+    return Prior(
+        log_weight=log_weight,
+        compliance=compliance,
+        scale=scale,
+        delay=np.searchsorted(list(bench.delays), delay),
+        mean=np.concatenate([own, bench.means.numpy()]),
+        variance=np.concatenate([WIDE.numpy()[:pose] ** 2, bench.variances.numpy()]),
+        jump_log_probability=np.array([math.log(j.probability) for j in jumps]),
+        jump_variance=changed.reshape(len(jumps), pose + len(bench.means)),
+        outlier=outlier,
+        farthest=FARTHEST,
+    )
