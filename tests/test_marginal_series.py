@@ -20,7 +20,7 @@ from bcppl.inference.series import marginal
 from bcppl.inference.series.nested import Filters
 from bcppl.inference.summaries import mean
 from bcppl.inference.targets import POSTERIOR
-from bcppl.traces import Series, Trace, extend, generate, simulate, update
+from bcppl.traces import Series, Trace, assess, extend, generate, simulate, update
 from bcppl.traces.carried import carried
 from tests.invariance import equal_weights, number
 from tests.linear_series import AUTOREGRESSION, SEEN, log_evidence, observed, posterior, step
@@ -281,9 +281,53 @@ def test_refusals_say_what_to_do() -> None:
         generate(marginal(AUTOREGRESSION, "rho", observed="z", particles=5), STEPS, {}, 3)
     with pytest.raises(InputError, match=r"simulate `unrolled\(series\)`"):
         simulate(program, STEPS, 3)
+    with pytest.raises(InputError, match="'y/2' of a series has no value"):
+        generate(program, STEPS, {"y/1": number(0.1)}, 3)
+    with pytest.raises(InputError, match=r"'y/1' of a series is given with shape \(3,\)"):
+        assess(program, ([()],), {"rho": trace["rho"], "y/1": torch.ones(3).double()}, 3)
     with pytest.raises(InputError, match="is another than the filters have assimilated"):
         update(trace, observations={"y/2": number(0.1)}).trace.log_prob("y/2")
     with pytest.raises(InputError, match="ask for the steps in order"):
         update(trace, {"rho": trace["rho"] * 0.5}).trace.log_prob("y/3")
     with pytest.raises(InputError, match="runs a simulator"):
         markov_chains(hmc("rho"), trace, 1, progress=False)
+
+
+def test_what_init_conditions_on_is_weighed() -> None:
+    """All normal given the scale: the mean of the estimates is exact, with an observation and a factor."""
+    torch.manual_seed(0)
+    count, scale = 4000, 1.3
+
+    def begin() -> dict[str, Tensor]:
+        s = pyro.sample("s", dist.LogNormal(number(0.0), 1.0))
+        x = pyro.sample("x", dist.Normal(number(0.0), s))
+        pyro.sample("first", dist.Normal(x, 0.5), obs=number(1.1))
+        pyro.factor("known", number(-0.7).expand(x.shape))
+        return {"s": s, "x": x}
+
+    def walk(state: dict[str, Tensor]) -> dict[str, Tensor]:
+        x = pyro.sample("x", dist.Normal(state["x"], 1.0))
+        pyro.sample("y", dist.Normal(x, 0.5))
+        return {"s": state["s"], "x": x}
+
+    program = marginal(Series(begin, walk), "s", observed="y", particles=20)
+    seen, values = {"y/1": number(0.4)}, torch.full((count,), scale, dtype=torch.float64)
+    trace, weight = generate(program, ([()],), seen, count, {"s": values})
+    covariance = torch.tensor([[scale**2 + 0.25, scale**2], [scale**2, scale**2 + 1.25]]).double()
+    joint = dist.MultivariateNormal(torch.zeros(2).double(), covariance)
+    exact = joint.log_prob(torch.tensor([1.1, 0.4]).double()) - 0.7
+    ratio = (weight - trace.log_prob("s") - exact).exp()
+    assert abs(float((ratio.mean() - 1.0) / (ratio.std() / math.sqrt(count)))) < 4.0
+
+
+def hierarchical() -> dict[str, Tensor]:
+    tau = pyro.sample("tau", dist.LogNormal(number(0.0), 0.5))
+    rho = pyro.sample("rho", dist.Normal(number(0.0), tau))
+    return {"rho": rho, "x": pyro.sample("x", dist.Normal(number(0.0), 1.0))}
+
+
+def test_a_parameter_that_depends_on_what_is_integrated_out_is_refused() -> None:
+    series, given = Series(hierarchical, step), {"rho": number(0.5).expand(4)}
+    with pytest.raises(InputError, match=r"'rho' depends on others .*\(tau, x\).* name them as static too"):
+        generate(marginal(series, "rho", observed="y", particles=5), STEPS, observed(T), 4, given)
+    generate(marginal(series, "rho", "tau", observed="y", particles=5), STEPS, observed(T), 4, given)

@@ -131,6 +131,7 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: update(start().trace, SEEN),  # type: ignore[arg-type]
         r"update is given a Trace .* Population\(trace, log_weights\), or use a verb of bcppl.traces",
     ),
+    "a number to run": (lambda: generate(3, (), {}, 4), "a program is a function, and int is given"),  # type: ignore[arg-type]
     "a trace to resample": (lambda: resample(start().trace), "resample is given a Trace"),  # type: ignore[arg-type]
     "a trace to move": (lambda: rejuvenate(start().trace, walk), "rejuvenate is given a Trace"),  # type: ignore[arg-type]
     "a name as a proposal": (

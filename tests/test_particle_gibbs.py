@@ -179,3 +179,24 @@ def test_refusals_say_what_to_do() -> None:
         particle_gibbs("phi")(equal_weights(trace))(trace, POSTERIOR)
     with pytest.raises(InputError, match="keep 'x/1', which `init` does not sample"):
         particle_gibbs("x/1")(equal_weights(trace))(trace, POSTERIOR)
+
+
+def test_a_parameter_that_stays_weighs_what_it_depends_on() -> None:
+    """The scale given the parameter alone is inverse gamma: nothing else depends on it."""
+    torch.manual_seed(0)
+    count, rho = 2000, 1.5
+
+    def begin() -> dict[str, Tensor]:
+        precision = pyro.sample("precision", dist.Gamma(number(2.0), 2.0))
+        rho = pyro.sample("rho", dist.Normal(number(0.0), precision.rsqrt()))
+        return {"rho": rho, "x": pyro.sample("x", dist.Normal(number(0.0), 1.0))}
+
+    series = Series(begin, AUTOREGRESSION.step)
+    given = {"rho": torch.full((count,), rho, dtype=torch.float64)}
+    trace, _ = generate(unrolled(series), ([()] * 2,), observed(2), count, given)
+    move = particle_gibbs("rho", particles=20)(equal_weights(trace))
+    for _ in range(5):
+        trace, _ = move(trace, POSTERIOR)
+    drawn = trace["precision"]
+    exact = dist.Gamma(2.5, 2.0 + 0.5 * rho**2).mean
+    assert abs(float((drawn.mean() - exact) / (drawn.std() / math.sqrt(count)))) < 4.0

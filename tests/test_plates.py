@@ -235,3 +235,16 @@ def test_kernels_move_as_many_particles_as_a_plate_has_entries(particles: int) -
     change = torch.cat(moved)
     assert bool((change.std(dim=0) > 0.01).all())
     assert float((change.mean(dim=0) / (change.std(dim=0) / len(change) ** 0.5)).abs().max()) < 3.7
+
+
+def test_a_factor_in_a_plate_counts_for_each_entry() -> None:
+    def program() -> None:
+        x = pyro.sample("x", dist.Normal(torch.zeros(()).double(), 1.0))
+        with pyro.plate("points", POINTS):
+            pyro.factor("for all", -(x**2))
+            pyro.factor("for each", -WIDTHS[:, None] * x)
+
+    trace, weight = generate(program, (), {}, N)
+    torch.testing.assert_close(weight, -POINTS * trace["x"] ** 2 - WIDTHS.sum() * trace["x"])
+    moved = update(trace[:2], {"x": trace["x"][2:]}).trace
+    torch.testing.assert_close(moved.log_prob("for all", "for each"), weight[2:])

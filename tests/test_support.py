@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from typing import Any
 
 import pyro
 import pyro.distributions as dist
@@ -142,3 +144,39 @@ def test_seven_numbers_without_a_unit_quaternion_are_no_pose() -> None:
         NormalPose(value, deviations)
     with pytest.raises(InputError, match="quaternion of length 2"):
         average_distance(center, torch.zeros(1, 3, dtype=torch.float64), value[4])
+
+
+@pytest.mark.parametrize(
+    ("distribution", "impossible", "possible"),
+    [
+        (dist.Categorical(real(0.6, 0.0, 0.4)), 1, 2),
+        (dist.Categorical(torch.tensor([0.6, 0.0, 0.4])), 1, 0),
+        (dist.OneHotCategorical(real(0.6, 0.0, 0.4)), [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]),
+        (dist.Bernoulli(0.0 * ONE), 1.0, 0.0),
+        (dist.Bernoulli(ONE), 0.0, 1.0),
+        (dist.Binomial(3, 0.0 * ONE), 1.0, 0.0),
+        (dist.Geometric(ONE), 2.0, 0.0),
+    ],
+)
+def test_a_stated_probability_of_0_is_0(distribution: Distribution, impossible: Any, possible: Any) -> None:
+    for each in (distribution, distribution.expand([3])):
+        assert bool((log_prob_inside(each, torch.as_tensor(impossible)) == -torch.inf).all())
+        assert bool((log_prob_inside(each, torch.as_tensor(possible)) > -1.0).all())
+
+
+def test_a_probability_that_rounds_to_0_is_that_of_its_logits() -> None:
+    assert float(log_prob_inside(dist.Categorical(logits=real(0.0, -800.0)), torch.tensor(1))) == -800.0
+    bernoulli = dist.Bernoulli(logits=real(40.0))
+    assert float(bernoulli.probs) == 1.0 and float(log_prob_inside(bernoulli, real(0.0))) == -40.0
+
+
+def test_parameters_that_are_no_numbers_count_where_an_earlier_value_is_possible() -> None:
+    def program() -> None:
+        scale = pyro.sample("scale", dist.HalfNormal(ONE))
+        pyro.sample("y", dist.Normal(0.0, scale.log().sqrt()))
+
+    observed = {"y": real(0.7)[0]}
+    _, weight = generate(program, (), observed, 2, {"scale": real(-1.0, 1.5)})
+    assert weight[0] == -torch.inf and math.isfinite(weight[1])
+    with pytest.raises(InferenceError, match="site 'y' has a log-probability of nan for 1 of 2"):
+        generate(program, (), observed, 2, {"scale": real(0.5, 1.5)})

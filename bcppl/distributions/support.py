@@ -10,7 +10,17 @@ import torch
 from pyro.distributions import MixtureSameFamily, SineBivariateVonMises, SineSkewed, VonMises
 from pyro.distributions.torch_distribution import ExpandedDistribution, MaskedDistribution
 from torch import Tensor
-from torch.distributions import Bernoulli, Categorical, Distribution, Independent, constraints
+from torch.distributions import (
+    Bernoulli,
+    Binomial,
+    Categorical,
+    Distribution,
+    Geometric,
+    Independent,
+    OneHotCategorical,
+    constraints,
+)
+from torch.distributions.utils import probs_to_logits
 
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
@@ -159,16 +169,33 @@ def _is_of_torch_or_pyro(distribution: Any) -> bool:
     )
 
 
-def has_probability(distribution: Any, value: int) -> Tensor:
-    """Whether a value has a probability above 0, over the batch; torch rounds a stated 0 up to e^-36."""
+def has_probability(distribution: Any, value: Tensor) -> Tensor:
+    """Whether values have a probability above 0, over the batch; torch rounds a stated 0 up to e^-36."""
     innermost = base(distribution)
-    probs = vars(innermost).get("probs")
-    if probs is not None and innermost._param is probs:  # not computed from logits, which may be any
-        if isinstance(innermost, Bernoulli):
-            return (probs if value else 1.0 - probs) > 0.0
-        if isinstance(innermost, Categorical) and 0 <= value < probs.shape[-1]:
-            return torch.as_tensor(probs[..., value] > 0.0)
+    if isinstance(innermost, OneHotCategorical):
+        return has_probability(innermost._categorical, value.argmax(dim=-1))
+    if "probs" not in vars(innermost):
+        return torch.tensor(True)
+    if isinstance(innermost, Categorical):
+        zero = _stated(innermost, innermost.probs == 0.0, is_binary=False)
+        index = value.long().clamp(0, zero.shape[-1] - 1)
+        shape = torch.broadcast_shapes(index.shape, zero.shape[:-1])
+        index = index.expand(shape).unsqueeze(-1)
+        return torch.as_tensor(~zero.expand(*shape, -1).gather(-1, index).squeeze(-1))
+    if isinstance(innermost, Bernoulli | Binomial | Geometric):
+        never, always = (_stated(innermost, innermost.probs == each, is_binary=True) for each in (0.0, 1.0))
+        if isinstance(innermost, Geometric):
+            return torch.as_tensor((value == 0) | ~always)
+        most = innermost.total_count if isinstance(innermost, Binomial) else 1
+        return torch.as_tensor(((value == 0) | ~never) & ((value == most) | ~always))
     return torch.tensor(True)
+
+
+def _stated(distribution: Any, rounded: Tensor, *, is_binary: bool) -> Tensor:
+    """Where a probability of 0 or 1 was given, and not rounded from logits."""
+    if not bool(rounded.any()):
+        return rounded
+    return rounded & (distribution.logits == probs_to_logits(distribution.probs, is_binary=is_binary))
 
 
 def _is_bounded(distribution: Any) -> bool:
@@ -199,7 +226,8 @@ def _inside(distribution: Any, value: Tensor, masked: bool) -> Tensor:
     if isinstance(distribution, ExpandedDistribution):
         return _inside(distribution.base_dist, value, masked)
     support = whole_support(distribution)
-    return ~_any_entry(~support.check(value), len(distribution.event_shape) - support.event_dim)
+    inside = ~_any_entry(~support.check(value), len(distribution.event_shape) - support.event_dim)
+    return inside & has_probability(distribution, value) if support.is_discrete else inside
 
 
 def _any_entry(true: Tensor, dimensions: int) -> Tensor:

@@ -49,14 +49,28 @@ def log_probability(
     value = value.to(torch.float64).expand(batch)
     if address in ran.structural:
         # Asked for alone, an impossible structure would have all the weight.
-        possible = has_probability(distribution, int(ran.values[address].reshape(-1)[0]))
+        possible = has_probability(distribution, ran.values[address].reshape(-1)[0])
         value = torch.where(possible, value, -torch.inf)
     if len(batch) > 1:
         value = value.sum(tuple(range(len(batch) - 1)))
     # The maximum is NaN where any is.
     if not bool(value.max() < torch.inf):
-        raise not_a_number(address, value, choices.get(address), observations.get(address))
+        value = torch.where(_impossible(ran, address, choices, observations), -torch.inf, value)
+        if not bool(value.max() < torch.inf):
+            raise not_a_number(address, value, choices.get(address), observations.get(address))
     return value
+
+
+def _impossible(
+    ran: Run, address: str, choices: Mapping[str, Tensor], observations: Mapping[str, Tensor]
+) -> Tensor:
+    """The particles (N,) with an impossible value before a site: its parameters may then be any."""
+    addresses = list(ran.distributions)
+    total = torch.zeros(ran.distributions[address].batch_shape[-1], dtype=torch.float64)
+    for earlier in addresses[: addresses.index(address)]:
+        if earlier in choices:
+            total = total + log_probability(ran, earlier, choices, observations)
+    return total == -torch.inf
 
 
 def _of_site(ran: Run, address: str, distribution: Any, latent: bool) -> Tensor:

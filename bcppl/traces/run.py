@@ -243,6 +243,8 @@ class _Recorder(Messenger):
 
     def _shared(self, value: Any, distribution: Any) -> Any:
         """A value that the program observes in its plates, (*plates, 1, *event), without the empty axis."""
+        if 0 in distribution.event_shape:  # of `pyro.factor`, which does not expand it to the plates
+            return value.new_empty(*distribution.batch_shape[:-1], *distribution.event_shape)
         plates = len(distribution.batch_shape) - 1
         whole = plates + 1 + len(distribution.event_shape)
         if plates and value.ndim == whole and value.shape[plates] == 1 != self.particles:

@@ -105,6 +105,11 @@ class Stage:
 
 def runnable(program: Program | Series) -> Program:
     """The program itself, or the first stage of a series."""
+    if not callable(program) and not isinstance(program, Series):
+        raise InputError(
+            f"a program is a function, and {type(program).__name__} is given; give the function itself, its "
+            "arguments beside it as a tuple (of a model its `program`)."
+        )
     return Stage(program) if isinstance(program, Series) else program
 
 

@@ -142,8 +142,10 @@ class _Conditional:
     ) -> _Particles:
         """The particles that were drawn, and the steps to the path from the particles at `rows` (M x N,)."""
         assert isinstance(free, SeriesTrace) and isinstance(onto, SeriesTrace)
-        observed = [a for a in onto.addresses if a not in onto.choices]
-        likelihood = [self._log_density(number, each, observed) for each in (free, onto)]
+        # The values that stay weigh those of `init` on which their distributions depend.
+        held = self.static if number == 0 else ()
+        weighing = [a for a in onto.addresses if a not in onto.choices or a in held]
+        likelihood = [self._log_density(number, each, weighing) for each in (free, onto)]
         log_likelihood = torch.where(self.free, likelihood[0], likelihood[1][rows])
         led: SeriesTrace = onto.chosen(rows)
         return _Particles(

@@ -28,6 +28,7 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 from bcppl.inference.series.nested import Filters
+from bcppl.inference.series.unrolling import numbered
 from bcppl.traces import Series, carried, extend, simulate
 
 
@@ -60,23 +61,33 @@ class SeriesLikelihood(LazyDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Estimate (M,) of the log-likelihood of the step's observation, (*event_shape)."""
+        if value.shape != self.event_shape:
+            raise InputError(
+                f"observation {self._name!r} of a series is given with shape {tuple(value.shape)}; give one of "
+                f"shape {tuple(self.event_shape)}, the same for all particles: that is what its filters weigh."
+            )
         return self.filters.log_increment(self.number, self.address, self.args, value)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Refused: filters only weigh observations."""
         raise InputError(
-            f"observation {self.address!r} of a series has no value, and its filters only weigh one; give "
-            "it, or simulate `unrolled(series)`, which has the same addresses."
+            f"observation {self._name!r} of a series has no value, and its filters only weigh one; give it, or "
+            "where nothing was seen any value of which the step masks the density (`.mask(seen)`); or "
+            "simulate `unrolled(series)`, which has the same addresses."
         )
+
+    @property
+    def _name(self) -> str:
+        return numbered(self.address, self.number)
 
 
 def marginal(series: Series, *static: str, observed: str, particles: int, threshold: float = 0.5) -> Marginal:
     """The program of a series' static parameters given its observations, with filters for its states.
 
     Args:
-        series: `init` samples the static parameters, whatever their distribution depends on before them, and
-            returns them in the state.
-        static: addresses of the static parameters, one or more.
+        series: `init` samples the static parameters and returns them in the state. What it conditions on
+            itself (`obs=`, `pyro.factor`) is weighed with the first step's observation.
+        static: addresses of the static parameters, one or more, with all that their distributions depend on.
         observed: the address at which each step observes.
         particles: N of each filter. A standard deviation of the estimated log-likelihood of 1 to 1.5 is a
             good compromise (Doucet, Pitt, Deligiannidis and Kohn, Biometrika 102, 2015).
@@ -88,7 +99,8 @@ def marginal(series: Series, *static: str, observed: str, particles: int, thresh
 
     Raises:
         InputError: no static parameter is named, or a number is out of range; when it runs: `init` samples
-            no such address, or a step visits no such observation.
+            no such address, a step visits no such observation, or the distribution of a static parameter
+            depends on a value that is integrated out.
     """
     if not static:
         raise InputError("marginal is given no static parameter; name the addresses that `init` samples.")
@@ -126,7 +138,7 @@ class Marginal:
         for number, each in enumerate(steps, 1):
             shape = self._event_shape(args, each)
             site = SeriesLikelihood(filters, number, self.observed, each, shape)
-            pyro.sample(f"{self.observed}/{number}", site)
+            pyro.sample(numbered(self.observed, number), site)
 
     def _event_shape(self, args: tuple[Any, ...], step: tuple[Any, ...]) -> tuple[int, ...]:
         """The shape of the observation, from one run of the first step."""

@@ -38,7 +38,8 @@ class Filters:
         count: N, of each filter.
         threshold: a filter resamples when its effective sample size is below this share of N.
         log_weights: (M, N), normalised in each filter.
-        increments: (T, M), log p(y_t | y_1, ..., y_t-1) as estimated.
+        increments: (T, M), log p(y_t | y_1, ..., y_t-1) as estimated; what `init` conditions on counts with
+            the first.
         state: what the newest step returned for the M x N particles, those of a filter side by side; None
             before the first step.
         seen: the address, the arguments and the observation of each step.
@@ -94,7 +95,7 @@ class Filters:
         return self.increments[number - 1]
 
     def _advance(self, address: str, args: tuple[Any, ...], value: Tensor) -> None:
-        trace, log_weights = self._resampled() if self.seen else (self._begun(), self.log_weights)
+        trace, log_weights = self._resampled() if self.seen else self._begun()
         longer, log_likelihood = extend(trace, args, {address: value})
         assert isinstance(longer, SeriesTrace)
         self.log_weights, increment = groups.reweighed(log_weights, log_likelihood)
@@ -102,13 +103,23 @@ class Filters:
         self.state, self.carried = longer.state, dict(longer.carried)
         self.seen.append((address, args, value))
 
-    def _begun(self) -> Trace:
-        given = {
-            address: value.repeat_interleave(self.count, dim=0) for address, value in self.static.items()
-        }
-        return generate(replace(self.series, history=False), self.args, {}, self.log_weights.numel(), given)[
-            0
-        ]
+    def _begun(self) -> tuple[Trace, Tensor]:
+        """The particles of `init`, and their log weights (M, N): what it conditions on itself counts."""
+        given = {a: value.repeat_interleave(self.count, dim=0) for a, value in self.static.items()}
+        series = replace(self.series, history=False)
+        trace, _ = generate(series, self.args, {}, self.log_weights.numel(), given)
+        for address in self.static:
+            density = trace.log_prob(address).reshape(self.log_weights.shape)
+            if not bool(torch.isclose(density, density[:, :1]).all()):
+                others = [each for each in trace.choices if each not in self.static]
+                raise InputError(
+                    f"the distribution of the static parameter {address!r} depends on others that `init` "
+                    f"samples ({', '.join(others)}) and that are integrated out; name them as static too."
+                )
+        fixed = [address for address in trace.addresses if address not in trace.choices]
+        if not fixed:
+            return trace, self.log_weights
+        return trace, self.log_weights + trace.log_prob(*fixed).reshape(self.log_weights.shape)
 
     def _resampled(self) -> tuple[Trace, Tensor]:
         """The particles from which the next step begins, and their log weights (M, N)."""
