@@ -63,16 +63,16 @@ class SeriesLikelihood(LazyDistribution):
         """Estimate (M,) of the log-likelihood of the step's observation, (*event_shape)."""
         if value.shape != self.event_shape:
             raise InputError(
-                f"observation {self._name!r} of a series is given with shape {tuple(value.shape)}; give one of "
-                f"shape {tuple(self.event_shape)}, the same for all particles: that is what its filters weigh."
+                f"observation {self._name!r} of a series is given with shape {tuple(value.shape)}; its filters "
+                f"weigh one that is the same for all particles, give it with shape {tuple(self.event_shape)}."
             )
         return self.filters.log_increment(self.number, self.address, self.args, value)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Refused: filters only weigh observations."""
         raise InputError(
-            f"observation {self._name!r} of a series has no value, and its filters only weigh one; give it, or "
-            "where nothing was seen any value of which the step masks the density (`.mask(seen)`); or "
+            f"observation {self._name!r} of a series has no value, and its filters only weigh one; give it, "
+            "or where nothing was seen any value of which the step masks the density (`.mask(seen)`); or "
             "simulate `unrolled(series)`, which has the same addresses."
         )
 
