@@ -63,7 +63,7 @@ class SeriesLikelihood(LazyDistribution):
         """Estimate (M,) of the log-likelihood of the step's observation, (*event_shape)."""
         if value.shape != self.event_shape:
             raise InputError(
-                f"observation {self._name!r} of a series is given with shape {tuple(value.shape)}; its filters "
+                f"observation {self._name!r} of a series is given with shape {tuple(value.shape)}; filters "
                 f"weigh one that is the same for all particles, give it with shape {tuple(self.event_shape)}."
             )
         return self.filters.log_increment(self.number, self.address, self.args, value)
