@@ -221,3 +221,12 @@ def test_what_cannot_be_checked_is_refused() -> None:
         check_kernel(walk, program, (), ["y"], draws=10)
     with pytest.raises(InputError, match="in place of a kernel"):
         check_kernel(drift("x"), program, (), ["y"])  # type: ignore[arg-type]
+
+
+def test_another_seed_is_a_second_opinion() -> None:
+    def asked(seed: int) -> float:
+        return check_kernel(metropolis_hastings(near), program, (), ["y"], draws=300, seed=seed).acceptance
+
+    state = torch.get_rng_state()
+    assert asked(0) == asked(0) != asked(1)
+    assert torch.equal(state, torch.get_rng_state())

@@ -25,7 +25,7 @@ from bcppl.inference.kernels.kernel import Kernel, Move, fitted
 from bcppl.inference.population import Population
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, simulate, update
-from bcppl.traces.checks.runs import seed, undisturbed
+from bcppl.traces.checks.runs import seed as seeded, undisturbed
 from bcppl.traces.indexing import beside
 from bcppl.traces.run import Program
 
@@ -62,6 +62,7 @@ def check_kernel(
     observed: Sequence[str] = (),
     draws: int = 10_000,
     moves: int = 3,
+    seed: int = 0,
 ) -> KernelCheck:
     """Check that a kernel leaves the posterior of a program invariant, and moves each particle by itself.
 
@@ -85,6 +86,7 @@ def check_kernel(
         observed: the addresses of the data.
         draws: of the joint, 100 or more.
         moves: by which each is moved.
+        seed: of the draws and the moves; another one gives a second opinion.
 
     Raises:
         KernelError: the kernel is wrong, or moves nothing.
@@ -94,7 +96,8 @@ def check_kernel(
     whole_number("a kernel is to be checked with {} draws", draws, least=100)
     whole_number("a kernel is to be checked by {} moves", moves)
     data = Joint(program, args, tuple(observed)).observed
-    with undisturbed():
+    seed = whole_number("a kernel is to be checked with the seed {}", seed, least=0)
+    with undisturbed(seed):
         taught = simulate(program, args, TAUGHT)
         move = fitted(kernel, Population(taught, torch.zeros(TAUGHT, dtype=torch.float64)))
         trace = simulate(program, args, draws)
@@ -133,7 +136,7 @@ def _check_alone(move: Move, trace: Trace, moves: int, data: Sequence[str]) -> N
 
 def _moved(move: Move, trace: Trace, moves: int) -> Mapping[str, Tensor]:
     """The values of a trace after moves with always the same random numbers."""
-    seed(1)
+    seeded(1)
     for _ in range(moves):
         trace, _ = move(trace, POSTERIOR)
     return trace.choices
