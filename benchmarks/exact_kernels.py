@@ -53,6 +53,7 @@ KERNELS: dict[str, Callable[[int, int], Tempered]] = {
         metropolis_hastings(differential_evolution("x")), 20, d
     ),
     "involutive": lambda d, n: swept(reflected("x"), 5, d),
+    "involutive, 20 sweeps": lambda d, n: swept(reflected("x"), 20, d),
     "delayed acceptance": lambda d, n: swept(delayed_acceptance(even("x"), surrogate=student_t("x")), 5, d),
     "hmc": lambda d, n: tempered(hmc("x")),
     "hmc, always moved": lambda d, n: tempered(hmc("x"), always_move=True),
@@ -80,6 +81,7 @@ REASONS = {
     "drift until displaced": UNTIL,
     "mixture until displaced": UNTIL,
     "differential evolution": "five sweeps are few, see that with 20",
+    "involutive": "five sweeps of steps of one size are few, see that with 20",
     "hmc": FEW,
     "hmc, always moved": FEW,
     "waste-free": "five states of a random walk hardly leave where they began; give fewer, longer chains",
