@@ -15,12 +15,9 @@ from bcppl.inference.proposals import drift
 from bcppl.inference.proposals.coordinates import coordinates_of
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Series, Trace, extend, generate, update
+from tests.invariance import number
 
 N = 40
-
-
-def number(value: float) -> torch.Tensor:
-    return torch.tensor(value, dtype=torch.float64)
 
 
 def bounded(width: float = 1.0) -> None:
@@ -45,6 +42,7 @@ def test_a_support_that_depends_on_a_value_is_that_of_the_particles(choose: Call
 
 def test_other_arguments_may_give_another_support() -> None:
     trace, _ = generate(bounded, (1.0,), {"seen": number(0.5)}, N)
+    assert trace.addresses == ["top", "x", "z", "seen"]
     assert trace.support("z").constraint is dist.constraints.real
     moved = update(trace, {"z": trace["z"].exp()}, args=(-1.0,)).trace
     assert moved.support("z").constraint.lower_bound == 0.0
