@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised
-from bcppl.beliefs.belief import ApparentPose, SeesPart
+from bcppl.beliefs.belief import SeesPart
 from bcppl.distributions.support import refuse_several_poses
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.ancestry import inherited
@@ -215,14 +215,26 @@ class Population:
                 f"a belief over {address!r} was asked for, which is no pose: its values have shape "
                 f"{tuple(poses.shape[1:])}; use bcppl.inference.summaries."
             )
-        return Belief(poses, self.log_weights, freedom or FREE, self._apparent(poses))
+        touched = self._touched(poses)
+        apparent = None if touched is None else partial(touched[0].apparent_poses, touched[1])
+        return Belief(poses, self.log_weights, freedom or FREE, apparent)
 
-    def _apparent(self, poses: Tensor) -> ApparentPose | None:
-        """What the last of the observed sites that know of it says of the pose as seen from a held peg."""
+    def shared_errors(self, address: str) -> tuple[Tensor, Tensor] | None:
+        """Errors that all touches share, given each particle's pose at an address and what was observed.
+
+        Returns:
+            Mean (N, M) and covariance (N, M, M), in prior standard deviations; None where no touch was
+            observed, or touches share none.
+        """
+        touched = self._touched(self.trace[address])
+        return None if touched is None else touched[0].shared_posterior(touched[1])
+
+    def _touched(self, poses: Tensor) -> tuple[SeesPart, Tensor] | None:
+        """The last of the observed sites that know the part as seen from a held peg, and its value."""
         for address in reversed(list(self.trace.observations)):
             site = self.trace.distributions[address]
             if isinstance(site, SeesPart) and site.is_displaced and torch.equal(site.pose, poses):
-                return partial(site.apparent_poses, self.trace[address])
+                return site, self.trace[address]
         return None
 
     def __repr__(self) -> str:

@@ -79,5 +79,5 @@ def test_a_bug_deep_within_the_ranking_is_no_unsuitable_model(
     error_of: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the approximation by which a touch is ranked, which every model of touches has."""
-    monkeypatch.setattr(ContactManifold, "quadratic", functools.partialmethod(raising, error=BUGS[0]))
+    monkeypatch.setattr(ContactManifold, "_second_order", functools.partialmethod(raising, error=BUGS[0]))
     assert_reported_as_a_bug(error_of(), BUGS[0])

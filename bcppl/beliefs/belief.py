@@ -47,6 +47,9 @@ class SeesPart(Protocol):
     def apparent_poses(self, value: Tensor, world_from_peg: Tensor, draws: int) -> Tensor:
         """As `ApparentPose`, given the value that was observed."""
 
+    def shared_posterior(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean (N, M) and covariance (N, M, M) of the errors that all touches share, given the value."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Belief:

@@ -33,8 +33,9 @@ def probe(
         str | None,
         typer.Option(
             help="A file of plans and views, or kinds and how many of each: touch (one place of the "
-            "surface), slide (a touch led on along it), pair (two faces in turn), search (a spiral over the "
-            "hole), attempt (straight into it), view (a depth image); touch:16,slide:12,pair:4 by default. "
+            "surface), lean (the same with the peg turned), slide (a touch led on along it), pair (two faces "
+            "in turn), search (a spiral over the hole), attempt (straight into it), view (a depth image); "
+            "touch:12,lean:4,slide:12,pair:4 by default. "
             "Faces are named by their normals in the part's frame."
         ),
     ] = None,

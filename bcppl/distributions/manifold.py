@@ -111,24 +111,7 @@ class ContactManifold(LazyDistribution):
         count = len(self.pose)
         if gaps is None:
             return Quadratic(self.pose.new_zeros(count, 6), self.pose.new_zeros(count, 6, 6))
-        slope, touching = gaps.gradient(self.pose), (felt == 1.0).to(torch.float64)
-        # The common error takes the mean of a window's contacts part of its weight.
-        variance, common = self.noise**2, self.shared**2
-        share = (common / (variance + touching.sum(dim=1) * common))[:, None, None]
-        # What is far off, seen as wide as the errors are taken to be, hardly pulls.
-        error = distance + self.sink
-        trust = (touching / (1.0 + error**2 / (_FAR**2 * (variance + common)))).sqrt()
-        rows, error = slope * trust[..., None], error * trust
-        weighed = (rows - share * rows.sum(dim=1, keepdim=True)) / variance
-        pull = (weighed * error[..., None]).sum(dim=1)
-        information = weighed.transpose(-1, -2) @ rows
-        spread = math.hypot(self.noise, self.shared)
-        score, free = distance / spread, slope / spread
-        hazard = torch.exp(-0.5 * score**2 - 0.5 * math.log(2.0 * math.pi) - log_ndtr(score))
-        hazard = torch.where(felt == 0.0, hazard, 0.0)
-        pull = pull - (hazard[..., None] * free).sum(dim=1)
-        bend = (hazard * (hazard + score)).clamp(min=0.0)
-        information = information + free.transpose(-1, -2) @ (bend[..., None] * free)
+        pull, information = self._second_order(distance, felt, gaps.gradient(self.pose))
         return Quadratic(
             torch.where(lost[:, None], torch.nan, pull),
             torch.where(lost[:, None, None], torch.nan, information),
@@ -223,6 +206,31 @@ class ContactManifold(LazyDistribution):
             return none, none, lost, None
         gaps = self.gap(self.pose, stood[..., decided, :])
         return gaps.distance, felt[..., decided].expand(count, -1), lost, gaps
+
+    def _second_order(self, distance: Tensor, felt: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient (N, C) of minus the log-likelihood and information (N, C, C), by what moves the gaps.
+
+        Gaps and contact signals are (N, S), their derivatives by C parameters (N, S, C).
+        """
+        touching = (felt == 1.0).to(torch.float64)
+        # The common error takes the mean of a window's contacts part of its weight.
+        variance, common = self.noise**2, self.shared**2
+        share = (common / (variance + touching.sum(dim=1) * common))[:, None, None]
+        # What is far off, seen as wide as the errors are taken to be, hardly pulls.
+        error = distance + self.sink
+        trust = (touching / (1.0 + error**2 / (_FAR**2 * (variance + common)))).sqrt()
+        rows, error = slope * trust[..., None], error * trust
+        weighed = (rows - share * rows.sum(dim=1, keepdim=True)) / variance
+        pull = (weighed * error[..., None]).sum(dim=1)
+        information = weighed.transpose(-1, -2) @ rows
+        spread = math.hypot(self.noise, self.shared)
+        score, free = distance / spread, slope / spread
+        hazard = torch.exp(-0.5 * score**2 - 0.5 * math.log(2.0 * math.pi) - log_ndtr(score))
+        hazard = torch.where(felt == 0.0, hazard, 0.0)
+        pull = pull - (hazard[..., None] * free).sum(dim=1)
+        bend = (hazard * (hazard + score)).clamp(min=0.0)
+        information = information + free.transpose(-1, -2) @ (bend[..., None] * free)
+        return pull, information
 
     def _of_contacts(self, distance: Tensor, touching: Tensor) -> Tensor:
         count = touching.sum(dim=1, dtype=torch.float64)

@@ -146,6 +146,16 @@ class FeelsForces(Protocol):
 
 
 @runtime_checkable
+class SharesErrors(Protocol):
+    """A likelihood of what a held peg touches, with errors that all touches share."""
+
+    bench: Any  # `bcppl.distributions.episodes.LinearErrors`
+
+    def inserted(self, world_from_part: Tensor) -> Tensor:
+        """The peg's pose (7,) with its tip at a part's frame (7,), turned as the part."""
+
+
+@runtime_checkable
 class Grasping(Protocol):
     """A likelihood of what a held peg touches, which may sit off in the hand."""
 

@@ -12,8 +12,9 @@ section 4.2.)
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -26,6 +27,7 @@ from bcppl.inference.design.predicted import (
     Information,
     PredictedObservations,
     predict_observations,
+    sum_information,
     sum_quadratics,
 )
 from bcppl.inference.design.ranking import (
@@ -40,6 +42,7 @@ from bcppl.inference.design.ranking import (
     rank,
     warn_of_failures,
 )
+from bcppl.inference.design.relative_mixture import HeldPeg, PoseMixture, RelativeMixture
 from bcppl.inference.design.tangent_mixture import TangentMixture, entropy_reduction
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded
@@ -60,6 +63,7 @@ def linearised_information_gain(
     cost: Costs | None = None,
     rate: Cost = 1.0,
     horizon: int = 1,
+    peg: HeldPeg | None = None,
     translation: float = 0.01,
     rotation: float = 0.2,
     seed: int | None = None,
@@ -96,6 +100,8 @@ def linearised_information_gain(
         cost: of a candidate, in any unit: a function of it or a mapping, with a number or several by name.
         rate: nats for one unit of cost; by name where costs are.
         horizon: 1, or 2 for two-step look-ahead.
+        peg: whose touches share errors (the grasp, the arm), and from which the pose is to be known, as an
+            insertion needs it. None: the pose in the world, as if touches shared none.
         translation: the gap between modes, metres; both gaps are widened where particles are sparse.
         rotation: the gap between modes, radians.
         seed: None draws it from torch's generator.
@@ -112,6 +118,9 @@ def linearised_information_gain(
         outer = draw_outer_samples(population, outer_samples)
     address = next(iter(population.trace.choices)) if address is None else address
     belief = TangentMixture.fit(population, address, translation, rotation)
+    wanted: PoseMixture = belief
+    if peg is not None and peg.errors.errors:
+        wanted = RelativeMixture.fit(population, address, belief, peg)
     trace = population.trace.chosen(outer.particles)
     mode = belief.label[outer.particles]
     whitened: list[Tensor] = []
@@ -119,17 +128,18 @@ def linearised_information_gain(
     utilities: list[Utility] = []
     predicted = predict_observations(trace, candidates, extend_args, information, seed)
     for k, observations in enumerate(predicted):
-        white = belief.whiten(observations.information(), trace[address], mode)
-        gains = entropy_reduction(white)
+        white = wanted.whiten(observations.information(wanted.shared), trace[address], mode)
+        gains = wanted.reduction(white, mode)
         if bool(torch.isnan(gains).all()):
             raise InferenceError(f"the simulation of candidate {k} failed under every outer sample.")
         warn_of_failures(k, torch.isnan(gains))
         if len(belief) > 1 and observations.sites:
-            gains = belief.entropy - _posterior_entropies(belief, observations, trace, address, mode, gains)
+            after = _posterior_entropies(belief, wanted, observations, trace, address, mode, gains)
+            gains = wanted.entropy - after
         elif len(belief) > 1:
             uncounted.append(k)
         whitened.append(white)
-        utilities.append(Utility.of(candidates[k], k, gains, outer, belief.entropy, costs[k]))
+        utilities.append(Utility.of(candidates[k], k, gains, outer, wanted.entropy, costs[k]))
     if uncounted:
         warnings.warn(
             f"the belief has {len(belief)} modes, and the gain of {len(uncounted)} of {len(candidates)} "
@@ -138,12 +148,14 @@ def linearised_information_gain(
             stacklevel=2,
         )
     if horizon == 2:
-        utilities = [_two_steps(one, whitened, costs, outer) for one in utilities]
-    return rank(utilities, belief.entropy)
+        reduction = partial(wanted.reduction, mode=mode)
+        utilities = [_two_steps(one, whitened, costs, outer, reduction) for one in utilities]
+    return rank(utilities, wanted.entropy)
 
 
 def _posterior_entropies(
     belief: TangentMixture,
+    wanted: PoseMixture,
     predicted: PredictedObservations,
     trace: Trace,
     address: str,
@@ -158,14 +170,16 @@ def _posterior_entropies(
     log_evidence, reductions = [], []
     for k in range(len(belief)):
         start = torch.where((mode == k)[:, None], trace[address], belief.mean[k])
-        at, white = _maximum(belief, predicted, trace, address, k, start)
-        sites = predicted.at(trace.at({address: at}))
+        at = _maximum(belief, predicted, trace, address, k, start)
+        sites, modes = predicted.at(trace.at({address: at})), torch.full_like(mode, k)
         log_prob = torch.stack([site.log_prob(value) for site, value in sites]).sum(0)
         away = belief.white_coordinates(k, at)
-        reductions.append(torch.where(mode == k, own_reductions, entropy_reduction(white)))
-        log_evidence.append(log_prob - 0.5 * away.square().sum(dim=0) - reductions[-1])
+        volume = entropy_reduction(belief.whiten(sum_information(sites, 0), at, modes))
+        white = wanted.whiten(sum_information(sites, wanted.shared), at, modes)
+        reductions.append(torch.where(mode == k, own_reductions, wanted.reduction(white, modes)))
+        log_evidence.append(log_prob - 0.5 * away.square().sum(dim=0) - volume)
     shares = torch.softmax(belief.mass.log()[:, None] + torch.stack(log_evidence), dim=0)
-    entropies = belief.entropies[:, None] - torch.stack(reductions)
+    entropies = wanted.entropies[:, None] - torch.stack(reductions)
     return (torch.special.entr(shares) + shares * entropies).sum(dim=0)
 
 
@@ -176,8 +190,8 @@ def _maximum(
     address: str,
     k: int,
     start: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """The poses (S, 7) that maximise likelihood times a mode's density; the whitened information there."""
+) -> Tensor:
+    """The poses (S, 7) that maximise likelihood times a mode's density."""
     at = start
     modes = torch.full((len(start),), k)
     eye = torch.eye(belief.freedom.dimension, dtype=torch.float64)
@@ -190,16 +204,19 @@ def _maximum(
         step = -torch.linalg.solve(eye + white, (descent + away)[..., None])[..., 0]
         step = step * (_TRUST_RADIUS / step.norm(dim=1, keepdim=True).clamp(min=_TRUST_RADIUS))
         at = poses.retract(at, belief.freedom.embed(step @ belief.factor[k].T))
-    _, information = sum_quadratics(predicted.at(trace.at({address: at})))
-    return at, belief.whiten(information, at, modes)
+    return at
 
 
 def _two_steps(
-    first: Utility, whitened: Sequence[Tensor], costs: Sequence[float], outer: OuterSamples
+    first: Utility,
+    whitened: Sequence[Tensor],
+    costs: Sequence[float],
+    outer: OuterSamples,
+    reduction: Callable[[Tensor], Tensor],
 ) -> Utility:
     """The utility of a candidate and the best second step, chosen before the first is measured."""
-    alone = entropy_reduction(whitened[first.number])
-    both = torch.stack([entropy_reduction(whitened[first.number] + white) for white in whitened])
+    alone = reduction(whitened[first.number])
+    both = torch.stack([reduction(whitened[first.number] + white) for white in whitened])
     # The added gain is over outer samples that are valid for both: those that fail for one may gain less.
     added = [mean_and_error(joint - alone, outer.weights)[0] for joint in both]
     values = torch.tensor([gain - cost for gain, cost in zip(added, costs, strict=True)]).nan_to_num(-1.0)

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
@@ -32,11 +33,11 @@ class PredictedObservations:
     # (S, *event) a sample of each, one for each outer sample
     values: dict[str, Tensor] = field(default_factory=dict)
 
-    def information(self) -> Tensor:
-        """(S, 6, 6) at the outer samples."""
+    def information(self, shared: int = 0) -> Tensor:
+        """(S, 6 + M, 6 + M) at the outer samples, about the pose and M errors that touches share."""
         if self.known is not None:
-            return self.known
-        return sum_quadratics([(site, self.values[a]) for a, site in self.sites.items()])[1]
+            return pad(self.known, (0, shared, 0, shared))
+        return sum_information([(site, self.values[a]) for a, site in self.sites.items()], shared)
 
     def at(self, trace: Trace) -> list[tuple[Any, Tensor]]:
         """The sites at other particles (S) of a trace, each with the outer samples' observations."""
@@ -51,6 +52,19 @@ def sum_quadratics(sites: Sequence[tuple[Any, Tensor]]) -> tuple[Tensor, Tensor]
         torch.stack([each.gradient for each in quadratics]).sum(dim=0),
         torch.stack([each.information for each in quadratics]).sum(dim=0),
     )
+
+
+def sum_information(sites: Sequence[tuple[Any, Tensor]], shared: int) -> Tensor:
+    """The summed information (S, 6 + M, 6 + M) of sites about the pose and M errors that touches share."""
+    if not shared:
+        return sum_quadratics(sites)[1]
+    each = [
+        site.joint_information(value)
+        if hasattr(site, "joint_information")
+        else pad(site.quadratic(value).information, (0, shared, 0, shared))
+        for site, value in sites
+    ]
+    return torch.stack(each).sum(dim=0)
 
 
 def predict_observations(

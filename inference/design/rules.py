@@ -17,11 +17,12 @@ from bcppl.inference.design.entropies import mixture_entropy
 from bcppl.inference.design.expected_entropy import expected_information_gain
 from bcppl.inference.design.linearised import linearised_information_gain
 from bcppl.inference.design.ranking import Ranking, Utility
+from bcppl.inference.design.relative_mixture import HeldPeg
 from bcppl.inference.planning.motions import expected_contacts
 from bcppl.inference.planning.touching import leading_point
 from bcppl.inference.population import Population
 from bcppl.sensors.candidates import Candidate, action_of, motion_of
-from bcppl.sensors.capabilities import Informative, Linearised
+from bcppl.sensors.capabilities import Informative, Linearised, SharesErrors
 
 # Ranks candidates for a population, given a scene of the model that knows their cameras.
 AcquisitionRule = Callable[[Population, Sequence[Candidate], Any], Ranking]
@@ -29,6 +30,9 @@ AcquisitionRule = Callable[[Population, Sequence[Candidate], Any], Ranking]
 
 def by_linearised_gain(pose: str, **settings: Any) -> AcquisitionRule:
     """The rule that ranks by the information gain about a pose, by `linearised_information_gain`.
+
+    Where touches share errors (the scene's bench has some), the pose is that relative to the held peg at the
+    belief's mean; give `peg=None` for the pose in the world as if they shared none.
 
     Args:
         pose: the address of the pose.
@@ -49,10 +53,21 @@ def by_linearised_gain(pose: str, **settings: Any) -> AcquisitionRule:
             candidates,
             lambda c: (scene, [*done, action_of(c)]),
             pose,
-            **{"information": information, **settings},
+            **{"information": information, "peg": _held_peg(population, pose, candidates, scene), **settings},
         )
 
     return rule
+
+
+def _held_peg(
+    population: Population, pose: str, candidates: Sequence[Candidate], scene: Any
+) -> HeldPeg | None:
+    """The peg of a scene with a candidate's sensor whose touches share errors; None without any."""
+    for candidate in candidates if hasattr(scene, "sensor") else []:
+        sensor = scene.sensor(action_of(candidate))
+        if isinstance(sensor, SharesErrors) and sensor.bench.errors:
+            return HeldPeg(sensor.bench, sensor.inserted(population.belief(pose).mean))
+    return None
 
 
 def can_be_linearised(scene: Any, candidates: Sequence[Candidate]) -> bool:

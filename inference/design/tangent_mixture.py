@@ -72,13 +72,23 @@ class TangentMixture:
         """Nats of the mixture: exact where modes do not overlap."""
         return float(torch.special.entr(self.mass).sum() + self.mass @ self.entropies)
 
+    shared = 0  # parameters that information matrices have besides the pose's
+
     def whiten(self, information: Tensor, world_from_part: Tensor, mode: Tensor) -> Tensor:
         """Information matrices (S, 6, 6) at poses (S, 7), as (S, d, d) in the whitened axes of modes (S,)."""
+        white = self.tangent_of(world_from_part, mode) @ self.factor[mode]
+        return white.transpose(-1, -2) @ information @ white
+
+    def reduction(self, white: Tensor, mode: Tensor) -> Tensor:
+        """Entropy reductions (S,) by whitened information, nats; NaN where it is not finite."""
+        return entropy_reduction(white)
+
+    def tangent_of(self, world_from_part: Tensor, mode: Tensor) -> Tensor:
+        """Derivatives (S, 6, d) in the tangent space at poses (S, 7), by free coordinates at modes' means."""
         turn = poses.local(self.mean[mode], world_from_part)[:, 3:]
         jacobian = torch.eye(6, dtype=torch.float64).repeat(len(turn), 1, 1)
         jacobian[:, 3:, 3:] = right_jacobian(turn)
-        white = jacobian[:, :, list(self.freedom.axes)] @ self.factor[mode]
-        return white.transpose(-1, -2) @ information @ white
+        return jacobian[:, :, list(self.freedom.axes)]
 
     def white_coordinates(self, mode: int, world_from_part: Tensor) -> Tensor:
         """The whitened tangent coordinates (d, S) of poses (S, 7) at a mode's mean."""

@@ -28,7 +28,8 @@ from bcppl.inference.summaries import COLLAPSED, WEIGHTLESS
 from bcppl.sensors import sensor_of
 from bcppl.sensors.candidates import Candidate, name_of, planner_of
 
-MIXED: Mapping[str, int] = {"touch": 16, "slide": 12, "pair": 4}
+MIXED: Mapping[str, int] = {"touch": 12, "lean": 4, "slide": 12, "pair": 4}
+STROKES = ("touch", "lean", "slide", "pair")  # kinds that meet the part half-way
 _AT_ONCE = 8  # candidates that are checked together, at least
 _DRAWS = 8  # candidates generated for each that is asked for, at most
 
@@ -56,8 +57,8 @@ def plan_candidates(
         belief: over world_from_part.
         part: its z axis points out of its top.
         peg: the held peg, its frame at the wrench sensor and its tip at its lowest z; None for views alone.
-        kinds: how many of "touch", "slide", "pair" (two touches), "search", "attempt" and "view"; None: 16
-            touches, 12 slides and 4 pairs.
+        kinds: how many of "touch", "lean" (a touch with the peg turned), "slide", "pair" (two touches),
+            "search", "attempt" and "view"; None: 12 touches, 4 that lean, 12 slides and 4 pairs.
         constraints: further ones (`bcppl.inference.planning.motion_constraints`).
         gap: of part and peg; computed unless given.
         hole: for searches and attempts; the part's only one unless given.
@@ -141,7 +142,7 @@ def _usual(kind: str, problem: PlanningProblem) -> list[Constraint]:
         return []
     mean, gap = problem.belief.mean, problem.peg_gap
     usual = [not_from_below(), collision_free(gap, mean)]
-    return [*usual, contact_at_mid_stroke(gap, mean)] if kind in ("touch", "slide", "pair") else usual
+    return [*usual, contact_at_mid_stroke(gap, mean)] if kind in STROKES else usual
 
 
 def _numbered(candidate: Candidate, number: int) -> Candidate:

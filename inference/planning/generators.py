@@ -18,6 +18,7 @@ from bcppl.geometry.gap import PegGap
 from bcppl.geometry.holes import Hole, hole_of
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.insertion import InsertionParameters, insertion_plan
+from bcppl.inference.planning.metrology import ROCKED
 from bcppl.inference.planning.motions import expected_contacts
 from bcppl.inference.planning.touching import (
     SurfacePoint,
@@ -43,6 +44,8 @@ _NEAR = 20  # points from among which the second touch of a pair is chosen
 _DOWNWARD = -0.5  # z of a normal of the underside
 _POSES = 9  # at which a slide is checked
 _REST = 0.15  # s before any motion, for the tare
+# By which a leaning peg is turned: as in a probe that rocks (`metrology.ROCKED`).
+_LEAN, _TURN = ROCKED.lean, ROCKED.turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +88,20 @@ def _touches(problem: PlanningProblem, most: int) -> Iterator[Plan]:
     for point in surface_points(problem.part, most, problem.seed):
         name = f"touch #: {face_name(point.normal)}"
         yield touch(problem.belief, problem.part, problem.held_peg, point, problem.touch_parameters, name)
+
+
+def _leaning(problem: PlanningProblem, most: int) -> Iterator[Plan]:
+    """Touches whose peg is turned about two axes: they tell where it sits in the hand from where the part is.
+
+    All touches of a peg that keeps its axes are moved alike by either.
+    """
+    generator = problem.generator(5)
+    for point in surface_points(problem.part, most, int(generator.integers(2**31))):
+        name, heading = f"lean #: {face_name(point.normal)}", generator.uniform(0.0, 2.0 * math.pi)
+        lean = _LEAN * np.array([math.cos(heading), math.sin(heading), 0.0])
+        lean[2] = generator.choice([-_TURN, _TURN])
+        given = problem.belief, problem.part, problem.held_peg, point, problem.touch_parameters
+        yield touch(*given, name, lean)
 
 
 def _slides(problem: PlanningProblem, most: int) -> Iterator[Plan]:
@@ -200,6 +217,7 @@ def _and_back(plan: Plan) -> Plan:
 
 MOTIONS: Mapping[str, Callable[[PlanningProblem, int], Iterator[Plan]]] = {
     "touch": _touches,
+    "lean": _leaning,
     "slide": _slides,
     "pair": _pairs,
     "search": _searches,

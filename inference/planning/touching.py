@@ -7,21 +7,24 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import torch
 import trimesh
 
+from bcppl import poses
 from bcppl.arguments import number_within, seed_number, whole_number
 from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.waypoints import (
     DAMPING,
+    NO_LEAN,
     STIFFNESS,
     UP,
     Waypoint,
     half_stroke,
     tip_of,
     top_of,
-    upright,
+    turned,
 )
 from bcppl.robot.plan import Plan
 
@@ -117,12 +120,13 @@ def touch(
     point: SurfacePoint,
     parameters: TouchParameters | None = None,
     name: str = "touch",
+    lean: Array = NO_LEAN,
 ) -> Plan:
     """A touch along the inward normal of a point: approach from above, guarded stroke, press, retreat.
 
-    The plan is for the belief's mean, and the peg keeps the part's orientation there. The stroke is as long
-    as the surface's position is uncertain, its middle at the mean. A side is touched far enough below the top
-    that the tip meets it in spite of the uncertainty.
+    The plan is for the belief's mean, and the peg keeps the part's orientation there, unless it leans. The
+    stroke is as long as the surface's position is uncertain, its middle at the mean. A side is touched far
+    enough below the top that the tip meets it in spite of the uncertainty.
 
     Args:
         belief: over world_from_part.
@@ -131,11 +135,12 @@ def touch(
         point: of contact.
         parameters: of the touch.
         name: of the plan.
+        lean: (3,) rotation vector by which the peg is turned from the part's axes, in the part's frame, rad.
 
     Raises:
         InputError: a parameter is out of range.
     """
-    return slide(belief, part, peg, point, np.zeros(3), parameters, name)
+    return slide(belief, part, peg, point, np.zeros(3), parameters, name, lean)
 
 
 def slide(
@@ -146,6 +151,7 @@ def slide(
     displacement: Array,
     parameters: TouchParameters | None = None,
     name: str = "slide",
+    lean: Array = NO_LEAN,
 ) -> Plan:
     """A touch after which the peg slides along the surface, pressed on, before it retracts.
 
@@ -156,7 +162,7 @@ def slide(
         InputError: a parameter is out of range.
     """
     chosen = _checked(parameters)
-    stroke = _Stroke.of(belief, part, peg, point, chosen)
+    stroke = _Stroke.of(belief, part, _turned(peg, lean), point, chosen)
     sliding: list[Waypoint] = []
     if np.linalg.norm(displacement) > 0.0:
         sliding.append(Waypoint(stroke.pressed + displacement, "held", chosen.sliding_speed))
@@ -166,7 +172,7 @@ def slide(
         Waypoint(stroke.clear + displacement, "free", chosen.free_speed),
         Waypoint(stroke.above + displacement, "free", chosen.free_speed),
     ]
-    return _plan(belief, name, stroke.above, waypoints, chosen)
+    return _plan(belief, name, stroke.above, waypoints, chosen, lean)
 
 
 def pair(
@@ -238,6 +244,14 @@ class _Stroke(NamedTuple):
         ]
 
 
+def _turned(peg: Part, lean: Array) -> Part:
+    """The peg in a frame with the part's axes."""
+    if not lean.any():
+        return peg
+    axes = poses.retract(poses.identity(), torch.from_numpy(np.concatenate([np.zeros(3), lean])))
+    return peg.moved(axes)
+
+
 def _checked(parameters: TouchParameters | None) -> TouchParameters:
     checked = TouchParameters() if parameters is None else parameters
     for name, value in checked._asdict().items():
@@ -261,9 +275,14 @@ def _contact(
 
 
 def _plan(
-    belief: Belief, name: str, start: Array, waypoints: Sequence[Waypoint], parameters: TouchParameters
+    belief: Belief,
+    name: str,
+    start: Array,
+    waypoints: Sequence[Waypoint],
+    parameters: TouchParameters,
+    lean: Array = NO_LEAN,
 ) -> Plan:
-    """The plan of a peg whose origin moves from a position through waypoints, its axes the part's."""
+    """The plan of a peg whose origin moves from a position through waypoints, turned from the part's axes."""
     positions = np.stack([start, start, *(waypoint.position for waypoint in waypoints)])
     lengths = np.linalg.norm(np.diff(positions[1:], axis=0), axis=1)
     spans = [_REST]
@@ -273,7 +292,7 @@ def _plan(
     return Plan(
         name,
         np.concatenate([[0.0], np.cumsum(spans)]),
-        upright(belief, positions),
+        turned(belief, positions, lean),
         ("free", *(waypoint.manner for waypoint in waypoints)),
         parameters.contact_force,
         np.array(parameters.stiffness),

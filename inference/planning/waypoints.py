@@ -57,9 +57,15 @@ def half_stroke(
     return float(np.clip(limits.standard_deviations * deviation, shortest, longest))
 
 
-def upright(belief: Belief, positions: Array) -> Array:
-    """Poses (K, 7) in the world at positions (K, 3) in the part's frame, oriented as the mean part."""
-    world_from_peg = belief.mean.expand(len(positions), 7).clone()
+def turned(belief: Belief, positions: Array, lean: Array = NO_LEAN) -> Array:
+    """Poses (K, 7) in the world at positions (K, 3) in the part's frame, turned by `lean` from the mean part.
+
+    The rotation vector (3,) is in the part's frame, radians.
+    """
+    axes = belief.mean.clone()
+    if lean.any():
+        axes = poses.retract(axes, torch.from_numpy(np.concatenate([np.zeros(3), lean])))
+    world_from_peg = axes.expand(len(positions), 7).clone()
     world_from_peg[:, :3] = poses.transform(belief.mean, torch.from_numpy(positions))
     return np.asarray(world_from_peg.numpy())
 

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.episodes.linear_errors import LinearErrors
+from bcppl.distributions.episodes.rows import COLUMNS, WRENCH
 from bcppl.distributions.manifold import Gaps
 
 
@@ -27,19 +28,33 @@ def displaced(gaps: Gaps, pose: Tensor, rows: Tensor, bench: LinearErrors) -> tu
     return torch.einsum("nra,dra->ndr", slope, by_delay), by_errors
 
 
+def by_shared_errors(gaps: Gaps, pose: Tensor, peg: Tensor, force: Tensor, bench: LinearErrors) -> Tensor:
+    """The gaps' changes (N, R, M), m, by the shared errors, at pegs (N, R, 7) that are not yet measured.
+
+    Each is pressed onto the part by a force (N, R), in N, along the contact's normal; clocks agree.
+    """
+    slope = _by_twist_of_peg(gaps.gradient(pose), pose, peg)
+    rows = peg.new_full((*peg.shape[:-1], COLUMNS), torch.nan)
+    rows[..., :7], rows[..., WRENCH] = peg, force[..., None] * slope
+    effect = bench.effect(rows.flatten(0, 1))
+    twist, offset = (each.unflatten(0, peg.shape[:-1]) for each in effect)
+    return (slope[..., None, :] @ twist)[..., 0, :] + offset
+
+
 def _by_twist_of_peg(gradient: Tensor, part: Tensor, peg: Tensor) -> Tensor:
     """Derivatives (N, R, 6) of gaps by the peg's displacement along its axes and rotation about them.
 
     Args:
         gradient: (N, R, 6) by those of the part, as of `Gap.gradient`.
         part: (N, 7) world_from_part.
-        peg: (R, 7) world_from_peg.
+        peg: (R, 7) world_from_peg, or (N, R, 7).
     """
     rotation = poses.rotation_matrix(part)
     normal = -gradient[..., :3]
     # The moment of the normal at the witness point, about the peg's origin, along the world's axes.
     about_part = -(gradient[..., 3:] @ rotation.transpose(-1, -2))
-    apart = part[:, None, :3] - peg[:, :3]
+    apart = part[:, None, :3] - peg[..., :3]
     moment = about_part + torch.linalg.cross(apart, normal)
-    into_peg = poses.rotation_matrix(peg)
-    return torch.cat([torch.einsum("nra,rab->nrb", each, into_peg) for each in (normal, moment)], dim=-1)
+    into_peg, pegs = poses.rotation_matrix(peg), "nr" if peg.ndim == 3 else "r"
+    turned = [torch.einsum(f"nra,{pegs}ab->nrb", each, into_peg) for each in (normal, moment)]
+    return torch.cat(turned, dim=-1)

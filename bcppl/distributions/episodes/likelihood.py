@@ -16,7 +16,7 @@ from bcppl import poses
 from bcppl.distributions.checks import Check, chi_square
 from bcppl.distributions.episodes.branches import Branches, Prior, begun
 from bcppl.distributions.episodes.covariances import Hypothesis, RowErrors, segments_of
-from bcppl.distributions.episodes.displaced import displaced
+from bcppl.distributions.episodes.displaced import by_shared_errors, displaced
 from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.posterior import drawn, moments, probable_jumps
 from bcppl.distributions.episodes.prior import WIDE, nodes_of, prior_of, with_delays
@@ -143,6 +143,24 @@ class ContactEpisodes(ContactManifold):
                 )
         return whole
 
+    def joint_information(self, value: Tensor) -> Tensor:
+        """The information (N, 6 + M, 6 + M) of a predicted window (N, T, 8) about pose and shared errors.
+
+        In the tangent space of the pose, and in standard deviations of the errors. The peg is pressed on with
+        the force that `sink` stands for, the median compliance of its contacts times it.
+        """
+        distance, felt, lost, gaps = self._measured(value[..., : FELT + 1])
+        count = len(self.pose)
+        if gaps is None:
+            return self.pose.new_zeros(count, *(2 * [6 + len(self.bench.means)]))
+        kept = ~torch.isnan(value[..., FELT]).all(dim=0)
+        stood = torch.where(lost[:, None, None], self.pose[:, None], value[:, kept, :7])
+        pressed = torch.where(felt == 1.0, self.sink / self.compliance, 0.0)
+        shared = by_shared_errors(gaps, self.pose, stood, pressed, self.bench)
+        slope = torch.cat([gaps.gradient(self.pose), shared], dim=-1)
+        information = self._second_order(distance, felt, slope)[1]
+        return torch.where(lost[:, None, None], torch.nan, information)
+
     def joint_covariance(self, value: Tensor) -> Tensor:
         """Covariance (N, 6 + M, 6 + M) of the pose and the shared errors given a window's rows, linear here.
 
@@ -183,10 +201,13 @@ class ContactEpisodes(ContactManifold):
         times = rows[segments.first[segments.contact == 1], TIME].tolist()
         return probable_jumps(self.branches(rows), [jump.name for jump in self.bench.jumps], times)
 
+    def shared_posterior(self, value: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean (N, M) and covariance (N, M, M) of the shared errors' parameters, as `shared_moments`."""
+        return moments(self.branches(value[:0] if is_predicted(value) else given_and_all(value)[1]))
+
     def shared_moments(self, value: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Means and variances (N, M) of each shared error, given a window's rows and those before them."""
-        rows = value[:0] if is_predicted(value) else given_and_all(value)[1]
-        mean, covariance = moments(self.branches(rows))
+        mean, covariance = self.shared_posterior(value)
         variance = covariance.diagonal(dim1=-2, dim2=-1)
         return {name: (mean[:, place], variance[:, place]) for name, place in self.bench.slices.items()}
 

@@ -248,6 +248,13 @@ class ContactProbe:
         way = rows[last + 1, :3] - rows[max(0, last - 2), :3]
         return way / way.norm() if float(way.norm()) > _MOVED else None
 
+    def inserted(self, world_from_part: Tensor) -> Tensor:
+        """The peg's pose (7,) with its tip at a part's frame (7,), turned as the part."""
+        peg = world_from_part.clone()
+        tip = torch.tensor([0.0, 0.0, self.peg.vertices[:, 2].min()], dtype=torch.float64)
+        peg[:3] -= poses.rotation_matrix(peg) @ tip
+        return peg
+
     # ---- the peg's motion itself (`bcppl.sensors.capabilities.FeelsForces`)
 
     def peg_rows(self, measurements: Sequence[Approximated]) -> PegRows:

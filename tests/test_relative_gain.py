@@ -1,0 +1,148 @@
+"""Gains about the pose as seen from a held peg: closed forms, finite differences, the belief's own draws."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pyro
+import pytest
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.beliefs import Belief
+from bcppl.distributions.episodes import ContactEpisodes, Grasp, KinematicError, LinearErrors, Size
+from bcppl.distributions.episodes.displaced import by_shared_errors
+from bcppl.distributions.episodes.nuisances import ArmCompliance
+from bcppl.distributions.episodes.rows import FELT, WRENCH
+from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.manifold import Quadratic
+from bcppl.distributions.poses import NormalPose
+from bcppl.geometry.extrusion import block, box_peg
+from bcppl.geometry.gap import PegGap
+from bcppl.inference import importance_sampling
+from bcppl.inference.design import linearised_information_gain
+from bcppl.inference.design.relative_mixture import HeldPeg, RelativeMixture
+from bcppl.inference.design.tangent_mixture import TangentMixture
+from bcppl.inference.planning.metrology import ROCKED
+from bcppl.inference.planning.motions import expected_contacts
+from bcppl.inference.planning.touching import SurfacePoint, touch
+from tests.test_linear_errors import MIXED, rows_with_wrenches, site
+from tests.test_manifold import around
+
+GRASP = Grasp(1e-3, 1e-9, 1e-9, slips=0.0)  # of 1 mm along each of the peg's axes
+AT = torch.tensor([0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+NOISE = 1e-4  # m
+
+
+class Height(LazyDistribution):
+    """The part's height, seen from the peg, with noise."""
+
+    def __init__(self, pose: Tensor) -> None:
+        self.pose = pose
+        super().__init__(len(pose), ())
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return -0.5 * ((value - self.pose[:, 2]) / NOISE) ** 2
+
+    def sample(self, sample_shape: object = None) -> Tensor:
+        return self.pose[:, 2] + NOISE * torch.randn(len(self.pose), dtype=torch.float64)
+
+    def quadratic(self, value: Tensor) -> Quadratic:
+        row = torch.eye(6, dtype=torch.float64)[2].expand(len(self.pose), 6) / NOISE
+        return Quadratic(row * ((self.pose[:, 2] - value) / NOISE)[:, None], row[..., None] * row[:, None])
+
+    def joint_information(self, value: Tensor) -> Tensor:
+        # A peg that sits 1 mm higher in the hand sees the part 1 mm lower.
+        row = torch.zeros(len(self.pose), 12, dtype=torch.float64)
+        row[:, 2], row[:, 8] = 1.0 / NOISE, -1e-3 / NOISE
+        return row[..., None] * row[:, None]
+
+
+def heights(count: int) -> None:
+    part = pyro.sample("part", NormalPose(poses.identity(), [1e-3] * 3 + [1e-2] * 3))
+    for k in range(count):
+        pyro.sample(f"height_{k}", Height(part))
+
+
+def test_a_touch_informs_the_relative_pose_and_hardly_that_in_the_world() -> None:
+    """Part and grasp are each 1 mm unsure along z: a sharp touch leaves 1/sqrt(2) mm in the world."""
+    torch.manual_seed(0)
+    population = importance_sampling(heights, (0,), {}, 4000)
+    asked = {"perfect": None, "world": HeldPeg(LinearErrors((GRASP,)))}
+    asked["relative"] = HeldPeg(LinearErrors((GRASP,)), AT)
+    found = {
+        name: linearised_information_gain(
+            population, [1], lambda count: (count,), outer_samples=8, peg=peg, seed=0, translation=1.0
+        ).best
+        for name, peg in asked.items()
+    }
+    exact = {
+        "perfect": 0.5 * math.log1p(1e-6 / NOISE**2),
+        "world": -0.5 * math.log(1.0 - 1e-6 / (2e-6 + NOISE**2)),
+        "relative": 0.5 * math.log1p(2e-6 / NOISE**2),
+    }
+    for name, gain in exact.items():
+        assert found[name].information_gain == pytest.approx(gain, abs=0.06), name
+    # Three axes are twice as wide in variance as seen from the peg.
+    wider = (found["relative"].entropy + exact["relative"]) - (found["world"].entropy + exact["world"])
+    assert wider == pytest.approx(1.5 * math.log(2.0), abs=0.02)
+
+
+def test_the_gaussian_is_that_of_the_belief_s_own_draws() -> None:
+    """After presses along z, which make part and grasp depend on one another."""
+    rows = MIXED[MIXED[:, FELT] == 1.0].clone()
+
+    def pressed() -> None:
+        part = pyro.sample("part", NormalPose(poses.identity(), [1e-3] * 3 + [2e-3] * 3))
+        pyro.sample("touch", site(part, rows, Grasp(slips=0.0), Size()))
+
+    torch.manual_seed(0)
+    population = importance_sampling(pressed, (), {"touch": rows}, 4000)
+    pose = TangentMixture.fit(population, "part", translation=1.0, rotation=10.0)
+    peg = HeldPeg(LinearErrors((Grasp(slips=0.0), Size())), AT)
+    relative = RelativeMixture.fit(population, "part", pose, peg)
+    drawn = population.belief("part").relative(AT, 16).covariance
+    world = population.belief("part").covariance
+    logs = [0.5 * float(torch.linalg.slogdet(each).logabsdet) for each in (drawn, world)]
+    assert float(relative.log_volume[0]) == pytest.approx(logs[0], abs=0.1)
+    alone = RelativeMixture.fit(population, "part", pose, peg._replace(world_from_peg=None))
+    assert float(alone.log_volume[0]) == pytest.approx(logs[1], abs=0.02)
+
+
+def test_predicted_touches_are_moved_by_shared_errors_as_measured_ones_are() -> None:
+    gap, pose = PegGap(block((0.06, 0.06, 0.025)), box_peg(0.016, 0.05)), around(3, 3, 1e-3, 0.03)
+    rows = rows_with_wrenches([1, 1, 1, 1], [0, 0, 1, 1], seed=4)
+    rows[:, :3] = torch.tensor(
+        [[0.0, 0.01, 0.0502], [0.01, 0.0, 0.0505], [0.0382, 0.0, 0.03], [0, -0.0384, 0.03]]
+    )
+    errors = LinearErrors((Grasp(slips=0.0), ArmCompliance(), KinematicError(), Size(0.001)))
+    one = ContactEpisodes(gap, pose, 4, 6e-5, 1e-5, 2e-5, bench=errors)
+    # Free errors first, which do not depend on the wrench: their twist is the contact's.
+    grasp = LinearErrors((Grasp(1.0, 1.0, 1.0, slips=0.0),))
+    wrench_of = ContactEpisodes(gap, pose, 4, 6e-5, 1e-5, 2e-5, bench=grasp)
+    _, slope = wrench_of._late(gap(pose, rows[:, :7]), rows)
+    force = torch.full((len(pose), 4), 4.0, dtype=torch.float64)
+    stood = rows[:, :7].expand(len(pose), 4, 7)
+    found = by_shared_errors(gap(pose, stood), pose, stood, force, errors)
+    for k in range(len(pose)):
+        pressed = rows.clone()
+        pressed[:, WRENCH] = 4.0 * slope[k, 0]
+        _, columns = one._late(gap(pose, rows[:, :7]), pressed)
+        torch.testing.assert_close(found[k], columns[k, 0], rtol=1e-9, atol=1e-15)
+        # Pressed onto the part, an arm that yields makes the gap larger than it was measured to be.
+        assert bool((found[k, :, 6:12] >= 0.0).all())
+
+
+def test_a_leaning_touch_meets_the_point_that_an_upright_one_meets() -> None:
+    part, peg = block((0.06, 0.06, 0.025)), box_peg(0.016, 0.05)
+    belief, gap = Belief(poses.identity(4), torch.zeros(4)), PegGap(part, peg)
+    side = SurfacePoint(np.array([part.vertices[:, 0].max(), 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
+    lean = np.array([0.0, ROCKED.lean, ROCKED.turn])
+    upright, leaning = (touch(belief, part, peg, side, lean=each) for each in (0.0 * lean, lean))
+    turned = poses.local(torch.from_numpy(upright.world_from_peg), torch.from_numpy(leaning.world_from_peg))
+    torch.testing.assert_close(turned[:, 3:], torch.from_numpy(lean).expand(len(turned), 3))
+    for plan in (upright, leaning):
+        ((contact, _),) = expected_contacts(plan)
+        assert abs(float(gap(belief.mean[None], torch.from_numpy(contact)[None]).distance)) < 2e-5
