@@ -8,6 +8,10 @@ class InputError(ValueError):
     """
 
 
+class OtherKindError(InputError, AttributeError):
+    """One kind of object is given where another is wanted, and lacks what that has."""
+
+
 class InferenceError(RuntimeError):
     """Inference cannot go on. The message names the site and the particles, and what to try."""
 

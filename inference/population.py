@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, NoReturn, overload
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised
 from bcppl.beliefs.belief import SeesPart
 from bcppl.distributions.support import refuse_several_poses
-from bcppl.errors import InferenceError, InputError
+from bcppl.errors import InferenceError, InputError, OtherKindError
 from bcppl.inference.ancestry import inherited
 from bcppl.poses import FREE
 from bcppl.traces import Trace
@@ -237,6 +237,16 @@ class Population:
                 return site, self.trace[address]
         return None
 
+    if not TYPE_CHECKING:  # the type checker would take any attribute to be there
+
+        def __getattr__(self, name: str) -> NoReturn:
+            if name in ("populations", "shares", "structures"):
+                raise OtherKindError(
+                    "one population is given where strata are wanted; make these with generate_strata of "
+                    "bcppl.inference.structures."
+                )
+            raise AttributeError(f"Population has no attribute {name!r}")
+
     def __repr__(self) -> str:
         try:
             size = f"{self.effective_sample_size:.1f}"
@@ -294,4 +304,6 @@ def refuse_no_population(where: str, given: Any) -> None:
         hint = "make it one, Population(*...)"
     elif isinstance(given, Trace):
         hint += ", or use a verb of bcppl.traces"
+    elif hasattr(given, "populations"):
+        hint = "choose one of its populations, or use bcppl.inference.structures"
     raise InputError(f"{where} is given a {type(given).__name__} in place of a population; {hint}.")

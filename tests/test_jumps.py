@@ -15,9 +15,24 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
+from bcppl.inference import evidence_variance, markov_chains, rejuvenate, resize
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.population import Population
-from bcppl.inference.structures import Jump, Strata, in_turn, jump, jumps, translate, translation, within
+from bcppl.inference.proposals import drift
+from bcppl.inference.structures import (
+    Jump,
+    Strata,
+    generate_strata,
+    in_turn,
+    jump,
+    jumps,
+    probabilities,
+    resample_strata,
+    tempered_strata,
+    translate,
+    translation,
+    within,
+)
 from bcppl.inference.structures.translation import sampling_nothing
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Structure, Trace, generate, structural
@@ -269,9 +284,10 @@ def too_many(trace: Trace) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        (Jump(more, fewer, split, wrong, check=True), "does not give 'term_0'"),
-        (Jump(more, fewer, split, check=True), "leaves out the forward choice 'part'"),
-        (Jump(fewer, more, sampling_nothing, split), "needs a value for address 'part'"),
+        (Jump(more, fewer, split, wrong), "does not give 'term_0'"),
+        (Jump(more, fewer, split), "leaves out the forward choice 'part'"),
+        (Jump(lambda s: {"number": 1}, fewer, split, merged), "'number', which is no structural site"),
+        (Jump(fewer, more, sampling_nothing, split), "leaves out the forward choice 'part'"),
         (Jump(more, fewer, lambda trace: ({}, {"part": trace["term_0"]}), split), "coordinates too many"),
         (Jump(more, fewer, too_many, merged), "'y', which is no latent"),
         (Jump(more, lambda s: None, split, merged), "does not lead back"),
@@ -282,8 +298,42 @@ def test_jumps_that_are_wrong_are_refused(kind: Jump, message: str) -> None:
     torch.manual_seed(0)
     with pytest.raises(InputError, match=message):
         jump(kind)(exact_strata(60), POSTERIOR)
-    with pytest.raises(InputError, match="no Jump"):
-        jump()
+    for given in ((), (split,)):
+        with pytest.raises(InputError, match="give one Jump or more"):
+            jump(*given)
+
+
+def test_vectors_of_other_lengths_need_programs_and_have_no_common_mean() -> None:
+    def vector() -> None:
+        count = structural("count", dist.Categorical(torch.ones(2))) + 1
+        terms = pyro.sample("terms", dist.Normal(torch.zeros(count), 1.0).to_event(1))
+        pyro.sample("y", dist.Normal(terms.sum(-1), 1.0))
+
+    strata = generate_strata(vector, (), {"y": number(1.0)}, 20)
+    with pytest.raises(InputError, match=r"a jump from Structure\(count=0\) to .* let `forward` and `back"):
+        jump(Jump(lambda s: {"count": 1} if not s["count"] else None, fewer))(strata, POSTERIOR)
+    with pytest.raises(InputError, match=r"other shapes in some strata .*\(2,\) in Structure\(count=1\)"):
+        strata["terms"]
+
+
+def test_strata_and_populations_and_kernels_are_not_taken_for_one_another() -> None:
+    strata, kernel = exact_strata(20), metropolis_hastings(drift("term_0"))
+    population = next(iter(strata.populations.values()))
+    for call in (
+        lambda: resize(strata, 5),
+        lambda: markov_chains(kernel, strata, 2),
+        lambda: evidence_variance(strata),
+        lambda: rejuvenate(strata, kernel),
+    ):
+        with pytest.raises(InputError, match="populations"):
+            call()
+    for call in (lambda: resample_strata(population), lambda: probabilities(population, "count")):
+        with pytest.raises(InputError, match="where strata are wanted"):
+            call()
+    for call in (lambda: tempered_strata(kernel), lambda: in_turn(kernel)):
+        with pytest.raises(InputError, match="in place of a move of strata"):
+            call()
+    assert not hasattr(strata, "nothing") and not hasattr(population, "nothing")
 
 
 def either() -> None:

@@ -43,8 +43,8 @@ class Jump:
         forward: program of a trace of the first structure (see `translated`); by default new values are
             sampled from the model.
         backward: program of a trace of the second.
-        check: check, at every move, that one program undoes the other, that the Jacobians of both cancel, and
-            that particles are not mixed.
+        check: check at every move, not only at the first one from each structure, that one program undoes
+            the other, that the Jacobians of both cancel, and that particles are not mixed.
     """
 
     to: Change
@@ -83,8 +83,10 @@ def jump(*jumps: Jump) -> StrataMove:
         InputError: there is no jump; when it moves: a jump is not undone by its reverse, or leads to a
             structure that it does not start back from.
     """
-    if not jumps:
-        raise InputError("jump is given no Jump; give one or more.")
+    if not jumps or not all(isinstance(each, Jump) for each in jumps):
+        given = ", ".join(type(each).__name__ for each in jumps) or "nothing"
+        raise InputError(f"jump is given {given}; give one Jump or more, Jump(to, back, forward, backward).")
+    checked: set[tuple[int, int, Structure]] = set()
 
     def move(strata: Strata, target: Target) -> MovedStrata:
         parts: list[tuple[Structure, Population]] = []
@@ -101,11 +103,13 @@ def jump(*jumps: Jump) -> StrataMove:
                 if len(mine) == 0:
                     continue
                 jumping = population if len(ways) == 1 else population[mine]
-                jumped = _jumped(jumping, way, len(ways), jumps, target)
+                which = jumps.index(way.jump), int(way.reversed)
+                first = (*which, structure) not in checked
+                jumped = _jumped(jumping, way, len(ways), jumps, target, way.jump.check or first)
+                checked.add((*which, structure))
                 if jumped.population is not None:
                     stays[mine[jumped.accepted]] = False
                     parts.append((jumped.structure, jumped.population))
-                which = jumps.index(way.jump), int(way.reversed)
                 made[which] += len(mine)
                 taken[which] += len(jumped.accepted)
             if bool(stays.any()):
@@ -142,15 +146,28 @@ class _Jumped(NamedTuple):
 
 
 def _jumped(
-    population: Population, way: _Way, choices: int, jumps: tuple[Jump, ...], target: Target
+    population: Population, way: _Way, choices: int, jumps: tuple[Jump, ...], target: Target, check: bool
 ) -> _Jumped:
     """The particles of a population after a jump, one of so many that they had to choose from."""
     old, observations = population.trace, Structure(way.values).observations
 
     def renewed(values: Values) -> Trace:
-        return old.revised(values, observations=observations)
+        try:
+            new = old.revised(values, observations=observations)
+        except InputError as error:
+            raise InputError(
+                f"a jump from {old.structure} to {dict(way.values)} does not fit: {error} Latent values are "
+                "kept by address; where one changes its shape, let `forward` and `backward` give it."
+            ) from error
+        for address in way.values:
+            if address not in new.structure:
+                raise InputError(
+                    f"a jump from {old.structure} gives a value of {address!r}, which is no structural site "
+                    f"of {new.structure}, where it leads to; let `to` and `back` give values of these."
+                )
+        return new
 
-    new, log_factor = translated(old, *way.programs, renewed, way.jump.check)
+    new, log_factor = translated(old, *way.programs, renewed, check)
     structure = new.structure
     back = _ways(jumps, structure)
     _refuse_one_way(old.structure, structure, way, back)

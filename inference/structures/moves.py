@@ -17,7 +17,7 @@ from typing import NamedTuple
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.inference.kernels import Kernel, Move, Until, moved_by
-from bcppl.inference.kernels.kernel import refuse_other
+from bcppl.inference.kernels.kernel import refuse_other, takes
 from bcppl.inference.population import Population
 from bcppl.inference.structures.strata import Strata
 from bcppl.inference.targets import Target
@@ -83,6 +83,8 @@ def in_turn(*moves: StrataMove, times: int = 1) -> StrataMove:
         InputError: there is no move, or no whole number of times, 1 or more.
     """
     times = whole_number("moves of strata are to be made {} times", times)
+    for each in moves:
+        refuse_no_move("in_turn", each)
     if not moves:
         raise InputError("in_turn is given no move; give one or more, such as within(kernel) and jump(...).")
 
@@ -97,6 +99,16 @@ def in_turn(*moves: StrataMove, times: int = 1) -> StrataMove:
         return MovedStrata(strata, tuple(sum(each) / times for each in zip(*shares, strict=True)))
 
     return move
+
+
+def refuse_no_move(where: str, move: object) -> None:
+    """Refuse what cannot be a move of strata."""
+    if not callable(move) or not takes(move, 2):
+        given = "a kernel" if callable(move) else f"a {type(move).__name__}"
+        raise InputError(
+            f"{where} is given {given} in place of a move of strata; make it one with within(kernel), or "
+            "give jump(Jump(...))."
+        )
 
 
 def target_in(target: Target, trace: Trace) -> Target:

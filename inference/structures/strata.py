@@ -6,13 +6,14 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING, NoReturn
 
 import torch
 from torch import Tensor
 
 from bcppl.beliefs import Belief, effective_sample_size, normalised
-from bcppl.errors import InputError
-from bcppl.inference.population import Population
+from bcppl.errors import InputError, OtherKindError
+from bcppl.inference.population import FIELDS, Population
 from bcppl.inference.summaries import Probabilities
 from bcppl.traces import Structure, Trace
 from bcppl.traces.series import SeriesTrace
@@ -143,7 +144,24 @@ class Strata:
                 f"use visiting({address!r}) for the others."
             )
         values = [_of_each(each.trace, address) for each in self.populations.values()]
+        apart = {tuple(v.shape[1:]): s for s, v in zip(self.populations, values, strict=True)}
+        if len(apart) > 1:
+            shapes_of = ", ".join(f"{shape} in {s}" for shape, s in apart.items())
+            raise InputError(
+                f"values at {address!r} have other shapes in some strata than in others ({shapes_of}); "
+                "choose strata with given(...)."
+            )
         return torch.cat(values)
+
+    if not TYPE_CHECKING:  # the type checker would take any attribute to be there
+
+        def __getattr__(self, name: str) -> NoReturn:
+            if name in FIELDS or hasattr(Population, name):
+                raise OtherKindError(
+                    "strata are given where one population is wanted; choose one of strata.populations, or "
+                    "use the function of that purpose in bcppl.inference.structures."
+                )
+            raise AttributeError(f"Strata has no attribute {name!r}")
 
     def belief(self, address: str) -> Belief:
         """The particles of all strata read as a posterior over the pose at an address.
@@ -271,7 +289,7 @@ def _log_total(populations: Iterable[Population]) -> float:
     totals = torch.tensor([each.log_total for each in populations], dtype=torch.float64)
     if not bool(torch.isfinite(totals.max())):
         together = torch.cat([each.log_weights for each in populations])
-        normalised(together, [a for each in populations for a in each.trace.impossible()])
+        normalised(together, [*dict.fromkeys(a for each in populations for a in each.trace.impossible())])
     return float(torch.logsumexp(totals, 0))
 
 

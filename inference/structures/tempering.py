@@ -34,7 +34,7 @@ from bcppl.inference.structures.generation import (
     likelihood_sites,
     log_prob_of,
 )
-from bcppl.inference.structures.moves import StrataMove
+from bcppl.inference.structures.moves import StrataMove, refuse_no_move
 from bcppl.inference.structures.strata import Strata
 from bcppl.inference.targets import Target
 from bcppl.traces import Series, Structure
@@ -169,8 +169,10 @@ def tempered_strata(
         scheme: of resampling.
 
     Raises:
-        InputError: a share is not in [0, 1), or the exponents do not increase to 1.
+        InputError: what is given is no move, a share is not in [0, 1), or the exponents do not increase to 1.
     """
+    if move is not None:
+        refuse_no_move("tempered_strata", move)
     fixed = None
     if exponents is not None:
         fixed = tuple(number_within("tempering is given the exponent {}", e) for e in exponents)
