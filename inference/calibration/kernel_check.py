@@ -108,7 +108,7 @@ def check_kernel(
             now, taken = move(now, POSTERIOR)
             accepted += float(taken.mean()) / moves
         _check_data(trace, now, data)
-    return KernelCheck(_check_change(quantities(now) - before), accepted)
+    return KernelCheck(check_change(quantities(now) - before), accepted)
 
 
 def _check_alone(move: Move, trace: Trace, moves: int, data: Sequence[str]) -> None:
@@ -167,7 +167,7 @@ def _check_data(trace: Trace, now: Trace, data: Sequence[str]) -> None:
         raise KernelError("the kernel moves no particle, so nothing is checked; propose shorter steps.")
 
 
-def _check_change(change: Tensor) -> float:
+def check_change(change: Tensor) -> float:
     """Refuse a mean change of (N, K) that is not 0 within its standard error; the p value of the largest."""
     spread = change.std(dim=0)
     moving = spread > 1e-12
@@ -187,7 +187,7 @@ def _quantities(trace: Trace, data: Sequence[str]) -> Quantities:
     """Functions (N, K) of draws: ranks among those of a trace, their squares, and products of two."""
     latent = [address for address in trace.choices if address not in data]
     ordered = _numbers(trace, latent, data).sort(dim=0).values.T.contiguous()
-    own = len(ordered) - sum(_site(trace, address).shape[1] for address in data)
+    own = len(ordered) - sum(site_numbers(trace, address).shape[1] for address in data)
     first, second = torch.triu_indices(own, len(ordered))
 
     def quantities(now: Trace) -> Tensor:
@@ -202,11 +202,12 @@ def _quantities(trace: Trace, data: Sequence[str]) -> Quantities:
 def _numbers(trace: Trace, latent: Sequence[str], data: Sequence[str]) -> Tensor:
     """(N, L): numbers of the latent values, log-densities of the data and of all, and numbers of the data."""
     density = [trace.log_prob(*data), trace.log_prob()] if data else [trace.log_prob()]
-    columns = [*(_site(trace, a) for a in latent), torch.stack(density, dim=1)]
-    return torch.cat([*columns, *(_site(trace, a) for a in data)], dim=1)
+    columns = [*(site_numbers(trace, a) for a in latent), torch.stack(density, dim=1)]
+    return torch.cat([*columns, *(site_numbers(trace, a) for a in data)], dim=1)
 
 
-def _site(trace: Trace, address: str) -> Tensor:
+def site_numbers(trace: Trace, address: str) -> Tensor:
+    """Numbers (N, D) of a site's values, of a pose its translation and rotation matrix."""
     value = trace[address].to(torch.float64)
     if freedom_of(trace.distributions[address]) is not None:
         value = torch.cat([value[..., :3], poses.rotation_matrix(value).flatten(-2)], dim=-1)

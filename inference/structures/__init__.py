@@ -15,7 +15,7 @@
     print(probabilities(strata, "count"), strata.log_evidence)
 
 Strata are resampled (`resample_strata`), given new measurements (`extend_strata`), tempered
-(`tempered_strata`), and moved, within structures (`within`) and across them (`jump`).
+(`tempered_strata`), and moved, within structures (`within`) and across them (`jump`; `check_move` tests it).
 """
 
 from bcppl.inference.structures.allotment import resample_strata
@@ -23,6 +23,7 @@ from bcppl.inference.structures.branching import branch_strata, extend_strata
 from bcppl.inference.structures.files import load_strata, save_strata
 from bcppl.inference.structures.generation import generate_strata, sample_strata
 from bcppl.inference.structures.jumps import Jump, jump
+from bcppl.inference.structures.move_check import check_move
 from bcppl.inference.structures.moves import MovedStrata, StrataMove, by_structure, in_turn, within
 from bcppl.inference.structures.strata import Strata, mean, probabilities
 from bcppl.inference.structures.tempering import (
@@ -43,6 +44,7 @@ __all__ = [
     "TemperedStrata",
     "branch_strata",
     "by_structure",
+    "check_move",
     "extend_strata",
     "generate_strata",
     "in_turn",
