@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from foreign_faults import FAULTS, recut, resampled
 from foreign_world import CONTACTS, MANNERS, RATES, kept, scene_of
-from jobs import each
+from jobs import each, in_order
 from kept import added, recorded
 from report import Row, finish, options, show
 from scenes import model
@@ -269,13 +269,11 @@ def main() -> None:
         for k in range(given.seeds)
     ]
     results: list[Result] = []
-    for first in range(0, len(cases), max(given.jobs, 1)):
-        batch = cases[first : first + max(given.jobs, 1)] if given.jobs > 1 else [cases[first]]
-        work = partial(known, particles=given.particles, folder=given.keep, file=given.file)
-        for one in each(work, batch, given.jobs):
-            results.append(one)
-            end = one.error or f"{one.add:.3f} mm, vision {one.vision:.2f} mm, {one.distance:.1f} squared"
-            print(*one.case, end, "warned" if one.warned else "", f"{one.seconds:.1f} s", flush=True)
+    work = partial(known, particles=given.particles, folder=given.keep, file=given.file)
+    for one in in_order(work, cases, given.jobs):
+        results.append(one)
+        end = one.error or f"{one.add:.3f} mm, vision {one.vision:.2f} mm, {one.distance:.1f} squared"
+        print(*one.case, end, "warned" if one.warned else "", f"{one.seconds:.1f} s", flush=True)
     regions = [f"{name} {100 * mass:.0f} %" for name, mass in HELD]
     lines = [line(name, several) for name, several in groups(results).items()]
     if not (given.cuts or given.faults):

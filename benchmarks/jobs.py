@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from typing import TypeVar
 
@@ -18,10 +18,18 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 def each(function: Callable[[Argument], Result], arguments: Iterable[Argument], jobs: int) -> list[Result]:
     """The results in order; with one job everything stays in this process, with all its threads."""
+    return list(in_order(function, arguments, jobs))
+
+
+def in_order(
+    function: Callable[[Argument], Result], arguments: Iterable[Argument], jobs: int
+) -> Iterator[Result]:
+    """The same, one after another, as soon as those before are there."""
     if jobs == 1:
-        return [function(argument) for argument in arguments]
+        yield from map(function, arguments)
+        return
     # Read by the libraries when a child loads them: new processes, not copies of this one.
     os.environ.update(dict.fromkeys(THREADS, "1"))
     spawned = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, spawned, torch.set_num_threads, (1,)) as pool:
-        return list(pool.map(function, arguments))
+        yield from pool.map(function, arguments)

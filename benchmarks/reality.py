@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jobs import each
+from jobs import in_order
 from kept import added, recorded
 from report import Row, finish, options, show
 from scenes import PARTICLES, default_run, one_line, quantile
@@ -282,13 +282,10 @@ def main() -> None:
     seeds = range(arguments.seed, arguments.seed + count)
     tasks = [Task(seed, *group) for seed in seeds for group in groups]
     outcomes: dict[Task, Outcome] = {}
-    for first in range(0, len(tasks), arguments.jobs):
-        batch = tasks[first : first + arguments.jobs]
-        for task, one in zip(
-            batch, each(partial(known, file=arguments.file), batch, arguments.jobs), strict=True
-        ):
-            outcomes[task] = one
-            print(*task, summary(one), flush=True)
+    done = in_order(partial(known, file=arguments.file), tasks, arguments.jobs)
+    for task, one in zip(tasks, done, strict=True):
+        outcomes[task] = one
+        print(*task, summary(one), flush=True)
     lines, rows = [], []
     clearances = [bench_scene(seed).clearance for seed in seeds]
     for group in groups:
