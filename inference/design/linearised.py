@@ -118,9 +118,9 @@ def linearised_information_gain(
         outer = draw_outer_samples(population, outer_samples)
     address = next(iter(population.trace.choices)) if address is None else address
     belief = TangentMixture.fit(population, address, translation, rotation)
-    wanted: PoseMixture = belief
+    interest: PoseMixture = belief
     if peg is not None and peg.errors.errors:
-        wanted = RelativeMixture.fit(population, address, belief, peg)
+        interest = RelativeMixture.fit(population, address, belief, peg)
     trace = population.trace.chosen(outer.particles)
     mode = belief.label[outer.particles]
     whitened: list[Tensor] = []
@@ -128,18 +128,18 @@ def linearised_information_gain(
     utilities: list[Utility] = []
     predicted = predict_observations(trace, candidates, extend_args, information, seed)
     for k, observations in enumerate(predicted):
-        white = wanted.whiten(observations.information(wanted.shared), trace[address], mode)
-        gains = wanted.reduction(white, mode)
+        white = interest.whiten(observations.information(interest.shared), trace[address], mode)
+        gains = interest.reduction(white, mode)
         if bool(torch.isnan(gains).all()):
             raise InferenceError(f"the simulation of candidate {k} failed under every outer sample.")
         warn_of_failures(k, torch.isnan(gains))
         if len(belief) > 1 and observations.sites:
-            after = _posterior_entropies(belief, wanted, observations, trace, address, mode, gains)
-            gains = wanted.entropy - after
+            after = _posterior_entropies(belief, interest, observations, trace, address, mode, gains)
+            gains = interest.entropy - after
         elif len(belief) > 1:
             uncounted.append(k)
         whitened.append(white)
-        utilities.append(Utility.of(candidates[k], k, gains, outer, wanted.entropy, costs[k]))
+        utilities.append(Utility.of(candidates[k], k, gains, outer, interest.entropy, costs[k]))
     if uncounted:
         warnings.warn(
             f"the belief has {len(belief)} modes, and the gain of {len(uncounted)} of {len(candidates)} "
@@ -148,14 +148,14 @@ def linearised_information_gain(
             stacklevel=2,
         )
     if horizon == 2:
-        reduction = partial(wanted.reduction, mode=mode)
+        reduction = partial(interest.reduction, mode=mode)
         utilities = [_two_steps(one, whitened, costs, outer, reduction) for one in utilities]
-    return rank(utilities, wanted.entropy)
+    return rank(utilities, interest.entropy)
 
 
 def _posterior_entropies(
     belief: TangentMixture,
-    wanted: PoseMixture,
+    interest: PoseMixture,
     predicted: PredictedObservations,
     trace: Trace,
     address: str,
@@ -175,11 +175,11 @@ def _posterior_entropies(
         log_prob = torch.stack([site.log_prob(value) for site, value in sites]).sum(0)
         away = belief.white_coordinates(k, at)
         volume = entropy_reduction(belief.whiten(sum_information(sites, 0), at, modes))
-        white = wanted.whiten(sum_information(sites, wanted.shared), at, modes)
-        reductions.append(torch.where(mode == k, own_reductions, wanted.reduction(white, modes)))
+        white = interest.whiten(sum_information(sites, interest.shared), at, modes)
+        reductions.append(torch.where(mode == k, own_reductions, interest.reduction(white, modes)))
         log_evidence.append(log_prob - 0.5 * away.square().sum(dim=0) - volume)
     shares = torch.softmax(belief.mass.log()[:, None] + torch.stack(log_evidence), dim=0)
-    entropies = wanted.entropies[:, None] - torch.stack(reductions)
+    entropies = interest.entropies[:, None] - torch.stack(reductions)
     return (torch.special.entr(shares) + shares * entropies).sum(dim=0)
 
 
