@@ -23,10 +23,10 @@ from report import Row, cores, finish, options, show
 from rich.console import Console
 from scenes import PARTICLES, every, model, one_line, quantile
 
-from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.contact.touch import Touch
 from bcppl.geometry.gap import PegGap
+from bcppl.geometry.parts import with_tip_at
 from bcppl.inference.design import mixture_entropy
 from bcppl.inference.design.loop import Round, probing_loop
 from bcppl.inference.design.rules import (
@@ -194,9 +194,7 @@ def follow(
 
 def judge(course: Course, scene: BenchScene, step: Step) -> None:
     """Puts down how far off a belief is and how unsure."""
-    inserted = torch.from_numpy(scene.truth).clone()
-    tip = torch.tensor([0.0, 0.0, float(scene.peg.vertices[:, 2].min())], dtype=torch.float64)
-    inserted[:3] -= poses.rotation_matrix(inserted) @ tip
+    inserted = with_tip_at(scene.peg, torch.from_numpy(scene.truth), torch.from_numpy(scene.truth)[:3])
     apparent = torch.from_numpy(scene.apparent(inserted.numpy()))
     add = step.belief.relative(inserted).weighted_add(scene.part.surface_points(), apparent)
     course.adds.append(1e3 * add)

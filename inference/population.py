@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised
-from bcppl.beliefs.belief import SeesPart
+from bcppl.beliefs.belief import ApparentPose, SeesPart
 from bcppl.distributions.support import refuse_several_poses
 from bcppl.errors import InferenceError, InputError, OtherKindError
 from bcppl.inference.ancestry import inherited
@@ -215,9 +215,12 @@ class Population:
                 f"a belief over {address!r} was asked for, which is no pose: its values have shape "
                 f"{tuple(poses.shape[1:])}; use bcppl.inference.summaries."
             )
-        touched = self._touched(poses)
-        apparent = None if touched is None else partial(touched[0].apparent_poses, touched[1])
-        return Belief(poses, self.log_weights, freedom or FREE, apparent)
+        return Belief(poses, self.log_weights, freedom or FREE, self.apparent_pose(address))
+
+    def apparent_pose(self, address: str) -> ApparentPose | None:
+        """The pose at an address as seen from a held peg; None where its measured pose is its true one."""
+        touched = self._touched(self.trace[address])
+        return None if touched is None else partial(touched[0].apparent_poses, touched[1])
 
     def shared_errors(self, address: str) -> tuple[Tensor, Tensor] | None:
         """Errors that all touches share, given each particle's pose at an address and what was observed.

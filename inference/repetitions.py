@@ -160,7 +160,14 @@ class Repeated:
         """
         first = self._alive[0].belief(address)
         each = torch.cat([p.trace.choices[address] for p in self.populations])
-        return replace(first, world_from_part=each, log_weights=self.log_weights)
+        seen = [p.apparent_pose(address) for p in self.populations]
+        known = [one for one in seen if one is not None]
+
+        def apparent(world_from_peg: Tensor, draws: int) -> Tensor:
+            return torch.cat([one(world_from_peg, draws) for one in known])
+
+        of_all = apparent if len(known) == len(seen) else None
+        return Belief(each, self.log_weights, first.freedom, of_all)
 
     def mean(self, address: str) -> Tensor:
         """The weighted mean (*event) over all runs at a latent address, of poses the mean pose (7,).

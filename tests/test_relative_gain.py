@@ -19,15 +19,21 @@ from bcppl.distributions.episodes.rows import FELT, WRENCH
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.manifold import Quadratic
 from bcppl.distributions.poses import NormalPose
+from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.gap import PegGap
 from bcppl.inference import importance_sampling
 from bcppl.inference.design import linearised_information_gain
 from bcppl.inference.design.relative_mixture import HeldPeg, RelativeMixture
 from bcppl.inference.design.tangent_mixture import TangentMixture
+from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.inference.planning.metrology import ROCKED
 from bcppl.inference.planning.motions import expected_contacts
 from bcppl.inference.planning.touching import SurfacePoint, touch
+from bcppl.inference.population import Population
+from bcppl.inference.repetitions import Repeated
+from bcppl.models import load_recording, look_and_touch
+from bcppl.robot.motion import ProbeWindow
 from tests.test_linear_errors import MIXED, rows_with_wrenches, site
 from tests.test_manifold import around
 
@@ -71,7 +77,7 @@ def test_a_touch_informs_the_relative_pose_and_hardly_that_in_the_world() -> Non
     torch.manual_seed(0)
     population = importance_sampling(heights, (0,), {}, 4000)
     asked = {"perfect": None, "world": HeldPeg(LinearErrors((GRASP,)))}
-    asked["relative"] = HeldPeg(LinearErrors((GRASP,)), AT)
+    asked["relative"] = HeldPeg(LinearErrors((GRASP,)), lambda part: AT)
     found = {
         name: linearised_information_gain(
             population, [1], lambda count: (count,), outer_samples=8, peg=peg, seed=0, translation=1.0
@@ -101,13 +107,13 @@ def test_the_gaussian_is_that_of_the_belief_s_own_draws() -> None:
     torch.manual_seed(0)
     population = importance_sampling(pressed, (), {"touch": rows}, 4000)
     pose = TangentMixture.fit(population, "part", translation=1.0, rotation=10.0)
-    peg = HeldPeg(LinearErrors((Grasp(slips=0.0), Size())), AT)
+    peg = HeldPeg(LinearErrors((Grasp(slips=0.0), Size())), lambda part: AT)
     relative = RelativeMixture.fit(population, "part", pose, peg)
     drawn = population.belief("part").relative(AT, 16).covariance
     world = population.belief("part").covariance
     logs = [0.5 * float(torch.linalg.slogdet(each).logabsdet) for each in (drawn, world)]
     assert float(relative.log_volume[0]) == pytest.approx(logs[0], abs=0.1)
-    alone = RelativeMixture.fit(population, "part", pose, peg._replace(world_from_peg=None))
+    alone = RelativeMixture.fit(population, "part", pose, peg._replace(inserted=None))
     assert float(alone.log_volume[0]) == pytest.approx(logs[1], abs=0.02)
 
 
@@ -146,3 +152,64 @@ def test_a_leaning_touch_meets_the_point_that_an_upright_one_meets() -> None:
     for plan in (upright, leaning):
         ((contact, _),) = expected_contacts(plan)
         assert abs(float(gap(belief.mean[None], torch.from_numpy(contact)[None]).distance)) < 2e-5
+    with pytest.raises(InputError, match="leans towards the side at 0°"):
+        touch(belief, part, peg, side, lean=-lean)
+
+
+def test_leaning_candidates_keep_their_tips_above_the_part_s_base() -> None:
+    """A peg of twice the part's height, whose upper end would take its tip below the table."""
+    part, peg = block((0.06, 0.06, 0.03)), box_peg(0.012, 0.08)
+    torch.manual_seed(0)
+    tangent = torch.randn(50, 6, dtype=torch.float64) * torch.tensor([2e-3] * 3 + [2e-2] * 3)
+    belief = Belief(poses.retract(poses.identity(50), tangent), torch.zeros(50))
+    base, corners = float(part.vertices[:, 2].min()), torch.from_numpy(peg.vertices)
+    planned = plan_candidates(belief, part, peg, {"lean": 24}, seed=1)
+    assert sum("side" in plan.name for plan in planned) >= 10
+    for plan in planned:
+        lowest = float(poses.transform(torch.from_numpy(plan.world_from_peg), corners)[..., 2].min())
+        assert lowest > base - 1e-3, plan.name
+
+
+def test_before_any_touch_the_prior_is_that_of_the_hypotheses() -> None:
+    """A row far away from the part tells nothing: it must not change the errors' covariance."""
+    recording = load_recording("peg_probe")
+    probe = look_and_touch.prepare(recording, profile="ur5e").likelihoods["window"]
+    window = next(m.action for m in recording.measurements if isinstance(m.action, ProbeWindow))
+    far = MIXED[:1].clone()
+    far[:, FELT], far[:, 2] = 0.0, 5.0
+    mean, covariance = probe.site(window, poses.identity(1)).shared_posterior(far)
+    prior_mean, prior = probe.shared_prior
+    torch.testing.assert_close(mean[0], prior_mean, rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(covariance[0], prior, rtol=1e-6, atol=1e-9)
+    assert float(prior.diagonal().max()) > 2.0, "hypotheses of a worse bench widen it"
+
+
+def grasped() -> Population:
+    """A peg 0.8 mm too high in the hand, known from presses on a part whose place is known."""
+    rows = MIXED[MIXED[:, FELT] == 1.0].clone()
+    rows[:, 2] += 8e-4
+
+    def pressed() -> None:
+        part = pyro.sample("part", NormalPose(poses.identity(), [2e-4] * 3 + [1e-3] * 3))
+        pyro.sample("touch", site(part, rows, Grasp(slips=0.0)))
+
+    torch.manual_seed(0)
+    return importance_sampling(pressed, (), {"touch": rows}, 1500)
+
+
+def test_what_is_made_of_a_belief_knows_how_the_peg_is_held() -> None:
+    """Copies merged, a mode, a moved belief, several runs: each has the relative pose, not the world's."""
+    population = grasped()
+    belief = population.belief("part")
+    expected = belief.relative(AT).mean
+    assert abs(float(expected[2]) - float(belief.mean[2])) > 5e-4
+    (mode,) = belief.modes(0.05, 2.0)
+    for one in (belief.merged, mode.belief):
+        torch.testing.assert_close(one.relative(AT).mean, expected, rtol=0.0, atol=1e-6)
+    several = Repeated((population, population), (0, 1)).belief("part")
+    torch.testing.assert_close(several.relative(AT).mean, expected, rtol=0.0, atol=1e-6)
+    shift = poses.identity()
+    shift[:3] = torch.tensor([2e-3, -1e-3, 3e-3])
+    moved = belief.moved(poses.compose(shift, belief.world_from_part))
+    off = moved.relative(AT).mean[:3] - expected[:3] - shift[:3]
+    assert float(off.abs().max()) < 1e-4

@@ -92,11 +92,16 @@ def test_views_and_touches_stand_in_one_ranking() -> None:
     plan = _down(world)
     scene = model.prepare(with_candidates(recording, [View(blind)]))
     candidates = [plan, recording.measurements[0].action, View(blind)]
-    ranking = by_linearised_gain("part", seed=0)(population, candidates, scene)
+    ranking = by_linearised_gain("part", peg=None, seed=0)(population, candidates, scene)
     gain = [ranking.of(k).information_gain for k in range(3)]
     assert gain[0] > 2.0 and gain[1] > 1.0
     assert 0.0 <= gain[2] < gain[1]
     assert all(math.isfinite(each) for each in gain)
+    # As seen from the held peg; what a view tells does not depend on whether a touch is in the list.
+    relative = by_linearised_gain("part", seed=0)
+    among = [relative(population, candidates, scene).of(k).information_gain for k in (1, 2)]
+    alone = [relative(population, candidates[1:], scene).of(k).information_gain for k in (0, 1)]
+    assert alone == among and 0.0 <= among[1] < among[0] < gain[1]
 
 
 def _down(world: object) -> object:

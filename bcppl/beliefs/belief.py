@@ -18,7 +18,13 @@ from bcppl.arguments import whole_number
 from bcppl.beliefs import entropy, modes
 from bcppl.beliefs.distances import average_distance
 from bcppl.beliefs.regions import Measure, Region, pose_deviation, region
-from bcppl.beliefs.weights import effective_sample_size, merged, normalised, weighted_quantiles
+from bcppl.beliefs.weights import (
+    distinct_poses,
+    effective_sample_size,
+    merged,
+    normalised,
+    weighted_quantiles,
+)
 from bcppl.errors import InputError
 from bcppl.poses import FREE, Freedom, as_pose
 
@@ -173,7 +179,29 @@ class Belief:
     def merged(self) -> Belief:
         """The same belief with the copies of a pose merged into one particle, their weights added."""
         world_from_part, weights = merged(self.world_from_part, self.weights)
-        return Belief(world_from_part, weights.log(), self.freedom)
+        if self.apparent is None:
+            return Belief(world_from_part, weights.log(), self.freedom)
+        alive = (self.weights > 0.0).nonzero()[:, 0]
+        _, which = distinct_poses(self.world_from_part[alive])
+        first = torch.full((len(weights),), len(self)).scatter_reduce(0, which, alive, "amin")
+        return self._of(first, world_from_part, weights.log())
+
+    def moved(self, world_from_part: Tensor) -> Belief:
+        """The belief with its particles at other poses (N, 7); as seen from a held peg they move alike."""
+        return self._of(torch.arange(len(self)), world_from_part, self.log_weights)
+
+    def _of(self, particles: Tensor, world_from_part: Tensor, log_weights: Tensor) -> Belief:
+        """Some particles (K,) at other poses (K, 7), which they also have as seen from a held peg."""
+        whole, old = self.apparent, self.world_from_part[particles]
+        if whole is None:
+            return Belief(world_from_part, log_weights, self.freedom)
+        motion = poses.compose(poses.inverse(old), world_from_part)[:, None]
+
+        def apparent(world_from_peg: Tensor, draws: int) -> Tensor:
+            seen = whole(world_from_peg, draws)[particles]
+            return poses.compose(seen, motion.expand_as(seen))
+
+        return Belief(world_from_part, log_weights, self.freedom, apparent)
 
     def credible_region(self, mass: float, measure: Measure = pose_deviation) -> Region:
         """The region about the mean that contains the truth with probability `mass`, in (0, 1).
@@ -203,12 +231,13 @@ class Belief:
         clusters = []
         for which in range(int(label.max()) + 1):
             within = label == which
+            particles = within.nonzero()[:, 0]
             poses_within, weights = whole.world_from_part[within], whole.weights[within]
             if symmetries is not None:
                 poses_within = modes.gathered(
                     poses_within, poses_within[weights.argmax()], translation, rotation, symmetries
                 )
-            belief = Belief(poses_within, weights.log(), self.freedom)
+            belief = whole._of(particles, poses_within, weights.log())
             clusters.append(Mode(float(weights.sum()), belief))
         return sorted(clusters, key=lambda mode: -mode.mass)
 

@@ -13,6 +13,7 @@ from bcppl import poses
 from bcppl.beliefs import Belief, average_distance, average_nearest_distance, average_point_distance
 from bcppl.cli import latent_sites
 from bcppl.cli.predictive_checks import PredictiveChecks, piece_errors
+from bcppl.geometry.parts import with_tip_at
 from bcppl.inference.criticism import Explanation, explanations
 from bcppl.recordings import Recording
 from bcppl.traces import Model
@@ -174,10 +175,8 @@ def relative_to_peg(belief: Belief, recording: Recording) -> Belief | None:
     stood = [window[-1] for window in each if window is not None and len(window)]
     if belief.apparent is None or recording.peg is None or not stood:
         return None
-    peg = torch.as_tensor(stood[-1], dtype=torch.float64).clone()
-    tip = torch.tensor([0.0, 0.0, recording.peg.vertices[:, 2].min()], dtype=torch.float64)
-    peg[:3] = belief.mean[:3] - poses.rotation_matrix(peg) @ tip
-    return belief.relative(peg)
+    last = torch.as_tensor(stood[-1], dtype=torch.float64)
+    return belief.relative(with_tip_at(recording.peg, last, belief.mean[:3]))
 
 
 def result(belief: Belief, recording: Recording) -> str:

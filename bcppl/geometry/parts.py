@@ -18,6 +18,7 @@ from bcppl.errors import InputError
 
 if TYPE_CHECKING:
     import trimesh
+    from torch import Tensor
 
 LARGEST_EXTENT = 5.0  # m: a larger mesh is in millimetres
 LARGEST_UNSCALED = 1.0  # m: the same of a mesh file without a stated scale
@@ -149,6 +150,13 @@ class Part:
         low, high = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)).astype(np.int64).T
         _, shared = np.unique(low * len(self.vertices) + high, return_counts=True)
         return int((shared != 2).sum())
+
+
+def with_tip_at(peg: Part, world_from_peg: Tensor, place: Tensor) -> Tensor:
+    """The pose (7,) of a peg turned as at a pose (7,), its tip, the lowest z on its axis, at a place (3,)."""
+    moved = world_from_peg.clone()
+    moved[:3] = place - poses.rotation_matrix(moved)[:, 2] * float(peg.vertices[:, 2].min())
+    return moved
 
 
 def _moved(piece: Piece, rotation: Array, shift: Array, name: str) -> Piece:

@@ -151,6 +151,10 @@ class SharesErrors(Protocol):
 
     bench: Any  # `bcppl.distributions.episodes.LinearErrors`
 
+    @property
+    def shared_prior(self) -> tuple[Tensor, Tensor]:
+        """Mean (M,) and covariance (M, M) of these errors before any touch."""
+
     def inserted(self, world_from_part: Tensor) -> Tensor:
         """The peg's pose (7,) with its tip at a part's frame (7,), turned as the part."""
 

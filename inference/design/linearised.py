@@ -101,7 +101,8 @@ def linearised_information_gain(
         rate: nats for one unit of cost; by name where costs are.
         horizon: 1, or 2 for two-step look-ahead.
         peg: whose touches share errors (the grasp, the arm), and from which the pose is to be known, as an
-            insertion needs it. None: the pose in the world, as if touches shared none.
+            insertion needs it. None: the pose in the world, as if touches shared none. Modes are told apart
+            as if they shared none either way: where there are several, gains are too large.
         translation: the gap between modes, metres; both gaps are widened where particles are sparse.
         rotation: the gap between modes, radians.
         seed: None draws it from torch's generator.

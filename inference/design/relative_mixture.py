@@ -9,6 +9,7 @@ means are linear in the pose, by regression over the mode's particles.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -28,12 +29,15 @@ class HeldPeg(NamedTuple):
 
     Attributes:
         errors: that all its touches share.
-        world_from_peg: (7,) the measured pose at which it is to hold, without a force; None for the part's
-            pose in the world.
+        inserted: its measured pose (7,), without a force, where it is to hold a part that is at a pose (7,);
+            None for the part's pose in the world.
+        prior: mean (M,) and covariance (M, M) of the errors before any touch, where these are not `errors`'
+            own (hypotheses may widen them).
     """
 
     errors: LinearErrors
-    world_from_peg: Tensor | None = None
+    inserted: Callable[[Tensor], Tensor] | None = None
+    prior: tuple[Tensor, Tensor] | None = None
 
 
 class PoseMixture(Protocol):
@@ -72,8 +76,9 @@ class RelativeMixture:
         """That of a population's modes, given the Gaussians of their poses."""
         given = population.shared_errors(address)
         if given is None:  # nothing was touched: as a priori, whatever the pose
-            count, errors = len(population), peg.errors
-            given = errors.means.expand(count, -1), torch.diag(errors.variances).expand(count, -1, -1)
+            errors, count = peg.errors, len(population)
+            own_mean, own_covariance = peg.prior or (errors.means, torch.diag(errors.variances))
+            given = own_mean.expand(count, -1), own_covariance.expand(count, -1, -1)
         mean, covariance = given
         weights, values = torch.softmax(population.log_weights, 0), population.trace[address]
         factors, standards, volumes = [], [], []
@@ -134,9 +139,10 @@ class RelativeMixture:
 
 def _motion(pose: TangentMixture, mode: int, peg: HeldPeg) -> Tensor:
     """Derivatives (d, M) of the relative pose's free coordinates by the shared errors, at a mode's mean."""
-    measured, part = peg.world_from_peg, pose.mean[mode]
-    if measured is None:
+    part = pose.mean[mode]
+    if peg.inserted is None:
         return part.new_zeros(pose.freedom.dimension, len(peg.errors.means))
+    measured = peg.inserted(part)
     row = part.new_zeros(1, COLUMNS)
     row[0, :7] = measured
     turn = poses.rotation_matrix(measured)

@@ -53,20 +53,17 @@ def by_linearised_gain(pose: str, **settings: Any) -> AcquisitionRule:
             candidates,
             lambda c: (scene, [*done, action_of(c)]),
             pose,
-            **{"information": information, "peg": _held_peg(population, pose, candidates, scene), **settings},
+            **{"information": information, "peg": _held_peg(scene), **settings},
         )
 
     return rule
 
 
-def _held_peg(
-    population: Population, pose: str, candidates: Sequence[Candidate], scene: Any
-) -> HeldPeg | None:
-    """The peg of a scene with a candidate's sensor whose touches share errors; None without any."""
-    for candidate in candidates if hasattr(scene, "sensor") else []:
-        sensor = scene.sensor(action_of(candidate))
-        if isinstance(sensor, SharesErrors) and sensor.bench.errors:
-            return HeldPeg(sensor.bench, sensor.inserted(population.belief(pose).mean))
+def _held_peg(scene: Any) -> HeldPeg | None:
+    """The peg of a scene whose touches share errors, whatever the candidates are; None without one."""
+    for likelihood in getattr(scene, "likelihoods", {}).values():
+        if isinstance(likelihood, SharesErrors) and likelihood.bench.errors:
+            return HeldPeg(likelihood.bench, likelihood.inserted, likelihood.shared_prior)
     return None
 
 

@@ -174,8 +174,8 @@ def tempered(
             trace that gives either. Random walks need of the order of the number of coordinates. Too few
             leave the evidence too low: on six isotropic axes with 1000 particles five sweeps of a walk of
             one size by -.18 +- .06 nats and of differential evolution by -.11 +- .06, twenty of the
-            walk by -.03 +- .02 (`benchmarks/exact.py`). The more exponents, the more it is: with data 20
-            prior deviations away, on one axis, six sweeps leave it by -.8 +- .2 and 25 by -.10 +- .05.
+            walk by -.03 +- .02 (`benchmarks/exact.py`). The more exponents, the more it is:
+            data many prior deviations away need more sweeps, also on one axis.
         resample: when and how; by default systematic wherever the exponent leaves no more than `share` of the
             effective sample size (half, where `share` is no number or the exponents are fixed).
         share: tempering keeps the conditional effective sample size above this share of the particles;

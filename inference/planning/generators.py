@@ -21,6 +21,7 @@ from bcppl.inference.planning.insertion import InsertionParameters, insertion_pl
 from bcppl.inference.planning.metrology import ROCKED
 from bcppl.inference.planning.motions import expected_contacts
 from bcppl.inference.planning.touching import (
+    UPRIGHT,
     SurfacePoint,
     TouchParameters,
     face_name,
@@ -97,8 +98,11 @@ def _leaning(problem: PlanningProblem, most: int) -> Iterator[Plan]:
     """
     generator = problem.generator(5)
     for point in surface_points(problem.part, most, int(generator.integers(2**31))):
-        name, heading = f"lean #: {face_name(point.normal)}", generator.uniform(0.0, 2.0 * math.pi)
-        lean = _LEAN * np.array([math.cos(heading), math.sin(heading), 0.0])
+        name, heading = f"lean #: {face_name(point.normal)}", generator.uniform(-math.pi, math.pi)
+        if abs(point.normal[2]) < UPRIGHT:  # away from a side, which the tip is to meet
+            heading = math.atan2(point.normal[1], point.normal[0]) + heading / 3.0
+        # Where the peg's upper end leans to; the axis is across it.
+        lean = _LEAN * np.array([-math.sin(heading), math.cos(heading), 0.0])
         lean[2] = generator.choice([-_TURN, _TURN])
         given = problem.belief, problem.part, problem.held_peg, point, problem.touch_parameters
         yield touch(*given, name, lean)
@@ -162,7 +166,7 @@ def _insertions(problem: PlanningProblem, most: int) -> Iterator[InsertionPlan]:
         shifted = belief
         if k is not None:
             shift = poses.compose(belief.world_from_part[k], poses.inverse(belief.mean))
-            shifted = replace(belief, world_from_part=poses.compose(shift, belief.world_from_part))
+            shifted = belief.moved(poses.compose(shift, belief.world_from_part))
         yield insertion_plan(shifted, problem.part, problem.held_peg, hole, problem.insertion_parameters)
 
 

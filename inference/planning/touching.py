@@ -14,6 +14,7 @@ from bcppl import poses
 from bcppl.arguments import number_within, seed_number, whole_number
 from bcppl.arrays import Array
 from bcppl.beliefs import Belief
+from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.waypoints import (
     DAMPING,
@@ -76,8 +77,9 @@ _MOST = 1_000_000  # points
 _REST = 0.15  # s before any motion, for the tare
 _QUICKEST = 0.05  # s that a motion takes at least
 _ALIKE = 2e-5  # m: vertices of a peg within it are equally far
-_UPRIGHT = 0.5  # a normal with a smaller z is a side's
+UPRIGHT = 0.5  # a normal with a smaller z is a side's
 _OVER = 0.006  # m above the part, beyond the uncertainty, between two touches
+_NEAR_TIP = 0.25  # of a peg's length: a side is met by a point within it of the tip
 _SHORTER = 0.6  # of the dwell, for each of two touches
 
 
@@ -95,10 +97,10 @@ def face_name(normal: Array) -> str:
     """The name of a surface by the direction of its outward normal (3,) in the part's frame."""
     if normal[2] > 1.0 - 1e-3:
         return "top"
-    if normal[2] < -_UPRIGHT:
+    if normal[2] < -UPRIGHT:
         return "bottom"
     heading = math.degrees(math.atan2(normal[1], normal[0])) % 360.0
-    kind = "side" if abs(normal[2]) < _UPRIGHT else "slope"
+    kind = "side" if abs(normal[2]) < UPRIGHT else "slope"
     return f"{kind} at {round(heading) % 360}°"
 
 
@@ -135,10 +137,11 @@ def touch(
         point: of contact.
         parameters: of the touch.
         name: of the plan.
-        lean: (3,) rotation vector by which the peg is turned from the part's axes, in the part's frame, rad.
+        lean: (3,) rotation vector by which the peg is turned from the part's axes, in the part's frame, rad;
+            at a side away from it, for the tip is to meet it.
 
     Raises:
-        InputError: a parameter is out of range.
+        InputError: a parameter is out of range, or the peg leans towards a side.
     """
     return slide(belief, part, peg, point, np.zeros(3), parameters, name, lean)
 
@@ -162,7 +165,7 @@ def slide(
         InputError: a parameter is out of range.
     """
     chosen = _checked(parameters)
-    stroke = _Stroke.of(belief, part, _turned(peg, lean), point, chosen)
+    stroke = _Stroke.of(belief, part, _turned(peg, lean, point), point, chosen)
     sliding: list[Waypoint] = []
     if np.linalg.norm(displacement) > 0.0:
         sliding.append(Waypoint(stroke.pressed + displacement, "held", chosen.sliding_speed))
@@ -244,12 +247,19 @@ class _Stroke(NamedTuple):
         ]
 
 
-def _turned(peg: Part, lean: Array) -> Part:
-    """The peg in a frame with the part's axes."""
+def _turned(peg: Part, lean: Array, point: SurfacePoint) -> Part:
+    """The peg in a frame with the part's axes; refuses one whose upper end would meet a side."""
     if not lean.any():
         return peg
     axes = poses.retract(poses.identity(), torch.from_numpy(np.concatenate([np.zeros(3), lean])))
-    return peg.moved(axes)
+    turned = peg.moved(axes)
+    above = float(leading_point(turned, -point.normal)[2]) - tip_of(turned)
+    if abs(point.normal[2]) < UPRIGHT and above > _NEAR_TIP * float(np.ptp(turned.vertices[:, 2])):
+        raise InputError(
+            f"a peg that leans towards the {face_name(point.normal)} would meet it {1e3 * above:.0f} mm "
+            "above its tip, which would hang as far below the point; let it lean away."
+        )
+    return turned
 
 
 def _checked(parameters: TouchParameters | None) -> TouchParameters:
@@ -266,7 +276,7 @@ def _contact(
 ) -> Array:
     """The peg's origin (3,) in contact with a point, in the part's frame."""
     position = point.position.copy()
-    if abs(point.normal[2]) < _UPRIGHT:
+    if abs(point.normal[2]) < UPRIGHT:
         top, bottom = top_of(part), float(part.vertices[:, 2].min())
         uncertainty = half_stroke(belief, np.array([0.0, 0.0, top]), UP, parameters)
         highest = max(top - uncertainty - parameters.side_depth, 0.5 * (top + bottom))

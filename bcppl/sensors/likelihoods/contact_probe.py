@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 
 import pyro
 import torch
@@ -17,12 +17,15 @@ from bcppl.contact.quasi_static import QuasiStaticMotion, WindowMotion
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.location import ContactSensing
 from bcppl.distributions.episodes import ContactEpisodes, Hypothesis, LinearError, LinearErrors
+from bcppl.distributions.episodes.branches import begun
+from bcppl.distributions.episodes.posterior import moments
+from bcppl.distributions.episodes.prior import prior_of, with_delays
 from bcppl.distributions.episodes.rows import EPISODE, FELT, TIME, WRENCH, new_rows
 from bcppl.distributions.manifold import MeasuresGap
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
-from bcppl.geometry.parts import Part
+from bcppl.geometry.parts import Part, with_tip_at
 from bcppl.geometry.turns import turns_freely
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.capabilities import Approximated, PegRows
@@ -248,12 +251,17 @@ class ContactProbe:
         way = rows[last + 1, :3] - rows[max(0, last - 2), :3]
         return way / way.norm() if float(way.norm()) > _MOVED else None
 
+    @cached_property
+    def shared_prior(self) -> tuple[Tensor, Tensor]:
+        """Mean (M,) and covariance (M, M) of the errors that touches share, before any touch."""
+        hypotheses = self.hypotheses or (Hypothesis(0.0, self.settings.compliance),)
+        prior = prior_of(self.bench, with_delays(hypotheses, self.bench), self.settings.gap_outlier, 0)
+        mean, covariance = moments(begun(prior, 1))
+        return mean[0], covariance[0]
+
     def inserted(self, world_from_part: Tensor) -> Tensor:
         """The peg's pose (7,) with its tip at a part's frame (7,), turned as the part."""
-        peg = world_from_part.clone()
-        tip = torch.tensor([0.0, 0.0, self.peg.vertices[:, 2].min()], dtype=torch.float64)
-        peg[:3] -= poses.rotation_matrix(peg) @ tip
-        return peg
+        return with_tip_at(self.peg, world_from_part, world_from_part[:3])
 
     # ---- the peg's motion itself (`bcppl.sensors.capabilities.FeelsForces`)
 
