@@ -11,6 +11,7 @@ from bcppl.inference.design.linearised import linearised_information_gain as lin
 from bcppl.inference.design.loop import Round as Round, World as World, probing_loop as probing_loop
 from bcppl.inference.design.observations import BatchedArguments as BatchedArguments
 from bcppl.inference.design.ranking import Ranking as Ranking, Utility as Utility
+from bcppl.inference.design.relative_mixture import HeldPeg as HeldPeg
 from bcppl.inference.design.rules import (
     AcquisitionRule as AcquisitionRule,
     at_random as at_random,
