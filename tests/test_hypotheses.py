@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -35,6 +36,11 @@ def moved(*tangent: float) -> Tensor:
     whole = torch.zeros(6, dtype=torch.float64)
     whole[: len(tangent)] = torch.tensor(tangent, dtype=torch.float64)
     return poses.retract(TRUTH, whole)
+
+
+def turned_about_z(degrees: float) -> np.ndarray:
+    half = math.radians(degrees) / 2.0
+    return np.array([0.0, 0.0, 0.0, math.cos(half), 0.0, 0.0, math.sin(half)])
 
 
 def seen(part: Part = SCENE.part) -> Tensor:
@@ -81,6 +87,21 @@ def test_a_truth_beyond_the_yaw_and_one_beyond_an_angle_are_named() -> None:
     within = UniformPose(moved(0.0, 0.0, 0.0, 0.0, 0.0, -0.35), 0.02, 0.22)
     (found,) = edges(belief(within, turned), "part")
     assert found.axis == "angle" and found.decisive
+
+
+@pytest.mark.parametrize("degrees", [0.0, 60.0, 170.0])
+def test_each_coordinate_grows_along_its_own_direction_however_far_the_part_is_turned(degrees: float) -> None:
+    tilted = poses.compose(moved(0.0, 0.0, 0.0, 0.1, 0.05), torch.from_numpy(turned_about_z(degrees)))
+    pose = poses.retract(tilted, torch.zeros(COUNT, 6).double())
+    prior = SwingTwistPose(TRUTH, 0.02, 0.2, math.pi - 0.01)
+    step, grown = 1e-6, {}
+    for axis, limit, place, outwards in hypotheses._limits(prior, pose):
+        there = {
+            name: each for name, _, each, _ in hypotheses._limits(prior, poses.retract(pose, step * outwards))
+        }
+        grown[axis] = float(((there[axis] - place) / step).mean())
+        assert limit > 0.0
+    assert grown["tilt"] == pytest.approx(1.0, abs=1e-4) and grown["yaw"] == pytest.approx(1.0, abs=1e-2)
 
 
 def test_a_truth_just_inside_is_reported_and_not_decisive_and_one_far_inside_is_not() -> None:

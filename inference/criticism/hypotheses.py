@@ -112,9 +112,12 @@ def _limits(prior: Any, pose: Tensor) -> Iterator[tuple[str, float, Tensor, Tens
         return
     tilt, yaw = tilt_and_yaw(prior.center, pose)
     if 0.0 < prior.tilt < math.pi:
-        swing = tangent[:, 3:5] / tangent[:, 3:5].norm(dim=1).clamp_min(1e-9)[:, None]
+        # The pose swings about a level axis after it has twisted: in its own frame that axis is turned back
+        # by the whole yaw, and the rotation vector lies half of it on the way.
+        turned = torch.atan2(tangent[:, 4], tangent[:, 3]) - 0.5 * yaw
         still = torch.zeros(len(pose), 3, dtype=torch.float64)
-        yield "tilt", prior.tilt, tilt, torch.cat([still, swing, still[:, :1]], dim=1)
+        swing = torch.stack([turned.cos(), turned.sin(), still[:, 0]], dim=1)
+        yield "tilt", prior.tilt, tilt, torch.cat([still, swing], dim=1)
     if 0.0 < prior.yaw < math.pi:
         yield "yaw", prior.yaw, yaw, eye[5].expand(len(pose), 6)
 
