@@ -231,6 +231,28 @@ def test_a_trace_that_was_made_outside_is_differentiated_whole() -> None:
     torch.testing.assert_close(of_weight, (x.detach()[:, None] * errors).sum()[None] / 0.49)
 
 
+@pytest.mark.parametrize("series", [False, True])
+def test_training_on_one_trace_reaches_the_exact_optimum(series: bool) -> None:
+    """Each loss is that of the parameters' present values, though the trace and its run are of the first."""
+    shift = torch.nn.Parameter(torch.tensor(0.0, dtype=torch.float64))
+
+    def program(*_: Tensor) -> Tensor:
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        pyro.sample("y", dist.Normal(x + shift, 1.0))
+        return x
+
+    if series:
+        start, _ = generate(Series(lambda: pyro.deterministic("none", number(0.0)), program), (), {}, 20)
+        trace, _ = extend(start, (), {"y": number(2.0)})
+    else:
+        trace, _ = generate(program, (), {"y": number(2.0)}, 20)
+    with gradients():
+        for _ in range(60):
+            (slope,) = torch.autograd.grad(-trace.log_prob("y").mean(), shift)
+            shift.data -= 0.3 * slope
+    assert float(shift.detach()) == pytest.approx(float(2.0 - trace["x"].mean()), abs=1e-6)
+
+
 def test_the_context_ends_with_an_error() -> None:
     with pytest.raises(ZeroDivisionError), gradients():
         _ = 1 / 0

@@ -49,6 +49,15 @@ class Storable(Protocol):
         ...
 
 
+@runtime_checkable
+class Branching(Protocol):
+    """State that goes on when it is asked for more, at random: each run of a program has a branch of its own."""
+
+    def branched(self) -> Any:
+        """The same state, which goes on without this one."""
+        ...
+
+
 C = TypeVar("C", bound=Carryable)
 
 
@@ -175,9 +184,12 @@ def carried(name: str, start: Callable[[], C]) -> C:
         entry = frame.available.get(name)
     if entry is None or not entry.made_by(start):
         entry = Entry.made(start, frame.particles)
-    elif not entry.as_made:
-        # From here on what is compared is mostly the same object.
-        entry = Entry(entry.state, snapshot(start), frame.particles)
+    elif name not in frame.used:
+        if isinstance(entry.state, Branching):
+            entry = replace(entry, state=entry.state.branched())
+        if not entry.as_made:
+            # From here on what is compared is mostly the same object.
+            entry = Entry(entry.state, snapshot(start), frame.particles)
     frame.used[name] = entry
     return entry.state
 

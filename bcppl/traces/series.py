@@ -188,19 +188,22 @@ class SeriesTrace(Trace):
         if not addresses:
             return self._whole_path()
         values = []
+        attached: dict[int, Run] = {}
         for address in addresses:
             name, number = (address, -1) if isinstance(address, str) else address
             then, index = self._after(number)
-            value = then._site(name)
+            if kept() and then.steps not in attached:
+                attached[then.steps] = then._again()
+            value = then._site(name, attached.get(then.steps))
             values.append(value if index is None else value.index_select(0, index))
         return sum(values[1:], values[0])
 
-    def _site(self, address: str) -> Tensor:
+    def _site(self, address: str, attached: Run | None) -> Tensor:
         if self.origin is not None and address not in self.known and address not in self.hidden:
             whole, index = self.origin
             if address in whole.known:
                 self.known[address] = whole.known[address].index_select(0, index)
-        return super()._site(address)
+        return super()._site(address, attached)
 
     def _whole_path(self) -> Tensor:
         """The sum over all steps; each step's is kept, so that asking after every step costs no more."""

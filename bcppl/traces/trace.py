@@ -67,21 +67,19 @@ class Trace:
     @cached_property
     def _run(self) -> Run:
         """The program run again at these values: that is cheap, and what sites compute is kept in `known`."""
-        given = {**self.choices, **self.observations}
-        again = run(self.program, self.args, self.particles, given, self.carried)
+        again = self._again()
         self.carried.update(again.carried)
         return again
 
-    @cached_property
-    def _attached(self) -> Run:
-        """The same run with gradients kept: one without them is attached to some tensors only, or to none."""
+    def _again(self) -> Run:
         return run(
             self.program, self.args, self.particles, {**self.choices, **self.observations}, self.carried
         )
 
     @property
     def _ran(self) -> Run:
-        return self._attached if kept() else self._run
+        # A graph is not kept: the parameters that a program closes over may have been trained since.
+        return self._again() if kept() else self._run
 
     @classmethod
     def of_run(
@@ -107,8 +105,6 @@ class Trace:
     def _keep_run(self, ran: Run) -> None:
         """Keep the run that these values come from, so that the program is not run again for them."""
         self.__dict__["_run"] = ran
-        if kept():
-            self.__dict__["_attached"] = ran
         self.carried.update(ran.carried)
 
     @property
@@ -153,23 +149,23 @@ class Trace:
             InputError: no site has that address.
             NotANumberError: a log-probability is NaN or +inf; names the site and the particles.
         """
-        values = [self._site(address) for address in addresses or self.addresses]
+        attached = self._again() if kept() else None
+        values = [self._site(address, attached) for address in addresses or self.addresses]
         return sum(values[1:], values[0]) if values else torch.zeros(self.particles, dtype=torch.float64)
 
-    def _site(self, address: str) -> Tensor:
+    def _site(self, address: str, attached: Run | None) -> Tensor:
+        """The log-probability (N,) of a site, by a run that keeps gradients where there is one."""
         if address in self.hidden:
             raise hidden_site(address)
-        if kept():
-            # What was evaluated without gradients is a constant; what is evaluated with them is not kept.
-            self._run.refuse_unvisited([address])
-            return self._evaluated(address)
-        if address not in self.known:
-            self._run.refuse_unvisited([address])
-            self.known[address] = self._evaluated(address)
-        return self.known[address]
-
-    def _evaluated(self, address: str) -> Tensor:
-        return log_probability(self._ran, address, self.choices, self.observations)
+        # What was evaluated without gradients is a constant; what is evaluated with them is not kept.
+        if attached is None and address in self.known:
+            return self.known[address]
+        ran = self._run if attached is None else attached
+        ran.refuse_unvisited([address])
+        value = log_probability(ran, address, self.choices, self.observations)
+        if attached is None:
+            self.known[address] = value
+        return value
 
     def __getitem__(self, key: str | Index) -> Any:
         if isinstance(key, str):

@@ -36,8 +36,8 @@ class SeriesLikelihood(LazyDistribution):
     """The likelihood of one step of a series given those before it, as M particle filters estimate it.
 
     An estimate is drawn once. It belongs to the filters, which the trace carries, and which are made again
-    where a static parameter changes and at no other time: `log_prob` of what has not changed is the same
-    number whenever it is asked for. Pseudo-marginal kernels leave their target invariant only so.
+    where a static parameter or the arguments of a step change and at no other time: `log_prob` of what has
+    not changed is the same number whenever it is asked for. Pseudo-marginal kernels leave their target invariant only so.
 
     Attributes:
         filters: M of them.
@@ -135,6 +135,7 @@ class Marginal:
             Filters.before, self.series, args, self.particles, self.threshold, self.static, *values
         )
         filters = carried(f"filters of {self.observed}", begin)
+        filters.restart_where_changed(steps)
         for number, each in enumerate(steps, 1):
             shape = self._event_shape(args, each)
             site = SeriesLikelihood(filters, number, self.observed, each, shape)

@@ -7,7 +7,7 @@ when its own effective sample size falls (Del Moral, Feynman-Kac formulae, 2004,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from bcppl.inference.series import groups
 from bcppl.inference.series.states import merged, merged_entries
 from bcppl.traces import Series, Trace, extend, generate
 from bcppl.traces.carried import Entry
-from bcppl.traces.dependence.equality import equal
+from bcppl.traces.dependence.equality import comparison, equal
 from bcppl.traces.indexing import indexed
 from bcppl.traces.series import SeriesTrace, resumed
 
@@ -29,7 +29,8 @@ class Filters:
     """M filters after T steps: indexed and merged by filter, and run on when a later step is asked for.
 
     What was estimated once stays: the estimates belong to a filter's particles, so that a step that is asked
-    for again has the same numbers, and a proposal that is refused leaves the old ones.
+    for again has the same numbers, and a proposal that is refused leaves the old ones. Each trace runs a
+    branch of its own on (`branched`): two that come from one estimate their later steps independently.
 
     Attributes:
         series: what is run.
@@ -58,6 +59,7 @@ class Filters:
     seen: list[tuple[str, tuple[Any, ...], Tensor]] = field(default_factory=list)
     carried: dict[str, Entry] = field(default_factory=dict)
     identity: object = field(default_factory=object)
+    __caches__ = ("log_weights", "increments", "state", "seen", "carried")
 
     @classmethod
     def before(
@@ -74,6 +76,21 @@ class Filters:
         static = dict(zip(addresses, values, strict=True))
         return cls(series, args, static, count, threshold, weights, weights.new_empty(0, len(weights)))
 
+    def branched(self) -> Filters:
+        """The same filters, which run on without these."""
+        return replace(self, seen=list(self.seen))
+
+    def restart_where_changed(self, steps: Sequence[tuple[Any, ...]]) -> None:
+        """Forget all that was estimated, if a step was run with other arguments than it has in `steps`.
+
+        The estimate of a step is one given the filter's own past: those before the changed one go with it.
+        """
+        are_same = comparison()
+        if all(are_same(then[1], now) for then, now in zip(self.seen, steps, strict=False)):
+            return
+        parameters = tuple(self.static), *self.static.values()
+        vars(self).update(vars(self.before(self.series, self.args, self.count, self.threshold, *parameters)))
+
     def log_increment(self, number: int, address: str, args: tuple[Any, ...], value: Tensor) -> Tensor:
         """Estimate (M,) of the log-likelihood of the observation of a step given those before it.
 
@@ -87,7 +104,7 @@ class Filters:
             )
         if number == len(self.seen) + 1:
             self._advance(address, args, value)
-        elif not equal(self.seen[number - 1][2], value):
+        elif self.seen[number - 1][0] != address or not equal(self.seen[number - 1][2], value):
             raise InputError(
                 f"the observation of step {number} of a series is another than the filters have assimilated; "
                 "generate a trace for other observations."
