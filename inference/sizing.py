@@ -15,6 +15,7 @@ from bcppl.beliefs import normalised
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Scheme, systematic
+from bcppl.traces.carried import Branching
 from bcppl.traces.series import SeriesTrace
 
 
@@ -46,9 +47,10 @@ def merge(population: Population) -> Population:
 
     Raises:
         InferenceError: no particle has any weight.
-        InputError: the population is of a series.
+        InputError: the population is of a series, or its likelihoods are estimated by filters (`marginal`).
     """
-    if isinstance(population.trace, SeriesTrace):
+    carried = population.trace.carried.values()
+    if isinstance(population.trace, SeriesTrace) or any(isinstance(e.state, Branching) for e in carried):
         raise InputError(
             "the particles of a series cannot be merged: those with equal values at the newest step may have "
             "different pasts; resample instead (`resize`)."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import pyro
@@ -93,11 +94,14 @@ def posterior(count: int) -> tuple[Tensor, Tensor, float]:
     return grid, torch.softmax(log, 0), float(torch.logsumexp(log, 0)) - math.log(4000.0)
 
 
-def smoothed(rho: float, count: int) -> tuple[Tensor, Tensor]:
-    """Mean (T + 1,) and covariance (T + 1, T + 1) of x_0, ..., x_T given all observations."""
+def smoothed(rho: float, count: int, exponents: Sequence[float] | None = None) -> tuple[Tensor, Tensor]:
+    """Mean (T + 1,) and covariance (T + 1, T + 1) of x_0, ..., x_T given all observations.
+
+    Each density of an x may be raised to an exponent (T + 1,).
+    """
     lag = torch.eye(count + 1, dtype=torch.float64)
     lag[torch.arange(1, count + 1), torch.arange(count)] = -rho
-    precision = lag.T @ lag
+    precision = lag.T @ torch.tensor(exponents or [1.0] * (count + 1)).double().diag() @ lag
     precision[1:, 1:] += torch.eye(count, dtype=torch.float64) / NOISE**2
     covariance = torch.linalg.inv(precision)
     return covariance[:, 1:] @ SEEN[:count] / NOISE**2, covariance

@@ -73,7 +73,7 @@ def test_the_path_is_left_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     # An ancestor that is drawn by weight alone, as if the step to the path had no density.
     density = _Conditional._log_density
 
-    def without_latent(self: Any, number: int, trace: Trace, addresses: Any) -> Tensor:
+    def without_latent(self: Any, number: int, trace: Trace, addresses: Any, *_: Any) -> Tensor:
         return density(self, number, trace, [a for a in addresses if a not in trace.choices])
 
     monkeypatch.setattr(_Conditional, "_log_density", without_latent)
@@ -92,6 +92,32 @@ def test_a_tempered_target_is_left_as_it_was() -> None:
     target = Target({f"y/{t}": 0.0 for t in range(3, T + 1)})
     after, _ = particle_gibbs(particles=4)(equal_weights(before))(before, target)
     assert largest_z(moments(before), moments(after)) < 4.5
+
+
+def test_exponents_of_the_path_itself_are_the_targets() -> None:
+    torch.manual_seed(0)
+    exponents = (1.0, 0.4, 1.0, 2.0, 0.4, 1.0)
+    before = exact_paths(with_known(RHO), 20_000, *smoothed(RHO, T, exponents))
+    target = Target(dict(zip(PATH, exponents, strict=True)))
+    after, _ = particle_gibbs(particles=6)(equal_weights(before))(before, target)
+    assert largest_z(moments(before), moments(after)) < 4.5
+    plain, _ = particle_gibbs(particles=6)(equal_weights(before))(before, POSTERIOR)
+    assert largest_z(moments(before), moments(plain)) > 8.0
+
+
+def test_a_path_that_is_impossible_finds_a_possible_one() -> None:
+    def walk(x: Tensor) -> Tensor:
+        x = pyro.sample("x", dist.Normal(x, 1.0))
+        pyro.sample("y", dist.Uniform(x - 0.5, x + 0.5))
+        return x
+
+    torch.manual_seed(0)
+    series = Series(lambda: pyro.sample("x", dist.Normal(number(0.0), 1.0)), walk)
+    seen = {"y/1": number(3.0), "y/2": number(3.0)}
+    trace, _ = generate(unrolled(series), ([()] * 2,), seen, 20)
+    assert int((trace.log_prob() == -torch.inf).sum()) > 15
+    chains = markov_chains(particle_gibbs(particles=30), trace, moves=20, progress=False)
+    assert bool((chains.draws["x/2"][-1] - 3.0).abs().max() < 0.5)
 
 
 def summed() -> Series:
@@ -175,6 +201,8 @@ def test_refusals_say_what_to_do() -> None:
     with pytest.raises(InputError, match="generate one from `unrolled"):
         other = simulate(AUTOREGRESSION, (), 3)
         particle_gibbs("rho")(equal_weights(other))(other, POSTERIOR)
+    with pytest.raises(InputError, match="give a `Target`"):
+        particle_gibbs("rho")(equal_weights(trace))(trace, lambda each: each.log_prob())
     with pytest.raises(InputError, match="'phi'"):
         particle_gibbs("phi")(equal_weights(trace))(trace, POSTERIOR)
     with pytest.raises(InputError, match="keep 'x/1', which `init` does not sample"):

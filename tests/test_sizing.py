@@ -23,7 +23,9 @@ from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.importance import generate_stratified, importance_sampling
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import always, multinomial, ssp
+from bcppl.inference.series import marginal
 from bcppl.inference.sizing import merge, replicate, resize
+from tests.linear_series import AUTOREGRESSION, observed
 
 CHANCES = torch.tensor([0.2, 0.75, 0.05], dtype=torch.float64)
 SEEN = torch.tensor([2.1, 1.9], dtype=torch.float64)
@@ -197,3 +199,11 @@ def test_a_pose_by_strata_of_ones_own(candidates: int) -> None:
     assert standard_errors(found) < 4
     with pytest.raises(InputError, match=r"no inverse distribution function; give strata as a function"):
         generate_stratified(program, (1,), observed, 40)
+
+
+def test_particles_whose_likelihoods_filters_estimate_are_not_merged() -> None:
+    """Those of equal parameters have different estimates, of which one alone would be a chosen one."""
+    walk = marginal(AUTOREGRESSION, "rho", observed="y", particles=3)
+    population = importance_sampling(walk, ([()] * 2,), observed(2), 10)
+    with pytest.raises(InputError, match="resample instead"):
+        merge(population)

@@ -55,8 +55,12 @@ def particle_gibbs(*static: str, particles: int = 50) -> Kernel:
 
     def kernel(population: Population) -> Move:
         def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-            exponents = target.exponents if isinstance(target, Target) else {}
-            paths = _Conditional(trace, static, particles, exponents).paths()
+            if not isinstance(target, Target):
+                raise InputError(
+                    "particle Gibbs is given a target that is a function of the trace; it draws by steps, "
+                    "give a `Target`, of which it knows each site's exponent."
+                )
+            paths = _Conditional(trace, static, particles, target).paths()
             changed = [_differ(value, trace[address]) for address, value in paths.items()]
             return update(trace, paths).trace, torch.stack(changed).to(torch.float64).mean(dim=0)
 
@@ -81,15 +85,13 @@ class _Particles(NamedTuple):
 class _Conditional:
     """Conditional SMC given the paths of M chains, which a trace of the unrolled program holds."""
 
-    def __init__(
-        self, trace: Trace, static: tuple[str, ...], count: int, exponents: Mapping[str, float]
-    ) -> None:
+    def __init__(self, trace: Trace, static: tuple[str, ...], count: int, target: Target) -> None:
         if not isinstance(trace.program, Unrolled):
             raise InputError(
                 "particle Gibbs is given a trace of another program than an unrolled series; "
                 "generate one from `unrolled(series)`."
             )
-        self.trace, self.static, self.count, self.exponents = trace, static, count, exponents
+        self.trace, self.static, self.count, self.target = trace, static, count, target
         self.series, self.arguments = trace.program.series, trace.args[0]
         self.visited = by_step(trace.addresses, len(self.arguments))
         trace.refuse_other_than_latent(static)
@@ -144,8 +146,8 @@ class _Conditional:
         assert isinstance(free, SeriesTrace) and isinstance(onto, SeriesTrace)
         # The values that stay weigh those of `init` on which their distributions depend.
         held = self.static if number == 0 else ()
-        weighing = [a for a in onto.addresses if a not in onto.choices or a in held]
-        likelihood = [self._log_density(number, each, weighing) for each in (free, onto)]
+        drawn = [a for a in onto.choices if a not in held]
+        likelihood = [self._log_density(number, each, onto.addresses, drawn) for each in (free, onto)]
         log_likelihood = torch.where(self.free, likelihood[0], likelihood[1][rows])
         led: SeriesTrace = onto.chosen(rows)
         return _Particles(
@@ -165,16 +167,21 @@ class _Conditional:
         # The path's later steps begin from the state that it reaches from its own last one.
         own = (torch.arange(len(log_weights)) + 1).repeat_interleave(self.count) * self.count - 1
         possible = same(onto.state, onto.chosen(own).state, len(own))
-        density = torch.where(possible, density, -torch.inf).reshape(log_weights.shape)
-        return torch.multinomial(torch.softmax(log_weights + density, dim=1), 1).squeeze(1)
+        density = torch.where(possible, density, -torch.inf).reshape(log_weights.shape) + log_weights
+        # A path that is impossible keeps its own past, until another one is drawn for it.
+        density[:, -1] = torch.where((density == -torch.inf).all(dim=1), 0.0, density[:, -1])
+        return torch.multinomial(torch.softmax(density, dim=1), 1).squeeze(1)
 
-    def _log_density(self, number: int, trace: Trace, addresses: Sequence[str]) -> Tensor:
-        """The log-probability (M x N,) of what a step visits, tempered where the target is."""
+    def _log_density(
+        self, number: int, trace: Trace, addresses: Sequence[str], drawn: Sequence[str] = ()
+    ) -> Tensor:
+        """The log-density (M x N,) of what a step visits under the target, over that of the sites drawn."""
         total = torch.zeros(trace.particles, dtype=torch.float64)
         for address in addresses:
-            exponent = self.exponents.get(numbered(address, number), 1.0)
-            if exponent > 0.0:
-                total = total + exponent * trace.log_prob(address)
+            exponent = self.target.exponent(numbered(address, number)) - (address in drawn)
+            if exponent != 0.0:
+                value = trace.log_prob(address)
+                total = total + torch.where(value == -torch.inf, value, exponent * value)
         return total
 
     def _path(self, number: int) -> dict[str, Tensor]:

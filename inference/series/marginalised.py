@@ -37,7 +37,8 @@ class SeriesLikelihood(LazyDistribution):
 
     An estimate is drawn once. It belongs to the filters, which the trace carries, and which are made again
     where a static parameter or the arguments of a step change and at no other time: `log_prob` of what has
-    not changed is the same number whenever it is asked for. Pseudo-marginal kernels leave their target invariant only so.
+    not changed is the same number whenever it is asked for. Pseudo-marginal kernels leave their target
+    invariant only so.
 
     Attributes:
         filters: M of them.

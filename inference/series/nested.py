@@ -88,8 +88,9 @@ class Filters:
         are_same = comparison()
         if all(are_same(then[1], now) for then, now in zip(self.seen, steps, strict=False)):
             return
-        parameters = tuple(self.static), *self.static.values()
-        vars(self).update(vars(self.before(self.series, self.args, self.count, self.threshold, *parameters)))
+        addresses, values = tuple(self.static), self.static.values()
+        start = self.before(self.series, self.args, self.count, self.threshold, addresses, *values)
+        vars(self).update(vars(start))
 
     def log_increment(self, number: int, address: str, args: tuple[Any, ...], value: Tensor) -> Tensor:
         """Estimate (M,) of the log-likelihood of the observation of a step given those before it.
