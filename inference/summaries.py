@@ -18,6 +18,8 @@ At the address of a pose (its distribution has a `freedom`) these are the belief
 tangent coordinates at it, metres and radians, 0 along held axes (`bcppl.beliefs`). All raise InputError where
 no latent site has the address, and NoWeightError where no particle has any weight.
 
+What a program names by `pyro.deterministic` has summaries too.
+
 Of a long series (`bcppl.traces.Series`) an address may be one with the number of a step, `("x", 3)`: the
 value of each particle's ancestor at that step, with the particle's present weight.
 """
@@ -25,6 +27,7 @@ value of each particle's ancestor at that step, with the particle's present weig
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from typing import NamedTuple
 
 import torch
@@ -55,10 +58,10 @@ def values_at(population: Population, address: Address) -> Tensor:
     """The values (N, *event) at a latent address."""
     name, then = _site(population, address)
     if isinstance(address, str):
-        return then.choices[name]
+        value: Tensor = then[name]
+        return value
     assert isinstance(population.trace, SeriesTrace)
-    value: Tensor = population.trace[address]
-    return value
+    return population.trace[address]
 
 
 def is_pose(population: Population, address: Address) -> bool:
@@ -70,7 +73,7 @@ def _site(population: Population, address: Address) -> tuple[str, Trace]:
     """The name of a latent address, and the trace of the step that has it."""
     trace = population.trace
     if isinstance(address, str):
-        latent_address("a summary of {} was asked for", address, trace.choices)
+        latent_address("a summary of {} was asked for", address, _summed_up(address, trace))
         return address, trace
     name, number = address
     if not isinstance(trace, SeriesTrace):
@@ -80,14 +83,22 @@ def _site(population: Population, address: Address) -> tuple[str, Trace]:
         )
     # A step may have others than the newest, such as what only `init` samples.
     then = trace._after(number)[0]
-    latent_address(f"a summary of step {number} was asked for at {{}}", name, then.choices)
+    what = f"a summary of step {number} was asked for at {{}}"
+    latent_address(what, name, _summed_up(name, then))
     return name, then
+
+
+def _summed_up(address: str, trace: Trace) -> Collection[str]:
+    """The addresses that have summaries; those that are determined by others are known after a run only."""
+    return trace.choices if address in trace.choices else [*trace.choices, *trace.determined]
 
 
 def _freedom(population: Population, address: Address) -> Freedom | None:
     name, then = _site(population, address)
     # A pose is one at every step, and the newest distributions are there.
     newest = population.trace
+    if name not in newest.choices and name not in then.choices:
+        return None
     return freedom_of((newest if name in newest.choices else then).distributions[name])
 
 

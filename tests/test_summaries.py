@@ -131,3 +131,52 @@ def test_what_a_series_samples_at_its_beginning_alone_is_summarised_too() -> Non
             mean(found, address)
     with pytest.raises(InputError, match="'a' was asked for, which is no latent address; latent are b"):
         mean(found, "a")
+
+
+def test_what_a_program_determines_has_values_and_summaries_particle_axis_first() -> None:
+    def rows() -> None:
+        x = pyro.sample("x", dist.Normal(number(0.0)[0], 1.0))
+        pyro.deterministic("twice", 2.0 * x)
+        pyro.deterministic("both", torch.stack([x, -x], dim=-1))
+        pyro.deterministic("constant", number(3.0, 4.0, 5.0))
+        with pyro.plate("rows", 3):
+            z = pyro.sample("z", dist.Normal(x, 1.0))
+            pyro.deterministic("shifted", z + 1.0)
+            pyro.deterministic("outer", x + 1.0)
+            pyro.deterministic("pairs", torch.stack([z, x.expand_as(z)], dim=-1), event_dim=1)
+        pyro.sample("seen", dist.Normal(x, 1.0))
+
+    trace, _ = generate(rows, (), {"seen": number(0.5)[0]}, 5)
+    x, z = trace["x"], trace["z"]
+    expected = {
+        "twice": 2.0 * x,
+        "both": torch.stack([x, -x], dim=1),
+        "constant": number(3.0, 4.0, 5.0).expand(5, 3),
+        "shifted": z + 1.0,
+        "outer": x + 1.0,
+        "pairs": torch.stack([z, x[:, None].expand(5, 3)], dim=2),
+    }
+    index = torch.tensor([3, 3, 0, 1])
+    for address, value in expected.items():
+        torch.testing.assert_close(trace[address], value, rtol=0, atol=0, msg=address)
+        torch.testing.assert_close(trace[index][address], value[index], rtol=0, atol=0, msg=address)
+    found = Population(trace, torch.randn(5, dtype=torch.float64))
+    torch.testing.assert_close(mean(found, "twice"), 2.0 * mean(found, "x"))
+    torch.testing.assert_close(mean(found, "shifted"), mean(found, "z") + 1.0)
+    with pytest.raises(InputError, match="it has x, z, seen, twice"):
+        trace["thrice"]
+
+
+def test_what_a_step_determines_is_that_of_each_particles_ancestor() -> None:
+    def step(x: torch.Tensor) -> torch.Tensor:
+        x = pyro.sample("x", dist.Normal(x, 1.0))
+        pyro.deterministic("square", x**2)
+        return x
+
+    trace, _ = generate(Series(lambda: pyro.sample("x", dist.Normal(number(0.0)[0], 1.0)), step), (), {}, 6)
+    for _ in range(3):
+        trace, _ = extend(trace[torch.randint(6, (6,))], (), {})
+    for then in (1, 2, -1):
+        torch.testing.assert_close(trace["square", then], trace["x", then] ** 2)
+    found = Population(trace, torch.zeros(6, dtype=torch.float64))
+    torch.testing.assert_close(mean(found, ("square", 1)), (trace["x", 1] ** 2).mean())

@@ -51,7 +51,7 @@ class Storable(Protocol):
 
 @runtime_checkable
 class Branching(Protocol):
-    """State that goes on when it is asked for more, at random: each run of a program has a branch of its own."""
+    """State that goes on at random when it is asked for more: each run has a branch of its own."""
 
     def branched(self) -> Any:
         """The same state, which goes on without this one."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -49,6 +49,7 @@ class Run:
         whole: the first address, if its distribution had N entries before it was expanded to the particles.
         surroundings: what lazy sites read from outside (`bcppl.traces.dependence.surroundings`).
         structural: addresses whose values determine which others are visited, in the order of the program.
+        determined: (N, ...) what it names by `pyro.deterministic`.
     """
 
     distributions: dict[str, Any]
@@ -60,6 +61,7 @@ class Run:
     whole: frozenset[str]
     surroundings: Mapping[str, dict[Any, Any]]
     structural: tuple[str, ...] = ()
+    determined: Mapping[str, Tensor] = field(default_factory=dict)
 
     def refuse_unvisited(self, addresses: Iterable[str]) -> None:
         """Refuse addresses that the program did not visit."""
@@ -112,7 +114,8 @@ def run(
     values, fixed = recorder.values, frozenset(recorder.fixed)
     coincident, whole = frozenset(recorder.coincident), frozenset(plate.whole)
     outside, structural = surroundings(recorder.distributions), tuple(recorder.structural)
-    return Run(recorder.distributions, values, fixed, used, result, coincident, whole, outside, structural)
+    sites, named = recorder.distributions, recorder.determined
+    return Run(sites, values, fixed, used, result, coincident, whole, outside, structural, named)
 
 
 @contextmanager
@@ -185,6 +188,7 @@ class _Recorder(Messenger):
         self.fixed: set[str] = set()
         self.coincident: set[str] = set()
         self.structural: list[str] = []
+        self.determined: dict[str, Tensor] = {}
 
     def _pyro_sample(self, message: Any) -> None:
         if _is_no_choice(message):
@@ -229,6 +233,8 @@ class _Recorder(Messenger):
 
     def _pyro_post_sample(self, message: Any) -> None:
         address = message["name"]
+        if message["infer"].get("_deterministic"):
+            self.determined[address] = self._determined(message)
         if _is_no_choice(message) or address in self.values:
             return
         value, distribution = message["value"], message["fn"]
@@ -240,6 +246,17 @@ class _Recorder(Messenger):
             value = value.movedim(plates, 0)
         self._has_shape(address, value, distribution)
         self.values[address] = value
+
+    def _determined(self, message: Any) -> Tensor:
+        """A value that the program names, the particle axis first: it stands behind those of the plates."""
+        value = message["value"]
+        plates = max(-frame.dim for frame in message["cond_indep_stack"] if frame.dim is not None)
+        # Pyro takes all axes to be the event's unless it is told.
+        declared = len(message["fn"].batch_shape)
+        axis = min(declared or plates, value.ndim) - 1
+        if axis >= 0 and value.shape[axis] == self.particles:
+            return value.movedim(axis, 0)
+        return value.expand(self.particles, *value.shape)
 
     def _shared(self, value: Any, distribution: Any) -> Any:
         """A value that the program observes in its plates, (*plates, 1, *event), without the empty axis."""

@@ -250,7 +250,7 @@ class SeriesTrace(Trace):
         if isinstance(key, tuple) and len(key) == 2 and isinstance(key[0], str):
             then, chosen = self._after(key[1])
             value = then[key[0]]
-            return value if chosen is None or key[0] not in then.choices else value.index_select(0, chosen)
+            return value if chosen is None or key[0] in then.observations else value.index_select(0, chosen)
         return super().__getitem__(list(key) if isinstance(key, tuple) else key)
 
     def chosen(self, index: Tensor) -> Any:

@@ -31,9 +31,10 @@ from bcppl.traces.values import Value, tensors
 class Trace:
     """Values by address for N particles, and the log-probability of every site, evaluated when asked for.
 
-    `trace["hole"]` is a value; `trace[ancestors]`, `trace[mask]` and `trace[:50]` are traces of those
-    particles. Treat it as immutable: the verbs of `bcppl.traces` make new ones. Observations are copied when
-    they are given, so that an array may be used again; values of latent addresses are held as they are.
+    `trace["hole"]` is a value, also one that the program names by `pyro.deterministic`; `trace[ancestors]`,
+    `trace[mask]` and `trace[:50]` are traces of those particles. Treat it as immutable: the verbs of
+    `bcppl.traces` make new ones. Observations are copied when they are given, so that an array may be used
+    again; values of latent addresses are held as they are.
 
     Attributes:
         program, args: what was run.
@@ -140,6 +141,11 @@ class Trace:
         """What the program returned."""
         return self._run.result
 
+    @property
+    def determined(self) -> Mapping[str, Tensor]:
+        """What the program names by `pyro.deterministic`, particle axis first."""
+        return self._run.determined
+
     def log_prob(self, *addresses: str) -> Tensor:
         """Log-probability (N,) of the sites at `addresses`, summed; of all sites where none is named.
 
@@ -173,7 +179,9 @@ class Trace:
                 return self.choices[key]
             if key in self.observations:
                 return self.observations[key]
-            held = [*self.choices, *self.observations]
+            if key in self.determined:
+                return self.determined[key]
+            held = [*self.choices, *self.observations, *self.determined]
             raise InputError(
                 f"the trace has no value at address {key!r}; it has {', '.join(held) or 'none'}."
             )
