@@ -103,7 +103,7 @@ def tempered_importance_sampling(
         raise InputError(f"{name} is given in place of a step that tempers; give tempered(kernel).")
     trace, log_likelihood = generate(program, args, observations, particles)
     prior = Population(trace, torch.zeros_like(log_likelihood))
-    return step.temper(prior, [a for a in trace.addresses if a not in trace.choices], log_likelihood)
+    return step.temper(prior, [a for a in trace.addresses if a not in trace.choices])
 
 
 def generate_stratified(

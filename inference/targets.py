@@ -121,6 +121,10 @@ class Target:
         chance = torch.log(torch.rand(old.particles, dtype=torch.float64))
         return self.above(new, chance + self(old) - log_ratio)
 
+    def within(self, trace: Trace) -> Target:
+        """The target on the sites that a trace visits: of several structures, others may visit others."""
+        return Target({a: e for a, e in self.exponents.items() if a in trace.distributions})
+
     def visible(self, trace: Trace) -> Trace:
         """The part of a proposed trace that the reverse proposal may read: here all of it."""
         return trace

@@ -16,7 +16,7 @@ from bcppl.errors import InputError
 from bcppl.inference import Observed, importance_sampling, steps
 from bcppl.inference.resampling import adaptive, always, never
 from bcppl.inference.series import auxiliary
-from bcppl.traces import Trace
+from bcppl.traces import Series, Trace
 from tests.invariance import number
 from tests.linear_series import NOISE, SEEN, log_evidence, with_known
 
@@ -109,3 +109,26 @@ def test_refusals_say_what_to_do() -> None:
         from bcppl.inference.resampling import systematic
 
         auxiliary(resample=systematic)  # type: ignore[arg-type]
+
+
+def test_a_prediction_that_rules_particles_out_takes_their_weight() -> None:
+    """Where they are impossible indeed, the estimate is that without a prediction, draw for draw."""
+
+    def step(x: Tensor) -> Tensor:
+        x = pyro.sample("x", dist.Uniform(x - 1.0, x + 1.0))
+        pyro.sample("y", dist.Uniform(x - 1.0, x + 1.0))
+        return x
+
+    def possible(trace: Trace, observed: Observed) -> Tensor:
+        near = (observed.observations["y"] - trace["x"]).abs() < 2.0
+        return torch.where(near, 0.0, -torch.inf).double()
+
+    series = Series(lambda: pyro.sample("x", dist.Normal(number(0.0), 2.0)), step)
+    found = []
+    for predict in (None, possible):
+        torch.manual_seed(0)
+        begun = importance_sampling(series, (), {}, 500)
+        filters = auxiliary(look_ahead=predict, resample=never)
+        *_, last = steps(filters, begun, [Observed((), {"y": number(1.5)})])
+        found.append(last.population.log_evidence)
+    assert found[0] == pytest.approx(found[1], abs=1e-12)

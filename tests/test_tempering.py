@@ -15,6 +15,7 @@ from bcppl.errors import InferenceError, InputError
 from bcppl.inference.exponents import conditional_effective_sample_size, next_exponent
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.filters.tempering import tempered
+from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
@@ -108,3 +109,23 @@ def test_sites_that_the_program_fixes_are_tempered_like_observations() -> None:
 def test_exponents_that_do_not_lead_to_one(exponents: tuple[float, ...]) -> None:
     with pytest.raises(InputError, match="give increasing ones that end with 1"):
         tempered(exponents=exponents)
+
+
+@pytest.mark.parametrize("by_site", [False, True])
+def test_old_sites_that_new_arguments_change_are_weighed(by_site: bool) -> None:
+    """The prior becomes three times as wide with the observation."""
+
+    def widened(seen: bool) -> None:
+        x = pyro.sample("x", dist.Normal(number(0.0), 3.0 if seen else 1.0))
+        if seen:
+            pyro.sample("y", dist.Normal(x, 0.5))
+            pyro.sample("z", dist.Normal(x, 0.5))
+
+    torch.manual_seed(0)
+    prior = importance_sampling(widened, (False,), {}, 20_000)
+    seen = {"y": number(2.0), "z": number(2.5)}
+    step = tempered(metropolis_hastings(drift("x")), by_site=by_site)
+    population, _ = step(prior, Observed((True,), seen))
+    exact = dist.Normal(number(0.0), math.sqrt(9.125)).log_prob(number(2.25))
+    exact = exact + dist.Normal(number(0.0), math.sqrt(0.5)).log_prob(number(0.5))
+    assert population.log_evidence == pytest.approx(float(exact), abs=0.1)

@@ -21,7 +21,7 @@ from bcppl.inference.kernels import Kernel, Until, moved_by
 from bcppl.inference.kernels.kernel import refuse_other, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Scheme, systematic
-from bcppl.inference.targets import Target
+from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace, generate
 
 
@@ -78,7 +78,7 @@ def persistent_sampling(
         exponents.append(exponent)
         log_evidences.append(pool.log_evidence)
         trace = _joined(trace, moved.population.trace)
-        log_likelihood = trace.log_prob(*addresses)
+        log_likelihood = POSTERIOR.part(trace, addresses)
     log_mixture = _log_mixture(log_likelihood, exponents, log_evidences)
     final = _weighted(trace, log_likelihood, log_mixture, 1.0, log_evidences[-1])
     info = StepInfo(

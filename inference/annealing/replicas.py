@@ -7,6 +7,7 @@ tempering: a scalable highly parallel MCMC scheme, JRSS B 84, 2022, algorithm 1.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
@@ -103,7 +104,8 @@ def replica_exchange(
     cold = run.trace[torch.arange(start.particles - count, start.particles)]
     stacked = {address: torch.stack(states) for address, states in draws.items()}
     rejection = run.rejected / run.proposed.clamp_min(1.0)
-    log_evidence = float((torch.logsumexp(run.log_factors, dim=1) - _log_count(run)).sum())
+    factors = torch.cat(run.log_factors, dim=1)
+    log_evidence = float((torch.logsumexp(factors, dim=1) - math.log(factors.shape[1])).sum())
     return Replicas(Chains(stacked, acceptance, cold), rejection, run.trips, log_evidence)
 
 
@@ -117,7 +119,6 @@ class _Run:
         order = torch.randperm(count)
         self.halves = [h for h in (order[: count // 2], order[count // 2 :]) if len(h)]
         self.moves: list[list[Move]] = []
-        self.hot = torch.zeros(start.particles, dtype=torch.bool)
         self.forget()
 
     def forget(self) -> None:
@@ -125,8 +126,10 @@ class _Run:
         pairs = len(self.ladder) - 1
         self.accepted = torch.zeros(self.trace.particles, dtype=torch.float64)
         self.rejected, self.proposed = (torch.zeros(pairs, dtype=torch.float64) for _ in range(2))
-        self.log_factors = torch.empty(pairs, 0, dtype=torch.float64)
+        self.log_factors: list[Tensor] = []  # (K - 1, C) of each exchange
         self.trips = 0
+        # Of each state, whether it was at exponent 1, and since then at the first one.
+        self.cold, self.hot = (torch.zeros(self.trace.particles, dtype=torch.bool) for _ in range(2))
 
     def fit(self, kernel: Kernel) -> None:
         """Fit the moves at each exponent, for each half of its chains to the other half."""
@@ -147,10 +150,10 @@ class _Run:
 
     def exchange(self, parity: int) -> None:
         """Exchange states of neighbouring exponents, beginning with the first or the second."""
-        log_likelihood = self.trace.log_prob(*self.sites).reshape(self.rows.shape)
+        log_likelihood = POSTERIOR.part(self.trace, self.sites).reshape(self.rows.shape)
         exponents = torch.tensor(self.ladder, dtype=torch.float64)
         step = (exponents[1:] - exponents[:-1])[:, None]
-        self.log_factors = torch.cat([self.log_factors, step * log_likelihood[:-1]], dim=1)
+        self.log_factors.append(step * log_likelihood[:-1])
         # From p(a)^s p(b)^t to p(b)^s p(a)^t. Where both are impossible, they stay.
         log_ratio = (step * (log_likelihood[:-1] - log_likelihood[1:])).nan_to_num(nan=-torch.inf)
         chance = log_ratio.clamp_max(0.0).exp()
@@ -162,11 +165,8 @@ class _Run:
         order[lower] = torch.where(accepted, self.rows[lower + 1], self.rows[lower])
         order[lower + 1] = torch.where(accepted, self.rows[lower], self.rows[lower + 1])
         self.trace = self.trace[order.flatten()]
-        self.hot = self.hot[order.flatten()]
-        self.trips += int(self.hot[self.rows[-1]].sum())
-        self.hot[self.rows[-1]] = False
-        self.hot[self.rows[0]] = True
-
-
-def _log_count(run: _Run) -> float:
-    return float(torch.tensor(run.log_factors.shape[1], dtype=torch.float64).log())
+        self.cold, self.hot = self.cold[order.flatten()], self.hot[order.flatten()]
+        first, last = self.rows[0], self.rows[-1]
+        self.hot[first] = self.cold[first]
+        self.trips += int(self.hot[last].sum())
+        self.hot[last], self.cold[last] = False, True

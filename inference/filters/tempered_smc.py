@@ -28,6 +28,7 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.support import freedom_of, support_of
 from bcppl.errors import InputError
+from bcppl.inference.exponents import resampled_below
 from bcppl.inference.filters.searching import Searching
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.step import Observed, Stepped
@@ -149,7 +150,7 @@ def infer(
         return int(any(getattr(site, "cost", 0) >= PHYSICS for site in trace.distributions.values()))
 
     def resample(population: Population) -> tuple[Population, Tensor | None]:
-        return adaptive(systematic, share[by_physics(population.trace)])(population)
+        return adaptive(systematic, resampled_below(share[by_physics(population.trace)]))(population)
 
     def step(population: Population, observed: Observed) -> Stepped:
         centres, along = None, []

@@ -18,11 +18,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
-from bcppl.inference.exponents import next_exponent
+from bcppl.inference.exponents import next_exponent, resampled_below
 from bcppl.inference.filters.step import Observed, StepInfo, Stepped
 from bcppl.inference.kernels import Kernel, Until, moved_by
 from bcppl.inference.kernels.kernel import refuse_other
@@ -74,6 +75,12 @@ def kept_share(share: object) -> float:
     return number_within(what, share, least=0.0, below=1.0)
 
 
+def ratio_of_old_sites(longer: Trace, new: Sequence[str], log_weight: Tensor) -> Tensor:
+    """Log ratio (N,) of the sites that new arguments change: the weight of `extend` but for the new sites."""
+    own = POSTERIOR.part(longer, new)
+    return torch.where(own == -torch.inf, 0.0, log_weight - own)
+
+
 class _Schedule(NamedTuple):
     share: float | Callable[[Trace], float]
     fixed: tuple[float, ...] | None
@@ -98,18 +105,19 @@ class Tempered:
 
     def __call__(self, population: Population, observed: Observed) -> Stepped:
         """Assimilate observations at new addresses."""
-        longer, log_likelihood = extend(population.trace, *observed)
+        longer, log_weight = extend(population.trace, *observed)
         # Sites that the program itself fixes (`obs=`, `pyro.factor`) are tempered with the observations.
         new = [a for a in longer.since(population.trace) if a not in longer.choices]
-        return self.temper(population.with_trace(longer), new, log_likelihood)
+        longest = population.with_trace(longer)
+        changed = ratio_of_old_sites(longer, new, log_weight)
+        return self.temper(longest.reweighed(changed) if bool(changed.any()) else longest, new)
 
-    def temper(self, population: Population, new: Sequence[str], log_likelihood: Tensor) -> Stepped:
+    def temper(self, population: Population, new: Sequence[str]) -> Stepped:
         """Temper sites that the trace has and the weights do not yet count.
 
         Args:
             population: weighed for all other sites.
             new: addresses of the sites; none of them is latent.
-            log_likelihood: their log-probability (N,).
         """
         start = population.log_evidence
         sites = population.trace.distributions
@@ -120,8 +128,7 @@ class Tempered:
         for number, group in enumerate(groups):
             later = {a: 0.0 for others in groups[number + 1 :] for a in others}
             exponent = 0.0
-            if len(groups) > 1:
-                log_likelihood = population.trace.log_prob(*group)
+            log_likelihood = POSTERIOR.part(population.trace, group)
             while exponent < 1.0:
                 reached = exponent
                 exponent = self.schedule.after(reached, population, log_likelihood)
@@ -139,9 +146,8 @@ class Tempered:
                     before = weighed.effective_sample_size
                 if acceptance is not None:
                     acceptances.append(acceptance)
-                # Of no address at all, `log_prob` would give all sites.
-                if exponent < 1.0 and group:
-                    log_likelihood = population.trace.log_prob(*group)
+                if exponent < 1.0:
+                    log_likelihood = POSTERIOR.part(population.trace, group)
         info = StepInfo(
             sum(acceptances) / len(acceptances) if acceptances else float("nan"),
             tuple(done),
@@ -214,9 +220,7 @@ def tempered(
     if resample is not None:
         check_resample("tempered", resample)
     if rejuvenation is None:
-        # An adaptive exponent leaves just `share`: particles that are not resampled there are not moved
-        # either, and the variance of the evidence was nine times as large for half the moves.
-        below = 0.5 if callable(share) or fixed is not None or share <= 0.0 else min(1.0, 1.01 * share)
+        below = 0.5 if callable(share) or fixed is not None else resampled_below(share)
         default = adaptive(systematic, below)
         rejuvenation = resample_move(kernel, sweeps, default if resample is None else resample, always_move)
     elif kernel is not None or resample is not None:

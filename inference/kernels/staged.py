@@ -195,6 +195,8 @@ def delayed_acceptance(
         screen = surrogate(population) if surrogate is not None else None
 
         def in_stages(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
+            if not isinstance(target, Target):
+                return move(trace, target)  # a function of the whole trace has no stages
             if screen is not None:
                 return move(trace, Screened(exponents=target.exponents, surrogate=screen))
             return move(trace, Staged(target.exponents, patterns, stages - 1))

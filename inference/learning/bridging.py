@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
-from bcppl.inference.exponents import next_exponent
+from bcppl.inference.exponents import next_exponent, resampled_below
 from bcppl.inference.filters.step import StepInfo, Stepped
 from bcppl.inference.filters.tempering import kept_share
 from bcppl.inference.kernels import Kernel, Until, moved_by
@@ -87,7 +87,7 @@ def bridged(
     start = _Start(proposal, args, tuple(proposed.choices))
     population = Population(trace, torch.zeros(particles, dtype=torch.float64))
     ratio, exponents, acceptances, resampled = trace.log_prob() - start(trace), [0.0], [], 0
-    resample = adaptive()
+    resample = adaptive(threshold=resampled_below(share))
     ancestors, before = None, float("nan")
     while exponents[-1] < 1.0:
         last = exponents[-1]

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
@@ -67,7 +68,9 @@ def auxiliary(
         if proposed is not None:
             log_factor = log_factor - proposed.log_prob
         if predicted is not None:
-            log_factor = log_factor - (predicted if ancestors is None else predicted[ancestors])
+            assumed = predicted if ancestors is None else predicted[ancestors]
+            # A particle that was given no chance has no weight, whatever it explains.
+            log_factor = torch.where(assumed == -torch.inf, -torch.inf, log_factor - assumed)
         now = chosen.with_trace(longer).reweighed(log_factor)
         info = StepInfo(
             resampled=int(ancestors is not None),

@@ -22,6 +22,7 @@ from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.structures.strata import Strata
+from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Series, Structure, Trace, generate
 from bcppl.traces.run import Program
 from bcppl.traces.series import runnable
@@ -76,20 +77,14 @@ def sample_strata(
 
 def weighed(strata: Strata) -> Strata:
     """Strata of a prior weighted by the likelihood of the observations."""
-    return strata.reweighed(
-        {s: log_prob_of(each.trace, likelihood_sites(each.trace)) for s, each in strata.populations.items()}
-    )
+    traces = {s: each.trace for s, each in strata.populations.items()}
+    return strata.reweighed({s: POSTERIOR.part(t, likelihood_sites(t)) for s, t in traces.items()})
 
 
 def likelihood_sites(trace: Trace, earlier: Collection[str] = ()) -> list[str]:
     """The addresses, other than `earlier` ones, that are neither latent nor structural."""
     structure = trace.structure
     return [a for a in trace.addresses if a not in trace.choices and a not in structure and a not in earlier]
-
-
-def log_prob_of(trace: Trace, sites: Sequence[str]) -> Tensor:
-    """Log-probability (N,) of some sites, of none too."""
-    return trace.log_prob(*sites) if sites else torch.zeros(len(trace), dtype=torch.float64)
 
 
 def enumerated(
@@ -110,7 +105,7 @@ def enumerated(
     parts = []
     for leaf, count in zip(leaves, allotted(wanted, particles, least=1), strict=True):
         trace, _ = generate(program, args, {**observations, **leaf.observations}, count)
-        log_prior = log_prob_of(trace, list(trace.structure))
+        log_prior = POSTERIOR.part(trace, list(trace.structure))
         # The sum over a stratum estimates the evidence of its structure, however many particles it has.
         parts.append((trace, log_prior + math.log(particles / count)))
     return _strata(parts, particles)
@@ -135,7 +130,7 @@ def drawn(
             return
         # What was drawn has weight 1; a structural site that the caller observes counts.
         observed = [a for a in trace.structure if a not in structure]
-        parts.append((trace, log_prob_of(trace, observed).clone()))
+        parts.append((trace, POSTERIOR.part(trace, observed).clone()))
 
     particles = whole_number("strata are given {} particles", particles)
     branch(Structure({}), {}, particles)

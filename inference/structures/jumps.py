@@ -23,7 +23,7 @@ from bcppl.errors import InputError
 from bcppl.inference.filters.smcp3 import Values
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Program
-from bcppl.inference.structures.moves import MovedStrata, StrataMove, target_in
+from bcppl.inference.structures.moves import MovedStrata, StrataMove
 from bcppl.inference.structures.strata import Strata
 from bcppl.inference.structures.translation import sampling_nothing, translated
 from bcppl.inference.targets import Target
@@ -174,8 +174,8 @@ def _jumped(
     # The reverse is proposed among those that start from the new structure.
     log_ratio = log_factor + math.log(choices) - math.log(len(back))
     chance = torch.log(torch.rand(len(old), dtype=torch.float64))
-    needed = chance + target_in(target, old)(old) - log_ratio
-    accepted, trace = target_in(target, new).above(new, needed)
+    needed = chance + target.within(old)(old) - log_ratio
+    accepted, trace = target.within(new).above(new, needed)
     if len(accepted) == 0:
         return _Jumped(structure, accepted, None)
     return _Jumped(structure, accepted, replace(population[accepted], trace=trace, approximation=None))

@@ -21,7 +21,7 @@ from bcppl.inference.kernels.kernel import refuse_other, takes
 from bcppl.inference.population import Population
 from bcppl.inference.structures.strata import Strata
 from bcppl.inference.targets import Target
-from bcppl.traces import Structure, Trace
+from bcppl.traces import Structure
 
 
 class MovedStrata(NamedTuple):
@@ -53,7 +53,7 @@ def within(kernel: Kernel, sweeps: int | Until = 1) -> StrataMove:
 
     def move(strata: Strata, target: Target) -> MovedStrata:
         moved = {
-            structure: moved_by(each, kernel, target_in(target, each.trace), sweeps)
+            structure: moved_by(each, kernel, target.within(each.trace), sweeps)
             for structure, each in strata.populations.items()
             # Where a structure determines all, there is nothing to move.
             if each.trace.choices
@@ -109,10 +109,3 @@ def refuse_no_move(where: str, move: object) -> None:
             f"{where} is given {given} in place of a move of strata; make it one with within(kernel), or "
             "give jump(Jump(...))."
         )
-
-
-def target_in(target: Target, trace: Trace) -> Target:
-    """The target on the sites of one structure: others may visit sites that this one does not."""
-    if target.exponents.keys() <= trace.observations.keys():
-        return target
-    return Target({a: e for a, e in target.exponents.items() if a in trace.distributions})

@@ -12,7 +12,7 @@ moves the estimate of the evidence is unbiased, otherwise it is consistent only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -24,20 +24,15 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.exponents import next_exponent
 from bcppl.inference.filters.step import Observed
-from bcppl.inference.filters.tempering import kept_share
+from bcppl.inference.filters.tempering import kept_share, ratio_of_old_sites
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.structures.allotment import resample_strata
 from bcppl.inference.structures.branching import branch_strata
-from bcppl.inference.structures.generation import (
-    drawn,
-    enumerated,
-    likelihood_sites,
-    log_prob_of,
-)
+from bcppl.inference.structures.generation import drawn, enumerated, likelihood_sites
 from bcppl.inference.structures.moves import StrataMove, refuse_no_move
 from bcppl.inference.structures.strata import Strata
-from bcppl.inference.targets import Target
-from bcppl.traces import Series, Structure
+from bcppl.inference.targets import POSTERIOR, Target
+from bcppl.traces import Series, Structure, Trace
 from bcppl.traces.run import Program
 
 
@@ -62,6 +57,22 @@ class SteppedStrata(NamedTuple):
 
     strata: Strata
     info: StrataInfo
+
+
+@dataclass(frozen=True)
+class _TemperedLikelihood(Target):
+    """The target whose likelihood is raised to a power in every structure, one that a jump reaches first too.
+
+    Attributes:
+        power: the exponent.
+        earlier: addresses of sites that are not tempered.
+    """
+
+    power: float = 1.0
+    earlier: frozenset[str] = frozenset()
+
+    def within(self, trace: Trace) -> Target:
+        return Target(dict.fromkeys(likelihood_sites(trace, self.earlier), self.power))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +116,16 @@ class TemperedStrata:
             observed: the program's arguments, and observations at new addresses.
             particles: how many there are after a resampling; as many as before by default.
         """
-        earlier = {a for each in strata.populations.values() for a in each.trace.addresses}
-        branched, _ = branch_strata(strata, observed)
-        return self._temper(branched, len(strata) if particles is None else particles, earlier)
+        earlier = frozenset(a for each in strata.populations.values() for a in each.trace.addresses)
+        branched, log_likelihoods = branch_strata(strata, observed)
+        changed = {
+            s: ratio_of_old_sites(each.trace, likelihood_sites(each.trace, earlier), log_likelihoods[s])
+            for s, each in branched.populations.items()
+        }
+        counted = branched.reweighed(changed)
+        return self._temper(counted, len(strata) if particles is None else particles, earlier)
 
-    def _temper(self, strata: Strata, particles: int, earlier: Collection[str] = ()) -> SteppedStrata:
+    def _temper(self, strata: Strata, particles: int, earlier: frozenset[str] = frozenset()) -> SteppedStrata:
         """Temper the sites at other than `earlier` addresses, which the weights do not yet count."""
         exponent, done, resampled = 0.0, [], 0
         acceptances: list[tuple[float, ...]] = []
@@ -119,7 +135,9 @@ class TemperedStrata:
             for structure, each in strata.populations.items():
                 if structure not in sites:
                     sites[structure] = likelihood_sites(each.trace, earlier)
-            log_likelihoods = {s: log_prob_of(each.trace, sites[s]) for s, each in strata.populations.items()}
+            log_likelihoods = {
+                s: POSTERIOR.part(each.trace, sites[s]) for s, each in strata.populations.items()
+            }
             reached, exponent = exponent, self._after(exponent, strata, log_likelihoods)
             done.append(exponent)
             # 0 times -inf is no number, so a particle that cannot be loses its weight here, once.
@@ -128,8 +146,8 @@ class TemperedStrata:
                 strata = resample_strata(strata, particles, least=self.least, scheme=self.scheme)
                 resampled += 1
             if self.move is not None:
-                tempered = {a for each in sites.values() for a in each} if exponent < 1.0 else set()
-                strata, acceptance = self.move(strata, Target(dict.fromkeys(tempered, exponent)))
+                target = _TemperedLikelihood(power=exponent, earlier=earlier) if exponent < 1.0 else POSTERIOR
+                strata, acceptance = self.move(strata, target)
                 acceptances.append(acceptance)
         accepted = (
             torch.tensor(acceptances, dtype=torch.float64).nanmean(dim=0).tolist() if acceptances else ()
