@@ -26,7 +26,7 @@ from bcppl.models import point_probe
 from bcppl.recordings import Recording
 from bcppl.traces import Series
 from tests.invariance import number
-from tests.mutant_inferences import MUTANTS, NORMAL, SOUND, Data, exact, normal_inference
+from tests.mutant_inferences import MUTANTS, NORMAL, SOUND, Data, exact, ignorant, normal_inference
 
 DRAWS = 49
 
@@ -162,8 +162,11 @@ def test_it_goes_on_from_a_folder(tmp_path: Path) -> None:
         return inference(data)
 
     again = calibrate(joint, counted, 8, seed=3, folder=tmp_path / "runs")
-    assert len(asked) == 4 and (tmp_path / "runs/round_000002.npz").stat().st_mtime_ns == written
+    # Four that are missing, and one that is compared.
+    assert len(asked) == 5 and (tmp_path / "runs/round_000002.npz").stat().st_mtime_ns == written
     assert np.array_equal(whole.ranks, again.ranks) and np.array_equal(whole.posterior, again.posterior)
+    with pytest.raises(InputError, match="of another inference"):
+        calibrate(joint, partial(normal_inference, ignorant), 8, seed=3, folder=tmp_path / "runs")
     with pytest.raises(InputError, match="calibration of other settings"):
         calibrate(joint, inference, 8, seed=4, folder=tmp_path / "runs")
     (tmp_path / "runs/round_000001.npz").write_bytes(b"PK")

@@ -13,8 +13,10 @@ import pytest
 import torch
 
 from bcppl.errors import InputError
-from bcppl.inference import saved
+from bcppl.inference import importance_sampling, saved
 from bcppl.inference.saved import plain
+from bcppl.inference.series import marginal
+from tests.linear_series import AUTOREGRESSION, observed
 from tests.saved_programs import KEPT, bits
 
 
@@ -91,3 +93,11 @@ def test_several_populations_are_in_one_file(tmp_path: Path) -> None:
     ] * 2
     with pytest.raises(InputError, match="holds 2 populations; use `load_several`"):
         saved.load(tmp_path / "p.h5", KEPT["series"].program)
+
+
+def test_what_filters_estimate_at_random_is_not_saved(tmp_path: Path) -> None:
+    walk = marginal(AUTOREGRESSION, "rho", observed="y", particles=3)
+    population = importance_sampling(walk, ([()] * 2,), observed(2), 10)
+    with pytest.raises(InputError, match="by the filters of y, cannot be saved"):
+        saved.save(population, tmp_path / "p.h5")
+    assert not (tmp_path / "p.h5").exists()

@@ -60,12 +60,12 @@ def calibrate(
         processes: above 1, rounds are distributed over fresh processes. Then `joint` and `inference` must be
             importable there, and a script must keep its own work behind `if __name__ == "__main__":`.
         folder: each round is kept in a file there; a call that was interrupted, or is to have more draws,
-            goes on from them.
+            goes on from them. The first of them is made again, to see that it is of this inference.
 
     Raises:
         InputError: what is given is no joint distribution, a number is out of range, inference gives no
             population or one with other latent addresses, it has fewer particles than `posterior_draws`, or
-            the folder is of other settings.
+            the folder is of other settings, of another joint distribution or of another inference.
         InferenceError: inference fails; names the seed of the round.
     """
     if not hasattr(joint, "draw"):
@@ -81,11 +81,28 @@ def calibrate(
     done = {} if path is None else {k: arrays for k in range(draws) if (arrays := kept(_file(path, k)))}
     missing = [number for number in range(draws) if number not in done]
     job = Round(joint, inference, ranked)
+    if done:
+        first = min(done)
+        _refuse_other(Path(folder or ""), done[first], job(seeds[first]))
     for number, arrays in gathered(job, [seeds[k] for k in missing], min(processes, max(1, len(missing)))):
         done[missing[number]] = arrays
         if path is not None:
             keep(_file(path, missing[number]), arrays)
     return Calibration.of_rounds([done[number] for number in range(draws)], ranked)
+
+
+def _refuse_other(folder: Path, there: Arrays, again: Arrays) -> None:
+    """Refuse rounds that what is given does not make; another machine may round otherwise."""
+    equal = np.array_equal(there["names"], again["names"]) and all(
+        there[name].shape == again[name].shape
+        and np.allclose(there[name], again[name], rtol=1e-6, equal_nan=True)
+        for name in ("truth", "posterior")
+    )
+    if not equal:
+        raise InputError(
+            f"{folder} holds a calibration of another inference or joint distribution, or of one that does "
+            "not repeat itself with the same seed; give another folder."
+        )
 
 
 def _file(folder: Path, number: int) -> Path:

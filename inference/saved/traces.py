@@ -19,7 +19,7 @@ from bcppl.distributions.support import support_of
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.saved.plain import NotPlainError, plain, same
 from bcppl.traces import Series, Trace
-from bcppl.traces.carried import Storable
+from bcppl.traces.carried import Branching, Storable
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.series import Forgotten, SeriesTrace, Stage
 
@@ -34,7 +34,8 @@ def content_of(trace: Trace) -> Content:
     """The plain data of a trace.
 
     Raises:
-        InputError: it is no trace, or a series without history has a state that is no plain data.
+        InputError: it is no trace, its likelihood is estimated by filters (`marginal`), or a series without
+            history has a state that is no plain data.
     """
     if type(trace) not in (Trace, SeriesTrace):
         raise InputError(f"a {type(trace).__name__} cannot be saved; save a trace, or a population of one.")
@@ -71,6 +72,11 @@ def _values(trace: Trace, carries: bool = True) -> Content:
     if carries:
         _ = trace._run  # makes the carried states those of the present values
         states = {name: entry.state for name, entry in trace.carried.items() if name in trace._run.carried}
+        if own := next((name for name, state in states.items() if isinstance(state, Branching)), None):
+            raise InputError(
+                f"a trace whose likelihood is estimated at random, by the {own}, cannot be saved, for its "
+                "program would estimate another one; save the values and the weights (`torch.save`)."
+            )
         content["carried"] = {n: dict(s.stored()) for n, s in states.items() if isinstance(s, Storable)}
     with suppress(NotPlainError):
         content["args"] = plain(tuple(trace.args))
