@@ -26,7 +26,6 @@ from report import DATA, Row, finish, options, show
 from bcppl import poses
 from bcppl.inference.filters.smc import smc, tempered
 from bcppl.inference.kernels import Kernel
-from bcppl.inference.resampling import adaptive, systematic
 from bcppl.models import part_in_view
 from bcppl.recordings.importers.bop import command
 
@@ -136,7 +135,7 @@ def look(asked: tuple[str, int, int]) -> Posed:
 def posed(model: Any, recording: Any, kernel: Kernel, sweeps: int, share: float, seed: int) -> Posed:
     """One run of tempered SMC over a recording."""
     scene = model.prepare(recording)
-    step = tempered(kernel, sweeps=sweeps, resample=adaptive(systematic, share), share=share)
+    step = tempered(kernel, sweeps=sweeps, share=share)
     begun = time.perf_counter()
     steps = smc(model, recording, step=step, particles=PARTICLES, seed=seed, scene=scene)
     *_, last = steps

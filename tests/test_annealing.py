@@ -196,5 +196,7 @@ def test_a_round_trip_is_from_exponent_1_to_the_first_and_back(moves: int, trips
         pyro.sample("x", dist.Normal(number(0.0), 1.0))
 
     start, _ = generate(prior, (), {}, 3 * 10)
-    run = replica_exchange(metropolis_hastings(drift("x")), start, moves, [0.0, 0.5, 1.0], progress=False)
-    assert run.round_trips == 10 * trips
+    kernel, exponents = metropolis_hastings(drift("x")), [0.0, 0.5, 1.0]
+    for warm_up in (0, 6):
+        run = replica_exchange(kernel, start, moves, exponents, warm_up=warm_up, progress=False)
+        assert run.round_trips == 10 * trips, "where states were before the warm-up's end does not count"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 
 import pytest
 import torch
@@ -35,6 +36,13 @@ def test_infer_runs_it_and_settings_given_win() -> None:
     assert torch.equal(one.belief.world_from_part, other.belief.world_from_part)
     with pytest.raises(InputError, match="-1 climbs"):
         bcppl.infer(part_in_view.model, recording, climbs=-1)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_particles_are_moved_after_every_exponent_but_the_last(seed: int) -> None:
+    begun = tempered_smc.infer(point_probe.model, short(1), particles=60, seed=seed, sweeps=(1, 1), search=0)
+    _, (_, info) = islice(begun, 2)
+    assert info.step.resampled >= len(info.exponents) - 1 > 2
 
 
 def test_the_command_line_keeps_the_settings_of_the_models_own_program_only() -> None:

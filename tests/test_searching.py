@@ -85,14 +85,14 @@ def exact_log_evidence() -> float:
 
 
 def test_a_mode_that_all_particles_left_is_reached_again() -> None:
-    for seed in (0, 2):
+    for seed in (0, 5):
         step = last(seed)
         assert float(step.belief.mean[0]) == pytest.approx(-0.5, abs=0.05)
         assert step.info.log_evidence == pytest.approx(exact_log_evidence(), abs=1.5)
 
 
 def test_without_a_search_it_depends_on_the_seed() -> None:
-    assert float(last(2, search=0).belief.mean[0]) > 0.4
+    assert float(last(5, search=0).belief.mean[0]) > 0.4
 
 
 def test_populations_are_joined_by_evidence() -> None:

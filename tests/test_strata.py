@@ -16,6 +16,7 @@ from bcppl.inference import Observed
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.structures import (
     Jump,
+    MovedStrata,
     Strata,
     allotment,
     by_structure,
@@ -32,7 +33,7 @@ from bcppl.inference.structures import (
     within,
 )
 from bcppl.inference.structures.generation import allotted
-from bcppl.inference.targets import POSTERIOR
+from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Series, Structure, structural
 from tests.invariance import matrix, number
 from tests.structural_programs import (
@@ -370,3 +371,19 @@ def test_sites_of_a_structure_that_a_jump_reaches_first_are_tempered() -> None:
         estimates.append(math.exp(temper.sample(program, (), {}, 40).strata.log_evidence))
     found = torch.tensor(estimates)
     assert abs(float(found.mean()) - 1.98) < 4.0 * float(found.std()) / math.sqrt(60)
+
+
+def test_a_move_of_ones_own_is_given_the_tempered_target() -> None:
+    def asked(strata: Strata, target: Target) -> MovedStrata:
+        for population in strata.populations.values():
+            trace, inside = population.trace, target.within(population.trace)
+            assert torch.equal(target(trace), inside(trace))
+            middle = inside(trace).median().expand(len(trace))
+            assert torch.equal(target.above(trace, middle)[0], (inside(trace) > middle).nonzero().flatten())
+            powers.append(float(((target(trace) - trace.log_prob()) / trace.log_prob("y")).mean()) + 1.0)
+        return MovedStrata(strata, ())
+
+    powers: list[float] = []
+    torch.manual_seed(0)
+    tempered_strata(asked, exponents=[0.3, 1.0]).generate(summed, (3,), OBSERVED, 60)
+    assert powers == pytest.approx([0.3] * 3 + [1.0] * 3)

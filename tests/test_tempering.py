@@ -125,7 +125,8 @@ def test_old_sites_that_new_arguments_change_are_weighed(by_site: bool) -> None:
     prior = importance_sampling(widened, (False,), {}, 20_000)
     seen = {"y": number(2.0), "z": number(2.5)}
     step = tempered(metropolis_hastings(drift("x")), by_site=by_site)
-    population, _ = step(prior, Observed((True,), seen))
+    population, info = step(prior, Observed((True,), seen))
+    assert info.log_evidence == population.log_evidence - prior.log_evidence
     exact = dist.Normal(number(0.0), math.sqrt(9.125)).log_prob(number(2.25))
     exact = exact + dist.Normal(number(0.0), math.sqrt(0.5)).log_prob(number(0.5))
     assert population.log_evidence == pytest.approx(float(exact), abs=0.1)

@@ -28,7 +28,6 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.support import freedom_of, support_of
 from bcppl.errors import InputError
-from bcppl.inference.exponents import resampled_below
 from bcppl.inference.filters.searching import Searching
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.step import Observed, Stepped
@@ -40,7 +39,6 @@ from bcppl.inference.proposals import Program, drift, independent, prior, spread
 from bcppl.inference.proposals.climbing import Modes, jumps, modes
 from bcppl.inference.proposals.coordinates import continuous_addresses
 from bcppl.inference.proposals.walk import joint_drift
-from bcppl.inference.resampling import adaptive, systematic
 from bcppl.traces import Model, Series, Trace, generate
 
 PHYSICS = 2  # the cost of a site that simulates contact (`bcppl.distributions.lazy`)
@@ -149,9 +147,6 @@ def infer(
     def by_physics(trace: Trace) -> int:
         return int(any(getattr(site, "cost", 0) >= PHYSICS for site in trace.distributions.values()))
 
-    def resample(population: Population) -> tuple[Population, Tensor | None]:
-        return adaptive(systematic, resampled_below(share[by_physics(population.trace)]))(population)
-
     def step(population: Population, observed: Observed) -> Stepped:
         centres, along = None, []
         if climbing:
@@ -164,7 +159,6 @@ def infer(
         return tempered(
             kernel(model.pose, model.proposals, centres, along, conditional),
             sweeps=lambda trace: moves[by_physics(trace)],
-            resample=resample,
             share=lambda trace: share[by_physics(trace)],
         )(population, observed)
 

@@ -81,6 +81,16 @@ def ratio_of_old_sites(longer: Trace, new: Sequence[str], log_weight: Tensor) ->
     return torch.where(own == -torch.inf, 0.0, log_weight - own)
 
 
+def _where_left(share: float | Callable[[Trace], float]) -> Resample:
+    """Systematic resampling wherever exponents leave no more than a share of the effective sample size."""
+
+    def resample(population: Population) -> tuple[Population, Tensor | None]:
+        kept = kept_share(share(population.trace)) if callable(share) else share
+        return adaptive(systematic, resampled_below(kept))(population)
+
+    return resample
+
+
 class _Schedule(NamedTuple):
     share: float | Callable[[Trace], float]
     fixed: tuple[float, ...] | None
@@ -108,9 +118,10 @@ class Tempered:
         longer, log_weight = extend(population.trace, *observed)
         # Sites that the program itself fixes (`obs=`, `pyro.factor`) are tempered with the observations.
         new = [a for a in longer.since(population.trace) if a not in longer.choices]
-        longest = population.with_trace(longer)
+        counted = population.with_trace(longer)
         changed = ratio_of_old_sites(longer, new, log_weight)
-        return self.temper(longest.reweighed(changed) if bool(changed.any()) else longest, new)
+        now, info = self.temper(counted.reweighed(changed) if bool(changed.any()) else counted, new)
+        return Stepped(now, info._replace(log_evidence=now.log_evidence - population.log_evidence))
 
     def temper(self, population: Population, new: Sequence[str]) -> Stepped:
         """Temper sites that the trace has and the weights do not yet count.
@@ -183,7 +194,7 @@ def tempered(
             walk by -.03 +- .02 (`benchmarks/exact.py`). The more exponents, the more it is:
             data many prior deviations away need more sweeps, also on one axis.
         resample: when and how; by default systematic wherever the exponent leaves no more than `share` of the
-            effective sample size (half, where `share` is no number or the exponents are fixed).
+            effective sample size (half, where the exponents are fixed).
         share: tempering keeps the conditional effective sample size above this share of the particles;
             with 0 there is one exponent, 1. A number, or a function of the trace, as `sweeps`.
         exponents: fixed ones, increasing, the last 1; then `share` does not matter.
@@ -220,8 +231,7 @@ def tempered(
     if resample is not None:
         check_resample("tempered", resample)
     if rejuvenation is None:
-        below = 0.5 if callable(share) or fixed is not None else resampled_below(share)
-        default = adaptive(systematic, below)
+        default = _where_left(0.0 if fixed is not None else share)
         rejuvenation = resample_move(kernel, sweeps, default if resample is None else resample, always_move)
     elif kernel is not None or resample is not None:
         raise InputError(

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
-from bcppl.inference.exponents import next_exponent
+from bcppl.inference.exponents import next_exponent, resampled_below
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.filters.tempering import kept_share, ratio_of_old_sites
 from bcppl.inference.resampling import Scheme, systematic
@@ -73,6 +73,14 @@ class _TemperedLikelihood(Target):
 
     def within(self, trace: Trace) -> Target:
         return Target(dict.fromkeys(likelihood_sites(trace, self.earlier), self.power))
+
+    def part(self, trace: Trace, addresses: Sequence[str]) -> Tensor:
+        return self.within(trace).part(trace, addresses)
+
+    def above(
+        self, trace: Trace, needed: Tensor, addresses: Sequence[str] | None = None
+    ) -> tuple[Tensor, Trace]:
+        return self.within(trace).above(trace, needed, addresses)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +179,7 @@ def tempered_strata(
     share: float = 0.5,
     exponents: Sequence[float] | None = None,
     least: int = 10,
-    threshold: float = 0.5,
+    threshold: float | None = None,
     scheme: Scheme = systematic,
 ) -> TemperedStrata:
     """A way to assimilate observations that tempers all structures' likelihoods together.
@@ -183,7 +191,8 @@ def tempered_strata(
         exponents: fixed ones, increasing, the last 1; then `share` does not matter.
         least: particles that each structure keeps when strata are resampled (`resample_strata`), so that one
             with little weight early on is not lost.
-        threshold: resample when the effective sample size is below this share of the particles.
+        threshold: resample when the effective sample size is below this share of the particles; by default
+            wherever the exponent leaves no more than `share` (half, where exponents are fixed).
         scheme: of resampling.
 
     Raises:
@@ -198,11 +207,14 @@ def tempered_strata(
             raise InputError(
                 f"tempering is given the exponents {list(fixed)}; give increasing ones that end with 1."
             )
+    kept = kept_share(share)
     return TemperedStrata(
         move,
-        kept_share(share),
+        kept,
         fixed,
         whole_number("strata are to keep {} particles of each structure", least, least=0),
-        number_within("strata are resampled below a share of {}", threshold, least=0.0, most=1.0),
+        resampled_below(0.0 if fixed is not None else kept)
+        if threshold is None
+        else number_within("strata are resampled below a share of {}", threshold, least=0.0, most=1.0),
         scheme,
     )
