@@ -187,9 +187,13 @@ def test_what_cannot_be_sent_to_another_process_is_refused() -> None:
         calibrate(NORMAL, lambda data: inference(data), 2, processes=2)
 
 
-def test_quantities_of_ones_own_are_ranked() -> None:
+def test_quantities_of_ones_own_are_ranked(tmp_path: Path) -> None:
     joint = Joint(NORMAL.program, (), ("y",), {"product": lambda values, data: values["x"].prod(-1)})
     assert "product" in calibrate(joint, partial(normal_inference, exact), 3).names
+    runs, other = tmp_path / "runs", {"product": lambda values, data: -values["x"].abs().sum(-1)}
+    calibrate(joint, partial(normal_inference, exact), 2, folder=runs)
+    with pytest.raises(InputError, match="of another inference, joint distribution or test quantity"):
+        calibrate(replace(joint, quantities=other), partial(normal_inference, exact), 2, folder=runs)
     joint = Joint(NORMAL.program, (), ("y",), {"all": lambda values, data: values["x"]})
     with pytest.raises(InputError, match="test quantity 'all' gives no tensor of shape"):
         calibrate(joint, partial(normal_inference, exact), 3)

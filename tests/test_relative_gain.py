@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pyro
@@ -18,7 +20,7 @@ from bcppl.distributions.episodes.nuisances import ArmCompliance
 from bcppl.distributions.episodes.rows import FELT, WRENCH
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.manifold import Quadratic
-from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.poses import MixturePose, NormalPose
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.gap import PegGap
@@ -33,6 +35,7 @@ from bcppl.inference.planning.touching import SurfacePoint, touch
 from bcppl.inference.population import Population
 from bcppl.inference.repetitions import Repeated
 from bcppl.models import load_recording, look_and_touch
+from bcppl.poses import FREE
 from bcppl.robot.motion import ProbeWindow
 from tests.test_linear_errors import MIXED, rows_with_wrenches, site
 from tests.test_manifold import around
@@ -59,11 +62,18 @@ class Height(LazyDistribution):
         row = torch.eye(6, dtype=torch.float64)[2].expand(len(self.pose), 6) / NOISE
         return Quadratic(row * ((self.pose[:, 2] - value) / NOISE)[:, None], row[..., None] * row[:, None])
 
-    def joint_information(self, value: Tensor) -> Tensor:
-        # A peg that sits 1 mm higher in the hand sees the part 1 mm lower.
+    # A peg that sits 1 mm higher in the hand sees the part 1 mm lower.
+    def with_shared_errors(self, value: Tensor, errors: Tensor) -> Tensor:
+        return value - 1e-3 * errors[:, 2]
+
+    def joint_log_prob(self, value: Tensor, errors: Tensor) -> Tensor:
+        return self.log_prob(value + 1e-3 * errors[:, 2])
+
+    def joint_quadratic(self, value: Tensor, errors: Tensor) -> Quadratic:
         row = torch.zeros(len(self.pose), 12, dtype=torch.float64)
         row[:, 2], row[:, 8] = 1.0 / NOISE, -1e-3 / NOISE
-        return row[..., None] * row[:, None]
+        off = (self.pose[:, 2] - 1e-3 * errors[:, 2] - value) / NOISE
+        return Quadratic(row * off[:, None], row[..., None] * row[:, None])
 
 
 def heights(count: int) -> None:
@@ -94,6 +104,32 @@ def test_a_touch_informs_the_relative_pose_and_hardly_that_in_the_world() -> Non
     # Three axes are twice as wide in variance as seen from the peg.
     wider = (found["relative"].entropy + exact["relative"]) - (found["world"].entropy + exact["world"])
     assert wider == pytest.approx(1.5 * math.log(2.0), abs=0.02)
+
+
+def of_two_heights(apart: float, count: int) -> None:
+    """A part at one of two places, whose tops differ in height by so many metres."""
+    centers = poses.identity(2)
+    centers[1, 0], centers[1, 2] = 0.03, apart
+    spread = torch.diag(torch.tensor([1e-4] * 3 + [1e-3] * 3, dtype=torch.float64) ** 2).expand(2, 6, 6)
+    part = pyro.sample("part", MixturePose(torch.full((2,), math.log(0.5)).double(), centers, spread, FREE))
+    for k in range(count):
+        pyro.sample(f"height_{k}", Height(part))
+
+
+@pytest.mark.parametrize("apart", [8e-4, 3e-3])
+def test_modes_that_the_grasp_can_explain_are_not_told_apart(apart: float) -> None:
+    """A height that is off by the difference of the modes may as well be the peg's in the hand."""
+    program = partial(of_two_heights, apart)
+    torch.manual_seed(0)
+    population = importance_sampling(program, (0,), {}, 1000)
+    peg = HeldPeg(LinearErrors((GRASP,)))
+    gain = linearised_information_gain(population, [1], lambda count: (count,), peg=peg, seed=0).best
+    variance = 1e-6 + 1e-8 + NOISE**2
+    read = np.random.default_rng(0).normal(0.0, math.sqrt(variance), 100_000)
+    odds = np.exp(apart * (read - 0.5 * apart) / variance)  # of the other mode
+    which = math.log(2.0) - float(np.mean(np.log1p(odds) - odds * np.log(odds) / (1.0 + odds)))
+    within = -0.5 * math.log(1.0 - 1e-8 / variance)
+    assert gain.information_gain == pytest.approx(which + within, abs=0.02)
 
 
 def test_the_gaussian_is_that_of_the_belief_s_own_draws() -> None:
@@ -139,6 +175,13 @@ def test_predicted_touches_are_moved_by_shared_errors_as_measured_ones_are() -> 
         torch.testing.assert_close(found[k], columns[k, 0], rtol=1e-9, atol=1e-15)
         # Pressed onto the part, an arm that yields makes the gap larger than it was measured to be.
         assert bool((found[k, :, 6:12] >= 0.0).all())
+    # Measured under errors and explained by them, the gaps are those that were predicted.
+    value = torch.cat([stood, rows[:, FELT, None].expand(len(pose), 4, 1)], dim=-1)
+    drawn = 0.01 * torch.randn(len(pose), len(errors.means), dtype=torch.float64)
+    measured = replace(one, sink=4.0 * one.compliance).with_shared_errors(value, drawn)
+    again = replace(one, sink=4.0 * one.compliance)._moved(measured, drawn)[0]
+    torch.testing.assert_close(again, gap(pose, stood).distance, rtol=0.0, atol=1e-7)
+    assert float((gap(pose, measured[..., :7]).distance - again).abs().max()) > 1e-6
 
 
 def test_a_leaning_touch_meets_the_point_that_an_upright_one_meets() -> None:

@@ -96,12 +96,12 @@ def _refuse_other(folder: Path, there: Arrays, again: Arrays) -> None:
     equal = np.array_equal(there["names"], again["names"]) and all(
         there[name].shape == again[name].shape
         and np.allclose(there[name], again[name], rtol=1e-6, equal_nan=True)
-        for name in ("truth", "posterior")
+        for name in ("truth", "posterior", "ranks")
     )
     if not equal:
         raise InputError(
-            f"{folder} holds a calibration of another inference or joint distribution, or of one that does "
-            "not repeat itself with the same seed; give another folder."
+            f"{folder} holds a calibration of another inference, joint distribution or test quantity, or of "
+            "one that does not repeat itself with the same seed; give another folder."
         )
 
 

@@ -27,7 +27,7 @@ from bcppl.inference.design.predicted import (
     Information,
     PredictedObservations,
     predict_observations,
-    sum_information,
+    sum_log_probs,
     sum_quadratics,
 )
 from bcppl.inference.design.ranking import (
@@ -74,7 +74,8 @@ def linearised_information_gain(
 
     Under an outer sample in which a touch misses, the information is that the part is not on the peg's path,
     and no more. Where the belief has several modes, the evidence of each is computed for every outer sample's
-    observation by a Laplace approximation; the entropy reduction over modes counts as well.
+    observation by a Laplace approximation; the entropy reduction over modes counts as well. Of errors that
+    touches share each outer sample has values of its own, and every mode explains the observation by others.
 
     Only the outer samples are simulated, the touches of all candidates in one batch. All candidates have the
     same outer samples, and the same noise as far as they have equally many contact stamps. Information that
@@ -101,8 +102,7 @@ def linearised_information_gain(
         rate: nats for one unit of cost; by name where costs are.
         horizon: 1, or 2 for two-step look-ahead.
         peg: whose touches share errors (the grasp, the arm), and from which the pose is to be known, as an
-            insertion needs it. None: the pose in the world, as if touches shared none. Modes are told apart
-            as if they shared none either way: where there are several, gains are too large.
+            insertion needs it. None: the pose in the world, as if touches shared none.
         translation: the gap between modes, metres; both gaps are widened where particles are sparse.
         rotation: the gap between modes, radians.
         seed: None draws it from torch's generator.
@@ -124,6 +124,8 @@ def linearised_information_gain(
         interest = RelativeMixture.fit(population, address, belief, peg)
     trace = population.trace.chosen(outer.particles)
     mode = belief.label[outer.particles]
+    with seeded(seed ^ 1):  # other numbers than the noise of observations
+        drawn = torch.randn(len(outer), interest.shared, dtype=torch.float64)
     whitened: list[Tensor] = []
     uncounted: list[int] = []
     utilities: list[Utility] = []
@@ -135,7 +137,7 @@ def linearised_information_gain(
             raise InferenceError(f"the simulation of candidate {k} failed under every outer sample.")
         warn_of_failures(k, torch.isnan(gains))
         if len(belief) > 1 and observations.sites:
-            after = _posterior_entropies(belief, interest, observations, trace, address, mode, gains)
+            after = _posterior_entropies(belief, interest, observations, trace, address, mode, drawn, gains)
             gains = interest.entropy - after
         elif len(belief) > 1:
             uncounted.append(k)
@@ -161,51 +163,68 @@ def _posterior_entropies(
     trace: Trace,
     address: str,
     mode: Tensor,
+    drawn: Tensor,
     own_reductions: Tensor,
 ) -> Tensor:
     """Entropies (S,) of a belief of several modes after each outer sample's observation.
 
     The evidence of a mode is a Laplace approximation: the likelihood and the mode's density at the maximum of
-    their product, and the volume around it.
+    their product over the pose and the shared errors, and the volume around it. The true errors are those of
+    the outer sample's mode, given its pose, at standard normal numbers (S, M) that are `drawn`.
     """
+    white = torch.cat([belief.white_coordinates(trace[address], mode), drawn], dim=1)
+    measured = predicted.with_shared_errors(_errors(interest, white, mode))
     log_evidence, reductions = [], []
     for k in range(len(belief)):
-        start = torch.where((mode == k)[:, None], trace[address], belief.mean[k])
-        at = _maximum(belief, predicted, trace, address, k, start)
-        sites, modes = predicted.at(trace.at({address: at})), torch.full_like(mode, k)
-        log_prob = torch.stack([site.log_prob(value) for site, value in sites]).sum(0)
-        away = belief.white_coordinates(k, at)
-        volume = entropy_reduction(belief.whiten(sum_information(sites, 0), at, modes))
-        white = interest.whiten(sum_information(sites, interest.shared), at, modes)
-        reductions.append(torch.where(mode == k, own_reductions, interest.reduction(white, modes)))
-        log_evidence.append(log_prob - 0.5 * away.square().sum(dim=0) - volume)
+        modes, own = torch.full_like(mode, k), (mode == k)[:, None]
+        start = torch.where(own, trace[address], belief.mean[k]), torch.where(own, drawn, 0.0)
+        at, white = _maximum(belief, interest, measured, trace, address, modes, start)
+        sites, errors = measured.at(trace.at({address: at})), _errors(interest, white, modes)
+        information = interest.whiten(sum_quadratics(sites, errors).information, at, modes)
+        volume = entropy_reduction(information)
+        reductions.append(torch.where(mode == k, own_reductions, interest.reduction(information, modes)))
+        log_evidence.append(sum_log_probs(sites, errors) - 0.5 * white.square().sum(dim=1) - volume)
     shares = torch.softmax(belief.mass.log()[:, None] + torch.stack(log_evidence), dim=0)
     entropies = interest.entropies[:, None] - torch.stack(reductions)
     return (torch.special.entr(shares) + shares * entropies).sum(dim=0)
 
 
+def _errors(interest: PoseMixture, white: Tensor, mode: Tensor) -> Tensor:
+    """Shared errors (S, M) at whitened coordinates (S, d + M) of modes (S,)."""
+    lower = interest.factor[mode][:, interest.factor.shape[1] - interest.shared :]
+    return interest.errors[mode] + (lower @ white[..., None])[..., 0]
+
+
 def _maximum(
     belief: TangentMixture,
+    interest: PoseMixture,
     predicted: PredictedObservations,
     trace: Trace,
     address: str,
-    k: int,
-    start: Tensor,
-) -> Tensor:
-    """The poses (S, 7) that maximise likelihood times a mode's density."""
-    at = start
-    modes = torch.full((len(start),), k)
-    eye = torch.eye(belief.freedom.dimension, dtype=torch.float64)
-    axes = list(belief.freedom.axes)
+    modes: Tensor,
+    start: tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor]:
+    """Where likelihood times the density of modes (S,) is largest: poses (S, 7), whitened coordinates.
+
+    From poses and whitened errors (S, M) to start at; the coordinates (S, d + M) are of both.
+    """
+    at, left = start
+    d = belief.freedom.dimension
+    eye = torch.eye(d + interest.shared, dtype=torch.float64)
+    axes = [*belief.freedom.axes, *range(6, 6 + interest.shared)]
+    factor = interest.factor[modes]
+    white = torch.cat([belief.white_coordinates(at, modes), left], dim=1)
     for _ in range(_ITERATIONS):
-        gradient, information = sum_quadratics(predicted.at(trace.at({address: at})))
-        white = torch.nan_to_num(belief.whiten(information, at, modes))
-        descent = torch.nan_to_num(gradient[:, axes] @ belief.factor[k])
-        away = belief.white_coordinates(k, at).T
-        step = -torch.linalg.solve(eye + white, (descent + away)[..., None])[..., 0]
+        sites = predicted.at(trace.at({address: at}))
+        gradient, information = sum_quadratics(sites, _errors(interest, white, modes))
+        curvature = torch.nan_to_num(interest.whiten(information, at, modes))
+        descent = torch.nan_to_num((gradient[:, None, axes] @ factor)[:, 0])
+        step = -torch.linalg.solve(eye + curvature, (descent + white)[..., None])[..., 0]
         step = step * (_TRUST_RADIUS / step.norm(dim=1, keepdim=True).clamp(min=_TRUST_RADIUS))
-        at = poses.retract(at, belief.freedom.embed(step @ belief.factor[k].T))
-    return at
+        moved = (factor[:, :d, :d] @ step[:, :d, None])[..., 0]
+        at = poses.retract(at, belief.freedom.embed(moved))
+        white = torch.cat([belief.white_coordinates(at, modes), white[:, d:] + step[:, d:]], dim=1)
+    return at, white
 
 
 def _two_steps(

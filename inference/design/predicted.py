@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from bcppl.distributions.lazy import LazyDistribution
+from bcppl.distributions.manifold import Quadratic
 from bcppl.errors import InputError
 from bcppl.inference.design.observations import Arguments, observed_addresses
 from bcppl.inference.resampling import seeded
@@ -37,7 +38,20 @@ class PredictedObservations:
         """(S, 6 + M, 6 + M) at the outer samples, about the pose and M errors that touches share."""
         if self.known is not None:
             return pad(self.known, (0, shared, 0, shared))
-        return sum_information([(site, self.values[a]) for a, site in self.sites.items()], shared)
+        sites = [(site, self.values[a]) for a, site in self.sites.items()]
+        none = torch.zeros(len(sites[0][1]), shared, dtype=torch.float64)
+        return sum_quadratics(sites, none).information
+
+    def with_shared_errors(self, errors: Tensor) -> PredictedObservations:
+        """The observations as they are measured under errors (S, M) that touches share."""
+        if not errors.shape[-1]:
+            return self
+        values = {
+            a: site.with_shared_errors(self.values[a], errors)
+            for a, site in self.sites.items()
+            if hasattr(site, "with_shared_errors")
+        }
+        return replace(self, values=self.values | values)
 
     def at(self, trace: Trace) -> list[tuple[Any, Tensor]]:
         """The sites at other particles (S) of a trace, each with the outer samples' observations."""
@@ -45,26 +59,28 @@ class PredictedObservations:
         return [(longer.distributions[a], value) for a, value in self.values.items()]
 
 
-def sum_quadratics(sites: Sequence[tuple[Any, Tensor]]) -> tuple[Tensor, Tensor]:
-    """The summed gradient (S, 6) and information (S, 6, 6) of sites' quadratic approximations."""
-    quadratics = [site.quadratic(value) for site, value in sites]
-    return (
-        torch.stack([each.gradient for each in quadratics]).sum(dim=0),
-        torch.stack([each.information for each in quadratics]).sum(dim=0),
-    )
-
-
-def sum_information(sites: Sequence[tuple[Any, Tensor]], shared: int) -> Tensor:
-    """The summed information (S, 6 + M, 6 + M) of sites about the pose and M errors that touches share."""
-    if not shared:
-        return sum_quadratics(sites)[1]
+def sum_log_probs(sites: Sequence[tuple[Any, Tensor]], errors: Tensor) -> Tensor:
+    """The summed log-likelihood (S,) of sites, at errors (S, M) that touches share."""
+    joint = errors.shape[-1] > 0
     each = [
-        site.joint_information(value)
-        if hasattr(site, "joint_information")
-        else pad(site.quadratic(value).information, (0, shared, 0, shared))
+        site.joint_log_prob(value, errors)
+        if joint and hasattr(site, "joint_log_prob")
+        else site.log_prob(value)
         for site, value in sites
     ]
     return torch.stack(each).sum(dim=0)
+
+
+def sum_quadratics(sites: Sequence[tuple[Any, Tensor]], errors: Tensor) -> Quadratic:
+    """Sites' quadratic approximations, summed, about pose and errors: (S, 6 + M) and (S, 6 + M, 6 + M)."""
+    shared, each = errors.shape[-1], []
+    for site, value in sites:
+        if shared and hasattr(site, "joint_quadratic"):
+            each.append(site.joint_quadratic(value, errors))
+        else:
+            gradient, information = site.quadratic(value)
+            each.append(Quadratic(pad(gradient, (0, shared)), pad(information, (0, shared, 0, shared))))
+    return Quadratic(*(torch.stack(parts).sum(dim=0) for parts in zip(*each, strict=True)))
 
 
 def predict_observations(

@@ -48,6 +48,14 @@ class PoseMixture(Protocol):
         """M, how many parameters an information matrix has besides the six of the pose."""
 
     @property
+    def factor(self) -> Tensor:
+        """(K, d + M, d + M) L of the covariance L L' of pose and parameters, 0 in rows d by the last M."""
+
+    @property
+    def errors(self) -> Tensor:
+        """(K, M) means of the parameters."""
+
+    @property
     def entropy(self) -> float:
         """Nats of the mixture: exact where modes do not overlap."""
 
@@ -68,6 +76,7 @@ class RelativeMixture:
 
     pose: TangentMixture
     factor: Tensor  # (K, d + M, d + M) L of the covariance L L' of pose and shared errors
+    errors: Tensor  # (K, M) means of the shared errors
     standard: Tensor  # (K, d, d + M) the relative pose in its own standard axes, by those of the factor
     log_volume: Tensor  # (K,) log of the product of its standard deviations
 
@@ -81,12 +90,13 @@ class RelativeMixture:
             given = own_mean.expand(count, -1), own_covariance.expand(count, -1, -1)
         mean, covariance = given
         weights, values = torch.softmax(population.log_weights, 0), population.trace[address]
-        factors, standards, volumes = [], [], []
+        factors, means, standards, volumes = [], [], [], []
         for mode in range(len(pose)):
             inside = pose.label == mode
             share = weights[inside] / weights[inside].sum()
             own = pose.freedom.coordinates(poses.local(pose.mean[mode], values[inside]))
-            own, errors_of = own - share @ own, mean[inside] - share @ mean[inside]
+            means.append(share @ mean[inside])
+            own, errors_of = own - share @ own, mean[inside] - means[-1]
             spread = pose.factor[mode]
             slope = torch.cholesky_solve((own * share[:, None]).T @ errors_of, spread).T  # (M, d)
             left = weighted_covariance(errors_of - own @ slope.T, share)
@@ -100,7 +110,8 @@ class RelativeMixture:
             factors.append(factor)
             standards.append(torch.linalg.solve_triangular(relative, seen, upper=False))
             volumes.append(relative.diagonal().log().sum())
-        return cls(pose, torch.stack(factors), torch.stack(standards), torch.stack(volumes))
+        each = (torch.stack(parts) for parts in (factors, means, standards, volumes))
+        return cls(pose, *each)
 
     @property
     def shared(self) -> int:

@@ -74,6 +74,11 @@ class TangentMixture:
 
     shared = 0  # parameters that information matrices have besides the pose's
 
+    @property
+    def errors(self) -> Tensor:
+        """(K, 0) the means of those."""
+        return self.factor.new_zeros(len(self), 0)
+
     def whiten(self, information: Tensor, world_from_part: Tensor, mode: Tensor) -> Tensor:
         """Information matrices (S, 6, 6) at poses (S, 7), as (S, d, d) in the whitened axes of modes (S,)."""
         white = self.tangent_of(world_from_part, mode) @ self.factor[mode]
@@ -90,10 +95,10 @@ class TangentMixture:
         jacobian[:, 3:, 3:] = right_jacobian(turn)
         return jacobian[:, :, list(self.freedom.axes)]
 
-    def white_coordinates(self, mode: int, world_from_part: Tensor) -> Tensor:
-        """The whitened tangent coordinates (d, S) of poses (S, 7) at a mode's mean."""
+    def white_coordinates(self, world_from_part: Tensor, mode: Tensor) -> Tensor:
+        """The whitened tangent coordinates (S, d) of poses (S, 7) at the means of modes (S,)."""
         away = self.freedom.coordinates(poses.local(self.mean[mode], world_from_part))
-        return torch.linalg.solve_triangular(self.factor[mode], away.T, upper=False)
+        return torch.linalg.solve_triangular(self.factor[mode], away[..., None], upper=False)[..., 0]
 
 
 def entropy_reduction(information: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.episodes.linear_errors import LinearErrors
+from bcppl.distributions.episodes.linear_errors import Effect, LinearErrors
 from bcppl.distributions.episodes.rows import COLUMNS, WRENCH
 from bcppl.distributions.manifold import Gaps
 
@@ -33,12 +33,35 @@ def by_shared_errors(gaps: Gaps, pose: Tensor, peg: Tensor, force: Tensor, bench
 
     Each is pressed onto the part by a force (N, R), in N, along the contact's normal; clocks agree.
     """
+    slope, effect = _pressed(gaps, pose, peg, force, bench)
+    return (slope[..., None, :] @ effect.twist)[..., 0, :] + effect.offset
+
+
+def mismeasured(
+    gaps: Gaps, pose: Tensor, peg: Tensor, force: Tensor, bench: LinearErrors, errors: Tensor
+) -> Tensor:
+    """Where pegs (N, R, 7) would be measured under shared errors (N, M), as of `by_shared_errors`.
+
+    What an error adds to the gap besides displacing the peg is a displacement along the contact's normal.
+    """
+    slope, effect = _pressed(gaps, pose, peg, force, bench)
+    twist, offset = (
+        (each @ errors[:, None, :, None])[..., 0] for each in (effect.twist, effect.offset[..., None, :])
+    )
+    moved = twist[..., :3] + offset * slope[..., :3]
+    moved = (poses.rotation_matrix(peg) @ moved[..., None])[..., 0]
+    return poses.retract(peg, -torch.cat([moved, twist[..., 3:]], dim=-1))
+
+
+def _pressed(
+    gaps: Gaps, pose: Tensor, peg: Tensor, force: Tensor, bench: LinearErrors
+) -> tuple[Tensor, Effect]:
+    """Derivatives (N, R, 6) of gaps by the peg's twist, and effects (N, R, ...) of the shared errors."""
     slope = _by_twist_of_peg(gaps.gradient(pose), pose, peg)
     rows = peg.new_full((*peg.shape[:-1], COLUMNS), torch.nan)
     rows[..., :7], rows[..., WRENCH] = peg, force[..., None] * slope
     effect = bench.effect(rows.flatten(0, 1))
-    twist, offset = (each.unflatten(0, peg.shape[:-1]) for each in effect)
-    return (slope[..., None, :] @ twist)[..., 0, :] + offset
+    return slope, Effect(*(each.unflatten(0, peg.shape[:-1]) for each in effect))
 
 
 def _by_twist_of_peg(gradient: Tensor, part: Tensor, peg: Tensor) -> Tensor:
