@@ -177,12 +177,7 @@ class Population:
 
     def __getitem__(self, index: str | Index) -> Any:
         if isinstance(index, str):
-            if index in self.trace:
-                return self.trace[index]
-            raise InputError(
-                f"a population has no value at address {index!r}; it has "
-                f"{', '.join([*self.trace.choices, *self.trace.observations]) or 'none'}."
-            )
+            return self.trace[index]
         particles = particles_at(index, len(self))
         return self._with(
             trace=self.trace.chosen(particles),

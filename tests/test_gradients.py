@@ -314,3 +314,21 @@ def test_tensors_are_looked_for_in_closures_and_containers() -> None:
     assert graph.carries(torch.nn.Linear(2, 2)) and graph.carries(torch.nn.Linear(2, 2).forward)
     assert not graph.carries({"a": [parameter.detach(), "text", empty]})
     late = None
+
+
+def test_what_is_evaluated_after_the_context_is_a_constant_and_what_within_is_present() -> None:
+    shift = torch.nn.Parameter(torch.tensor(0.5, dtype=torch.float64))
+
+    def program() -> Tensor:
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        pyro.factor("bonus", shift * x)
+        return pyro.deterministic("moved", x + shift)
+
+    with gradients():
+        trace, _ = generate(program, (), {}, 3)
+    assert not trace.log_prob().requires_grad
+    shift.data += 1.0
+    with gradients():
+        for value in (trace["moved"], trace.result):
+            torch.testing.assert_close(value.detach(), trace["x"] + 1.5)
+            assert float(torch.autograd.grad(value.sum(), shift)[0]) == 3.0

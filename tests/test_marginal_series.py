@@ -20,7 +20,7 @@ from bcppl.inference.series import marginal
 from bcppl.inference.series.nested import Filters
 from bcppl.inference.summaries import mean
 from bcppl.inference.targets import POSTERIOR
-from bcppl.traces import Series, Trace, assess, extend, generate, simulate, update
+from bcppl.traces import Series, Trace, assess, extend, generate, gradients, simulate, update
 from bcppl.traces.carried import carried
 from tests.invariance import equal_weights, number
 from tests.linear_series import AUTOREGRESSION, SEEN, log_evidence, observed, posterior, step
@@ -375,3 +375,31 @@ def test_a_parameter_that_depends_on_what_is_integrated_out_is_refused() -> None
     with pytest.raises(InputError, match=r"'rho' depends on others .*\(tau, x\).* name them as static too"):
         generate(marginal(series, "rho", observed="y", particles=5), STEPS, observed(T), 4, given)
     generate(marginal(series, "rho", "tau", observed="y", particles=5), STEPS, observed(T), 4, given)
+
+
+def test_a_trace_that_is_shortened_goes_on_with_other_filters() -> None:
+    torch.manual_seed(0)
+    program = marginal(AUTOREGRESSION, "rho", observed="y", particles=5)
+    trace, _ = generate(program, ([()] * 3,), observed(3), 40)
+    short = update(trace, args=([()] * 2,)).trace
+    short.log_prob()  # the filters run in the order of the steps
+    ends = [extend(short, ([()] * 3,), {"y/3": number(y)})[1] for y in (0.2, 0.2, -1.0)]
+    assert not bool((ends[0] == ends[1]).any()) and not bool((ends[0] == trace.log_prob("y/3")).any())
+
+
+def test_steps_may_observe_other_numbers_of_readings() -> None:
+    def read(state: dict[str, Tensor], count: int) -> dict[str, Tensor]:
+        pyro.sample("y", dist.Normal(state["rho"][..., None].expand(-1, count), 1.0).to_event(1))
+        return state
+
+    program = marginal(Series(pushed_start, read), "rho", observed="y", particles=3)
+    seen = {"y/1": torch.tensor([0.1, 0.2]).double(), "y/2": torch.tensor([0.3, 0.4, 0.5]).double()}
+    trace, _ = generate(program, ([(2,), (3,)],), seen, 6)
+    exact = sum(dist.Normal(trace["rho"][:, None], 1.0).log_prob(y).sum(1) for y in seen.values())
+    torch.testing.assert_close(trace.log_prob(*seen), exact)
+
+
+def test_a_gradient_of_what_filters_estimate_is_refused() -> None:
+    program = marginal(AUTOREGRESSION, "rho", observed="y", particles=5)
+    with gradients(), pytest.raises(InputError, match="pass no gradient on"):
+        generate(program, ([()],), observed(1), 3)

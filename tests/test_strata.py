@@ -387,3 +387,15 @@ def test_a_move_of_ones_own_is_given_the_tempered_target() -> None:
     torch.manual_seed(0)
     tempered_strata(asked, exponents=[0.3, 1.0]).generate(summed, (3,), OBSERVED, 60)
     assert powers == pytest.approx([0.3] * 3 + [1.0] * 3)
+
+
+def test_what_programs_determine_has_values_in_strata() -> None:
+    def program() -> None:
+        structural("k", dist.Categorical(matrix([0.5, 0.5])))
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        pyro.deterministic("twice", 2.0 * x)
+
+    strata = generate_strata(program, (), {}, 6)
+    assert torch.equal(strata["twice"], 2.0 * strata["x"]) and len(strata.visiting("twice")) == 6
+    for population in strata.populations.values():
+        assert torch.equal(population["twice"], 2.0 * population["x"])

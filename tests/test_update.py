@@ -347,3 +347,34 @@ sound = Update.__init__
 
 def without_drawn(self: Update, trace: Trace, previous: Trace, discarded: Any, drawn: Any = None) -> None:
     sound(self, trace, previous, discarded)
+
+
+def test_arguments_may_grow_in_place_from_step_to_step() -> None:
+    """A trace keeps those that it was made with."""
+
+    def program(deviations: list[float]) -> None:
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        for k, deviation in enumerate(deviations):
+            pyro.sample(f"y_{k}", dist.Normal(x, deviation))
+
+    deviations = [1.0]
+    torch.manual_seed(0)
+    trace, _ = generate(program, (deviations,), {"y_0": number(0.5)}, 4)
+    deviations.append(2.0)
+    for begun in (trace, trace[torch.tensor([2, 1])]):
+        longer, log_weight = extend(begun, (deviations,), {"y_1": number(1.0)})
+        torch.testing.assert_close(log_weight, dist.Normal(begun["x"], 2.0).log_prob(number(1.0)))
+        assert begun.addresses == ["x", "y_0"] and longer.addresses == ["x", "y_0", "y_1"]
+
+
+def test_what_was_impossible_stays_so_when_arguments_change() -> None:
+    def program(width: float) -> None:
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        pyro.sample("y", dist.Uniform(x - width, x + width))
+
+    torch.manual_seed(0)
+    trace, before = generate(program, (1.0,), {"y": number(1.5)}, 200)
+    ratio = update(trace, args=(0.8,)).log_ratio
+    near = (trace["x"] - 1.5).abs() < 0.8
+    assert bool((before == -torch.inf).any()) and bool((ratio[~near] == -torch.inf).all())
+    torch.testing.assert_close(ratio[near], -number(0.8).log().expand(int(near.sum())))

@@ -24,7 +24,7 @@ from bcppl.traces.explained import hidden_site, other_addresses, refuse_masked
 from bcppl.traces.indexing import Index, aligned, beside, particles_at
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.structural import Structure
-from bcppl.traces.values import Value, tensors
+from bcppl.traces.values import Value, held, tensors
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -139,12 +139,12 @@ class Trace:
     @property
     def result(self) -> Any:
         """What the program returned."""
-        return self._run.result
+        return self._ran.result
 
     @property
     def determined(self) -> Mapping[str, Tensor]:
         """What the program names by `pyro.deterministic`, particle axis first."""
-        return self._run.determined
+        return self._ran.determined
 
     def log_prob(self, *addresses: str) -> Tensor:
         """Log-probability (N,) of the sites at `addresses`, summed; of all sites where none is named.
@@ -170,7 +170,7 @@ class Trace:
         ran.refuse_unvisited([address])
         value = log_probability(ran, address, self.choices, self.observations)
         if attached is None:
-            self.known[address] = value
+            value = self.known[address] = value.detach()  # a factor holds what it was given, with its graph
         return value
 
     def __getitem__(self, key: str | Index) -> Any:
@@ -306,7 +306,7 @@ class Trace:
             draws_lazy: whether lazy sites that have no value are sampled; else they are NaN.
         """
         kept = {a: v for a, v in self.choices.items() if a not in without}
-        args = self.args if args is None else args
+        args = self.args if args is None else held(args)
         observed = {**self.observations, **(observations or {})}
         given = {**kept, **values, **observed}
         ran = run(self.program, args, self.particles, given, self.carried, draws_lazy=draws_lazy)

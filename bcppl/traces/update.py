@@ -44,7 +44,9 @@ class Update:
         total = torch.zeros(new.particles, dtype=torch.float64)
         if others := set(changed(old, new, both)):
             named = [a for a in both if a in others or (a in old.known and a in new.known)]
-            total = total + (new.log_prob(*named) - old.log_prob(*named))
+            now = new.log_prob(*named)
+            # What is impossible stays so: -inf minus -inf is no number.
+            total = total + torch.where(now == -torch.inf, now, now - old.log_prob(*named))
         added = [a for a in new.addresses if a not in old._run.distributions and a not in self.drawn]
         vanished = [a for a in old.addresses if a not in new._run.distributions]
         total = total + new.log_prob(*added) if added else total

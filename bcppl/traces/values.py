@@ -31,6 +31,18 @@ def tensors(given: Mapping[str, Value]) -> dict[str, Tensor]:
     return {address: _tensor(address, value) for address, value in given.items()}
 
 
+def held(value: Any) -> Any:
+    """Arguments as a trace keeps them: lists and dictionaries are copied, for they may grow later."""
+    if type(value) is dict:
+        return {key: held(each) for key, each in value.items()}
+    if type(value) not in (list, tuple):
+        return value
+    parts = [held(each) for each in value]
+    if type(value) is list:
+        return parts
+    return value if all(a is b for a, b in zip(value, parts, strict=True)) else tuple(parts)
+
+
 def _tensor(address: str, value: Any) -> Tensor:
     if isinstance(value, Tensor):
         return value

@@ -22,7 +22,7 @@ from bcppl.traces.indexing import indexed
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.series import Series, SeriesTrace, Stage, runnable
 from bcppl.traces.trace import Trace, refuse_masked_latents, shapes
-from bcppl.traces.values import Value, tensors
+from bcppl.traces.values import Value, held, tensors
 
 # A vector that was meant as one event is unlikely to have more entries.
 FEW = 20
@@ -34,7 +34,7 @@ def simulate(program: Program | Series, args: tuple[Any, ...] = (), particles: i
     Raises:
         InputError: see `bcppl.traces.run.run`.
     """
-    program = runnable(program)
+    program, args = runnable(program), held(args)
     ran = run(program, args, particles, {}, {})
     _refuse_coincidence(program, args, particles, ran)
     return _traced(program, args, particles, ran)
@@ -109,7 +109,7 @@ def assessed(
     program: Program | Series, args: tuple[Any, ...], choices: Mapping[str, Value], particles: int
 ) -> Trace:
     """The trace of a program at given values for all of its choices; it raises what `assess` does."""
-    program = runnable(program)
+    program, args = runnable(program), held(args)
     ran = run(program, args, particles, choices, {})
     _refuse_fixed(ran)
     ran.refuse_unvisited(choices)
@@ -131,7 +131,7 @@ def constrained(
     carried: Mapping[str, Entry] | None = None,
 ) -> tuple[Trace, list[str]]:
     """A program run as by `generate`, or one step of a series, and the addresses that weigh it."""
-    observations = copied(observations)
+    observations, args = copied(observations), held(args)
     again = [a for a in choices if a in observations]
     if again:
         raise InputError(f"address {again[0]!r} is observed and given a value for each particle; give one.")

@@ -65,7 +65,7 @@ def calibrate(
     Raises:
         InputError: what is given is no joint distribution, a number is out of range, inference gives no
             population or one with other latent addresses, it has fewer particles than `posterior_draws`, or
-            the folder is of other settings, of another joint distribution or of another inference.
+            the folder is of other settings, or its first round is not what is given would make of it.
         InferenceError: inference fails; names the seed of the round.
     """
     if not hasattr(joint, "draw"):

@@ -57,6 +57,11 @@ def auxiliary(
     def step(population: Population, observed: Observed) -> Stepped:
         start = population.log_evidence
         predicted = None if look_ahead is None else look_ahead(population.trace, observed)
+        if predicted is not None and predicted.shape != (len(population),):
+            raise InputError(
+                f"an auxiliary filter's look_ahead gives {tuple(predicted.shape)} numbers for "
+                f"{len(population)} particles; give one for each."
+            )
         expected = population if predicted is None else population.reweighed(predicted)
         chosen, ancestors = when(expected)
         proposed = None

@@ -14,11 +14,12 @@ over the steps with such moves is SMC^2 (Chopin, Jacob and Papaspiliopoulos, JRS
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pyro
 import torch
 from pyro.poutine.messenger import Messenger
@@ -30,6 +31,7 @@ from bcppl.errors import InputError
 from bcppl.inference.series.nested import Filters
 from bcppl.inference.series.unrolling import numbered
 from bcppl.traces import Series, carried, extend, simulate
+from bcppl.traces.differentiation.graph import kept
 
 
 class SeriesLikelihood(LazyDistribution):
@@ -62,6 +64,11 @@ class SeriesLikelihood(LazyDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Estimate (M,) of the log-likelihood of the step's observation, (*event_shape)."""
+        if kept():
+            raise InputError(
+                f"the likelihood of {self._name!r} is estimated by filters, which pass no gradient on; "
+                "differentiate `unrolled(series)` in its place."
+            )
         if value.shape != self.event_shape:
             raise InputError(
                 f"observation {self._name!r} of a series is given with shape {tuple(value.shape)}; filters "
@@ -121,7 +128,7 @@ class Marginal:
     observed: str
     particles: int
     threshold: float
-    _shapes: dict[int, tuple[int, ...]] = field(default_factory=dict, repr=False)
+    _shapes: dict[Hashable, tuple[int, ...]] = field(default_factory=dict, repr=False)
 
     def __call__(self, steps: Sequence[tuple[Any, ...]], *args: Any) -> None:
         """Sample the static parameters, and visit the observation of each step."""
@@ -143,8 +150,9 @@ class Marginal:
             pyro.sample(numbered(self.observed, number), site)
 
     def _event_shape(self, args: tuple[Any, ...], step: tuple[Any, ...]) -> tuple[int, ...]:
-        """The shape of the observation, from one run of the first step."""
-        if not self._shapes:
+        """The shape of the observation, from one run of a step with arguments of this kind."""
+        kind = _kind(step)
+        if kind not in self._shapes:
             with torch.random.fork_rng(devices=[]):
                 trace, _ = extend(simulate(self.series, args), step, {})
             if self.observed not in trace.addresses:
@@ -153,8 +161,17 @@ class Marginal:
                     f"it visits {', '.join(trace.addresses) or 'none'}."
                 )
             site = trace.distributions[self.observed]
-            self._shapes[1] = (*site.batch_shape[:-1], *site.event_shape)
-        return self._shapes[1]
+            self._shapes[kind] = (*site.batch_shape[:-1], *site.event_shape)
+        return self._shapes[kind]
+
+
+def _kind(value: Any) -> Hashable:
+    """What an observation's shape may depend on: shapes and whole numbers, but no number that is measured."""
+    if isinstance(value, list | tuple):
+        return tuple(_kind(each) for each in value)
+    if isinstance(value, Tensor | np.ndarray) and value.ndim:
+        return tuple(value.shape)
+    return value if isinstance(value, int | str) else type(value).__name__
 
 
 class _CompleteError(Exception):

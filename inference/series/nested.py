@@ -81,12 +81,12 @@ class Filters:
         return replace(self, seen=list(self.seen))
 
     def restart_where_changed(self, steps: Sequence[tuple[Any, ...]]) -> None:
-        """Forget all that was estimated, if a step was run with other arguments than it has in `steps`.
+        """Forget all that was estimated, if a step was run that `steps` lacks or has with other arguments.
 
         The estimate of a step is one given the filter's own past: those before the changed one go with it.
         """
-        are_same = comparison()
-        if all(are_same(then[1], now) for then, now in zip(self.seen, steps, strict=False)):
+        are_same, ran = comparison(), len(self.seen)
+        if ran <= len(steps) and all(map(are_same, [then[1] for then in self.seen], steps[:ran])):
             return
         addresses, values = tuple(self.static), self.static.values()
         start = self.before(self.series, self.args, self.count, self.threshold, addresses, *values)

@@ -131,13 +131,13 @@ class Strata:
         Raises:
             InputError: none does.
         """
-        chosen = [(s, each) for s, each in self.populations.items() if address in each.trace]
+        chosen = [(s, each) for s, each in self.populations.items() if _has(each.trace, address)]
         if not chosen:
             raise InputError(f"no stratum has a value at {address!r}; there are {_listed(self.structures)}.")
         return self._among(chosen)
 
     def __getitem__(self, address: str) -> Tensor:
-        missing = [s for s, each in self.populations.items() if address not in each.trace]
+        missing = [s for s, each in self.populations.items() if not _has(each.trace, address)]
         if missing:
             raise InputError(
                 f"{_listed(missing)} of the strata have no value at {address!r}; "
@@ -272,10 +272,14 @@ def _joined(traces: Sequence[Trace]) -> Trace:
     )
 
 
+def _has(trace: Trace, address: str) -> bool:
+    return address in trace or address in trace.determined
+
+
 def _of_each(trace: Trace, address: str) -> Tensor:
     """Values (N, *event) also of an observed address."""
     value: Tensor = trace[address]
-    return value if address in trace.choices else value.expand(len(trace), *value.shape)
+    return value.expand(len(trace), *value.shape) if address in trace.observations else value
 
 
 def _log_total(populations: Iterable[Population]) -> float:

@@ -32,7 +32,7 @@ from bcppl.inference.structures.generation import drawn, enumerated, likelihood_
 from bcppl.inference.structures.moves import StrataMove, refuse_no_move
 from bcppl.inference.structures.strata import Strata
 from bcppl.inference.targets import POSTERIOR, Target
-from bcppl.traces import Series, Structure, Trace
+from bcppl.traces import Series, Structure, Trace, update
 from bcppl.traces.run import Program
 
 
@@ -65,14 +65,14 @@ class _TemperedLikelihood(Target):
 
     Attributes:
         power: the exponent.
-        earlier: addresses of sites that are not tempered.
+        sites: gives the addresses that are tempered.
     """
 
     power: float = 1.0
-    earlier: frozenset[str] = frozenset()
+    sites: Callable[[Trace], list[str]] = likelihood_sites
 
     def within(self, trace: Trace) -> Target:
-        return Target(dict.fromkeys(likelihood_sites(trace, self.earlier), self.power))
+        return Target(dict.fromkeys(self.sites(trace), self.power))
 
     def part(self, trace: Trace, addresses: Sequence[str]) -> Tensor:
         return self.within(trace).part(trace, addresses)
@@ -81,6 +81,22 @@ class _TemperedLikelihood(Target):
         self, trace: Trace, needed: Tensor, addresses: Sequence[str] | None = None
     ) -> tuple[Tensor, Trace]:
         return self.within(trace).above(trace, needed, addresses)
+
+
+def _new_sites(args: tuple[Any, ...]) -> Callable[[Trace], list[str]]:
+    """Gives the likelihood's sites that a program does not visit with earlier arguments.
+
+    They are a matter of the structure alone. One that no particle had before a jump has old sites too.
+    """
+    known: dict[Structure, list[str]] = {}
+
+    def sites(trace: Trace) -> list[str]:
+        if trace.structure not in known:
+            earlier = update(trace[:1], args=args).trace
+            known[trace.structure] = likelihood_sites(trace, earlier.addresses)
+        return known[trace.structure]
+
+    return sites
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,17 +140,19 @@ class TemperedStrata:
             observed: the program's arguments, and observations at new addresses.
             particles: how many there are after a resampling; as many as before by default.
         """
-        earlier = frozenset(a for each in strata.populations.values() for a in each.trace.addresses)
+        sites = _new_sites(next(iter(strata.populations.values())).trace.args)
         branched, log_likelihoods = branch_strata(strata, observed)
         changed = {
-            s: ratio_of_old_sites(each.trace, likelihood_sites(each.trace, earlier), log_likelihoods[s])
+            s: ratio_of_old_sites(each.trace, sites(each.trace), log_likelihoods[s])
             for s, each in branched.populations.items()
         }
         counted = branched.reweighed(changed)
-        return self._temper(counted, len(strata) if particles is None else particles, earlier)
+        return self._temper(counted, len(strata) if particles is None else particles, sites)
 
-    def _temper(self, strata: Strata, particles: int, earlier: frozenset[str] = frozenset()) -> SteppedStrata:
-        """Temper the sites at other than `earlier` addresses, which the weights do not yet count."""
+    def _temper(
+        self, strata: Strata, particles: int, likelihood: Callable[[Trace], list[str]] = likelihood_sites
+    ) -> SteppedStrata:
+        """Temper the likelihood's sites, which the weights do not yet count."""
         exponent, done, resampled = 0.0, [], 0
         acceptances: list[tuple[float, ...]] = []
         sites: dict[Structure, list[str]] = {}
@@ -142,7 +160,7 @@ class TemperedStrata:
             # Which sites there are is a matter of the structure alone.
             for structure, each in strata.populations.items():
                 if structure not in sites:
-                    sites[structure] = likelihood_sites(each.trace, earlier)
+                    sites[structure] = likelihood(each.trace)
             log_likelihoods = {
                 s: POSTERIOR.part(each.trace, sites[s]) for s, each in strata.populations.items()
             }
@@ -154,7 +172,9 @@ class TemperedStrata:
                 strata = resample_strata(strata, particles, least=self.least, scheme=self.scheme)
                 resampled += 1
             if self.move is not None:
-                target = _TemperedLikelihood(power=exponent, earlier=earlier) if exponent < 1.0 else POSTERIOR
+                target = (
+                    _TemperedLikelihood(power=exponent, sites=likelihood) if exponent < 1.0 else POSTERIOR
+                )
                 strata, acceptance = self.move(strata, target)
                 acceptances.append(acceptance)
         accepted = (

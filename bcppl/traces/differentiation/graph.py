@@ -45,8 +45,10 @@ def gradients() -> Iterator[None]:
     over. Draws of reparameterised distributions are attached to the parameters of these, others are
     constants. The program is run again, and every log-probability evaluated again, each time that one is
     asked for: at the present values of trained parameters, also where the trace has kept one of earlier
-    values. A trace that is made within and evaluated after the context is evaluated without gradients. In a
-    series the states from which a step begins are constants where the steps before it were run outside.
+    values. Outside, a trace is of the parameters that it was made with: after a step of training, generate a
+    new one before particles are moved or weighed. A trace that is made within and evaluated after the context
+    is evaluated without gradients. In a series the states from which a step begins are constants where the
+    steps before it were run outside.
 
     Raises:
         InputError: (by the verbs) a program or a site takes a tensor that asks for gradients out of torch, or
