@@ -56,6 +56,7 @@ def check_addresses(start: Start, particles: int, args: Any, program: Any) -> No
     """
     before, dtype = _Kept.of(args, program), torch.get_default_dtype()
     first, others = start(particles), []
+    before.add_arguments(first.args)  # a trace keeps lists of its own
     generators = {torch.get_rng_state().numpy().tobytes()}
     for number in range(RUNS):
         seed(1000 + number)
@@ -70,6 +71,8 @@ def check_addresses(start: Start, particles: int, args: Any, program: Any) -> No
                 None,
                 "the program sets torch's default type of numbers; set it before it is run.",
             )
+    if other := set(first.addresses) ^ set(rerun(first).addresses):
+        raise _other_addresses(first, min(other), before)
     if len(generators) == 1:
         raise ProgramError(
             Fault.RANDOMNESS,
@@ -219,6 +222,12 @@ class _Kept:
 
     def __init__(self, live: dict[str, Any]) -> None:
         self.live, self.copies = live, {name: _copy(value) for name, value in live.items()}
+
+    def add_arguments(self, args: Any) -> None:
+        """Look at these arguments too."""
+        live = {f"argument {k}": value for k, value in enumerate(args)}
+        self.live |= live
+        self.copies |= {name: _copy(value) for name, value in live.items()}
 
     @classmethod
     def of(cls, args: Any, program: Any) -> _Kept:
