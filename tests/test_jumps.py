@@ -15,11 +15,10 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
-from bcppl.inference import Observed, evidence_variance, markov_chains, rejuvenate, resize
+from bcppl.inference import evidence_variance, markov_chains, rejuvenate, resize
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
-from bcppl.inference.resampling import multinomial
 from bcppl.inference.structures import (
     Jump,
     Strata,
@@ -393,33 +392,3 @@ def test_jumps_of_poses_have_the_jacobian_of_the_tangent_space(monkeypatch: pyte
     assert z_of_poses() < 3.7
     monkeypatch.setattr(translation, "log_abs_det_jacobian", flat)
     assert z_of_poses() > 6.0
-
-
-def test_old_sites_of_a_structure_that_was_lost_are_not_tempered() -> None:
-    """Of ten particles two are left, mostly of the first structure: a jump reaches the other's factor."""
-
-    def program(count: int) -> None:
-        which = structural("which", dist.Categorical(matrix([0.95, 0.05])))
-        x = pyro.sample("x", dist.Normal(number(0.0), 0.1))
-        if which == 1:
-            pyro.factor("old", 3.0 + 0.0 * x)
-        for k in range(count):
-            pyro.sample(f"y_{k}", dist.Normal(x, 1.0))
-
-    across = Jump(
-        to=lambda s: {"which": 1} if s["which"] == 0 else None,
-        back=lambda s: {"which": 0} if s["which"] == 1 else None,
-    )
-    temper = tempered_strata(jump(across), exponents=[0.1, 1.0], least=0, threshold=0.0)
-    covariance = torch.eye(2, dtype=torch.float64) + 0.01
-    seen = dist.MultivariateNormal(torch.zeros_like(covariance[0]), covariance).log_prob(matrix([0.3, 0.2]))
-    exact = (0.95 + 0.05 * math.exp(3.0)) * math.exp(float(seen))
-    ratios = []
-    for seed in range(150):
-        torch.manual_seed(seed)
-        ten = generate_strata(program, (1,), {"y_0": number(0.3)}, 10)
-        begun = resample_strata(ten, 2, least=0, scheme=multinomial)
-        strata = temper.extend(begun, Observed((2,), {"y_1": number(0.2)})).strata
-        ratios.append(math.exp(strata.log_evidence) / exact)
-    found = torch.tensor(ratios)
-    assert abs(float(found.mean()) - 1.0) < 4.0 * float(found.std()) / math.sqrt(150) + 1e-3

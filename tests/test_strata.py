@@ -16,7 +16,6 @@ from bcppl.inference import Observed
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.structures import (
     Jump,
-    MovedStrata,
     Strata,
     allotment,
     by_structure,
@@ -33,7 +32,7 @@ from bcppl.inference.structures import (
     within,
 )
 from bcppl.inference.structures.generation import allotted
-from bcppl.inference.targets import POSTERIOR, Target
+from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Series, Structure, structural
 from tests.invariance import matrix, number
 from tests.structural_programs import (
@@ -334,59 +333,6 @@ def test_strata_of_a_series_are_refused_where_their_pasts_would_be_mixed() -> No
 def test_tempering_refuses_exponents_that_do_not_end_with_1() -> None:
     with pytest.raises(InputError, match="end with 1"):
         tempered_strata(exponents=[0.5, 0.9])
-
-
-def test_old_sites_that_new_arguments_change_are_weighed_once() -> None:
-    def widened(seen: bool) -> None:
-        structural("s", dist.Categorical(matrix([0.5, 0.5])))
-        x = pyro.sample("x", dist.Normal(number(0.0), 3.0 if seen else 1.0))
-        if seen:
-            pyro.sample("y", dist.Normal(x, 1.0))
-
-    torch.manual_seed(0)
-    strata = generate_strata(widened, (False,), {}, 200)
-    observed = Observed((True,), {"y": number(2.5)})
-    plain = extend_strata(strata, observed).log_evidence
-    for temper in (tempered_strata(share=0.0), tempered_strata(exponents=[0.3, 1.0], threshold=0.0)):
-        assert temper.extend(strata, observed).strata.log_evidence == pytest.approx(plain, abs=1e-9)
-
-
-def test_sites_of_a_structure_that_a_jump_reaches_first_are_tempered() -> None:
-    """Hardly a particle begins in the second structure, which has all of its likelihood in one factor."""
-
-    def program() -> None:
-        which = structural("which", dist.Categorical(matrix([0.99, 0.01])))
-        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
-        if which == 1:
-            pyro.factor("bonus", math.log(99.0) + 0.0 * x)
-
-    across = Jump(
-        to=lambda s: {"which": 1} if s["which"] == 0 else None,
-        back=lambda s: {"which": 0} if s["which"] == 1 else None,
-    )
-    temper = tempered_strata(jump(across), exponents=[0.5, 1.0], least=0)
-    estimates = []
-    for seed in range(60):
-        torch.manual_seed(seed)
-        estimates.append(math.exp(temper.sample(program, (), {}, 40).strata.log_evidence))
-    found = torch.tensor(estimates)
-    assert abs(float(found.mean()) - 1.98) < 4.0 * float(found.std()) / math.sqrt(60)
-
-
-def test_a_move_of_ones_own_is_given_the_tempered_target() -> None:
-    def asked(strata: Strata, target: Target) -> MovedStrata:
-        for population in strata.populations.values():
-            trace, inside = population.trace, target.within(population.trace)
-            assert torch.equal(target(trace), inside(trace))
-            middle = inside(trace).median().expand(len(trace))
-            assert torch.equal(target.above(trace, middle)[0], (inside(trace) > middle).nonzero().flatten())
-            powers.append(float(((target(trace) - trace.log_prob()) / trace.log_prob("y")).mean()) + 1.0)
-        return MovedStrata(strata, ())
-
-    powers: list[float] = []
-    torch.manual_seed(0)
-    tempered_strata(asked, exponents=[0.3, 1.0]).generate(summed, (3,), OBSERVED, 60)
-    assert powers == pytest.approx([0.3] * 3 + [1.0] * 3)
 
 
 def test_what_programs_determine_has_values_in_strata() -> None:

@@ -251,7 +251,7 @@ class _Recorder(Messenger):
         """A value that the program names, the particle axis first: it stands behind those of the plates."""
         value = message["value"]
         plates = max(-frame.dim for frame in message["cond_indep_stack"] if frame.dim is not None)
-        # Pyro takes all axes to be the event's unless it is told.
+        # Without `event_dim` Pyro takes all axes to be the event's.
         declared = len(message["fn"].batch_shape)
         axis = min(declared or plates, value.ndim) - 1
         if axis >= 0 and value.shape[axis] == self.particles:
