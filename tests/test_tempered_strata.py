@@ -27,6 +27,10 @@ from tests.invariance import matrix, number
 from tests.structural_programs import SEEN, summed
 
 OBSERVED = {"y": SEEN}
+ACROSS = Jump(
+    to=lambda s: {"which": 1} if s["which"] == 0 else None,
+    back=lambda s: {"which": 0} if s["which"] == 1 else None,
+)
 
 
 def test_old_sites_that_new_arguments_change_are_weighed_once() -> None:
@@ -53,11 +57,7 @@ def test_sites_of_a_structure_that_a_jump_reaches_first_are_tempered() -> None:
         if which == 1:
             pyro.factor("bonus", math.log(99.0) + 0.0 * x)
 
-    across = Jump(
-        to=lambda s: {"which": 1} if s["which"] == 0 else None,
-        back=lambda s: {"which": 0} if s["which"] == 1 else None,
-    )
-    temper = tempered_strata(jump(across), exponents=[0.5, 1.0], least=0)
+    temper = tempered_strata(jump(ACROSS), exponents=[0.5, 1.0], least=0)
     estimates = []
     for seed in range(60):
         torch.manual_seed(seed)
@@ -93,11 +93,7 @@ def test_old_sites_of_a_structure_that_was_lost_are_not_tempered() -> None:
         for k in range(count):
             pyro.sample(f"y_{k}", dist.Normal(x, 1.0))
 
-    across = Jump(
-        to=lambda s: {"which": 1} if s["which"] == 0 else None,
-        back=lambda s: {"which": 0} if s["which"] == 1 else None,
-    )
-    temper = tempered_strata(jump(across), exponents=[0.1, 1.0], least=0, threshold=0.0)
+    temper = tempered_strata(jump(ACROSS), exponents=[0.1, 1.0], least=0, threshold=0.0)
     covariance = torch.eye(2, dtype=torch.float64) + 0.01
     seen = dist.MultivariateNormal(torch.zeros_like(covariance[0]), covariance).log_prob(matrix([0.3, 0.2]))
     exact = (0.95 + 0.05 * math.exp(3.0)) * math.exp(float(seen))

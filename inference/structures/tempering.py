@@ -155,14 +155,10 @@ class TemperedStrata:
         """Temper the likelihood's sites, which the weights do not yet count."""
         exponent, done, resampled = 0.0, [], 0
         acceptances: list[tuple[float, ...]] = []
-        sites: dict[Structure, list[str]] = {}
         while exponent < 1.0:
-            # Which sites there are is a matter of the structure alone.
-            for structure, each in strata.populations.items():
-                if structure not in sites:
-                    sites[structure] = likelihood(each.trace)
             log_likelihoods = {
-                s: POSTERIOR.part(each.trace, sites[s]) for s, each in strata.populations.items()
+                s: POSTERIOR.part(each.trace, likelihood(each.trace))
+                for s, each in strata.populations.items()
             }
             reached, exponent = exponent, self._after(exponent, strata, log_likelihoods)
             done.append(exponent)
