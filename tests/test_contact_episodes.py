@@ -104,6 +104,18 @@ def test_a_row_given_before_counts_once() -> None:
     assert float((mutant - whole).abs().max()) > 1.0, "rows as if none had been before"
 
 
+def test_a_measured_window_of_each_particle_is_that_window() -> None:
+    """As `assess` is given what was measured: a value for each particle, the same for all or not."""
+    pose, other = around(6), MIXED.clone()
+    other[2, 2] = -9e-5
+    each = torch.stack([MIXED, other, MIXED, MIXED, other, other])
+    torch.testing.assert_close(
+        site(pose, 8).log_prob(MIXED.expand(6, 8, COLUMNS)), site(pose, 8).log_prob(MIXED)
+    )
+    asked = torch.stack([site(pose[n : n + 1], 8).log_prob(each[n])[0] for n in range(6)])
+    torch.testing.assert_close(site(pose, 8).log_prob(each), asked)
+
+
 def test_quadratic_is_the_gradient_and_nearly_the_curvature() -> None:
     """Of one compliance, of which the log-likelihood is a quadratic function of the gaps."""
     step = torch.tensor([1e-7] * 3 + [3e-6] * 3, dtype=torch.float64)

@@ -104,6 +104,11 @@ class ContactEpisodes(ContactManifold):
         """Log-likelihood (N,) of one window (T, COLUMNS), or of one for each particle (N, T, COLUMNS)."""
         if is_predicted(value):
             return super().log_prob(value[..., : FELT + 1])
+        if value.ndim == 3:
+            # One that was measured is most often the same for all.
+            windows, whose = torch.nan_to_num(value, nan=-torch.inf).unique(dim=0, return_inverse=True)
+            every = torch.stack([self.log_prob(torch.where(w == -torch.inf, torch.nan, w)) for w in windows])
+            return every[whose, torch.arange(len(whose))]
         given, rows = given_and_all(value)
         if len(given) == len(rows):
             return self.pose.new_zeros(len(self.pose))

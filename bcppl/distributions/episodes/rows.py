@@ -28,7 +28,7 @@ def padded(rows: Tensor, stamps: int) -> Tensor:
 def is_predicted(value: Tensor) -> bool:
     """Whether a value holds rows that a `motion` predicts, which have no times."""
     rows = value.numpy()
-    return rows.ndim == 3 or bool((np.isnan(rows[:, TIME]) & ~np.isnan(rows[:, FELT])).any())
+    return rows.shape[-1] <= TIME or bool((np.isnan(rows[..., TIME]) & ~np.isnan(rows[..., FELT])).any())
 
 
 def late(rows: Tensor, interval: int) -> tuple[Tensor, Tensor]:
