@@ -25,7 +25,6 @@ from bcppl.distributions.episodes import (
     LinearError,
     LinearErrors,
 )
-from bcppl.distributions.episodes.covariances import segments_of
 from bcppl.distributions.episodes.displaced import displaced
 from bcppl.distributions.episodes.rows import (
     COLUMNS,
@@ -53,6 +52,7 @@ from bcppl.inference.targets import POSTERIOR
 from bcppl.sensors.likelihoods.bench_profiles import BenchProfile
 from bcppl.traces import generate
 from tests.calibration.case import AXES, DRAWS
+from tests.episode_errors import factors
 
 HALF, HEIGHT, LENGTH = 0.03, 0.025, 0.05
 GAP = PegGap(block((2.0 * HALF, 2.0 * HALF, HEIGHT)), box_peg(0.016, LENGTH))
@@ -186,16 +186,17 @@ def simulated(profile: BenchProfile = STILL, solids: bool = False) -> tuple[Trut
     hypothesis = every[int(torch.multinomial(torch.tensor([h.log_weight for h in every]).exp(), 1))]
     deviations = hypothesis.scale * errors.variances.sqrt()
     value = errors.means + deviations * torch.randn(len(deviations), dtype=torch.float64)
-    probabilities = torch.tensor([jump.probability for jump in errors.jumps])
-    each, now = [], value
-    for _ in range(len(ROWS) // len(FORCES)):
-        which = int(torch.multinomial(torch.cat([probabilities, 1.0 - probabilities.sum()[None]]), 1))
-        if which < len(probabilities):
-            jumped = hypothesis.scale * errors.jumps[which].variances.sqrt()
-            now = now + jumped * torch.randn(len(now), dtype=torch.float64)
-        each.append(now)
-    values = torch.stack(each).repeat_interleave(len(FORCES), dim=0)
-    factor = torch.from_numpy(segments_of(ROWS, site._row_errors, (hypothesis,)).factor[0])
+    steps, touches, held = [], len(ROWS) // len(FORCES), len(FORCES)
+    for jump in errors.jumps:
+        happens = torch.rand(touches, 1, dtype=torch.float64) < jump.probability
+        change = hypothesis.scale * (jump.variances / held).sqrt()  # at any row of the touch
+        steps.append(
+            happens.repeat_interleave(held, dim=0)
+            * change
+            * torch.randn(len(ROWS), len(value), dtype=torch.float64)
+        )
+    values = value + torch.stack(steps).sum(dim=0).cumsum(dim=0)
+    factor = factors(ROWS, site._row_errors, hypothesis)
     blocks = factor.unflatten(0, (-1, len(FORCES)))[..., : len(FORCES)]
     noise = (blocks @ torch.randn(len(blocks), len(FORCES), 1, dtype=torch.float64)).flatten()
     wanted = noise - hypothesis.compliance * ROWS[:, FORCE]

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from bcppl.distributions.episodes.covariances import segments_of
 from bcppl.distributions.episodes.rows import FORCE
 from bcppl.inference.calibration.ranks import p_value
 from tests.calibration.case import DRAWS, gather
@@ -28,6 +27,7 @@ from tests.calibration.shared_errors import (
     simulated,
 )
 from tests.calibration.test_calibration import BROKEN, SEED, SOUND
+from tests.episode_errors import factors
 
 ROUNDS = 120
 
@@ -46,7 +46,7 @@ def test_what_is_simulated_has_the_residuals_of_the_likelihood() -> None:
         moved, columns = (each[0] for each in site._late(gaps, rows))
         place = list(site.bench.delays).index(truth.hypothesis.delay)
         apart = gaps.distance[0] + moved[place] + truth.hypothesis.compliance * rows[:, FORCE]
-        factor = torch.from_numpy(segments_of(rows, site._row_errors, (truth.hypothesis,)).factor[0])
+        factor = factors(rows, site._row_errors, truth.hypothesis)
         blocks = factor.unflatten(0, (-1, len(FORCES)))[..., : len(FORCES)]
         for left_out, parameters in {"nothing": slice(0, 0), **site.bench.slices}.items():
             errors = truth.errors.clone()

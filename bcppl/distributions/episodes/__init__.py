@@ -1,6 +1,5 @@
 """Likelihood of a held peg's touches by episodes of contact."""
 
-from bcppl.distributions.episodes.covariances import Hypothesis
 from bcppl.distributions.episodes.likelihood import ContactEpisodes
 from bcppl.distributions.episodes.linear_errors import LinearError, LinearErrors
 from bcppl.distributions.episodes.nuisances import (
@@ -11,6 +10,7 @@ from bcppl.distributions.episodes.nuisances import (
     PartSlides,
     Size,
 )
+from bcppl.distributions.episodes.row_errors import Hypothesis
 
 __all__ = [
     "ArmCompliance",

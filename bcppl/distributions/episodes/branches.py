@@ -9,23 +9,33 @@ import numpy as np
 from bcppl.arrays import Array, Indices
 
 KEPT = 8  # hypotheses of a particle
-INLIER, OUTLIER = 0, 1  # what an episode is; from 2 on, after which jump
+SHARED = 3  # states that the rows of an episode share
+INLIER, OUTLIER = 0, 1  # what an episode is; plus twice the number of the change before or in it
 
 
 class Segments(NamedTuple):
     """S segments of consecutive rows: an episode of contact, or one row without contact.
 
+    The errors of an episode are a row's own, and three states that its rows share (`SHARED`): a factor of the
+    contact's compliance, an error that stays, and one that is forgotten (an Ornstein-Uhlenbeck process).
+
     Attributes:
         first, last: (S,) the index of a segment's first row, and that after its last.
         contact: (S,) 1 for an episode.
-        factor: (H, R, n) of each hypothesis, rows of the Cholesky factors of the episodes' covariances, each
-            within its own segment; for a row without contact the first number is its standard deviation.
+        own: (H, R) of each hypothesis, variances of the rows' own errors, m^2; of a row without contact, of
+            all of its errors.
+        sunk: (H, R) by how much one standard deviation of the contact's compliance moves the gap, m.
+        kept: (R,) correlation of the error that is forgotten with that of the row before.
+        shared: (H, 3) variances of the states at an episode's first row.
     """
 
     first: Indices
     last: Indices
     contact: Indices
-    factor: Array
+    own: Array
+    sunk: Array
+    kept: Array
+    shared: Array
 
 
 class Prior(NamedTuple):
@@ -36,8 +46,8 @@ class Prior(NamedTuple):
             contact in m/N, and the factor of the shared errors' standard deviations.
         delay: (H,) the place of its delay among those for which gaps are given.
         mean, variance: (M,) of the parameters.
-        jump_log_probability: (J,) at each episode.
-        jump_variance: (J, M).
+        change_log_probability: (C,) of each change, at an episode: none, then jumps of one or more errors.
+        change_variance: (C, M) by each.
         outlier: the probability that an episode, or a row without contact, is one.
         farthest: m, the range over which an outlier's gap is spread evenly.
     """
@@ -48,8 +58,8 @@ class Prior(NamedTuple):
     delay: Indices
     mean: Array
     variance: Array
-    jump_log_probability: Array
-    jump_variance: Array
+    change_log_probability: Array
+    change_variance: Array
     outlier: float
     farthest: float
 
@@ -63,7 +73,7 @@ class Branches(NamedTuple):
         which: (N, B) the hypothesis of the prior.
         mean: (N, B, M) of the parameters.
         covariance: (N, B, M, M).
-        event: (N, B, E) of each episode so far: `INLIER`, `OUTLIER`, or 2 plus the number of a jump.
+        event: (N, B, E) of each episode so far: twice the number of a change, and one more for an outlier.
         squared: (N, B, E) its squared whitened errors, as predicted.
     """
 

@@ -15,11 +15,11 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.checks import Check, chi_square
 from bcppl.distributions.episodes.branches import Branches, Prior, begun
-from bcppl.distributions.episodes.covariances import Hypothesis, RowErrors, segments_of
 from bcppl.distributions.episodes.displaced import by_shared_errors, displaced, mismeasured
 from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.posterior import drawn, moments, probable_jumps
 from bcppl.distributions.episodes.prior import WIDE, nodes_of, prior_of, with_delays
+from bcppl.distributions.episodes.row_errors import Hypothesis, RowErrors, segments_of
 from bcppl.distributions.episodes.rows import (
     COLUMNS,
     EPISODE,
@@ -209,7 +209,7 @@ class ContactEpisodes(ContactManifold):
             return []
         segments = segments_of(rows, self._row_errors, self._every)
         times = rows[segments.first[segments.contact == 1], TIME].tolist()
-        return probable_jumps(self.branches(rows), [jump.name for jump in self.bench.jumps], times)
+        return probable_jumps(self.branches(rows), self.bench, times)
 
     def shared_posterior(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """Mean (N, M) and covariance (N, M, M) of the shared errors' parameters, as `shared_moments`."""

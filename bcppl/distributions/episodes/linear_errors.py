@@ -45,6 +45,20 @@ class Jump(NamedTuple):
     variances: Tensor
 
 
+class Change(NamedTuple):
+    """What may happen to the errors at an episode: none of their jumps, one, or several at once.
+
+    Attributes:
+        jumps: their numbers; empty for none.
+        probability: that these happen and no others.
+        variances: (M,) of the change of each parameter.
+    """
+
+    jumps: tuple[int, ...]
+    probability: float
+    variances: Tensor
+
+
 class LinearError(Protocol):
     """An error that all touches share."""
 
@@ -112,6 +126,18 @@ class LinearErrors:
                 variances[place] = jump.variances
                 jumps.append(jump._replace(variances=variances))
         return jumps
+
+    @cached_property
+    def changes(self) -> list[Change]:
+        """All that may happen at an episode, where jumps are independent; nothing comes first."""
+        changes = [Change((), 1.0, torch.zeros(len(self.means), dtype=torch.float64))]
+        for number, jump in enumerate(self.jumps):
+            none = [c._replace(probability=c.probability * (1.0 - jump.probability)) for c in changes]
+            changes = none + [
+                Change((*c.jumps, number), c.probability * jump.probability, c.variances + jump.variances)
+                for c in changes
+            ]
+        return changes
 
     @cached_property
     def delays(self) -> Mapping[int, float]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from bcppl.distributions.episodes.branches import OUTLIER, Branches
+from bcppl.distributions.episodes.branches import Branches
+from bcppl.distributions.episodes.linear_errors import LinearErrors
 
 
 def drawn(branches: Branches, draws: int) -> Tensor:
@@ -32,17 +34,20 @@ def moments(branches: Branches) -> tuple[Tensor, Tensor]:
 
 
 def probable_jumps(
-    branches: Branches, names: Sequence[str], times: Sequence[float]
+    branches: Branches, bench: LinearErrors, times: Sequence[float]
 ) -> list[tuple[str, float, Tensor]]:
     """The jumps that any hypothesis holds, by name and time, in their order, with their probabilities (N,).
 
     Args:
         branches: after E episodes.
-        names: of the jumps.
+        bench: whose jumps they are.
         times: (E,) of the episodes' first rows, s.
     """
     weights, held = branches.weights[..., None], []
-    for number, name in enumerate(names, OUTLIER + 1):
-        probability = torch.from_numpy((weights * (branches.event == number)).sum(axis=1))
-        held += [(name, times[k], probability[:, k]) for k in probability.any(dim=0).nonzero()[:, 0].tolist()]
+    for number, jump in enumerate(bench.jumps):
+        among = [number in change.jumps for change in bench.changes]
+        jumped = np.array(among)[branches.event // 2]
+        probability = torch.from_numpy((weights * jumped).sum(axis=1))
+        each = probability.any(dim=0).nonzero()[:, 0].tolist()
+        held += [(jump.name, times[k], probability[:, k]) for k in each]
     return sorted(held, key=lambda jump: jump[1])

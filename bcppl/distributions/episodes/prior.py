@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from bcppl.distributions.episodes.branches import Prior
-from bcppl.distributions.episodes.covariances import Hypothesis
 from bcppl.distributions.episodes.linear_errors import LinearErrors
+from bcppl.distributions.episodes.row_errors import Hypothesis
 from bcppl.distributions.manifold import FARTHEST
 
 # Nodes of the compliance, in decades from its median: they are closer than `varying` is wide.
@@ -42,9 +42,9 @@ def with_delays(hypotheses: tuple[Hypothesis, ...], bench: LinearErrors) -> tupl
 @lru_cache(maxsize=64)
 def prior_of(bench: LinearErrors, hypotheses: tuple[Hypothesis, ...], outlier: float, pose: int) -> Prior:
     """The prior of hypotheses with delays, with so many parameters of the pose before the shared errors'."""
-    own, jumps = np.zeros(pose), bench.jumps
+    own, changes = np.zeros(pose), bench.changes
     log_weight, compliance, _, scale, delay = np.array(hypotheses).T.copy()
-    changed = np.array([np.concatenate([own, j.variances.numpy()]) for j in jumps])
+    changed = np.array([np.concatenate([own, c.variances.numpy()]) for c in changes])
     return Prior(
         log_weight=log_weight,
         compliance=compliance,
@@ -52,8 +52,8 @@ def prior_of(bench: LinearErrors, hypotheses: tuple[Hypothesis, ...], outlier: f
         delay=np.searchsorted(list(bench.delays), delay),
         mean=np.concatenate([own, bench.means.numpy()]),
         variance=np.concatenate([WIDE.numpy()[:pose] ** 2, bench.variances.numpy()]),
-        jump_log_probability=np.array([math.log(j.probability) for j in jumps]),
-        jump_variance=changed.reshape(len(jumps), pose + len(bench.means)),
+        change_log_probability=np.array([math.log(c.probability) for c in changes]),
+        change_variance=changed,
         outlier=outlier,
         farthest=FARTHEST,
     )

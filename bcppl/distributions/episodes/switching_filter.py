@@ -3,11 +3,12 @@
 The gap at a row is the measured one plus a linear function of M parameters, which are normal a priori, plus
 the row's own errors, which are normal and correlated within an episode. So given what is discrete the
 parameters are normal at any time and are integrated out by a Kalman filter, one for each hypothesis: of the
-contact's compliance and the noise's scale from the beginning, of a jump of some parameters, or of an outlier,
-at an episode that surprises. Hypotheses multiply there, and the most probable ones are kept (a Gaussian
-mixture filter: Alspach and Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, IEEE
-TAC 17, 1972). Each row's probability is conditional on those before it, so the product is a density of all
-rows, whatever was dropped, but for the share of what was.
+contact's compliance and the noise's scale from the beginning, of a change of some parameters in an episode,
+or of an outlier, where an episode surprises. A change is that of a Wiener process from row to row: what slips
+in a touch slips at any of its rows, at once or slowly. Hypotheses multiply there, and the most probable ones
+are kept (a Gaussian mixture filter: Alspach and Sorenson, Nonlinear Bayesian estimation using Gaussian sum
+approximations, IEEE TAC 17, 1972). Each row's probability is conditional on those before it, so the product
+is a density of all rows, whatever was dropped, but for the share of what was.
 
 A row without contact has the probability that its gap is positive, and the parameters the first two moments
 given that (assumed density filtering).
@@ -21,12 +22,12 @@ import numpy as np
 
 from bcppl.arrays import Array
 from bcppl.compiled import compiled, summed
-from bcppl.distributions.episodes.branches import INLIER, KEPT, OUTLIER, Branches, Prior, Segments
+from bcppl.distributions.episodes.branches import INLIER, KEPT, OUTLIER, SHARED, Branches, Prior, Segments
 from bcppl.threads import parallel_sum, thread_count
 
 _FAINT = 12.0  # nats below the most probable hypothesis, from which on one is dropped
 _CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
-_SURPRISING = 3.0  # standard deviations of a chi-square
+_SURPRISING = 1.0  # standard deviations of a chi-square
 # Particles of a chunk of work, and rows of all of them, at least: fewer take less than a thread's beginning.
 _CHUNK, _ROWS = 8, 2000
 
@@ -118,36 +119,46 @@ def _times(covariance: Array, column: Array, product: Array) -> float:
 
 @summed
 def _update(
-    error: Array, columns: Array, factor: Array, mean: Array, covariance: Array, pull: Array
+    error: Array,
+    columns: Array,
+    own: Array,
+    kept: Array,
+    renewed: float,
+    change: Array,
+    mean: Array,
+    covariance: Array,
+    pull: Array,
 ) -> tuple[float, float]:
-    """Condition the parameters on an episode's rows, in place; of the covariance the lower triangle.
+    """Condition the state on an episode's rows, in place; of the covariance the lower triangle.
 
-    `error` (n,) and `columns` (n, M) are whitened in place by `factor` (n, n).
+    The state (S,) is the parameters and what the rows share. It has a `mean` (S,) and a `covariance`; `pull`
+    (S,) is room. The gap less its expectation, `error` (n,), has derivatives `columns` (n, S) and variances
+    `own` (n,) besides. The last state is that of the row before by a correlation `kept` (n,), and `renewed`,
+    its variance, stays. Parameters change before each row, by its share of variances `change` (M,).
 
     Returns:
         the log-density of the rows, and the squares of their standardised errors.
     """
-    count, parameters = columns.shape
-    log_density, squared = 0.0, 0.0
+    count, states = columns.shape
+    log_density, squared, last = 0.0, 0.0, states - 1
     for i in range(count):
-        for j in range(i):
-            share = factor[i, j]
-            error[i] -= share * error[j]
-            for a in range(parameters):
-                columns[i, a] -= share * columns[j, a]
-        error[i] /= factor[i, i]
-        for a in range(parameters):
-            columns[i, a] /= factor[i, i]
-        innovation, variance = error[i], 1.0 + _times(covariance, columns[i], pull)
-        for a in range(parameters):
+        for a in range(len(change)):
+            covariance[a, a] += change[a] / count
+        if i:
+            mean[last] *= kept[i]
+            for a in range(last):
+                covariance[last, a] *= kept[i]
+            covariance[last, last] = kept[i] ** 2 * covariance[last, last] + (1.0 - kept[i] ** 2) * renewed
+        innovation, variance = error[i], own[i] + _times(covariance, columns[i], pull)
+        for a in range(states):
             innovation += columns[i, a] * mean[a]
-        for a in range(parameters):
+        for a in range(states):
             share = pull[a] / variance
             mean[a] -= share * innovation
             for b in range(a + 1):
                 covariance[a, b] -= share * pull[b]
         squared += innovation * innovation / variance
-        log_density -= 0.5 * math.log(variance) + math.log(factor[i, i])
+        log_density -= 0.5 * math.log(variance)
     return log_density - 0.5 * (squared + count * math.log(2.0 * math.pi)), squared
 
 
@@ -165,19 +176,20 @@ def _filter(
     trust: Array,
 ) -> None:
     number, log_weight, which, mean, covariance, event, squared = after
-    parameters, jumps, size = columns.shape[3], len(prior.jump_log_probability), log_weight.shape[1]
-    known, longest, most = before.event.shape[2], segments.factor.shape[2], size * (2 + jumps)
+    parameters, changes, size = columns.shape[3], len(prior.change_log_probability), log_weight.shape[1]
+    known, longest, most = (
+        before.event.shape[2],
+        int((segments.last - segments.first).max()),
+        2 * size * changes,
+    )
+    states = parameters + SHARED
     log_in = math.log1p(-prior.outlier)
     log_out = math.log(prior.outlier) if prior.outlier > 0.0 else -np.inf
-    kept = 1.0
-    for j in range(jumps):
-        kept -= math.exp(prior.jump_log_probability[j])
-    log_kept = math.log(kept)
     # Candidates at one episode: which branch each comes from, and its state.
     weight, source, kind = np.empty(most), np.empty(most, np.int64), np.empty(most, np.int64)
-    square, means = np.empty(most), np.empty((most, parameters))
-    covariances = np.empty((most, parameters, parameters))
-    error, whitened, pull = np.empty(longest), np.empty((longest, parameters)), np.empty(parameters)
+    square, means, covariances = np.empty(most), np.empty((most, states)), np.empty((most, states, states))
+    error, slopes, pull = np.empty(longest), np.empty((longest, states)), np.empty(states)
+    changed = np.empty(parameters)
     old_which, old_event, old_squared = which[0].copy(), event[0].copy(), squared[0].copy()
     for n in range(begin, end):
         own = n if len(before.mean) > 1 else 0
@@ -195,8 +207,7 @@ def _filter(
                     if distance[n, delay, first] > _CLEAR:
                         continue
                     column = columns[n, delay, first]
-                    spread = segments.factor[which[n, b], first, 0]
-                    gap, variance = distance[n, delay, first], spread * spread
+                    gap, variance = distance[n, delay, first], segments.own[which[n, b], first]
                     variance += _times(covariance[n, b], column, pull)
                     for a in range(parameters):
                         gap += column[a] * mean[n, b, a]
@@ -221,49 +232,52 @@ def _filter(
             for b in range(number[n]):
                 h = which[n, b]
                 delay = prior.delay[h]
-                for option in range(1 + jumps):
-                    means[found], covariances[found] = mean[n, b], covariance[n, b]
-                    if option:
-                        for a in range(parameters):
-                            covariances[found, a, a] += (
-                                prior.jump_variance[option - 1, a] * prior.scale[h] ** 2
-                            )
-                    for i in range(rows):
-                        sunk = prior.compliance[h] * force[first + i]
-                        share = trust[n, delay, first + i]
-                        error[i] = share * (distance[n, delay, first + i] + sunk)
-                        for a in range(parameters):
-                            whitened[i, a] = share * columns[n, delay, first + i, a]
+                for i in range(rows):
+                    share = trust[n, delay, first + i]
+                    error[i] = share * (
+                        distance[n, delay, first + i] + prior.compliance[h] * force[first + i]
+                    )
+                    for a in range(parameters):
+                        slopes[i, a] = share * columns[n, delay, first + i, a]
+                    slopes[i, parameters] = segments.sunk[h, first + i]
+                    slopes[i, parameters + 1 :] = 1.0
+                for change in range(changes):
+                    for a in range(parameters):
+                        changed[a] = prior.change_variance[change, a] * prior.scale[h] ** 2
+                    for into in (found, found + 1):
+                        means[into, :parameters], means[into, parameters:] = mean[n, b], 0.0
+                        covariances[into, :parameters, :parameters] = covariance[n, b]
+                        covariances[into, parameters:] = 0.0
+                        for a in range(SHARED):
+                            covariances[into, parameters + a, parameters + a] = segments.shared[h, a]
+                    # As an outlier it says nothing of what has changed, but what comes after it does.
+                    for a in range(parameters):
+                        covariances[found + 1, a, a] += changed[a]
                     log_density, square[found] = _update(
                         error[:rows],
-                        whitened[:rows],
-                        segments.factor[h, first:last],
+                        slopes[:rows],
+                        segments.own[h, first:last],
+                        segments.kept[first:last],
+                        segments.shared[h, SHARED - 1],
+                        changed,
                         means[found],
                         covariances[found],
                         pull,
                     )
-                    source[found] = b
-                    if option == 0:
-                        inlier = log_weight[n, b] + log_in + log_density
-                        outlier = log_weight[n, b] + stray
-                        surprise = square[found] - rows > _SURPRISING * math.sqrt(2.0 * rows) + 1.0
-                        if parameters == 0 or not surprise:
-                            # Nothing differs between the two but a state that is hardly ever the outlier's.
-                            weight[found], kind[found] = _log_sum(inlier, outlier), INLIER
-                            found += 1
-                            break
-                        weight[found], kind[found] = inlier + log_kept, INLIER
+                    inlier = log_weight[n, b] + log_in + log_density
+                    outlier = log_weight[n, b] + stray
+                    source[found], source[found + 1] = b, b
+                    kind[found], kind[found + 1] = 2 * change + INLIER, 2 * change + OUTLIER
+                    surprise = square[found] - rows > _SURPRISING * math.sqrt(2.0 * rows) + 1.0
+                    if change == 0 and (parameters == 0 or not surprise):
+                        # Nothing differs between the two but a state that is hardly ever the outlier's.
+                        weight[found] = _log_sum(inlier, outlier)
                         found += 1
-                        means[found], covariances[found] = mean[n, b], covariance[n, b]
-                        weight[found], kind[found], source[found] = outlier, OUTLIER, b
-                        square[found] = square[found - 1]
-                        found += 1
-                    else:
-                        kind[found] = OUTLIER + option
-                        weight[found] = (
-                            log_weight[n, b] + log_in + log_density + prior.jump_log_probability[option - 1]
-                        )
-                        found += 1
+                        break
+                    weight[found] = inlier + prior.change_log_probability[change]
+                    weight[found + 1] = outlier + prior.change_log_probability[change]
+                    square[found + 1] = square[found]
+                    found += 2
             best, left = weight[:found].max(), 0
             old_which[:], old_event[:], old_squared[:] = which[n], event[n], squared[n]
             while left < min(size, found):
@@ -271,7 +285,8 @@ def _filter(
                 if weight[c] < best - _FAINT:
                     break
                 log_weight[n, left], which[n, left] = weight[c], old_which[source[c]]
-                mean[n, left], covariance[n, left] = means[c], covariances[c]
+                mean[n, left] = means[c, :parameters]
+                covariance[n, left] = covariances[c, :parameters, :parameters]
                 event[n, left], squared[n, left] = old_event[source[c]], old_squared[source[c]]
                 event[n, left, episode], squared[n, left, episode] = kind[c], square[c]
                 weight[c] = -np.inf

@@ -54,8 +54,8 @@ class BenchProfile:
     kinematics: tuple[float, float] = (0.0003, 0.1)
     delay: float = 0.045
     size: float = 0.00005
-    slips: float = 0.005
-    slides: float = 0.005
+    slips: float = 0.02
+    slides: float = 0.02
 
     def errors(self, part: Point, peg: Point, *, is_round: bool = False) -> tuple[LinearError, ...]:
         """The errors, smooth ones about a guess (3,) of where the part is and where the peg will be held.

@@ -1,4 +1,4 @@
-"""Errors of the rows of an episode: their covariances, the same for all particles, as Cholesky factors."""
+"""Errors of the rows of an episode, as a process in time: the same for all particles."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class RowErrors(NamedTuple):
 
 
 def segments_of(rows: Tensor, errors: RowErrors, hypotheses: tuple[Hypothesis, ...]) -> Segments:
-    """The segments of rows (R, COLUMNS), with the factors of their covariances under each hypothesis."""
+    """The segments of rows (R, COLUMNS), with their errors under each hypothesis."""
     columns = rows[:, [FELT, NOISE, FORCE, TIME, EPISODE]].contiguous()
     return _segments(columns.numpy().tobytes(), errors, hypotheses)
 
@@ -58,24 +58,18 @@ def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, .
     begins[1:] = ~(contact[1:] & contact[:-1] & (episode[1:] == episode[:-1]))
     first = begins.nonzero()[:, 0]
     last = torch.cat([first[1:], torch.tensor([len(felt)])])
-    longest = int((last - first).max()) if len(first) else 1
-    nodes = torch.tensor([h.compliance for h in hypotheses], dtype=torch.float64)
+    compliance = torch.tensor([h.compliance for h in hypotheses], dtype=torch.float64)
     scale = torch.tensor([h.noise for h in hypotheses], dtype=torch.float64)
-    factor = torch.zeros(len(hypotheses), len(felt), longest, dtype=torch.float64)
-    spread = (noise**2 + errors.blur**2 + errors.drift**2 + errors.shared**2).sqrt()
-    factor[:, ~contact, 0] = scale[:, None] * spread[~contact]
-    for begin, end in zip(first.tolist(), last.tolist(), strict=True):
-        if not contact[begin]:
-            continue
-        own = slice(begin, end)
-        apart = (time[own, None] - time[own]).abs()
-        lasting = errors.drift**2 * torch.exp(-apart / errors.lasting) + errors.shared**2
-        lasting = lasting + torch.diag(noise[own] ** 2 + errors.blur**2)
-        sunk = nodes[:, None] * force[own]
-        covariance = scale[:, None, None] ** 2 * lasting + torch.diag_embed((errors.rough * sunk) ** 2)
-        covariance = covariance + errors.varying**2 * sunk[..., None] * sunk[..., None, :]
-        factor[:, own, : end - begin] = torch.linalg.cholesky(covariance)
+    sunk = compliance[:, None] * torch.where(contact, force, 0.0)
+    lasting = torch.tensor([0.0, errors.shared**2, errors.drift**2], dtype=torch.float64)
+    own = noise**2 + errors.blur**2 + torch.where(contact, 0.0, lasting.sum())
+    own = scale[:, None] ** 2 * own + (errors.rough * sunk) ** 2
+    shared = scale[:, None] ** 2 * lasting
+    shared[:, 0] = 1.0
+    kept = torch.ones_like(time)
+    kept[1:] = torch.exp(-(time[1:] - time[:-1]).abs() / errors.lasting)
     arrays = (
-        np.ascontiguousarray(each.numpy()) for each in (first, last, contact[first].to(torch.int64), factor)
+        np.ascontiguousarray(each.numpy())
+        for each in (first, last, contact[first].to(torch.int64), own, errors.varying * sunk, kept, shared)
     )
     return Segments(*arrays)
