@@ -102,6 +102,8 @@ class Branches(NamedTuple):
     def trimmed(self) -> Branches:
         """The same without what no particle uses, and each particle's own."""
         count, most = len(self.number), int(self.number.max(initial=1))
+        if 2 * most > self.log_weight.shape[1] and len(self.log_weight) == count:
+            return self  # a copy would take as long as half of the filter, to save less than half of the room
         own = (each if len(each) == count else np.repeat(each, count, axis=0) for each in self[1:])
         return Branches._make([self.number, *(each[:, :most].copy() for each in own)])
 
