@@ -186,16 +186,13 @@ def simulated(profile: BenchProfile = STILL, solids: bool = False) -> tuple[Trut
     hypothesis = every[int(torch.multinomial(torch.tensor([h.log_weight for h in every]).exp(), 1))]
     deviations = hypothesis.scale * errors.variances.sqrt()
     value = errors.means + deviations * torch.randn(len(deviations), dtype=torch.float64)
-    steps, touches, held = [], len(ROWS) // len(FORCES), len(FORCES)
+    touches, held, moved = len(ROWS) // len(FORCES), len(FORCES), torch.zeros(len(ROWS), len(value))
     for jump in errors.jumps:
         happens = torch.rand(touches, 1, dtype=torch.float64) < jump.probability
         change = hypothesis.scale * (jump.variances / held).sqrt()  # at any row of the touch
-        steps.append(
-            happens.repeat_interleave(held, dim=0)
-            * change
-            * torch.randn(len(ROWS), len(value), dtype=torch.float64)
-        )
-    values = value + torch.stack(steps).sum(dim=0).cumsum(dim=0)
+        drawn = change * torch.randn(touches, held, len(value), dtype=torch.float64)
+        moved = moved + (happens[..., None] * drawn).flatten(0, 1).cumsum(dim=0)
+    values = value + moved
     factor = factors(ROWS, site._row_errors, hypothesis)
     blocks = factor.unflatten(0, (-1, len(FORCES)))[..., : len(FORCES)]
     noise = (blocks @ torch.randn(len(blocks), len(FORCES), 1, dtype=torch.float64)).flatten()
