@@ -15,9 +15,10 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.checks import Check, chi_square
 from bcppl.distributions.episodes.branches import Branches, Prior, begun
-from bcppl.distributions.episodes.displaced import by_shared_errors, displaced, mismeasured
+from bcppl.distributions.episodes.displaced import displaced
 from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.posterior import drawn, moments, probable_jumps
+from bcppl.distributions.episodes.predicted import PredictedEpisodes
 from bcppl.distributions.episodes.prior import WIDE, nodes_of, prior_of, with_delays
 from bcppl.distributions.episodes.row_errors import Hypothesis, RowErrors, segments_of
 from bcppl.distributions.episodes.rows import (
@@ -42,7 +43,7 @@ _REMEMBERED = 3  # windows: the last one's rows are those that the next one is g
 
 
 @dataclass(eq=False, repr=False)
-class ContactEpisodes(ContactManifold):
+class ContactEpisodes(PredictedEpisodes):
     """Where a held peg was measured to be, and whether it felt the part, over the rows of a window.
 
     A row is the mean of stamps that hardly differ, or one stamp. In an episode, which is an uninterrupted
@@ -147,29 +148,6 @@ class ContactEpisodes(ContactManifold):
                     whole.gradient + sign * own.gradient, whole.information + sign * own.information
                 )
         return whole
-
-    def joint_log_prob(self, value: Tensor, errors: Tensor) -> Tensor:
-        """Log-likelihood (N,) of a predicted window (N, T, 8) at shared errors (N, M)."""
-        distance, felt, lost, _ = self._moved(value, errors)
-        log_prob = self._of_contacts(distance, felt == 1.0) + self._of_free(distance, felt == 0.0)
-        return torch.where(lost, torch.nan, log_prob)
-
-    def joint_quadratic(self, value: Tensor, errors: Tensor) -> Quadratic:
-        """The log-likelihood of a predicted window (N, T, 8) to second order about pose and shared errors.
-
-        At errors (N, M) in their standard deviations, on which gaps depend linearly. The gradient is
-        (N, 6 + M) and the information (N, 6 + M, 6 + M), in the tangent space of the pose and in standard
-        deviations of the errors. The peg is pressed on with the force that `sink` stands for, the median
-        compliance of its contacts times it. Errors that last and the contacts' own compliance, which the
-        likelihood of a measured window has besides, are left out: a second of contact counts for up to 1.7
-        times as much as it will.
-        """
-        distance, felt, lost, slope = self._moved(value, errors)
-        pull, information = self._second_order(distance, felt, slope)
-        return Quadratic(
-            torch.where(lost[:, None], torch.nan, pull),
-            torch.where(lost[:, None, None], torch.nan, information),
-        )
 
     def joint_covariance(self, value: Tensor) -> Tensor:
         """Covariance (N, 6 + M, 6 + M) of the pose and the shared errors given a window's rows, linear here.
@@ -292,35 +270,6 @@ class ContactEpisodes(ContactManifold):
 
     def _late(self, gaps: Gaps, rows: Tensor) -> tuple[Tensor, Tensor]:
         return displaced(gaps, self.pose, rows, self.bench)
-
-    def with_shared_errors(self, value: Tensor, errors: Tensor) -> Tensor:
-        """A window (N, T, 8) that was predicted without shared errors as it is measured under some (N, M)."""
-        _, felt, lost, gaps = self._measured(value[..., : FELT + 1])
-        if gaps is None:
-            return value
-        kept, stood, pressed = self._pressed(value, felt, lost)
-        measured = value.clone()
-        measured[:, kept, :7] = mismeasured(gaps, self.pose, stood, pressed, self.bench, errors)
-        return torch.where(lost[:, None, None], torch.nan, measured)
-
-    def _moved(self, value: Tensor, errors: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Distances and contact signals (N, S) of a predicted window at shared errors, and which are lost.
-
-        Then the distances' derivatives (N, S, 6 + M) by pose and errors.
-        """
-        distance, felt, lost, gaps = self._measured(value[..., : FELT + 1])
-        if gaps is None:
-            return distance, felt, lost, distance.new_zeros(*distance.shape, 6 + errors.shape[-1])
-        _, stood, pressed = self._pressed(value, felt, lost)
-        shared = by_shared_errors(gaps, self.pose, stood, pressed, self.bench)
-        slope = torch.cat([gaps.gradient(self.pose), shared], dim=-1)
-        return distance + (shared @ errors[..., None])[..., 0], felt, lost, slope
-
-    def _pressed(self, value: Tensor, felt: Tensor, lost: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Which stamps (T,) of a predicted window are decided; there pegs (N, S, 7) and forces (N, S)."""
-        kept = ~torch.isnan(value[..., FELT]).all(dim=0)
-        stood = torch.where(lost[:, None, None], self.pose[:, None], value[:, kept, :7])
-        return kept, stood, torch.where(felt == 1.0, self.sink / self.compliance, 0.0)
 
     def _shift(self, gaps: Gaps, rows: Tensor, branches: Branches) -> Tensor:
         """The gaps' changes (N, R) by the delay and the shared errors, on average over hypotheses."""
