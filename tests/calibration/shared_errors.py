@@ -189,7 +189,8 @@ def simulated(profile: BenchProfile = STILL, solids: bool = False) -> tuple[Trut
     touches, held, moved = len(ROWS) // len(FORCES), len(FORCES), torch.zeros(len(ROWS), len(value))
     for jump in errors.jumps:
         happens = torch.rand(touches, 1, dtype=torch.float64) < jump.probability
-        change = hypothesis.scale * (jump.variances / held).sqrt()  # at any row of the touch
+        loading = torch.diff(torch.tensor([0.0, *FORCES], dtype=torch.float64).cummax(0).values) / max(FORCES)
+        change = hypothesis.scale * (loading[:, None] * jump.variances).sqrt()
         drawn = change * torch.randn(touches, held, len(value), dtype=torch.float64)
         moved = moved + (happens[..., None] * drawn).flatten(0, 1).cumsum(dim=0)
     values = value + moved

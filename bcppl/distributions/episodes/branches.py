@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from torch import Tensor
 
-from bcppl.arrays import Array, Indices
+from bcppl.arrays import Array, Indices, Mask
 
 KEPT = 8  # hypotheses of a particle
 SHARED = 3  # states that the rows of an episode share
@@ -26,6 +27,7 @@ class Segments(NamedTuple):
             all of its errors.
         sunk: (H, R) by how much one standard deviation of the contact's compliance moves the gap, m.
         kept: (R,) correlation of the error that is forgotten with that of the row before.
+        loading: (R,) the share of a change's variances that comes before each row of an episode.
         shared: (H, 3) variances of the states at an episode's first row.
     """
 
@@ -35,6 +37,7 @@ class Segments(NamedTuple):
     own: Array
     sunk: Array
     kept: Array
+    loading: Array
     shared: Array
 
 
@@ -98,6 +101,40 @@ class Branches(NamedTuple):
         shifted = np.where(used, self.log_weight, -np.inf) - self.log_evidence[:, None]
         return np.asarray(np.exp(shifted))
 
+    def surviving(self, hypotheses: int) -> Mask:
+        """(N, H) which hypotheses of the prior any of a particle's is still of."""
+        used = np.arange(self.log_weight.shape[1]) < self.number[:, None]
+        mask = np.zeros((len(self.number), hypotheses + 1), dtype=np.bool_)
+        np.put_along_axis(mask, np.where(used, self.which, hypotheses), True, axis=1)
+        return mask[:, :-1]
+
+    def with_only(self, mask: Mask) -> Branches:
+        """As `begun`, with those hypotheses of the prior that a mask (N, H) leaves each particle."""
+        order = np.argsort(~mask, axis=1, kind="stable")
+        log_weight = np.take_along_axis(self.log_weight.repeat(len(mask), axis=0), order, axis=1)
+        only = self._replace(number=mask.sum(axis=1), log_weight=log_weight, which=order)
+        if len(mask) > 1:
+            return only  # the states are held once for all particles, by hypothesis
+        return only._replace(mean=self.mean[:, order[0]], covariance=self.covariance[:, order[0]])
+
+    def with_those(self, which: Indices, others: Branches) -> Branches:
+        """The same with the hypotheses of some particles in place of their own."""
+        size = max(self.log_weight.shape[1], others.log_weight.shape[1])
+        replaced = []
+        for mine, other in zip(self, others, strict=True):
+            if mine.ndim > 1 and mine.shape[1] < size:
+                grown = np.zeros((mine.shape[0], size, *mine.shape[2:]), mine.dtype)
+                grown[:, : mine.shape[1]] = mine
+                mine = grown
+            else:
+                mine = mine.copy()
+            if mine.ndim > 1:
+                mine[which, : other.shape[1]] = other
+            else:
+                mine[which] = other
+            replaced.append(mine)
+        return Branches._make(replaced)
+
     @property
     def trimmed(self) -> Branches:
         """The same without what no particle uses, and each particle's own."""
@@ -106,6 +143,13 @@ class Branches(NamedTuple):
             return self  # a copy would take as long as half of the filter, to save less than half of the room
         own = (each if len(each) == count else np.repeat(each, count, axis=0) for each in self[1:])
         return Branches._make([self.number, *(each[:, :most].copy() for each in own)])
+
+
+class Linearised(NamedTuple):
+    """Hypotheses, and the shared errors (N, M) of each particle about which the gap is linear."""
+
+    branches: Branches
+    about: Tensor
 
 
 def begun(prior: Prior, particles: int) -> Branches:

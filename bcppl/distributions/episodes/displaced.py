@@ -8,7 +8,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.episodes.linear_errors import Effect, LinearErrors
 from bcppl.distributions.episodes.rows import COLUMNS, WRENCH
-from bcppl.distributions.manifold import Gaps
+from bcppl.distributions.manifold import Gaps, MeasuresGap
 
 
 def displaced(gaps: Gaps, pose: Tensor, rows: Tensor, bench: LinearErrors) -> tuple[Tensor, Tensor]:
@@ -26,6 +26,31 @@ def displaced(gaps: Gaps, pose: Tensor, rows: Tensor, bench: LinearErrors) -> tu
     slope = _by_twist_of_peg(gaps.gradient(pose), pose, rows[:, :7])
     by_errors = torch.einsum("nra,dram->ndrm", slope, effect.twist) + effect.offset
     return torch.einsum("nra,dra->ndr", slope, by_delay), by_errors
+
+
+def relinearised(
+    gap: MeasuresGap, pose: Tensor, rows: Tensor, bench: LinearErrors, errors: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gaps (N, D, R) without errors, as they seem from pegs displaced by some (N, M); and as of `displaced`.
+
+    Where flat faces meet another corner of the peg may touch once it is turned: there the gap has a kink, and
+    is linear about what the errors seem to be, not about none.
+
+    Returns:
+        the gaps with each delay, their changes (N, D, R, M) by the errors, and derivatives (N, R, 6) by the
+        part's pose.
+    """
+    by_delay, effect = bench.late_effects(rows)
+    twist = torch.einsum("ram,nm->nra", bench.effect(rows).twist, errors)
+    turn = poses.rotation_matrix(rows[:, :7])
+    moved = torch.einsum("rab,nrb->nra", turn, twist[..., :3])
+    peg = rows[:, :7].expand(len(pose), len(rows), 7)
+    peg = poses.retract(peg, torch.cat([moved, twist[..., 3:]], dim=-1))
+    gaps = gap(pose, peg)
+    gradient = gaps.gradient(pose)
+    slope = _by_twist_of_peg(gradient, pose, peg)
+    distance = gaps.distance[:, None] + torch.einsum("nra,ndra->ndr", slope, by_delay - twist[:, None])
+    return distance, torch.einsum("nra,dram->ndrm", slope, effect.twist) + effect.offset, gradient
 
 
 def by_shared_errors(gaps: Gaps, pose: Tensor, peg: Tensor, force: Tensor, bench: LinearErrors) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,10 +14,10 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.checks import Check, chi_square
-from bcppl.distributions.episodes.branches import Branches, Prior, begun
-from bcppl.distributions.episodes.displaced import displaced
+from bcppl.distributions.episodes.branches import Branches, Linearised, Prior, begun
+from bcppl.distributions.episodes.displaced import displaced, relinearised
 from bcppl.distributions.episodes.linear_errors import LinearErrors
-from bcppl.distributions.episodes.posterior import drawn, moments, probable_jumps
+from bcppl.distributions.episodes.posterior import drawn, mean_of, moments, probable_jumps
 from bcppl.distributions.episodes.predicted import PredictedEpisodes
 from bcppl.distributions.episodes.prior import WIDE, nodes_of, prior_of, with_delays
 from bcppl.distributions.episodes.row_errors import Hypothesis, RowErrors, segments_of
@@ -32,13 +32,15 @@ from bcppl.distributions.episodes.rows import (
     given_and_all,
     is_cut,
     is_predicted,
+    last_end,
     padded,
 )
 from bcppl.distributions.episodes.switching_filter import filtered
-from bcppl.distributions.manifold import FARTHEST, ContactManifold, Gaps, Quadratic
+from bcppl.distributions.manifold import FARTHEST, ContactManifold, Gaps, MeasuresGap, Quadratic
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 
 _FAR = 4.0  # standard deviations
+_TURNED = 0.0025  # rad, by which a corner of a peg 12 mm wide moves 15 um
 _REMEMBERED = 3  # windows: the last one's rows are those that the next one is given
 
 
@@ -96,7 +98,8 @@ class ContactEpisodes(PredictedEpisodes):
     blur: float = field(default=0.0, metadata=NONNEGATIVE)
     bench: LinearErrors = field(default_factory=LinearErrors)
     hypotheses: tuple[Hypothesis, ...] = ()
-    memory: dict[bytes, Branches] = field(default_factory=dict)
+    memory: dict[bytes, Linearised] = field(default_factory=dict)
+    solids: MeasuresGap | None = None
 
     def __post_init__(self) -> None:
         super(ContactManifold, self).__init__(len(self.pose), (self.stamps, COLUMNS))
@@ -118,18 +121,50 @@ class ContactEpisodes(PredictedEpisodes):
 
     def branches(self, rows: Tensor, after: Tensor | None = None) -> Branches:
         """The hypotheses after rows (R, COLUMNS), the first of them `after`, where these were seen before."""
+        return self._known(rows, after).branches
+
+    def _known(self, rows: Tensor, after: Tensor | None = None) -> Linearised:
+        """The hypotheses after rows, and the shared errors about which the gap is linear."""
         key = rows.numpy().tobytes()
         known = self.memory.get(key)
         if known is None:
-            prior, begin = self._prior(0), None
+            before, new = None, rows
+            place = last_end(rows)
+            if self.bench.errors and place > (0 if after is None else len(after)):
+                # However a probe is cut, errors are assumed anew where a cell ends.
+                self._known(rows[:place], after)
+                after = rows[:place]
             if after is not None and len(after) and not is_cut(rows, len(after)):
-                begin = self.memory.get(after.numpy().tobytes())
-                rows = rows if begin is None else rows[len(after) :]
-            begin = begun(prior, len(self.pose)) if begin is None else begin
-            known = self.memory[key] = self._filtered(begin, prior, rows).trimmed
+                before = self.memory.get(after.numpy().tobytes())
+                new = rows if before is None else rows[len(after) :]
+            if before is None:
+                prior = self._prior(0)
+                about = torch.zeros(len(self.pose), len(prior.mean), dtype=torch.float64)
+                before = Linearised(begun(prior, len(self.pose)), about)
+            branches = self._filtered(before.branches, self._prior(0), new, before.about).trimmed
+            known = self.memory[key] = self._relinearised(rows, Linearised(branches, before.about))
             for old in list(self.memory)[:-_REMEMBERED]:
                 del self.memory[old]
         return known
+
+    def _relinearised(self, rows: Tensor, known: Linearised) -> Linearised:
+        """The same where particles' shared errors now seem to turn the peg otherwise than was assumed.
+
+        Where flat faces meet, another corner touches then, of which the gap is another function.
+        """
+        if not self.bench.errors or not len(rows):
+            return known
+        errors = mean_of(known.branches)
+        turned = self.bench.effect(rows).twist[:, 3:] @ (errors - known.about).T  # (R, 3, N)
+        far = (turned.abs().amax(dim=(0, 1)) > _TURNED).nonzero()[:, 0]
+        if not len(far):
+            return known
+        there, prior = replace(self, pose=self.pose[far], gap=self.solids or self.gap), self._prior(0)
+        begin = begun(prior, len(far)).with_only(known.branches.surviving(len(prior.scale))[far.numpy()])
+        again = there._filtered(begin, prior, rows, errors[far])
+        about = known.about.clone()
+        about[far] = errors[far]
+        return Linearised(known.branches.with_those(far.numpy(), again), about)
 
     def quadratic(self, value: Tensor) -> Quadratic:
         """The log-likelihood of a window to second order, the shared errors integrated out.
@@ -280,18 +315,27 @@ class ContactEpisodes(PredictedEpisodes):
         each = each + torch.einsum("nbrm,nbm->nbr", columns[particle, delay], torch.from_numpy(branches.mean))
         return (torch.from_numpy(branches.weights)[..., None] * each).sum(dim=1)
 
-    def _filtered(self, begin: Branches, prior: Prior, rows: Tensor, free: bool = False) -> Branches:
-        """The hypotheses after rows, the pose `free` to move about `self.pose` or held there."""
+    def _filtered(
+        self, begin: Branches, prior: Prior, rows: Tensor, about: Tensor, free: bool = False
+    ) -> Branches:
+        """The hypotheses after rows, the pose `free` to move about `self.pose` or held there.
+
+        The gap is linear in the shared errors about some (N, M).
+        """
         if not len(rows):
             return begin
-        gaps = self.gap(self.pose, rows[:, :7])
-        moved, columns = self._late(gaps, rows)
-        distance = gaps.distance[:, None] + moved
+        if about.any():
+            solids = self.solids or self.gap
+            distance, columns, gradient = relinearised(solids, self.pose, rows, self.bench, about)
+        else:
+            gaps = self.gap(self.pose, rows[:, :7])
+            moved, columns = self._late(gaps, rows)
+            distance, gradient = gaps.distance[:, None] + moved, gaps.gradient(self.pose)
         trusted = []
         if free and self.blur:
             trusted.append(self._trust(distance, columns, rows))
         if free:
-            own = gaps.gradient(self.pose)[:, None].expand(*columns.shape[:-1], 6)
+            own = gradient[:, None].expand(*columns.shape[:-1], 6)
             columns = torch.cat([own, columns], dim=-1)
         given = [distance, rows[:, FORCE], columns, *trusted]
         arrays = (np.ascontiguousarray(each.numpy()) for each in given)
@@ -331,4 +375,7 @@ class ContactEpisodes(PredictedEpisodes):
         prior = self._prior(6)
         if self.blur:
             prior = prior._replace(outlier=0.0)
-        return moments(self._filtered(begun(prior, len(self.pose)), prior, rows, free=True))
+        about = self.pose.new_zeros(len(self.pose), len(self.bench.means))
+        if self.bench.errors and not self.blur:
+            about = self._known(rows).about
+        return moments(self._filtered(begun(prior, len(self.pose)), prior, rows, about, free=True))

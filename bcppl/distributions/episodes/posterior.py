@@ -24,6 +24,11 @@ def drawn(branches: Branches, draws: int) -> Tensor:
     return mean + ((axes * variances.clamp(min=0.0).sqrt()[..., None, :]) @ standard)[..., 0]
 
 
+def mean_of(branches: Branches) -> Tensor:
+    """Mean (N, M) of the parameters."""
+    return torch.from_numpy(np.einsum("nb,nbm->nm", branches.weights, branches.mean))
+
+
 def moments(branches: Branches) -> tuple[Tensor, Tensor]:
     """Mean (N, M) and covariance (N, M, M) of the parameters."""
     weights, means = torch.from_numpy(branches.weights), torch.from_numpy(branches.mean)

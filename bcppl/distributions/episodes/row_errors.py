@@ -68,8 +68,23 @@ def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, .
     shared[:, 0] = 1.0
     kept = torch.ones_like(time)
     kept[1:] = torch.exp(-(time[1:] - time[:-1]).abs() / errors.lasting)
+    loading = torch.zeros_like(time)
+    for begin, end in zip(first.tolist(), last.tolist(), strict=True):
+        if contact[begin]:
+            # What is held by friction slips when it is loaded more than it was.
+            most = force[begin:end].clamp(min=1e-3).cummax(dim=0).values
+            loading[begin:end] = torch.diff(most, prepend=most.new_zeros(1)) / most[-1]
     arrays = (
         np.ascontiguousarray(each.numpy())
-        for each in (first, last, contact[first].to(torch.int64), own, errors.varying * sunk, kept, shared)
+        for each in (
+            first,
+            last,
+            contact[first].to(torch.int64),
+            own,
+            errors.varying * sunk,
+            kept,
+            loading,
+            shared,
+        )
     )
     return Segments(*arrays)

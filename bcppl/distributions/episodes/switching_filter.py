@@ -4,11 +4,12 @@ The gap at a row is the measured one plus a linear function of M parameters, whi
 the row's own errors, which are normal and correlated within an episode. So given what is discrete the
 parameters are normal at any time and are integrated out by a Kalman filter, one for each hypothesis: of the
 contact's compliance and the noise's scale from the beginning, of a change of some parameters in an episode,
-or of an outlier, where an episode surprises. A change is that of a Wiener process from row to row: what slips
-in a touch slips at any of its rows, at once or slowly. Hypotheses multiply there, and the most probable ones
-are kept (a Gaussian mixture filter: Alspach and Sorenson, Nonlinear Bayesian estimation using Gaussian sum
-approximations, IEEE TAC 17, 1972). Each row's probability is conditional on those before it, so the product
-is a density of all rows, whatever was dropped, but for the share of what was.
+or of an outlier, where an episode surprises. A change is a Wiener process that runs while a contact is loaded
+more than it was: what is held by friction slips then, at once or slowly, and not under a steady force.
+Hypotheses multiply there, and the most probable ones are kept (a Gaussian mixture filter: Alspach and
+Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, IEEE TAC 17, 1972). Each row's
+probability is conditional on those before it, so the product is a density of all rows, whatever was dropped,
+but for the share of what was.
 
 A row without contact has the probability that its gap is positive, and the parameters the first two moments
 given that (assumed density filtering).
@@ -123,6 +124,7 @@ def _update(
     columns: Array,
     own: Array,
     kept: Array,
+    loading: Array,
     renewed: float,
     change: Array,
     mean: Array,
@@ -134,7 +136,8 @@ def _update(
     The state (S,) is the parameters and what the rows share. It has a `mean` (S,) and a `covariance`; `pull`
     (S,) is room. The gap less its expectation, `error` (n,), has derivatives `columns` (n, S) and variances
     `own` (n,) besides. The last state is that of the row before by a correlation `kept` (n,), and `renewed`,
-    its variance, stays. Parameters change before each row, by its share of variances `change` (M,).
+    its variance, stays. Before each row parameters change by a share `loading` (n,) of variances `change`
+    (M,).
 
     Returns:
         the log-density of the rows, and the squares of their standardised errors.
@@ -143,7 +146,7 @@ def _update(
     log_density, squared, last = 0.0, 0.0, states - 1
     for i in range(count):
         for a in range(len(change)):
-            covariance[a, a] += change[a] / count
+            covariance[a, a] += change[a] * loading[i]
         if i:
             mean[last] *= kept[i]
             for a in range(last):
@@ -192,11 +195,14 @@ def _filter(
     changed = np.empty(parameters)
     old_which, old_event, old_squared = which[0].copy(), event[0].copy(), squared[0].copy()
     for n in range(begin, end):
-        own = n if len(before.mean) > 1 else 0
+        own, kept = n if len(before.mean) > 1 else 0, n if len(before.which) > 1 else 0
         for b in range(number[n]):
-            log_weight[n, b], which[n, b] = before.log_weight[own, b], before.which[own, b]
-            mean[n, b], covariance[n, b] = before.mean[own, b], before.covariance[own, b]
-            event[n, b, :known], squared[n, b, :known] = before.event[own, b], before.squared[own, b]
+            h = before.which[kept, b]
+            # Before the first row a state is that of its hypothesis, and held once for all particles.
+            place = h if len(before.which) > len(before.mean) else b
+            log_weight[n, b], which[n, b] = before.log_weight[kept, b], h
+            mean[n, b], covariance[n, b] = before.mean[own, place], before.covariance[own, place]
+            event[n, b, :known], squared[n, b, :known] = before.event[own, place], before.squared[own, place]
         episode = known
         for s in range(len(segments.first)):
             first, last = segments.first[s], segments.last[s]
@@ -258,6 +264,7 @@ def _filter(
                         slopes[:rows],
                         segments.own[h, first:last],
                         segments.kept[first:last],
+                        segments.loading[first:last],
                         segments.shared[h, SHARED - 1],
                         changed,
                         means[found],

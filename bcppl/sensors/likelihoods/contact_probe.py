@@ -31,7 +31,6 @@ from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.capabilities import Approximated, PegRows
 from bcppl.sensors.likelihoods.bench_profiles import profile_named
 from bcppl.sensors.likelihoods.probe_rows import (
-    Measured,
     ProbeRows,
     RememberedGaps,
     after_those_before,
@@ -182,6 +181,7 @@ class ContactProbe:
             bench=self.bench,
             hypotheses=self.hypotheses,
             memory=gap.memory if isinstance(gap, RememberedGaps) else {},
+            solids=self.gap,
         )
 
     def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
@@ -224,9 +224,7 @@ class ContactProbe:
     ) -> Iterator[tuple[ContactEpisodes, Tensor]]:
         """The likelihood of all probes at poses (S, 7), and their rows."""
         value = torch.cat([new_rows(value) for _, _, value in measurements])
-        gaps = self.gap(part, value[:, :7])
-        measured = Measured(gaps.distance, gaps.gradient(part))
-        yield self.site(measurements[-1].action, part, blur, measured), value
+        yield self.site(measurements[-1].action, part, blur, RememberedGaps(self.gap, part)), value
 
     def new_contact(self, measurements: Sequence[Approximated], newest: bool) -> bool:
         """Whether contact begins in one of the windows, or in the newest of them."""
