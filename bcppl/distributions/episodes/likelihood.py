@@ -61,8 +61,10 @@ class ContactEpisodes(PredictedEpisodes):
     row that an earlier window has used is in the value again, marked as given, and the log-likelihood is that
     of all rows minus that of the given ones.
 
-    What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap
-    linearly and is integrated out (`bcppl.distributions.episodes.switching_filter`).
+    What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap and
+    is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear in it about what it
+    seems to be: at the end of each cell of time all rows are explained anew if the peg seems to be turned
+    otherwise than was assumed (as in an iterated extended Kalman smoother, Bell, SIAM J. Optim. 4, 1994).
 
     A row without contact has the probability that a gap about d is positive, as in `ContactManifold`; an
     episode is an outlier as a whole.
@@ -85,6 +87,8 @@ class ContactEpisodes(PredictedEpisodes):
         hypotheses: of compliance, noise and scale; by default the nodes of the compliance.
         memory: of what is known after which rows, at these poses; where windows share one, each row is used
             once.
+        solids: what measures the gap of pegs that are displaced by shared errors; `gap` unless given.
+        cell: the time after which the errors about which gaps are linear are chosen anew, s.
     """
 
     __caches__ = ("memory",)
@@ -100,6 +104,7 @@ class ContactEpisodes(PredictedEpisodes):
     hypotheses: tuple[Hypothesis, ...] = ()
     memory: dict[bytes, Linearised] = field(default_factory=dict)
     solids: MeasuresGap | None = None
+    cell: float = field(default=0.5, metadata=POSITIVE)
 
     def __post_init__(self) -> None:
         super(ContactManifold, self).__init__(len(self.pose), (self.stamps, COLUMNS))
@@ -129,7 +134,7 @@ class ContactEpisodes(PredictedEpisodes):
         known = self.memory.get(key)
         if known is None:
             before, new = None, rows
-            place = last_end(rows)
+            place = last_end(rows, self.cell)
             if self.bench.errors and place > (0 if after is None else len(after)):
                 # However a probe is cut, errors are assumed anew where a cell ends.
                 self._known(rows[:place], after)

@@ -6,8 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bcppl.contact.sensing.episodes import CELL
-
 # Of a row: the peg's pose, then these; WRENCH is that on the peg, in its frame. EARLIER are the twists in it
 # that lead to where the peg was so many SECONDS before, m and rad: the wrench may be late by as much. WITHIN
 # is the twist by which that differs within an interval of the delay (`late`), 0 for none.
@@ -75,8 +73,8 @@ def is_cut(rows: Tensor, place: int) -> bool:
     )
 
 
-def last_end(rows: Tensor) -> int:
-    """The last place at which one of the cells of time ends (`CELL`) and no episode goes on; 0 for none."""
-    cell = np.floor(rows[:, TIME].numpy() / CELL + 1e-6)
-    ends = np.flatnonzero(np.diff(cell)) + 1
+def last_end(rows: Tensor, cell: float) -> int:
+    """The last place at which a cell of time, so many seconds, ends and no episode goes on; 0 for none."""
+    number = np.floor(rows[:, TIME].numpy() / cell + 1e-6)
+    ends = np.flatnonzero(np.diff(number)) + 1
     return next((int(place) for place in ends[::-1] if not is_cut(rows, int(place))), 0)
