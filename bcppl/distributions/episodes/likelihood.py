@@ -63,7 +63,7 @@ class ContactEpisodes(PredictedEpisodes):
 
     What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap and
     is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear in it about what it
-    seems to be: at the end of each cell of time all rows are explained anew if the peg seems to be turned
+    seems to be: at the end of each cell of time all rows are linearised again if the peg seems to be turned
     otherwise than was assumed (as in an iterated extended Kalman smoother, Bell, SIAM J. Optim. 4, 1994).
 
     A row without contact has the probability that a gap about d is positive, as in `ContactManifold`; an
@@ -88,7 +88,7 @@ class ContactEpisodes(PredictedEpisodes):
         memory: of what is known after which rows, at these poses; where windows share one, each row is used
             once.
         solids: what measures the gap of pegs that are displaced by shared errors; `gap` unless given.
-        cell: the time after which the errors about which gaps are linear are chosen anew, s.
+        cell: the time after which gaps are linearised again, s.
     """
 
     __caches__ = ("memory",)
@@ -136,7 +136,7 @@ class ContactEpisodes(PredictedEpisodes):
             before, new = None, rows
             place = last_end(rows, self.cell)
             if self.bench.errors and place > (0 if after is None else len(after)):
-                # However a probe is cut, errors are assumed anew where a cell ends.
+                # However a probe is cut, gaps are linearised again where a cell ends.
                 self._known(rows[:place], after)
                 after = rows[:place]
             if after is not None and len(after) and not is_cut(rows, len(after)):
