@@ -59,6 +59,8 @@ GAP = PegGap(block((2.0 * HALF, 2.0 * HALF, HEIGHT)), box_peg(0.016, LENGTH))
 SPREAD = torch.tensor([1e-3] * 3 + [0.01] * 3, dtype=torch.float64)
 CENTER = poses.identity()
 NOISE_OF_ROW, SHARED, DRIFT = 6e-5, 1e-5, 2e-5  # m
+# About as wide as a posterior, m and rad.
+ALIKE = torch.tensor([5e-4] * 3 + [3.6e-3] * 3, dtype=torch.float64)
 STRAY = 1e-9  # of an episode: none is drawn
 PARTICLES = 150
 STILL, SUDDEN = BenchProfile(slips=0.0, slides=0.0), BenchProfile(slips=0.01, slides=0.01)
@@ -68,8 +70,9 @@ COMPLIANCE = 5e-6  # m/N
 def design() -> tuple[Tensor, Tensor]:
     """Rows (R, COLUMNS) of a probe, pegs about where they touch, and the directions (R, 3) they come in."""
     rows, along = [], []
-    tops = [(-0.02, -0.02), (0.02, -0.02), (0.0, 0.02)]
-    sides = [((-1.0, 0.0), (0.0, -0.02)), ((-1.0, 0.0), (0.0, 0.02)), ((0.0, 1.0), (0.0, 0.0))]
+    # Away from the block's edges: past one, a gap is no smooth function of where the peg stops.
+    tops = [(-0.014, -0.014), (0.014, -0.014), (0.0, 0.014)]
+    sides = [((-1.0, 0.0), (0.0, -0.014)), ((-1.0, 0.0), (0.0, 0.014)), ((0.0, 1.0), (0.0, 0.0))]
     # Each place twice, the hand turned and leaning the other way: that tells the grasp from the part.
     for flip in (1.0, -1.0):
         turned = torch.tensor([0.0, 0.0, flip * 0.3], dtype=torch.float64)
@@ -89,7 +92,7 @@ FORCES = (2.0, 5.0, 9.0, 6.0)  # N
 def _rows_of(places: Sequence[Any], along: Sequence[Tensor]) -> Tensor:
     every = torch.zeros(len(places), len(FORCES), COLUMNS, dtype=torch.float64)
     for k, ((place, turned, flip), direction) in enumerate(zip(places, along, strict=True)):
-        lean = torch.tensor([0.07 * flip, 0.05, 0.0], dtype=torch.float64)
+        lean = torch.tensor([0.11 * flip, -0.08, 0.0], dtype=torch.float64)
         peg = poses.retract(poses.as_pose([*place.tolist(), 1.0, 0.0, 0.0, 0.0]), _twist(turned))
         peg = poses.retract(peg, _twist(lean))
         push = direction.double() @ poses.rotation_matrix(peg)  # in the peg's frame
@@ -198,7 +201,7 @@ def simulated(profile: BenchProfile = STILL, solids: bool = False) -> tuple[Trut
     blocks = factor.unflatten(0, (-1, len(FORCES)))[..., : len(FORCES)]
     noise = (blocks @ torch.randn(len(blocks), len(FORCES), 1, dtype=torch.float64)).flatten()
     wanted = noise - hypothesis.compliance * ROWS[:, FORCE]
-    rows, above = ROWS.clone(), torch.full((len(ROWS),), 0.01, dtype=torch.float64)
+    rows, above = ROWS.clone(), torch.full((len(ROWS),), 0.03, dtype=torch.float64)
     below = -above
     for _ in range(40):  # the gap falls along the direction in which the peg comes
         middle = 0.5 * (below + above)
@@ -287,6 +290,21 @@ def rank(bench: Bench, seed: int, profile: BenchProfile = STILL, solids: bool = 
         exact,
     )
     return ranks(columns[0], columns[1:])
+
+
+def rank_among_alike(seed: int, bench: Bench | None = None, count: int = 32) -> float:
+    """The rank in (0, 1) of the truth's posterior density among poses that might as well have been the truth.
+
+    All are drawn about a common centre, so they can be exchanged; no inference is made.
+    """
+    torch.manual_seed(seed)
+    truth, rows = simulated()
+    apart = ALIKE * torch.randn(count, 6, dtype=torch.float64)
+    moved = poses.local(CENTER, truth.pose) - apart[0] + apart
+    pose = poses.retract(CENTER.expand(count, 7), moved)
+    density = (bench or Bench()).site(pose, rows).log_prob(rows) - 0.5 * ((moved / SPREAD) ** 2).sum(dim=1)
+    weight = density.softmax(dim=0)
+    return float(weight[density < density[0]].sum() + torch.rand(()) * weight[0])
 
 
 @dataclass(frozen=True)

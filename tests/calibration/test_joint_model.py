@@ -11,7 +11,9 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from scipy.stats import kstest
 
+from bcppl.distributions.episodes import Grasp
 from bcppl.distributions.episodes.rows import FORCE
 from bcppl.inference.calibration.ranks import p_value
 from tests.calibration.case import DRAWS, gather
@@ -23,8 +25,10 @@ from tests.calibration.shared_errors import (
     Bench,
     errors_of,
     quantities,
+    rank_among_alike,
     round_of,
     simulated,
+    without,
 )
 from tests.calibration.test_calibration import BROKEN, SEED, SOUND
 from tests.episode_errors import factors
@@ -58,6 +62,13 @@ def test_what_is_simulated_has_the_residuals_of_the_likelihood() -> None:
     assert medians["nothing"] == pytest.approx(0.6745, rel=0.15)
     for error in errors_of()[:3]:
         assert medians[error.name] > 1.5 * medians["nothing"], error.name
+
+
+def test_likelihoods_are_those_of_what_is_simulated() -> None:
+    """Without any inference: the truth ranks like any pose that could be exchanged with it."""
+    found = kstest([rank_among_alike(seed) for seed in range(40)], "uniform").pvalue
+    wrong = kstest([rank_among_alike(seed, without(Grasp)) for seed in range(40)], "uniform").pvalue
+    assert found > 0.01 and wrong < 1e-4, (found, wrong)
 
 
 def table(name: str, rounds: int) -> tuple[float, float, str]:
