@@ -117,32 +117,16 @@ class Branches(NamedTuple):
             return only  # the states are held once for all particles, by hypothesis
         return only._replace(mean=self.mean[:, order[0]], covariance=self.covariance[:, order[0]])
 
-    def with_those(self, which: Indices, others: Branches) -> Branches:
-        """The same with the hypotheses of some particles in place of their own."""
-        size = max(self.log_weight.shape[1], others.log_weight.shape[1])
-        replaced = []
+    def put(self, which: Indices, others: Branches) -> None:
+        """Write the hypotheses of other particles, as many and after the same rows, over those of some."""
         for mine, other in zip(self, others, strict=True):
-            if mine.ndim > 1 and mine.shape[1] < size:
-                grown = np.zeros((mine.shape[0], size, *mine.shape[2:]), mine.dtype)
-                grown[:, : mine.shape[1]] = mine
-                mine = grown
-            else:
-                mine = mine.copy()
-            if mine.ndim > 1:
-                mine[which, : other.shape[1]] = other
-            else:
-                mine[which] = other
-            replaced.append(mine)
-        return Branches._make(replaced)
+            mine[which] = other
 
     @property
-    def trimmed(self) -> Branches:
-        """The same without what no particle uses, and each particle's own."""
-        count, most = len(self.number), int(self.number.max(initial=1))
-        if 2 * most > self.log_weight.shape[1] and len(self.log_weight) == count:
-            return self  # a copy would take as long as half of the filter, to save less than half of the room
-        own = (each if len(each) == count else np.repeat(each, count, axis=0) for each in self[1:])
-        return Branches._make([self.number, *(each[:, :most].copy() for each in own)])
+    def of_each(self) -> Branches:
+        """The same where what holds for all particles is written for each."""
+        count = len(self.number)
+        return Branches._make(each if len(each) == count else np.repeat(each, count, axis=0) for each in self)
 
 
 class Linearised(NamedTuple):

@@ -63,8 +63,8 @@ class ContactEpisodes(PredictedEpisodes):
 
     What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap and
     is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear in it about what it
-    seems to be: at the end of each cell of time all rows are linearised again if the peg seems to be turned
-    otherwise than was assumed (as in an iterated extended Kalman smoother, Bell, SIAM J. Optim. 4, 1994).
+    seems to be: at the end of each span of time (`rows.last_end`) all rows are linearised again if the peg
+    seems to be turned otherwise than was assumed (as in an iterated extended Kalman smoother, Bell, SIAM J. Optim. 4, 1994).
 
     A row without contact has the probability that a gap about d is positive, as in `ContactManifold`; an
     episode is an outlier as a whole.
@@ -88,7 +88,7 @@ class ContactEpisodes(PredictedEpisodes):
         memory: of what is known after which rows, at these poses; where windows share one, each row is used
             once.
         solids: what measures the gap of pegs that are displaced by shared errors; `gap` unless given.
-        cell: the time after which gaps are linearised again, s.
+        cell: the shortest span after which gaps are linearised again, s.
     """
 
     __caches__ = ("memory",)
@@ -146,7 +146,7 @@ class ContactEpisodes(PredictedEpisodes):
                 prior = self._prior(0)
                 about = torch.zeros(len(self.pose), len(prior.mean), dtype=torch.float64)
                 before = Linearised(begun(prior, len(self.pose)), about)
-            branches = self._filtered(before.branches, self._prior(0), new, before.about).trimmed
+            branches = self._filtered(before.branches, self._prior(0), new, before.about).of_each
             known = self.memory[key] = self._relinearised(rows, Linearised(branches, before.about))
             for old in list(self.memory)[:-_REMEMBERED]:
                 del self.memory[old]
@@ -167,9 +167,13 @@ class ContactEpisodes(PredictedEpisodes):
         there, prior = replace(self, pose=self.pose[far], gap=self.solids or self.gap), self._prior(0)
         begin = begun(prior, len(far)).with_only(known.branches.surviving(len(prior.scale))[far.numpy()])
         again = there._filtered(begin, prior, rows, errors[far])
+        if len(far) == len(errors):
+            return Linearised(again, errors)
         about = known.about.clone()
         about[far] = errors[far]
-        return Linearised(known.branches.with_those(far.numpy(), again), about)
+        # These are the filter's own, and nothing else holds them yet.
+        known.branches.put(far.numpy(), again)
+        return Linearised(known.branches, about)
 
     def quadratic(self, value: Tensor) -> Quadratic:
         """The log-likelihood of a window to second order, the shared errors integrated out.

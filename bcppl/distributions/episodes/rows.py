@@ -74,7 +74,11 @@ def is_cut(rows: Tensor, place: int) -> bool:
 
 
 def last_end(rows: Tensor, cell: float) -> int:
-    """The last place at which a cell of time, so many seconds, ends and no episode goes on; 0 for none."""
-    number = np.floor(rows[:, TIME].numpy() / cell + 1e-6)
-    ends = np.flatnonzero(np.diff(number)) + 1
+    """The last place at which a span of time ends and no episode goes on; 0 for none.
+
+    From the first row on spans end after 1, 2, 3, 4, 6, 8, 12, ... cells of so many seconds: as much is learnt
+    in each, and all rows can be explained again at each end in a time that grows as their number.
+    """
+    number = np.floor((rows[:, TIME] - rows[:1, TIME]).numpy() / cell + 1e-6)
+    ends = np.flatnonzero(np.diff(np.floor(2.0 * np.log2(number + (number == 0) * 0.5)))) + 1
     return next((int(place) for place in ends[::-1] if not is_cut(rows, int(place))), 0)

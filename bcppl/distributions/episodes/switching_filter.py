@@ -27,6 +27,7 @@ from bcppl.distributions.episodes.branches import INLIER, KEPT, OUTLIER, SHARED,
 from bcppl.threads import parallel_sum, thread_count
 
 _FAINT = 12.0  # nats below the most probable hypothesis, from which on one is dropped
+_UNLIKELY = 10.0  # the same before an episode, of a hypothesis with a change
 _CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
 _SURPRISING = 1.0  # standard deviations of a chi-square
 # Particles of a chunk of work, and rows of all of them, at least: fewer take less than a thread's beginning.
@@ -235,6 +236,7 @@ def _filter(
                 continue
             rows, found = last - first, 0
             stray = log_out - rows * math.log(prior.farthest)
+            likely = log_weight[n, : number[n]].max() - _UNLIKELY
             for b in range(number[n]):
                 h = which[n, b]
                 delay = prior.delay[h]
@@ -248,6 +250,8 @@ def _filter(
                     slopes[i, parameters] = segments.sunk[h, first + i]
                     slopes[i, parameters + 1 :] = 1.0
                 for change in range(changes):
+                    if change and log_weight[n, b] + prior.change_log_probability[change] < likely:
+                        continue
                     for a in range(parameters):
                         changed[a] = prior.change_variance[change, a] * prior.scale[h] ** 2
                     for into in (found, found + 1):
