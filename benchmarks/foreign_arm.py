@@ -1,14 +1,15 @@
 """An arm of six joints under impedance control, a peg at its wrist sensor, and a part, in MuJoCo.
 
 Joints have dry friction, the controller follows its command with a lag, the sensor carries the peg's weight
-and inertia, and contact is a spring and a damper of stated stiffness.
+and inertia, and contact is a spring and a damper of stated stiffness. The peg in the hand and the part may be
+displaced while it moves: the arm does not know of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import mujoco
 import numpy as np
@@ -110,8 +111,35 @@ class Log(NamedTuple):
     force: Array
 
 
+class Hidden(Protocol):
+    """What the arm does not know of: how the peg is held, and where the part is.
+
+    Attributes:
+        stated_from_peg: (7,) the true peg in the frame that the arm takes for the peg's, the sensor's.
+        world_from_part: (7,).
+    """
+
+    stated_from_peg: Array
+    world_from_part: Array
+
+    def felt(self, stated: Array, force: Array, point: Array) -> None:
+        """Take note of a tick, at whose end the two are put where both poses then are.
+
+        Args:
+            stated: (7,) world_from_stated at the start of the tick.
+            force: (3,) of the part on the peg then, N, in the world.
+            point: (3,) mean of the contacts' points, m, in the world; zeros without contact.
+        """
+
+
 def carried_out(
-    motion: Motion, seconds: float, part: Part, peg: Part, truth: Array, mechanics: Mechanics
+    motion: Motion,
+    seconds: float,
+    part: Part,
+    peg: Part,
+    truth: Array,
+    mechanics: Mechanics,
+    hidden: Hidden | None = None,
 ) -> Log:
     """The log of a motion, after whose end the command stays where it is.
 
@@ -122,9 +150,11 @@ def carried_out(
         peg: its frame is the wrench sensor's.
         truth: (7,) world_from_part.
         mechanics: of the arm and the contact.
+        hidden: displaces peg and part; the log's poses are then those of the peg as stated.
     """
     model = _model(part, peg, truth, mechanics)
     data = mujoco.MjData(model)
+    displaced = _Displaced(model, data, hidden) if hidden is not None else None
     command = next(motion)
     _stand(model, data, command)
     sensor = _Sensor(mechanics.cut_off)
@@ -146,8 +176,12 @@ def carried_out(
             if k == 0:
                 reached = np.append(data.site_xpos[0], _turn(data))
                 contact = _contact(model, data)
+                if hidden is not None:
+                    hidden.felt(reached, *_force_on_peg(model, data))
         wrench = sensor.filtered(readings)
         rows.append((command, reached, wrench[0], contact))
+        if displaced is not None:
+            displaced.place()
         command = _next(motion, sensor.force(wrench[-1]), command)
     times = STEP * TICK * np.arange(len(rows))
     commands, reached, wrench, contact = (np.array(column) for column in zip(*rows, strict=True))
@@ -177,6 +211,41 @@ class _Sensor:
     def force(self, wrench: Array) -> float:
         """The length of the force (N) beyond that at the start."""
         return float(np.linalg.norm(wrench[:3] - self._zero))
+
+
+class _Displaced:
+    """The peg in the hand and the part, put where they are hidden to be."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, hidden: Hidden) -> None:
+        self._model, self._data, self._hidden = model, data, hidden
+        self._geoms = np.flatnonzero(model.geom_bodyid == model.body("peg").id)
+        self._held = np.hstack([model.geom_pos[self._geoms], model.geom_quat[self._geoms]])
+        # Shortcuts for geometries that stay in their bodies.
+        model.geom_sameframe[:] = 0
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+        self.place()
+
+    def place(self) -> None:
+        """Put both where they are now."""
+        for geom, held in zip(self._geoms, self._held, strict=True):
+            pose = composed(self._hidden.stated_from_peg, held)
+            self._model.geom_pos[geom], self._model.geom_quat[geom] = pose[:3], pose[3:]
+        self._data.mocap_pos[0] = self._hidden.world_from_part[:3]
+        self._data.mocap_quat[0] = self._hidden.world_from_part[3:]
+
+
+def composed(a_from_b: Array, b_from_c: Array) -> Array:
+    """The pose (7,) a_from_c."""
+    pose = np.zeros(7)
+    mujoco.mju_mulPose(pose[:3], pose[3:], a_from_b[:3], a_from_b[3:], b_from_c[:3], b_from_c[3:])
+    return pose
+
+
+def inverse(a_from_b: Array) -> Array:
+    """The pose (7,) b_from_a."""
+    pose = np.zeros(7)
+    mujoco.mju_negPose(pose[:3], pose[3:], a_from_b[:3], a_from_b[3:])
+    return pose
 
 
 def _next(motion: Motion, force: float, last: Array) -> Array:
@@ -216,10 +285,22 @@ def _contact(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
     return np.array([-min(data.contact.dist, default=np.inf), force])
 
 
+def _force_on_peg(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, Array]:
+    """The part's force on the peg (3,), N, and the mean of the contacts' points (3,), m, in the world."""
+    wrench, force, point, peg = np.zeros(6), np.zeros(3), np.zeros(3), model.body("peg").id
+    for k in range(data.ncon):
+        contact = data.contact[k]
+        mujoco.mj_contactForce(model, data, k, wrench)
+        sign = 1.0 if model.geom_bodyid[contact.geom2] == peg else -1.0
+        force += sign * contact.frame.reshape(3, 3).T @ wrench[:3]
+        point += contact.pos / data.ncon
+    return force, point
+
+
 def _model(part: Part, peg: Part, truth: Array, mechanics: Mechanics) -> mujoco.MjModel:
     joints = mechanics.joint_friction * np.array([1.0, 1.0, 0.7, 0.15, 0.15, 0.1])
     spec = mujoco.MjSpec.from_string(ARM.format(step=STEP, f=joints, mass=mechanics.tool_mass))
-    fixed = spec.worldbody.add_body(pos=truth[:3], quat=truth[3:])
+    fixed = spec.worldbody.add_body(pos=truth[:3], quat=truth[3:], mocap=True)
     for name, body, solid, collides in (("peg", spec.body("peg"), peg, 1), ("part", fixed, part, 2)):
         for k, piece in enumerate(solid.pieces):
             geom = body.add_geom(friction=[mechanics.friction, 0.0, 0.0], condim=3)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from foreign_arm import NOMINAL, Log, Mechanics, Motion, carried_out
+from foreign_arm import NOMINAL, Hidden, Log, Mechanics, Motion, carried_out
 from foreign_parts import LENGTH, PARTS, ForeignPart, Place, peg
 from foreign_views import perturbed, views
 from scipy.ndimage import uniform_filter1d
@@ -30,6 +30,7 @@ Array = npt.NDArray[np.float64]
 
 MANNERS = {"taps": (6, 6.0), "presses": (7, 12.0)}  # how many, within how many seconds
 CONTACTS = {"softer": (-1.0, 0.0), "stiffer": (0.0, 1.0)}  # log10 of a contact's stiffness over the nominal
+STIFFNESSES = CONTACTS | {"nominal": (0.0, 0.0)}
 RATES = (100, 500)  # Hz
 WINDOW = 0.5  # s
 TICK = 0.001  # s
@@ -86,7 +87,7 @@ def scene_of(seed: int) -> Scene:
 def mechanics_of(seed: int, contact: str) -> Mechanics:
     """The arm's and the contact's parameters in a scene; but for the stiffness they are the same for all."""
     generator = np.random.default_rng([seed, 2])
-    factor = 10.0 ** generator.uniform(*CONTACTS[contact])
+    factor = 10.0 ** generator.uniform(*STIFFNESSES[contact])
     spring, turning = generator.uniform(1500.0, 2500.0), generator.uniform(90.0, 150.0)
     return Mechanics(
         stiffness=factor * NOMINAL,
@@ -101,8 +102,8 @@ def mechanics_of(seed: int, contact: str) -> Mechanics:
     )
 
 
-def log_of(scene: Scene, manner: str, contact: str) -> Log:
-    """What happens when a scene is touched in a manner."""
+def log_of(scene: Scene, manner: str, contact: str, hidden: Hidden | None = None) -> Log:
+    """What happens when a scene is touched in a manner, with something that the arm does not know of."""
     generator = np.random.default_rng([scene.seed, 3, sorted(MANNERS).index(manner)])
     count, seconds = MANNERS[manner]
     aimed = perturbed(scene.truth, ERROR, TURN_ERROR, generator)
@@ -113,7 +114,7 @@ def log_of(scene: Scene, manner: str, contact: str) -> Log:
     highest = _in_world(aimed, scene.foreign.part.vertices)[:, 2].max() + ABOVE
     mechanics = mechanics_of(scene.seed, contact)
     motion = _touching(strokes, highest, manner)
-    return carried_out(motion, seconds, scene.foreign.part, scene.peg, scene.truth, mechanics)
+    return carried_out(motion, seconds, scene.foreign.part, scene.peg, scene.truth, mechanics, hidden)
 
 
 def recording_of(
@@ -124,7 +125,7 @@ def recording_of(
     Args:
         scene: what is touched.
         manner: "taps" or "presses".
-        contact: "stiffer" or "softer".
+        contact: "stiffer", "softer" or "nominal".
         rate: stamps per second, a divisor of 1000.
         log: of `log_of`; None to carry the touches out.
     """
