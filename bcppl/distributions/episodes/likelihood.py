@@ -64,7 +64,8 @@ class ContactEpisodes(PredictedEpisodes):
     What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap and
     is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear in it about what it
     seems to be: at the end of each span of time (`rows.last_end`) all rows are linearised again if the peg
-    seems to be turned otherwise than was assumed (as in an iterated extended Kalman smoother, Bell, SIAM J. Optim. 4, 1994).
+    seems to be turned otherwise than was assumed (as in an iterated extended Kalman smoother, Bell, SIAM J.
+    Optim. 4, 1994).
 
     A row without contact has the probability that a gap about d is positive, as in `ContactManifold`; an
     episode is an outlier as a whole.
@@ -249,11 +250,17 @@ class ContactEpisodes(PredictedEpisodes):
         return bool(self.bench.errors)
 
     def apparent_poses(self, value: Tensor, world_from_peg: Tensor, draws: int) -> Tensor:
-        """The part's poses (N, draws, 7) as of `bcppl.beliefs.belief.ApparentPose`, given a window's rows."""
+        """The part's poses (N, draws, 7) as of `bcppl.beliefs.belief.ApparentPose`, given a window's rows.
+
+        The place there has an error of its own (`shared`), as every contact has.
+        """
         branches = self.branches(given_and_all(value)[1])
         row = world_from_peg.new_zeros(1, COLUMNS)
         row[0, :7] = world_from_peg
         twist = drawn(branches, draws) @ self.bench.effect(row).twist[0].T
+        generator = torch.Generator().manual_seed(1)
+        local = torch.randn(*twist.shape[:-1], 3, generator=generator, dtype=torch.float64)
+        twist[..., :3] += self.shared * local
         turn = poses.rotation_matrix(world_from_peg)
         measured = world_from_peg.expand(*twist.shape[:-1], 7)
         true = poses.retract(measured, torch.cat([twist[..., :3] @ turn.T, twist[..., 3:]], dim=-1))

@@ -76,8 +76,8 @@ def is_cut(rows: Tensor, place: int) -> bool:
 def last_end(rows: Tensor, cell: float) -> int:
     """The last place at which a span of time ends and no episode goes on; 0 for none.
 
-    From the first row on spans end after 1, 2, 3, 4, 6, 8, 12, ... cells of so many seconds: as much is learnt
-    in each, and all rows can be explained again at each end in a time that grows as their number.
+    From the first row on spans end after 1, 2, 3, 4, 6, 8, 12, ... cells of so many seconds: all rows can be
+    explained again at each end in a time that grows as their number.
     """
     number = np.floor((rows[:, TIME] - rows[:1, TIME]).numpy() / cell + 1e-6)
     ends = np.flatnonzero(np.diff(np.floor(2.0 * np.log2(number + (number == 0) * 0.5)))) + 1

@@ -45,6 +45,7 @@ class BenchProfile:
         kinematics: over the workspace, and the distance over which it changes.
         delay: by which the wrench is later than the pose, at most; evenly from 0.
         size: of part and peg together.
+        repeats: of the flange's pose from one contact to another, however near.
         slips, slides: probabilities that the peg slips in the hand or the part on the table, at each episode
             of contact.
     """
@@ -54,6 +55,7 @@ class BenchProfile:
     kinematics: tuple[float, float] = (0.0003, 0.1)
     delay: float = 0.045
     size: float = 0.00005
+    repeats: float = 0.00003
     slips: float = 0.02
     slides: float = 0.02
 
@@ -88,12 +90,13 @@ class BenchProfile:
 PROFILES: Mapping[str, BenchProfile | None] = {
     "perfect": None,
     "ur5e": BenchProfile(),
-    "panda": BenchProfile(compliance=(2.5e-5, 6e-4), kinematics=(0.0005, 0.1)),
+    "panda": BenchProfile(compliance=(2.5e-5, 6e-4), kinematics=(0.0005, 0.1), repeats=0.0001),
     "industrial": BenchProfile(
         grasp=(0.0002, math.radians(0.2), math.radians(0.3)),
         compliance=(5e-6, 1e-4),
         kinematics=(0.0001, 0.1),
         delay=0.01,
+        repeats=0.00002,
     ),
 }
 

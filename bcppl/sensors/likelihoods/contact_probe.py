@@ -45,6 +45,7 @@ from bcppl.traces.carried import once
 
 PREDICTED = 0.05  # s between the rows of a probe that is not yet carried out
 PRESSED = 4.0  # N: of such a probe's contacts
+GEOMETRY = 0.00001  # m: by which part and peg differ from their models where they touch
 _NEAR = 0.02  # m: a window in which the peg stays farther away carries no information
 _MOVED = 0.001  # m: a shorter displacement has no direction
 
@@ -57,7 +58,8 @@ class TouchSettings:
         gap_noise: standard deviation of the peg's surface position at one stamp, m; less where the measured
             poses scatter less.
         gap_drift: standard deviation of its errors that last for `lasting` seconds, m.
-        gap_shared: standard deviation of the error that all stamps of a contact share, m.
+        gap_shared: standard deviation of the error that all stamps of a contact share and no other contact
+            does, m; by default what the profile says.
         lasting: s.
         compliance: of part and peg where they touch, m/N: the median of what it may be.
         compliance_decades: standard deviation of its decimal logarithm.
@@ -72,7 +74,7 @@ class TouchSettings:
 
     gap_noise: float = 0.00006
     gap_drift: float = 0.000015
-    gap_shared: float = 0.00001
+    gap_shared: float | None = None
     lasting: float = 0.1
     compliance: float = 0.000005
     compliance_decades: float = 0.5
@@ -133,6 +135,9 @@ class ContactProbe:
         self.settings, self.peg = settings, recording.peg
         self.gap, self.quasi_static = _solids(recording.part, recording.peg)
         self.bench, self.hypotheses = _shared_errors(recording, settings)
+        profile = profile_named(settings.profile)
+        own = GEOMETRY if profile is None else math.hypot(GEOMETRY, profile.repeats)
+        self.gap_shared = own if settings.gap_shared is None else settings.gap_shared
         self._streams: dict[str, ProbeRows] = {}
 
     @classmethod
@@ -170,7 +175,7 @@ class ContactProbe:
             part,
             capacity(window),
             math.hypot(settings.gap_noise, blur),
-            math.hypot(settings.gap_shared, blur),
+            math.hypot(self.gap_shared, blur),
             settings.compliance * PRESSED,
             settings.gap_outlier,
             WindowMotion(self.quasi_static, window, stride),
