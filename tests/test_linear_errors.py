@@ -278,6 +278,9 @@ def test_the_pose_relative_to_the_peg_is_sure_where_that_in_the_world_is_not() -
     assert float(belief.spread[2]) > 3e-4, "the world's pose is unsure by as much as the grasp is"
     assert float(relative.spread[2]) < 1.3e-4
     assert abs(float(relative.mean[2]) - shift) < 2e-4, "a peg that is lower meets a part that seems higher"
+    rough = replace(one, shared=3e-4, memory={})
+    other = Belief(pose, log_weights, apparent=lambda at, draws: rough.apparent_poses(value, at, draws))
+    assert float(other.relative(at, 64).spread[:2].min()) > 2.5e-4, "the place there has an error of its own"
     assert belief.relative(at).log_weights.shape == (41 * 8,)
     assert Belief(pose, log_weights).relative(at).world_from_part is pose
 
