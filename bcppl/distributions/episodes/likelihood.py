@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,38 +13,28 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.checks import Check, chi_square
-from bcppl.distributions.episodes.branches import Branches, Linearised, Prior, begun
-from bcppl.distributions.episodes.displaced import displaced, relinearised
-from bcppl.distributions.episodes.linear_errors import LinearErrors
-from bcppl.distributions.episodes.posterior import drawn, mean_of, moments, probable_jumps
-from bcppl.distributions.episodes.predicted import PredictedEpisodes
-from bcppl.distributions.episodes.prior import WIDE, nodes_of, prior_of, with_delays
-from bcppl.distributions.episodes.row_errors import Hypothesis, RowErrors, segments_of
+from bcppl.distributions.episodes.branches import Branches, begun
+from bcppl.distributions.episodes.filtered import FilteredEpisodes
+from bcppl.distributions.episodes.posterior import drawn, moments, probable_jumps
+from bcppl.distributions.episodes.prior import WIDE
+from bcppl.distributions.episodes.row_errors import segments_of
 from bcppl.distributions.episodes.rows import (
     COLUMNS,
-    EPISODE,
     FELT,
     FORCE,
     GIVEN,
-    NOISE,
     TIME,
     given_and_all,
-    is_cut,
     is_predicted,
-    last_end,
     padded,
 )
-from bcppl.distributions.episodes.switching_filter import filtered
-from bcppl.distributions.manifold import FARTHEST, ContactManifold, Gaps, MeasuresGap, Quadratic
-from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
+from bcppl.distributions.manifold import Gaps, Quadratic
 
 _FAR = 4.0  # standard deviations
-_TURNED = 0.0025  # rad, by which a corner of a peg 12 mm wide moves 15 um
-_REMEMBERED = 3  # windows: the last one's rows are those that the next one is given
 
 
 @dataclass(eq=False, repr=False)
-class ContactEpisodes(PredictedEpisodes):
+class ContactEpisodes(FilteredEpisodes):
     """Where a held peg was measured to be, and whether it felt the part, over the rows of a window.
 
     A row is the mean of stamps that hardly differ, or one stamp. In an episode, which is an uninterrupted
@@ -92,24 +81,6 @@ class ContactEpisodes(PredictedEpisodes):
         cell: the shortest span after which gaps are linearised again, s.
     """
 
-    __caches__ = ("memory",)
-
-    drift: float = field(default=0.00002, metadata=NONNEGATIVE)
-    lasting: float = field(default=0.1, metadata=POSITIVE)
-    compliance: float = field(default=0.000005, metadata=POSITIVE)
-    uncertain: float = field(default=0.5, metadata=POSITIVE)
-    varying: float = field(default=0.6, metadata=NONNEGATIVE)
-    rough: float = field(default=0.2, metadata=NONNEGATIVE)
-    blur: float = field(default=0.0, metadata=NONNEGATIVE)
-    bench: LinearErrors = field(default_factory=LinearErrors)
-    hypotheses: tuple[Hypothesis, ...] = ()
-    memory: dict[bytes, Linearised] = field(default_factory=dict)
-    solids: MeasuresGap | None = None
-    cell: float = field(default=0.5, metadata=POSITIVE)
-
-    def __post_init__(self) -> None:
-        super(ContactManifold, self).__init__(len(self.pose), (self.stamps, COLUMNS))
-
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-likelihood (N,) of one window (T, COLUMNS), or of one for each particle (N, T, COLUMNS)."""
         if is_predicted(value):
@@ -124,57 +95,6 @@ class ContactEpisodes(PredictedEpisodes):
             return self.pose.new_zeros(len(self.pose))
         before = self.branches(given)
         return torch.from_numpy(self.branches(rows, given).log_evidence - before.log_evidence)
-
-    def branches(self, rows: Tensor, after: Tensor | None = None) -> Branches:
-        """The hypotheses after rows (R, COLUMNS), the first of them `after`, where these were seen before."""
-        return self._known(rows, after).branches
-
-    def _known(self, rows: Tensor, after: Tensor | None = None) -> Linearised:
-        """The hypotheses after rows, and the shared errors about which the gap is linear."""
-        key = rows.numpy().tobytes()
-        known = self.memory.get(key)
-        if known is None:
-            before, new = None, rows
-            place = last_end(rows, self.cell)
-            if self.bench.errors and place > (0 if after is None else len(after)):
-                # However a probe is cut, gaps are linearised again where a cell ends.
-                self._known(rows[:place], after)
-                after = rows[:place]
-            if after is not None and len(after) and not is_cut(rows, len(after)):
-                before = self.memory.get(after.numpy().tobytes())
-                new = rows if before is None else rows[len(after) :]
-            if before is None:
-                prior = self._prior(0)
-                about = torch.zeros(len(self.pose), len(prior.mean), dtype=torch.float64)
-                before = Linearised(begun(prior, len(self.pose)), about)
-            branches = self._filtered(before.branches, self._prior(0), new, before.about).of_each
-            known = self.memory[key] = self._relinearised(rows, Linearised(branches, before.about))
-            for old in list(self.memory)[:-_REMEMBERED]:
-                del self.memory[old]
-        return known
-
-    def _relinearised(self, rows: Tensor, known: Linearised) -> Linearised:
-        """The same where particles' shared errors now seem to turn the peg otherwise than was assumed.
-
-        Where flat faces meet, another corner touches then, of which the gap is another function.
-        """
-        if not self.bench.errors or not len(rows):
-            return known
-        errors = mean_of(known.branches)
-        turned = self.bench.effect(rows).twist[:, 3:] @ (errors - known.about).T  # (R, 3, N)
-        far = (turned.abs().amax(dim=(0, 1)) > _TURNED).nonzero()[:, 0]
-        if not len(far):
-            return known
-        there, prior = replace(self, pose=self.pose[far], gap=self.solids or self.gap), self._prior(0)
-        begin = begun(prior, len(far)).with_only(known.branches.surviving(len(prior.scale))[far.numpy()])
-        again = there._filtered(begin, prior, rows, errors[far])
-        if len(far) == len(errors):
-            return Linearised(again, errors)
-        about = known.about.clone()
-        about[far] = errors[far]
-        # These are the filter's own, and nothing else holds them yet.
-        known.branches.put(far.numpy(), again)
-        return Linearised(known.branches, about)
 
     def quadratic(self, value: Tensor) -> Quadratic:
         """The log-likelihood of a window to second order, the shared errors integrated out.
@@ -301,27 +221,6 @@ class ContactEpisodes(PredictedEpisodes):
         weights = torch.from_numpy(np.bincount(prior.delay, np.exp(prior.log_weight)))
         return torch.einsum("d,ndr->nr", weights, self._variance(columns, rows) + moved**2).sqrt()
 
-    def _variance(self, columns: Tensor, rows: Tensor) -> Tensor:
-        """Variances (N, D, R) of gaps a priori, without what the contact's compliance adds."""
-        own = rows[:, NOISE] ** 2 + self.blur**2 + self.drift**2 + self.shared**2
-        return own + (columns**2 * self.bench.variances).sum(dim=-1)
-
-    @property
-    def _every(self) -> tuple[Hypothesis, ...]:
-        return with_delays(self.hypotheses or nodes_of(self.compliance, self.uncertain), self.bench)
-
-    @property
-    def _few(self) -> tuple[Hypothesis, ...]:
-        """Those of an approximation to second order, which needs fewer nodes."""
-        return with_delays(self.hypotheses or nodes_of(self.compliance, self.uncertain, 2), self.bench)
-
-    def _prior(self, pose: int) -> Prior:
-        """With so many parameters of the pose before the others."""
-        return prior_of(self.bench, self._few if pose else self._every, self.outlier, pose)
-
-    def _late(self, gaps: Gaps, rows: Tensor) -> tuple[Tensor, Tensor]:
-        return displaced(gaps, self.pose, rows, self.bench)
-
     def _shift(self, gaps: Gaps, rows: Tensor, branches: Branches) -> Tensor:
         """The gaps' changes (N, R) by the delay and the shared errors, on average over hypotheses."""
         moved, columns = self._late(gaps, rows)
@@ -330,54 +229,6 @@ class ContactEpisodes(PredictedEpisodes):
         each = moved[particle, delay]
         each = each + torch.einsum("nbrm,nbm->nbr", columns[particle, delay], torch.from_numpy(branches.mean))
         return (torch.from_numpy(branches.weights)[..., None] * each).sum(dim=1)
-
-    def _filtered(
-        self, begin: Branches, prior: Prior, rows: Tensor, about: Tensor, free: bool = False
-    ) -> Branches:
-        """The hypotheses after rows, the pose `free` to move about `self.pose` or held there.
-
-        The gap is linear in the shared errors about some (N, M).
-        """
-        if not len(rows):
-            return begin
-        if about.any():
-            solids = self.solids or self.gap
-            distance, columns, gradient = relinearised(solids, self.pose, rows, self.bench, about)
-        else:
-            gaps = self.gap(self.pose, rows[:, :7])
-            moved, columns = self._late(gaps, rows)
-            distance, gradient = gaps.distance[:, None] + moved, gaps.gradient(self.pose)
-        trusted = []
-        if free and self.blur:
-            trusted.append(self._trust(distance, columns, rows))
-        if free:
-            own = gradient[:, None].expand(*columns.shape[:-1], 6)
-            columns = torch.cat([own, columns], dim=-1)
-        given = [distance, rows[:, FORCE], columns, *trusted]
-        arrays = (np.ascontiguousarray(each.numpy()) for each in given)
-        return filtered(
-            begin, prior, segments_of(rows, self._row_errors, self._few if free else self._every), *arrays
-        )
-
-    @property
-    def _row_errors(self) -> RowErrors:
-        return RowErrors(self.blur, self.shared, self.drift, self.lasting, self.varying, self.rough)
-
-    def _trust(self, distance: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
-        """Factors (N, D, R) of contacts' errors, each by itself: what is far off hardly pulls.
-
-        While errors are taken to be wider than they are, to be led to a mode from afar, no row comes before
-        another. An episode counts by the probability that it is no outlier.
-        """
-        sunk = self.compliance * torch.nan_to_num(rows[:, FORCE])
-        variance = self._variance(columns, rows) + (3.0 * sunk) ** 2
-        squared = (distance + sunk + columns @ self.bench.means) ** 2 / variance
-        inlier = -0.5 * (squared + (2.0 * math.pi * variance).log())
-        numbers, episode = rows[:, EPISODE].unique(return_inverse=True)
-        excess = distance.new_zeros(*distance.shape[:-1], len(numbers))
-        excess.index_add_(-1, episode, inlier + math.log(FARTHEST))
-        sure = torch.sigmoid(excess + math.log1p(-self.outlier) - math.log(self.outlier))[..., episode]
-        return (sure * (_FAR**2 / squared).clamp(max=1.0)).sqrt()
 
     def _quadratic_of(self, rows: Tensor) -> Quadratic:
         mean, covariance = self._joint_moments(rows)
