@@ -140,6 +140,9 @@ class KinematicError(_Unchanging):
 class PartSlides:
     """The part slides on its table when it is touched: it never does before the first jump.
 
+    A push at an arm a turns it by its shift times a / r^2, r about 30 mm being the radius of the friction's
+    limit surface (Howe and Cutkosky, IJRR 15, 1996): by half a degree where a is 15 mm and the shift 0.5 mm.
+
     Attributes:
         shift: standard deviation along the table's two axes, m.
         turn: about its normal, rad.
@@ -148,7 +151,7 @@ class PartSlides:
     """
 
     shift: float = field(default=0.0005, metadata=POSITIVE)
-    turn: float = field(default=math.radians(0.3), metadata=POSITIVE)
+    turn: float = field(default=math.radians(0.5), metadata=POSITIVE)
     probability: float = field(default=0.005, metadata=RARE)
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
     name = "the part's place on the table"
