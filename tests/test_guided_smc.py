@@ -278,11 +278,12 @@ def test_touches_alone_place_the_part() -> None:
     truth = torch.as_tensor(recording().truth)
     off = poses.local(last.belief.mean, truth)
     assert set(last.population.trace.choices) == {"part"}
-    assert float(off[:3].norm()) < 0.0005 and float(off[3:].norm()) < 0.01
+    # The grasp leaves a millimetre along each axis.
+    assert float(off[:3].norm()) < 0.0015 and float(off[3:].norm()) < 0.01
     guess = poses.local(torch.from_numpy(recording().guess.world_from_part), truth)
     assert float(guess[:3].norm()) > 0.002
-    # The spread is right within an order: the truth is no farther off than five of it.
-    assert float(off @ torch.linalg.solve(last.belief.covariance, off)) < 60.0
+    # The 99.9 % quantile of six degrees of freedom.
+    assert float(off @ torch.linalg.solve(last.belief.covariance, off)) < 22.5
 
 
 def test_free_windows_alone_keep_the_prior() -> None:
