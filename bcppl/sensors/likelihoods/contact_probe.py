@@ -30,7 +30,7 @@ from bcppl.geometry.parts import Part, with_tip_at
 from bcppl.geometry.turns import turns_freely
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.capabilities import Approximated, PegRows
-from bcppl.sensors.likelihoods.bench_profiles import profile_named
+from bcppl.sensors.likelihoods.bench_profiles import BenchProfile, profile_named
 from bcppl.sensors.likelihoods.probe_rows import (
     ProbeRows,
     RememberedGaps,
@@ -98,10 +98,9 @@ def _solids(part: Part, peg: Part) -> tuple[PegGap, QuasiStaticMotion]:
 
 
 def _shared_errors(
-    recording: Recording, settings: TouchSettings
+    recording: Recording, settings: TouchSettings, profile: BenchProfile | None
 ) -> tuple[LinearErrors, tuple[Hypothesis, ...]]:
     """The errors that all touches share, and the hypotheses of how good the bench is."""
-    profile = profile_named(settings.profile)
     x, y, z = map(float, recording.guess.world_from_part[:3])
     held = recording.peg
     length = 0.0 if held is None else -float(held.vertices[:, 2].min())
@@ -134,8 +133,8 @@ class ContactProbe:
             raise InputError("the recording has probe windows but no peg; add the peg that was held.")
         self.settings, self.peg = settings, recording.peg
         self.gap, self.quasi_static = _solids(recording.part, recording.peg)
-        self.bench, self.hypotheses = _shared_errors(recording, settings)
         profile = profile_named(settings.profile)
+        self.bench, self.hypotheses = _shared_errors(recording, settings, profile)
         own = GEOMETRY if profile is None else math.hypot(GEOMETRY, profile.repeats)
         self.gap_shared = own if settings.gap_shared is None else settings.gap_shared
         self._streams: dict[str, ProbeRows] = {}
