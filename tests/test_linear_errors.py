@@ -30,6 +30,7 @@ from bcppl.distributions.episodes import (
     Size,
 )
 from bcppl.distributions.episodes.branches import begun
+from bcppl.distributions.episodes.displaced import lines_at
 from bcppl.distributions.episodes.row_errors import RowErrors
 from bcppl.distributions.episodes.rows import (
     EARLIER,
@@ -164,7 +165,8 @@ def test_the_gap_s_change_by_a_displaced_peg_is_that_of_the_gap_itself() -> None
     )
     errors = LinearErrors((*SHARED, PartSlides(center=(0.02, 0.01, 0.0))))
     one = ContactEpisodes(gap, pose, 4, 6e-5, 1e-5, 2e-5, bench=errors)
-    shifts, columns = one._late(gap(pose, rows[:, :7]), rows)
+    lines = lines_at(gap(pose, rows[:, :7]), pose, rows, one.bench)
+    shifts, columns = lines.moved, lines.columns
     for place, interval in enumerate(errors.delays):
         then, twist = late(rows, interval)
         differences = (columns[:, place] - measured_columns(gap, pose, then, errors)).abs()
@@ -274,7 +276,7 @@ def test_the_pose_relative_to_the_peg_is_sure_where_that_in_the_world_is_not() -
     one = sensor.site(action, pose)
     log_weights = one.log_prob(value)
     belief = Belief(pose, log_weights, apparent=lambda at, draws: one.apparent_poses(value, at, draws))
-    relative = belief.relative(at, 64)
+    relative = belief.relative(at, 256)
     assert float(belief.spread[2]) > 3e-4, "the world's pose is unsure by as much as the grasp is"
     assert float(relative.spread[2]) < 1.3e-4
     assert abs(float(relative.mean[2]) - shift) < 2e-4, "a peg that is lower meets a part that seems higher"

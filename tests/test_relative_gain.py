@@ -15,7 +15,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.distributions.episodes import ContactEpisodes, Grasp, KinematicError, LinearErrors, Size
-from bcppl.distributions.episodes.displaced import by_shared_errors
+from bcppl.distributions.episodes.displaced import by_shared_errors, lines_at
 from bcppl.distributions.episodes.nuisances import ArmCompliance
 from bcppl.distributions.episodes.rows import FELT, WRENCH
 from bcppl.distributions.lazy import LazyDistribution
@@ -164,14 +164,14 @@ def test_predicted_touches_are_moved_by_shared_errors_as_measured_ones_are() -> 
     # Free errors first, which do not depend on the wrench: their twist is the contact's.
     grasp = LinearErrors((Grasp(1.0, 1.0, 1.0, slips=0.0),))
     wrench_of = ContactEpisodes(gap, pose, 4, 6e-5, 1e-5, 2e-5, bench=grasp)
-    _, slope = wrench_of._late(gap(pose, rows[:, :7]), rows)
+    slope = lines_at(gap(pose, rows[:, :7]), pose, rows, wrench_of.bench).columns
     force = torch.full((len(pose), 4), 4.0, dtype=torch.float64)
     stood = rows[:, :7].expand(len(pose), 4, 7)
     found = by_shared_errors(gap(pose, stood), pose, stood, force, errors)
     for k in range(len(pose)):
         pressed = rows.clone()
         pressed[:, WRENCH] = 4.0 * slope[k, 0]
-        _, columns = one._late(gap(pose, rows[:, :7]), pressed)
+        columns = lines_at(gap(pose, rows[:, :7]), pose, pressed, one.bench).columns
         torch.testing.assert_close(found[k], columns[k, 0], rtol=1e-9, atol=1e-15)
         # Pressed onto the part, an arm that yields makes the gap larger than it was measured to be.
         assert bool((found[k, :, 6:12] >= 0.0).all())

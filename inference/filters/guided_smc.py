@@ -56,8 +56,9 @@ WALK = (0.2, 2.0)  # scales of the random walks
 CERTAIN = 0.01  # nats: a log-likelihood as small for all particles carries no information
 ASKED = 4  # particles that are evaluated first for that
 FEW = 0.2  # the effective sample size that SMCP3 is to leave, as a share of N
-# Where it does not, it is run again with more copies of each particle, as many as seem needed and at most so
-# many of each and in all: memory and time grow with them. N of all are kept.
+# Where it does not, it is run again with more copies of each particle, as many as seem needed, until so much of N
+# is left; at most so many of each and in all, for memory and time grow with them. N of all are kept.
+ENOUGH = 0.1
 MOST, ROOM = 40, 40_000
 # Where images leave several modes: of 75 particles 20 stay effective, too few for the modes' shares.
 SEVERAL = 8
@@ -217,10 +218,13 @@ def assimilate(population: Population, observed: Observed, pair: Pair, least: in
     times = min(least, allowed)
     reached = weighted(population if times == 1 else replicate(population, times))
     while times < allowed and (reached is None or reached.effective_sample_size < goal):
-        each = 0.0 if reached is None else reached.effective_sample_size / times
+        before = 0.0 if reached is None else reached.effective_sample_size
         # The estimate is often too large: ask for more copies than would just do.
-        times = min(allowed, max(2 * times, math.ceil(1.5 * goal / max(each, goal / MOST))))
+        times = min(allowed, max(2 * times, math.ceil(1.5 * goal * times / max(before, goal * times / MOST))))
         reached = weighted(replicate(population, times))
+        if before and (reached is None or reached.effective_sample_size < before):
+            return None  # more copies find what the proposal had missed
+        goal = ENOUGH * count
     if reached is None or reached.effective_sample_size < LEAST * count * times / MOST:
         return None
     effective = reached.effective_sample_size

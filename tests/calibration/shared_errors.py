@@ -25,7 +25,7 @@ from bcppl.distributions.episodes import (
     LinearError,
     LinearErrors,
 )
-from bcppl.distributions.episodes.displaced import displaced
+from bcppl.distributions.episodes.displaced import lines_at
 from bcppl.distributions.episodes.rows import (
     COLUMNS,
     EARLIER,
@@ -224,11 +224,9 @@ def _gap(pose: Tensor, rows: Tensor, errors: LinearErrors, values: Tensor, delay
 
 def _linear_gap(pose: Tensor, rows: Tensor, errors: LinearErrors, values: Tensor, delay: int) -> Tensor:
     """Gaps (R,) as the model has them."""
-    gaps = GAP(pose[None], rows[:, :7])
-    moved, columns = (
-        each[0, list(errors.delays).index(delay)] for each in displaced(gaps, pose[None], rows, errors)
-    )
-    return gaps.distance[0] + moved + (columns * values).sum(dim=1)
+    lines, place = lines_at(GAP(pose[None], rows[:, :7]), pose[None], rows, errors), list(errors.delays)
+    moved, columns = (each[0, place.index(delay)] for each in (lines.moved, lines.columns))
+    return lines.distance[0] + moved + (columns * values).sum(dim=1)
 
 
 OTHERS = ("the delay", "the contact's compliance", "the noise", "the scale of the errors")

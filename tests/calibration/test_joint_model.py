@@ -14,6 +14,7 @@ import torch
 from scipy.stats import kstest
 
 from bcppl.distributions.episodes import Grasp
+from bcppl.distributions.episodes.displaced import lines_at
 from bcppl.distributions.episodes.rows import FORCE
 from bcppl.inference.calibration.ranks import p_value
 from tests.calibration.case import DRAWS, gather
@@ -46,10 +47,10 @@ def test_what_is_simulated_has_the_residuals_of_the_likelihood() -> None:
     for _ in range(8):
         truth, rows = simulated(solids=True)
         site = Bench().site(truth.pose[None], rows)
-        gaps = site.gap(site.pose, rows[:, :7])
-        moved, columns = (each[0] for each in site._late(gaps, rows))
+        lines = lines_at(site.gap(site.pose, rows[:, :7]), site.pose, rows, site.bench)
+        moved, columns = lines.moved[0], lines.columns[0]
         place = list(site.bench.delays).index(truth.hypothesis.delay)
-        apart = gaps.distance[0] + moved[place] + truth.hypothesis.compliance * rows[:, FORCE]
+        apart = lines.distance[0] + moved[place] + truth.hypothesis.compliance * rows[:, FORCE]
         factor = factors(rows, site._row_errors, truth.hypothesis)
         blocks = factor.unflatten(0, (-1, len(FORCES)))[..., : len(FORCES)]
         for left_out, parameters in {"nothing": slice(0, 0), **site.bench.slices}.items():

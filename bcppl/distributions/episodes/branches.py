@@ -10,35 +10,26 @@ from torch import Tensor
 from bcppl.arrays import Array, Indices, Mask
 
 KEPT = 8  # hypotheses of a particle
-SHARED = 3  # states that the rows of an episode share
 INLIER, OUTLIER = 0, 1  # what an episode is; plus twice the number of the change before or in it
 
 
 class Segments(NamedTuple):
     """S segments of consecutive rows: an episode of contact, or one row without contact.
 
-    The errors of an episode are a row's own, and three states that its rows share (`SHARED`): a factor of the
-    contact's compliance, an error that stays, and one that is forgotten (an Ornstein-Uhlenbeck process).
-
     Attributes:
         first, last: (S,) the index of a segment's first row, and that after its last.
         contact: (S,) 1 for an episode.
-        own: (H, R) of each hypothesis, variances of the rows' own errors, m^2; of a row without contact, of
-            all of its errors.
-        sunk: (H, R) by how much one standard deviation of the contact's compliance moves the gap, m.
-        kept: (R,) correlation of the error that is forgotten with that of the row before.
-        loading: (R,) the share of a change's variances that comes before each row of an episode.
-        shared: (H, 3) variances of the states at an episode's first row.
+        own: (H, R) of each hypothesis, variances of the errors of rows without contact, m^2.
+        errors: (H, R, E) covariances of a row's error with those of its episode up to it, m^2.
+        loaded: (R,) by a row of an episode, the share of a change's variances that has come.
     """
 
     first: Indices
     last: Indices
     contact: Indices
     own: Array
-    sunk: Array
-    kept: Array
-    loading: Array
-    shared: Array
+    errors: Array
+    loaded: Array
 
 
 class Prior(NamedTuple):

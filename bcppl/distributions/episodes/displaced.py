@@ -2,17 +2,54 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arrays import Array
+from bcppl.compiled import compiled
 from bcppl.distributions.episodes.linear_errors import Effect, LinearErrors
 from bcppl.distributions.episodes.rows import COLUMNS, WRENCH
 from bcppl.distributions.manifold import Gaps, MeasuresGap
 
 
-def displaced(gaps: Gaps, pose: Tensor, rows: Tensor, bench: LinearErrors) -> tuple[Tensor, Tensor]:
-    """The gaps' changes (N, D, R) by each delay, m, and (N, D, R, M) by the shared errors' parameters.
+class Lines(NamedTuple):
+    """Gaps of N parts to pegs at R rows as linear functions of M shared errors, for each of D delays.
+
+    With delay d and errors x the gap is `distance + slope @ (late[d] + twist[d] @ x) + offset[d] @ x`: what
+    differs from part to part has six columns, not M for each delay.
+
+    Attributes:
+        distance: (N, R) without errors, m.
+        slope: (N, R, 6) by a twist of the peg in its frame.
+        gradient: (N, R, 6) by the part's pose.
+        late: (D, R, 6) twists of the peg by each delay.
+        twist, offset: (D, R, 6, M) and (D, R, M), as of `Effect`.
+    """
+
+    distance: Tensor
+    slope: Tensor
+    gradient: Tensor
+    late: Tensor
+    twist: Tensor
+    offset: Tensor
+
+    @property
+    def moved(self) -> Tensor:
+        """The gaps' changes (N, D, R) by each delay, m."""
+        return torch.einsum("nra,dra->ndr", self.slope, self.late)
+
+    @property
+    def columns(self) -> Tensor:
+        """The gaps' changes (N, D, R, M) by the shared errors, m."""
+        return torch.einsum("nra,dram->ndrm", self.slope, self.twist) + self.offset
+
+
+def lines_at(gaps: Gaps, pose: Tensor, rows: Tensor, bench: LinearErrors) -> Lines:
+    """About no error.
 
     Args:
         gaps: (N, R), at the pegs as measured.
@@ -20,27 +57,20 @@ def displaced(gaps: Gaps, pose: Tensor, rows: Tensor, bench: LinearErrors) -> tu
         rows: (R, COLUMNS).
         bench: the errors that all touches share.
     """
-    by_delay, effect = bench.late_effects(rows)
-    if not bench.errors:
-        return rows.new_zeros(len(pose), 1, len(rows)), effect.offset.expand(len(pose), *effect.offset.shape)
-    slope = _by_twist_of_peg(gaps.gradient(pose), pose, rows[:, :7])
-    by_errors = torch.einsum("nra,dram->ndrm", slope, effect.twist) + effect.offset
-    return torch.einsum("nra,dra->ndr", slope, by_delay), by_errors
+    late, effect = bench.late_effects(rows)
+    gradient = gaps.gradient(pose)
+    # Without errors nothing reads the slope.
+    slope = _by_twist_of_peg(gradient, pose, rows[:, :7]) if bench.errors else torch.zeros_like(gradient)
+    return Lines(gaps.distance, slope, gradient, late, *effect)
 
 
-def relinearised(
-    gap: MeasuresGap, pose: Tensor, rows: Tensor, bench: LinearErrors, errors: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Gaps (N, D, R) without errors, as they seem from pegs displaced by some (N, M); and as of `displaced`.
+def lines_about(gap: MeasuresGap, pose: Tensor, rows: Tensor, bench: LinearErrors, errors: Tensor) -> Lines:
+    """As of `lines_at`, about some errors (N, M): measured at pegs that are displaced by them.
 
     Where flat faces meet another corner of the peg may touch once it is turned: there the gap has a kink, and
     is linear about what the errors seem to be, not about none.
-
-    Returns:
-        the gaps with each delay, their changes (N, D, R, M) by the errors, and derivatives (N, R, 6) by the
-        part's pose.
     """
-    by_delay, effect = bench.late_effects(rows)
+    late, effect = bench.late_effects(rows)
     twist = torch.einsum("ram,nm->nra", bench.effect(rows).twist, errors)
     turn = poses.rotation_matrix(rows[:, :7])
     moved = torch.einsum("rab,nrb->nra", turn, twist[..., :3])
@@ -49,8 +79,7 @@ def relinearised(
     gaps = gap(pose, peg)
     gradient = gaps.gradient(pose)
     slope = _by_twist_of_peg(gradient, pose, peg)
-    distance = gaps.distance[:, None] + torch.einsum("nra,ndra->ndr", slope, by_delay - twist[:, None])
-    return distance, torch.einsum("nra,dram->ndrm", slope, effect.twist) + effect.offset, gradient
+    return Lines(gaps.distance - (slope * twist).sum(dim=-1), slope, gradient, late, *effect)
 
 
 def by_shared_errors(gaps: Gaps, pose: Tensor, peg: Tensor, force: Tensor, bench: LinearErrors) -> Tensor:
@@ -97,12 +126,32 @@ def _by_twist_of_peg(gradient: Tensor, part: Tensor, peg: Tensor) -> Tensor:
         part: (N, 7) world_from_part.
         peg: (R, 7) world_from_peg, or (N, R, 7).
     """
-    rotation = poses.rotation_matrix(part)
-    normal = -gradient[..., :3]
-    # The moment of the normal at the witness point, about the peg's origin, along the world's axes.
-    about_part = -(gradient[..., 3:] @ rotation.transpose(-1, -2))
-    apart = part[:, None, :3] - peg[..., :3]
-    moment = about_part + torch.linalg.cross(apart, normal)
-    into_peg, pegs = poses.rotation_matrix(peg), "nr" if peg.ndim == 3 else "r"
-    turned = [torch.einsum(f"nra,{pegs}ab->nrb", each, into_peg) for each in (normal, moment)]
-    return torch.cat(turned, dim=-1)
+    pegs = peg if peg.ndim == 3 else peg[None]
+    tensors = (gradient, poses.rotation_matrix(part), part, poses.rotation_matrix(pegs), pegs)
+    given, part_turn, frame, peg_turn, peg_frame = (np.ascontiguousarray(each.numpy()) for each in tensors)
+    slope = np.empty(tuple(gradient.shape))
+    _turned(given, part_turn, frame, peg_turn, peg_frame, slope)
+    return torch.from_numpy(slope)
+
+
+@compiled
+def _turned(
+    gradient: Array, part_turn: Array, part: Array, peg_turn: Array, peg: Array, slope: Array
+) -> None:
+    moment = np.empty(3)
+    for n in range(gradient.shape[0]):
+        own = n if len(peg) > 1 else 0
+        for r in range(gradient.shape[1]):
+            for i in range(3):
+                # The moment of the normal at the witness point, about the peg's origin, in the world's axes.
+                j, k = (i + 1) % 3, (i + 2) % 3
+                moment[i] = gradient[n, r, j] * (peg[own, r, k] - part[n, k])
+                moment[i] -= gradient[n, r, k] * (peg[own, r, j] - part[n, j])
+                moment[i] *= -1.0
+                for a in range(3):
+                    moment[i] -= part_turn[n, i, a] * gradient[n, r, 3 + a]
+            for i in range(3):
+                slope[n, r, i] = slope[n, r, 3 + i] = 0.0
+                for a in range(3):
+                    slope[n, r, i] -= peg_turn[own, r, a, i] * gradient[n, r, a]
+                    slope[n, r, 3 + i] += peg_turn[own, r, a, i] * moment[a]

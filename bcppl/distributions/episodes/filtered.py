@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from bcppl.distributions.episodes.branches import Branches, Linearised, Prior, begun
-from bcppl.distributions.episodes.displaced import displaced, relinearised
+from bcppl.distributions.episodes.displaced import Lines, lines_about, lines_at
 from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.posterior import mean_of
 from bcppl.distributions.episodes.predicted import PredictedEpisodes
@@ -18,7 +17,7 @@ from bcppl.distributions.episodes.prior import nodes_of, prior_of, with_delays
 from bcppl.distributions.episodes.row_errors import Hypothesis, RowErrors, segments_of
 from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FORCE, NOISE, is_cut, last_end
 from bcppl.distributions.episodes.switching_filter import filtered
-from bcppl.distributions.manifold import FARTHEST, ContactManifold, Gaps, MeasuresGap
+from bcppl.distributions.manifold import FARTHEST, ContactManifold, MeasuresGap
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 
 _FAR = 4.0  # standard deviations
@@ -117,8 +116,9 @@ class FilteredEpisodes(PredictedEpisodes):
         """With so many parameters of the pose before the others."""
         return prior_of(self.bench, self._few if pose else self._every, self.outlier, pose)
 
-    def _late(self, gaps: Gaps, rows: Tensor) -> tuple[Tensor, Tensor]:
-        return displaced(gaps, self.pose, rows, self.bench)
+    def _lines(self, rows: Tensor) -> Lines:
+        """The gaps at rows (R, COLUMNS), linear about no error."""
+        return lines_at(self.gap(self.pose, rows[:, :7]), self.pose, rows, self.bench)
 
     def _filtered(
         self, begin: Branches, prior: Prior, rows: Tensor, about: Tensor, free: bool = False
@@ -129,35 +129,29 @@ class FilteredEpisodes(PredictedEpisodes):
         """
         if not len(rows):
             return begin
-        if about.any():
-            solids = self.solids or self.gap
-            distance, columns, gradient = relinearised(solids, self.pose, rows, self.bench, about)
-        else:
-            gaps = self.gap(self.pose, rows[:, :7])
-            moved, columns = self._late(gaps, rows)
-            distance, gradient = gaps.distance[:, None] + moved, gaps.gradient(self.pose)
-        trusted = []
-        if free and self.blur:
-            trusted.append(self._trust(distance, columns, rows))
-        if free:
-            own = gradient[:, None].expand(*columns.shape[:-1], 6)
-            columns = torch.cat([own, columns], dim=-1)
-        given = [distance, rows[:, FORCE], columns, *trusted]
-        arrays = (np.ascontiguousarray(each.numpy()) for each in given)
-        return filtered(
-            begin, prior, segments_of(rows, self._row_errors, self._few if free else self._every), *arrays
+        lines = (
+            lines_about(self.solids or self.gap, self.pose, rows, self.bench, about)
+            if about.any()
+            else self._lines(rows)
         )
+        hypotheses = self._few if free else self._every
+        segments = segments_of(rows, self._row_errors, hypotheses)
+        if not free:
+            return filtered(begin, prior, segments, lines, rows[:, FORCE])
+        trust = self._trust(lines, rows) if self.blur else None
+        return filtered(begin, prior, segments, lines, rows[:, FORCE], lines.gradient, trust)
 
     @property
     def _row_errors(self) -> RowErrors:
         return RowErrors(self.blur, self.shared, self.drift, self.lasting, self.varying, self.rough)
 
-    def _trust(self, distance: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
+    def _trust(self, lines: Lines, rows: Tensor) -> Tensor:
         """Factors (N, D, R) of contacts' errors, each by itself: what is far off hardly pulls.
 
         While errors are taken to be wider than they are, to be led to a mode from afar, no row comes before
         another. An episode counts by the probability that it is no outlier.
         """
+        distance, columns = lines.distance[:, None] + lines.moved, lines.columns
         sunk = self.compliance * torch.nan_to_num(rows[:, FORCE])
         variance = self._variance(columns, rows) + (3.0 * sunk) ** 2
         squared = (distance + sunk + columns @ self.bench.means) ** 2 / variance

@@ -14,6 +14,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.checks import Check, chi_square
 from bcppl.distributions.episodes.branches import Branches, begun
+from bcppl.distributions.episodes.displaced import lines_at
 from bcppl.distributions.episodes.filtered import FilteredEpisodes
 from bcppl.distributions.episodes.posterior import drawn, moments, probable_jumps
 from bcppl.distributions.episodes.prior import WIDE
@@ -217,13 +218,15 @@ class ContactEpisodes(FilteredEpisodes):
 
     def _spread_at(self, gaps: Gaps, rows: Tensor) -> Tensor:
         """Standard deviations (N, R) of the gaps of rows without contact, a priori."""
-        prior, (moved, columns) = self._prior(0), self._late(gaps, rows)
+        prior, lines = self._prior(0), lines_at(gaps, self.pose, rows, self.bench)
         weights = torch.from_numpy(np.bincount(prior.delay, np.exp(prior.log_weight)))
-        return torch.einsum("d,ndr->nr", weights, self._variance(columns, rows) + moved**2).sqrt()
+        variances = self._variance(lines.columns, rows) + lines.moved**2
+        return torch.einsum("d,ndr->nr", weights, variances).sqrt()
 
     def _shift(self, gaps: Gaps, rows: Tensor, branches: Branches) -> Tensor:
         """The gaps' changes (N, R) by the delay and the shared errors, on average over hypotheses."""
-        moved, columns = self._late(gaps, rows)
+        lines = lines_at(gaps, self.pose, rows, self.bench)
+        moved, columns = lines.moved, lines.columns
         delay = torch.from_numpy(self._prior(0).delay[branches.which])  # (N, B)
         particle = torch.arange(len(delay))[:, None]
         each = moved[particle, delay]

@@ -21,7 +21,9 @@ def drawn(branches: Branches, draws: int) -> Tensor:
     mean = torch.from_numpy(branches.mean)[particle, which]
     variances, axes = torch.linalg.eigh(torch.from_numpy(branches.covariance)[particle, which])
     standard = torch.randn(*mean.shape, 1, generator=generator, dtype=torch.float64)
-    return mean + ((axes * variances.clamp(min=0.0).sqrt()[..., None, :]) @ standard)[..., 0]
+    # The symmetric root: that of the axes alone would depend on their signs, which are those of rounding.
+    root = (axes * variances.clamp(min=0.0).sqrt()[..., None, :]) @ axes.transpose(-1, -2)
+    return mean + (root @ standard)[..., 0]
 
 
 def mean_of(branches: Branches) -> Tensor:

@@ -61,30 +61,20 @@ def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, .
     compliance = torch.tensor([h.compliance for h in hypotheses], dtype=torch.float64)
     scale = torch.tensor([h.noise for h in hypotheses], dtype=torch.float64)
     sunk = compliance[:, None] * torch.where(contact, force, 0.0)
-    lasting = torch.tensor([0.0, errors.shared**2, errors.drift**2], dtype=torch.float64)
-    own = noise**2 + errors.blur**2 + torch.where(contact, 0.0, lasting.sum())
+    own = noise**2 + errors.blur**2
+    alone = scale[:, None] ** 2 * (own + errors.shared**2 + errors.drift**2)
     own = scale[:, None] ** 2 * own + (errors.rough * sunk) ** 2
-    shared = scale[:, None] ** 2 * lasting
-    shared[:, 0] = 1.0
-    kept = torch.ones_like(time)
-    kept[1:] = torch.exp(-(time[1:] - time[:-1]).abs() / errors.lasting)
-    loading = torch.zeros_like(time)
+    joint = torch.zeros(len(hypotheses), len(felt), int((last - first).max()), dtype=torch.float64)
+    loaded = torch.zeros_like(time)
     for begin, end in zip(first.tolist(), last.tolist(), strict=True):
         if contact[begin]:
             # What is held by friction slips when it is loaded more than it was.
             most = force[begin:end].clamp(min=1e-3).cummax(dim=0).values
-            loading[begin:end] = torch.diff(most, prepend=most.new_zeros(1)) / most[-1]
-    arrays = (
-        np.ascontiguousarray(each.numpy())
-        for each in (
-            first,
-            last,
-            contact[first].to(torch.int64),
-            own,
-            errors.varying * sunk,
-            kept,
-            loading,
-            shared,
-        )
-    )
-    return Segments(*arrays)
+            loaded[begin:end] = most / most[-1]
+            apart = (time[begin:end, None] - time[begin:end]).abs()
+            lasting = errors.shared**2 + errors.drift**2 * torch.exp(-apart / errors.lasting)
+            both = errors.varying**2 * sunk[:, begin:end, None] * sunk[:, None, begin:end]
+            both = both + scale[:, None, None] ** 2 * lasting + torch.diag_embed(own[:, begin:end])
+            joint[:, begin:end, : end - begin] = both
+    arrays = (first, last, contact[first].to(torch.int64), alone, joint, loaded)
+    return Segments(*(np.ascontiguousarray(each.numpy()) for each in arrays))

@@ -18,12 +18,15 @@ given that (assumed density filtering).
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from torch import Tensor
 
 from bcppl.arrays import Array
 from bcppl.compiled import compiled, summed
-from bcppl.distributions.episodes.branches import INLIER, KEPT, OUTLIER, SHARED, Branches, Prior, Segments
+from bcppl.distributions.episodes.branches import INLIER, KEPT, OUTLIER, Branches, Prior, Segments
+from bcppl.distributions.episodes.displaced import Lines
 from bcppl.threads import parallel_sum, thread_count
 
 _FAINT = 12.0  # nats below the most probable hypothesis, from which on one is dropped
@@ -34,14 +37,27 @@ _SURPRISING = 1.0  # standard deviations of a chi-square
 _CHUNK, _ROWS = 8, 2000
 
 
+class _Gaps(NamedTuple):
+    """What `filtered` is given, as arrays."""
+
+    distance: Array
+    force: Array
+    gradient: Array
+    slope: Array
+    late: Array
+    twist: Array
+    offset: Array
+    trust: Array
+
+
 def filtered(
     before: Branches,
     prior: Prior,
     segments: Segments,
-    distance: Array,
-    force: Array,
-    columns: Array,
-    trust: Array | None = None,
+    lines: Lines,
+    force: Tensor,
+    gradient: Tensor | None = None,
+    trust: Tensor | None = None,
 ) -> Branches:
     """The hypotheses after further rows.
 
@@ -49,12 +65,11 @@ def filtered(
         before: after the rows before these.
         prior: of all hypotheses.
         segments: of these rows.
-        distance: (N, D, R) gaps at the peg as measured, with each delay, m.
+        lines: the gaps at these rows.
         force: (R,) N.
-        columns: (N, D, R, M) the gap's change by each parameter, m.
+        gradient: (N, R, P) the gap's derivatives by P parameters before the shared errors; none unless given.
         trust: (N, D, R) factors of the errors and columns of contacts; 1 unless given.
     """
-    trust = np.ones_like(distance) if trust is None else trust
     if not len(segments.first):
         return before
     particles, (_, branches, known) = len(before.number), before.event.shape
@@ -71,8 +86,13 @@ def filtered(
         np.zeros((*size, episodes)),
     )
 
+    own = lines.slope.new_zeros(*lines.distance.shape, 0) if gradient is None else gradient
+    trust = lines.slope.new_zeros(0, 0, 0) if trust is None else trust
+    arrays = (lines.distance, force, own, lines.slope, lines.late, lines.twist, lines.offset, trust)
+    given = _Gaps(*(np.ascontiguousarray(each.numpy()) for each in arrays))
+
     def work(begin: int, end: int) -> int:
-        _filter(begin, end, before, after, prior, segments, distance, force, columns, trust)
+        _filter(begin, end, before, after, prior, segments, given)
         return 0
 
     rows = max(1, len(force))
@@ -101,69 +121,108 @@ def _log_sum(a: float, b: float) -> float:
 
 
 @summed
-def _times(covariance: Array, column: Array, product: Array) -> float:
-    """Set `product` (M,) to a symmetric matrix times a column (M,); returns the column's square by it.
+def _dot(first: Array, second: Array) -> float:
+    total = 0.0
+    for a in range(len(first)):
+        total += first[a] * second[a]
+    return total
 
-    Of the matrix the lower triangle is read.
-    """
-    parameters, square = len(column), 0.0
-    product[:] = 0.0
-    for a in range(parameters):
-        share, dot = column[a], 0.0
-        for b in range(a):
-            product[b] += share * covariance[a, b]
-            dot += covariance[a, b] * column[b]
-        product[a] += dot + share * covariance[a, a]
-    for a in range(parameters):
+
+@summed
+def _times(covariance: Array, column: Array, product: Array) -> float:
+    """Set `product` (M,) to a symmetric matrix times a column (M,); returns the column's square by it."""
+    square = 0.0
+    for a in range(len(column)):
+        product[a] = _dot(covariance[a], column)
         square += column[a] * product[a]
     return square
 
 
 @summed
-def _update(
-    error: Array,
-    columns: Array,
-    own: Array,
-    kept: Array,
-    loading: Array,
-    renewed: float,
-    change: Array,
-    mean: Array,
-    covariance: Array,
-    pull: Array,
-) -> tuple[float, float]:
-    """Condition the state on an episode's rows, in place; of the covariance the lower triangle.
+def _joint(columns: Array, pull: Array, errors: Array, joint: Array) -> None:
+    """Set `joint` (n, n), the lower triangle, to the covariance of gaps by parameters and by `errors`."""
+    for i in range(len(columns)):
+        for j in range(i + 1):
+            joint[i, j] = errors[i, j] + _dot(pull[i], columns[j])
 
-    The state (S,) is the parameters and what the rows share. It has a `mean` (S,) and a `covariance`; `pull`
-    (S,) is room. The gap less its expectation, `error` (n,), has derivatives `columns` (n, S) and variances
-    `own` (n,) besides. The last state is that of the row before by a correlation `kept` (n,), and `renewed`,
-    its variance, stays. Before each row parameters change by a share `loading` (n,) of variances `change`
-    (M,).
+
+@summed
+def _factored(
+    joint: Array, error: Array, columns: Array, change: Array, loaded: Array, factor: Array, white: Array
+) -> tuple[float, float]:
+    """Set `factor` (n, n) to the Cholesky factor of the gaps' covariance, `white` (n,) to whitened errors.
+
+    `joint` is that without the change, whose variances are `change` (M,); by row i it has come by the share
+    `loaded[i]`.
 
     Returns:
-        the log-density of the rows, and the squares of their standardised errors.
+        the log-density of the gaps, and their squared whitened errors.
     """
-    count, states = columns.shape
-    log_density, squared, last = 0.0, 0.0, states - 1
-    for i in range(count):
-        for a in range(len(change)):
-            covariance[a, a] += change[a] * loading[i]
-        if i:
-            mean[last] *= kept[i]
-            for a in range(last):
-                covariance[last, a] *= kept[i]
-            covariance[last, last] = kept[i] ** 2 * covariance[last, last] + (1.0 - kept[i] ** 2) * renewed
-        innovation, variance = error[i], own[i] + _times(covariance, columns[i], pull)
-        for a in range(states):
-            innovation += columns[i, a] * mean[a]
-        for a in range(states):
-            share = pull[a] / variance
-            mean[a] -= share * innovation
-            for b in range(a + 1):
-                covariance[a, b] -= share * pull[b]
-        squared += innovation * innovation / variance
-        log_density -= 0.5 * math.log(variance)
-    return log_density - 0.5 * (squared + count * math.log(2.0 * math.pi)), squared
+    squared, log_determinant = 0.0, 0.0
+    for i in range(len(error)):
+        for j in range(i + 1):
+            factor[i, j] = joint[i, j]
+    for a in range(len(change)):
+        if change[a] > 0.0:
+            for i in range(len(error)):
+                for j in range(i + 1):
+                    factor[i, j] += change[a] * loaded[j] * columns[i, a] * columns[j, a]
+    for i in range(len(error)):
+        for j in range(i):
+            known = factor[i, j]
+            for k in range(j):
+                known -= factor[i, k] * factor[j, k]
+            factor[i, j] = known / factor[j, j]
+        variance, rest = factor[i, i], error[i]
+        for k in range(i):
+            variance -= factor[i, k] * factor[i, k]
+            rest -= factor[i, k] * white[k]
+        factor[i, i] = math.sqrt(variance)
+        white[i] = rest / factor[i, i]
+        squared += white[i] * white[i]
+        log_determinant += math.log(variance)
+    return -0.5 * (squared + log_determinant + len(error) * math.log(2.0 * math.pi)), squared
+
+
+@summed
+def _condition(
+    factor: Array,
+    white: Array,
+    pull: Array,
+    columns: Array,
+    change: Array,
+    loaded: Array,
+    gain: Array,
+    mean: Array,
+    covariance: Array,
+) -> None:
+    """Condition parameters, before the change, on an episode's gaps; `gain` (n, M) is room."""
+    for i in range(len(white)):
+        for a in range(len(mean)):
+            gain[i, a] = pull[i, a] + loaded[i] * change[a] * columns[i, a]
+        for k in range(i):
+            for a in range(len(mean)):
+                gain[i, a] -= factor[i, k] * gain[k, a]
+        for a in range(len(mean)):
+            gain[i, a] /= factor[i, i]
+            mean[a] -= gain[i, a] * white[i]
+    covariance -= np.dot(gain.T, gain)
+
+
+@summed
+def _line(gaps: _Gaps, n: int, delay: int, row: int, column: Array) -> float:
+    """Set `column` (P + M,) to the derivatives of a gap; returns it without errors, with a delay."""
+    distance, own = gaps.distance[n, row], gaps.gradient.shape[2]
+    for a in range(own):
+        column[a] = gaps.gradient[n, row, a]
+    for m in range(gaps.offset.shape[2]):
+        column[own + m] = gaps.offset[delay, row, m]
+    for a in range(6):
+        share = gaps.slope[n, row, a]
+        distance += share * gaps.late[delay, row, a]
+        for m in range(gaps.offset.shape[2]):
+            column[own + m] += share * gaps.twist[delay, row, a, m]
+    return distance
 
 
 @compiled
@@ -174,27 +233,29 @@ def _filter(
     after: Branches,
     prior: Prior,
     segments: Segments,
-    distance: Array,
-    force: Array,
-    columns: Array,
-    trust: Array,
+    gaps: _Gaps,
 ) -> None:
     number, log_weight, which, mean, covariance, event, squared = after
-    parameters, changes, size = columns.shape[3], len(prior.change_log_probability), log_weight.shape[1]
+    parameters, changes, size = mean.shape[2], len(prior.change_log_probability), log_weight.shape[1]
     known, longest, most = (
         before.event.shape[2],
         int((segments.last - segments.first).max()),
         2 * size * changes,
     )
-    states = parameters + SHARED
     log_in = math.log1p(-prior.outlier)
     log_out = math.log(prior.outlier) if prior.outlier > 0.0 else -np.inf
-    # Candidates at one episode: which branch each comes from, and its state.
+    # Candidates at one episode: which branch each comes from, and what happens.
     weight, source, kind = np.empty(most), np.empty(most, np.int64), np.empty(most, np.int64)
-    square, means, covariances = np.empty(most), np.empty((most, states)), np.empty((most, states, states))
-    error, slopes, pull = np.empty(longest), np.empty((longest, states)), np.empty(states)
-    changed = np.empty(parameters)
+    square, error, white = np.empty(most), np.empty((size, longest)), np.empty(longest)
+    pulls = np.empty((size, longest, parameters))
+    joints, factor = np.empty((size, longest, longest)), np.empty((longest, longest))
+    # Of a segment: its gaps with each delay, and for which delays they are known.
+    delays = len(gaps.late)
+    distance, columns = np.empty((delays, longest)), np.empty((delays, longest, parameters))
+    filled = np.empty(delays, np.bool_)
+    pull, gain, changed = np.empty(parameters), np.empty((longest, parameters)), np.empty(parameters)
     old_which, old_event, old_squared = which[0].copy(), event[0].copy(), squared[0].copy()
+    old_mean, old_covariance = mean[0].copy(), covariance[0].copy()
     for n in range(begin, end):
         own, kept = n if len(before.mean) > 1 else 0, n if len(before.which) > 1 else 0
         for b in range(number[n]):
@@ -207,17 +268,18 @@ def _filter(
         episode = known
         for s in range(len(segments.first)):
             first, last = segments.first[s], segments.last[s]
+            filled[:] = False
             if segments.contact[s] == 0:
                 score, positive, either = np.nan, 0.0, 0.0
                 for b in range(number[n]):
                     delay = prior.delay[which[n, b]]
-                    if distance[n, delay, first] > _CLEAR:
+                    column = columns[delay, 0]
+                    if not filled[delay]:
+                        distance[delay, 0], filled[delay] = _line(gaps, n, delay, first, column), True
+                    if distance[delay, 0] > _CLEAR:
                         continue
-                    column = columns[n, delay, first]
-                    gap, variance = distance[n, delay, first], segments.own[which[n, b], first]
-                    variance += _times(covariance[n, b], column, pull)
-                    for a in range(parameters):
-                        gap += column[a] * mean[n, b, a]
+                    gap = distance[delay, 0] + _dot(column, mean[n, b])
+                    variance = segments.own[which[n, b], first] + _times(covariance[n, b], column, pull)
                     root = math.sqrt(variance)
                     # Hypotheses that differ in the compliance alone are the same without contact.
                     if gap / root != score:
@@ -231,49 +293,36 @@ def _filter(
                         bend = hazard * (hazard + score) / variance
                         for a in range(parameters):
                             mean[n, b, a] += pull[a] / root * hazard
-                            for c in range(a + 1):
-                                covariance[n, b, a, c] -= pull[a] * pull[c] * bend
+                            share = pull[a] * bend
+                            for c in range(parameters):
+                                covariance[n, b, a, c] -= share * pull[c]
                 continue
             rows, found = last - first, 0
+            loaded = segments.loaded[first:last]
             stray = log_out - rows * math.log(prior.farthest)
             likely = log_weight[n, : number[n]].max() - _UNLIKELY
             for b in range(number[n]):
                 h = which[n, b]
                 delay = prior.delay[h]
+                slope, own_pull, joint = columns[delay, :rows], pulls[b, :rows], joints[b]
                 for i in range(rows):
-                    share = trust[n, delay, first + i]
-                    error[i] = share * (
-                        distance[n, delay, first + i] + prior.compliance[h] * force[first + i]
+                    share = gaps.trust[n, delay, first + i] if gaps.trust.size else 1.0
+                    if not filled[delay]:
+                        distance[delay, i] = _line(gaps, n, delay, first + i, slope[i])
+                        slope[i] *= share
+                    error[b, i] = _dot(slope[i], mean[n, b]) + share * (
+                        distance[delay, i] + prior.compliance[h] * gaps.force[first + i]
                     )
-                    for a in range(parameters):
-                        slopes[i, a] = share * columns[n, delay, first + i, a]
-                    slopes[i, parameters] = segments.sunk[h, first + i]
-                    slopes[i, parameters + 1 :] = 1.0
+                filled[delay] = True
+                np.dot(slope, covariance[n, b], own_pull)
+                _joint(slope, own_pull, segments.errors[h, first:last], joint)
                 for change in range(changes):
                     if change and log_weight[n, b] + prior.change_log_probability[change] < likely:
                         continue
                     for a in range(parameters):
                         changed[a] = prior.change_variance[change, a] * prior.scale[h] ** 2
-                    for into in (found, found + 1):
-                        means[into, :parameters], means[into, parameters:] = mean[n, b], 0.0
-                        covariances[into, :parameters, :parameters] = covariance[n, b]
-                        covariances[into, parameters:] = 0.0
-                        for a in range(SHARED):
-                            covariances[into, parameters + a, parameters + a] = segments.shared[h, a]
-                    # As an outlier it says nothing of what has changed, but what comes after it does.
-                    for a in range(parameters):
-                        covariances[found + 1, a, a] += changed[a]
-                    log_density, square[found] = _update(
-                        error[:rows],
-                        slopes[:rows],
-                        segments.own[h, first:last],
-                        segments.kept[first:last],
-                        segments.loading[first:last],
-                        segments.shared[h, SHARED - 1],
-                        changed,
-                        means[found],
-                        covariances[found],
-                        pull,
+                    log_density, square[found] = _factored(
+                        joint, error[b, :rows], slope, changed, loaded, factor, white
                     )
                     inlier = log_weight[n, b] + log_in + log_density
                     outlier = log_weight[n, b] + stray
@@ -289,21 +338,41 @@ def _filter(
                     weight[found + 1] = outlier + prior.change_log_probability[change]
                     square[found + 1] = square[found]
                     found += 2
-            best, left = weight[:found].max(), 0
+            best, left, known_branches = weight[:found].max(), 0, number[n]
             old_which[:], old_event[:], old_squared[:] = which[n], event[n], squared[n]
+            old_mean[:known_branches], old_covariance[:known_branches] = (
+                mean[n, :known_branches],
+                covariance[n, :known_branches],
+            )
             while left < min(size, found):
                 c = int(weight[:found].argmax())
                 if weight[c] < best - _FAINT:
                     break
-                log_weight[n, left], which[n, left] = weight[c], old_which[source[c]]
-                mean[n, left] = means[c, :parameters]
-                covariance[n, left] = covariances[c, :parameters, :parameters]
-                event[n, left], squared[n, left] = old_event[source[c]], old_squared[source[c]]
+                b, change = source[c], kind[c] // 2
+                h = old_which[b]
+                for a in range(parameters):
+                    changed[a] = prior.change_variance[change, a] * prior.scale[h] ** 2
+                log_weight[n, left], which[n, left] = weight[c], h
+                mean[n, left], covariance[n, left] = old_mean[b], old_covariance[b]
+                if kind[c] % 2 == INLIER:
+                    slope = columns[prior.delay[h], :rows]
+                    _factored(joints[b], error[b, :rows], slope, changed, loaded, factor, white)
+                    _condition(
+                        factor,
+                        white[:rows],
+                        pulls[b],
+                        slope,
+                        changed,
+                        loaded,
+                        gain[:rows],
+                        mean[n, left],
+                        covariance[n, left],
+                    )
+                # As an outlier it says nothing of what has changed, but what comes after it does.
+                for a in range(parameters):
+                    covariance[n, left, a, a] += changed[a]
+                event[n, left], squared[n, left] = old_event[b], old_squared[b]
                 event[n, left, episode], squared[n, left, episode] = kind[c], square[c]
                 weight[c] = -np.inf
                 left += 1
             number[n], episode = left, episode + 1
-        for b in range(number[n]):
-            for a in range(parameters):
-                for c in range(a):
-                    covariance[n, b, c, a] = covariance[n, b, a, c]
