@@ -56,8 +56,8 @@ WALK = (0.2, 2.0)  # scales of the random walks
 CERTAIN = 0.01  # nats: a log-likelihood as small for all particles carries no information
 ASKED = 4  # particles that are evaluated first for that
 FEW = 0.2  # the effective sample size that SMCP3 is to leave, as a share of N
-# Where it does not, it is run again with more copies of each particle, as many as seem needed, until so much of N
-# is left; at most so many of each and in all, for memory and time grow with them. N of all are kept.
+# Where it does not, it is run again with more copies of each particle, as many as seem needed, until so much
+# of N is left; at most so many of each and in all: memory and time grow with them. N of all are kept.
 ENOUGH = 0.1
 MOST, ROOM = 40, 40_000
 # Where images leave several modes: of 75 particles 20 stay effective, too few for the modes' shares.
