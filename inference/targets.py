@@ -30,6 +30,8 @@ from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.traces import Trace
 
+PHYSICS = 2  # the cost of a site that simulates contact
+
 
 def cost_of(site: Any) -> int:
     """The cost of evaluating a site: 0 arithmetic, 1 rendering, 2 physics (`bcppl.distributions.lazy`)."""

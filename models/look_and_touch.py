@@ -9,14 +9,17 @@ the grasp, the arm and the clock, is integrated out; how large it may be is the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import pyro
 
 from bcppl.distributions.poses import prior_from_guess
+from bcppl.geometry.parts import Part
 from bcppl.models.shipped import simulated_in
+from bcppl.rendering.part_renderer import PartRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors.likelihoods.camera_settings import CameraSettings
 from bcppl.sensors.likelihoods.contact_probe import ContactProbe, TouchSettings
 from bcppl.sensors.likelihoods.erring_camera import ErringCamera
@@ -34,8 +37,15 @@ def look_and_touch(scene: Scene, actions: Sequence[Any]) -> None:
         scene.sensor(action).observe(number, action, part)
 
 
-def prepare(recording: Recording, **settings: Any) -> Scene:
-    """The scene of a recording; `settings` are fields of `CameraSettings` and `TouchSettings`.
+def prepare(
+    recording: Recording, renderer: Callable[[Part], PartRenderer] = RayCaster, **settings: Any
+) -> Scene:
+    """The scene of a recording.
+
+    Args:
+        recording: of depth images and probe windows.
+        renderer: makes the renderer of the part, such as `bcppl.rendering.rasterisation.renderer_for`.
+        settings: fields of `CameraSettings` and `TouchSettings`.
 
     Raises:
         InputError: a setting is unknown or out of range, a camera cannot see the part near its guess, or
@@ -44,7 +54,7 @@ def prepare(recording: Recording, **settings: Any) -> Scene:
     cameras, touches = chosen("look_and_touch", settings, CAMERAS, TouchSettings())
     prior = prior_from_guess(recording.guess)
     likelihoods: dict[str, Prepare] = {
-        "view": partial(ErringCamera, prior=prior, settings=cameras),
+        "view": partial(ErringCamera, prior=prior, settings=cameras, renderer=renderer),
         "window": partial(ContactProbe.prepare, settings=touches),
     }
     return Scene(prior, likelihoods_for(recording, likelihoods), "look_and_touch")

@@ -54,7 +54,8 @@ def test_the_truth_explains_the_touches_and_no_other_place_in_the_hand_does_bett
     trace = constrained(truth.expand(8, 7).clone(), poses.retract(grip.expand(8, 7).clone(), step))
     score = touches(trace)
     assert (score[0] > score[1:] + 5.0).all(), score
-    assert float(trace.log_prob("depth_0").std()) == 0.0
+    seen = {a: v[:1].expand_as(v) for a, v in trace.choices.items() if a.startswith(("bias", "seen_by"))}
+    assert float(update(trace, seen).trace.log_prob("depth_0").std()) == 0.0, "no camera feels the hand"
 
 
 def test_only_touching_with_the_hand_turned_discriminates_the_peg_s_pose_from_the_part_s() -> None:
@@ -81,7 +82,7 @@ def test_a_peg_held_as_planned_is_that_of_peg_in_hole() -> None:
     moved = update(empty, {"hole": pose}).trace
     values = plain_scene.observed(measurements)
     plain, _ = extend(moved, (plain_scene, [m.action for m in measurements]), values)
-    for address in values:
+    for address in (a for a in values if not a.startswith("depth")):
         assert torch.equal(held.log_prob(address), plain.log_prob(address)), address
 
 
@@ -93,7 +94,7 @@ def test_a_peg_held_as_planned_is_that_of_peg_in_hole() -> None:
         ({"grip_shift": 0.0}, "positive unless the model is peg_in_hole; grip_shift is 0.0"),
         ({"grip_turn": float("nan")}, "grip_turn is nan"),
         ({"grip_shift": "1"}, "grip_shift is '1'"),
-        ({"depth_scale": 0.0}, "a site's spread must be positive and depth_scale is 0.0"),
+        ({"normal_scale": 0.0}, "a site's spread must be positive and normal_scale is 0.0"),
         ({"contact_scale": -0.003}, "contact_scale is -0.003"),
         ({"pose_every": 0}, "pose_every 0"),
     ],
@@ -111,6 +112,7 @@ def test_a_model_accepts_another_renderer(model: Any) -> None:
     seen = replace(recorded(), measurements=views)
     compared = []
     for options in ({}, {"renderer": renderer_for}):
+        torch.manual_seed(0)  # which errors the cameras have
         # Without errors the image sees the part where it is, so that both see it at one pose.
         exact: dict[str, Any] = {"shift": 0.0} if model is part_in_view else {}
         prepared = model.prepare(seen, **options, **exact)

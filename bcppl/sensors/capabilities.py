@@ -91,6 +91,16 @@ class Linearised(Protocol):
 
 
 @runtime_checkable
+class Screens(Protocol):
+    """A simulated likelihood, and a cheap one of the same measurements, which is the one that is linearised.
+
+    Its measurements bring no latent values.
+    """
+
+    geometry: Any  # the cheap likelihood
+
+
+@runtime_checkable
 class Contacts(Protocol):
     """Measurements that are informative only near the part, and several of whose explanations may fit."""
 

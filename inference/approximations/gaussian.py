@@ -39,7 +39,8 @@ from bcppl.inference.approximations.laplace import (
     quadratic_approximation,
     together,
 )
-from bcppl.sensors.capabilities import Approximated, Contacts, FitsPose, Linearised
+from bcppl.inference.targets import PHYSICS, cost_of
+from bcppl.sensors.capabilities import Approximated, Contacts, FitsPose, Linearised, Screens
 
 _MODES, _FAINT = 8, 10.0  # that views leave: at most so many, within so many nats of the most probable
 UNSURE = 0.0005  # m: beyond this standard deviation the contact may be with another place of the part
@@ -115,8 +116,7 @@ class GaussianApproximation:
                 relevant[contact.number] = not isinstance(sensor, Contacts) or sensor.is_informative(
                     contact.action, contact.value, self.prior.centers
                 )
-        informative = tuple(c for c in self.contacts if relevant[c.number])
-        by_sensor = list(self._by_sensor(informative))
+        by_sensor = list(self._by_sensor(tuple(c for c in self.contacts if relevant[c.number])))
         contacts = [(sensor, own) for sensor, own in by_sensor if isinstance(sensor, Contacts)]
         first = self.quadratic is None
         ambiguous = any(sensor.new_contact(own, newest=not first) for sensor, own in contacts)
@@ -204,6 +204,10 @@ class GaussianApproximation:
         """Whether the instruments leave several modes."""
         return len(self.prior.log_weights) > 1
 
+    def screens(self, action: Any) -> bool:
+        """Whether a measurement is simulated, and what is approximated is a cheap likelihood of it."""
+        return isinstance(self.scene.sensor(action), Screens)
+
     def stratum(self, trace: Any) -> Tensor:
         """The mode of each particle (N,), int64."""
         return self.mixture.component(trace[self.pose])
@@ -215,11 +219,8 @@ class GaussianApproximation:
         """
         if self.quadratic is None:
             return -math.inf
-        sites = [
-            self.scene.sensor(c.action).address(c.number)
-            for c in self.contacts
-            if self.relevant.get(c.number)
-        ]
+        informative = self._informative
+        sites = [self.scene.sensor(c.action).address(c.number) for c in informative]
 
         def log_prior(pose: Tensor) -> Tensor:
             within = self.scene.prior.log_prob(pose) > -torch.inf
@@ -227,9 +228,23 @@ class GaussianApproximation:
 
         best = self.quadratic.log_likelihood + log_prior(self.quadratic.around)
         reached = log_prior(trace[self.pose])
-        if sites:
+        if any(cost_of(trace.distributions[a]) >= PHYSICS for a in sites):
+            reached = reached + self.log_likelihood(trace[self.pose])
+        elif sites:
             reached = reached + trace.log_prob(*sites)
         return float(best.max() - reached.max())
+
+    def log_likelihood(self, pose: Tensor) -> Tensor:
+        """That of all informative contacts at poses (N, 7), by the sites that are approximated."""
+        total = pose.new_zeros(len(pose))
+        for sensor, own in self._by_sensor(self._informative):
+            for site, value in sensor.sites(own, pose, 0.0):
+                total = total + site.log_prob(value)
+        return total
+
+    @property
+    def _informative(self) -> tuple[Approximated, ...]:
+        return tuple(c for c in self.contacts if self.relevant.get(c.number))
 
     def conditional(self, trace: Any, values: Mapping[str, Tensor] | None = None) -> Any:
         """The approximate conditional distribution of the pose, given each particle's nuisance parameters.

@@ -28,13 +28,14 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import NoWeightError
 from bcppl.inference.approximations.gaussian import GaussianApproximation
+from bcppl.inference.filters.screening import approximated, by_mode, runs_physics, screened
 from bcppl.inference.filters.second_search import searched
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair, moved as moved_by_pair
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
 from bcppl.inference.filters.tempering import resample_move, tempered
 from bcppl.inference.filters.view_search import is_refuted, searched_by_climbing
-from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence
+from bcppl.inference.kernels import Kernel, delayed_acceptance, metropolis_hastings, sequence
 from bcppl.inference.kernels.kernel import Move
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Program, drift
@@ -46,7 +47,6 @@ from bcppl.inference.proposals.approximated import (
     joint_random_walk,
 )
 from bcppl.inference.proposals.coordinates import continuous_addresses
-from bcppl.inference.resampling import systematic
 from bcppl.inference.sizing import replicate
 from bcppl.inference.targets import POSTERIOR
 from bcppl.sensors.capabilities import Defers, FitsPose
@@ -85,6 +85,10 @@ class Approximation(Protocol):
         """Whether it may have several modes before any contact; more copies are then made of a particle."""
         return False
 
+    def screens(self, action: Any) -> bool:
+        """Whether it has a cheap likelihood of a measurement that is simulated."""
+        return False
+
     def stratum(self, trace: Trace) -> Tensor:
         """The mode of each particle (N,), int64."""
         return torch.zeros(len(trace), dtype=torch.int64)
@@ -113,16 +117,20 @@ class GaussianPrograms:
 def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]]) -> Kernel:
     """A random walk of one other latent value, the approximation's proposals, and a random walk of the pose.
 
-    `proposals` are those that go with the approximation that the population carries.
+    `proposals` are those that go with the approximation that the population carries. Where the program runs
+    physics, proposals of the pose are decided by the approximated sites first (`approximated`).
     """
 
     def moved(population: Population) -> Move:
         others = [address for address in continuous_addresses(population.trace) if address != pose]
         walks = [metropolis_hastings(drift(other, WALK)) for other in others]
-        guided = [metropolis_hastings(proposal) for proposal in proposals(population.approximation)]
+        of_pose: list[Any] = [*proposals(population.approximation), drift(pose, WALK)]
+        guided = [metropolis_hastings(proposal) for proposal in of_pose]
+        if runs_physics(population.trace):
+            guided = [delayed_acceptance(move, surrogate=approximated) for move in guided]
         # One for all: chosen for each particle, every walk would have to run.
         chosen = [walks[int(torch.randint(len(walks), ()))]] if walks else []
-        return sequence([*chosen, *guided, metropolis_hastings(drift(pose, WALK))])(population)
+        return sequence([*chosen, *guided])(population)
 
     return moved
 
@@ -171,7 +179,11 @@ def guided(
         after = before.including(scene, len(actions) - 1, action, values)
         population = population.with_approximation(after)
         least = SEVERAL if after.is_ambiguous else 1
-        assimilated = assimilate(population, observed, programs.pair(before, after, action), least)
+        pair = programs.pair(before, after, action)
+        if after.screens(action):
+            assimilated = assimilate_screened(population, before, observed, pair)
+        else:
+            assimilated = assimilate(population, observed, pair, least)
         if assimilated is None:
             return settled(by_tempering(population, observed), population.trace)
         moved, ancestors, acceptance, _ = rejuvenation(assimilated.population, POSTERIOR)
@@ -234,10 +246,15 @@ def assimilate(population: Population, observed: Observed, pair: Pair, least: in
     return Assimilated(reached.selected(chosen), effective, chosen // times)
 
 
-def by_mode(population: Population, count: int) -> Tensor:
-    """Systematic ancestors (count,), so that each mode keeps its share but for one particle."""
-    order = population.approximation.stratum(population.trace).argsort(stable=True)
-    return order[systematic(population.log_weights[order], count)].sort().values
+def assimilate_screened(
+    population: Population, before: Approximation, observed: Observed, pair: Pair
+) -> Assimilated | None:
+    """The same where a cheap likelihood chooses among copies, and the others are simulated."""
+    reached = screened(population, before, observed, pair)
+    if reached is None or reached[0].effective_sample_size < LEAST * len(population):
+        return None
+    few, origin = reached
+    return Assimilated(few, few.effective_sample_size, origin)
 
 
 def _given_all(approximation: Any, trace: Trace, actions: Sequence[Any]) -> Any:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bcppl.errors import NoWeightError
+from bcppl.inference.filters.screening import runs_physics, screened_draws
 from bcppl.inference.filters.searching import joined
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.population import Population
@@ -49,9 +50,12 @@ def joined_with_draws(
     """
     trace, count = population.trace, COPIES * len(population)
     try:
-        drawn = importance_sampling(
-            trace.program, trace.args, trace.observations, count, proposal(approximation)
-        )
+        if runs_physics(trace):
+            drawn = screened_draws(trace, approximation, proposal(approximation))
+        else:
+            drawn = importance_sampling(
+                trace.program, trace.args, trace.observations, count, proposal(approximation)
+            )
         both, chosen = joined(population, drawn)
     except NoWeightError:
         return population

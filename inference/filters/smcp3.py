@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import torch
@@ -43,7 +44,7 @@ from bcppl.inference.kernels.kernel import scattered, weighted
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Fitted, Program, Proposal, program_of
 from bcppl.inference.resampling import Resample, adaptive, check_resample
-from bcppl.traces import Trace, extend, simulate, update
+from bcppl.traces import Trace, Update, extend, simulate, update
 from bcppl.traces.anticipated import Anticipated
 from bcppl.traces.differentiation.programs import result_with_grad, with_gradients
 from bcppl.traces.series import SeriesTrace
@@ -82,11 +83,22 @@ class Pair:
     check: bool = False
 
 
-def moved(population: Population, pair: Pair, observed: Observed | None = None) -> Population:
+def moved(
+    population: Population,
+    pair: Pair,
+    observed: Observed | None = None,
+    ratio: Callable[[Update], Tensor] = attrgetter("log_ratio"),
+) -> Population:
     """The population moved by a pair, given a measurement if there is one, and weighted for it.
 
     Without a measurement the target stays. A program that learns is fitted to the other half of the
     population.
+
+    Args:
+        population: of N particles.
+        pair: of programs.
+        observed: the measurement.
+        ratio: of the target, (N,) log, of what is changed; another than the program's weights for another.
 
     Raises:
         InputError: a program gives an address that the other has not, more coordinates
@@ -103,7 +115,7 @@ def moved(population: Population, pair: Pair, observed: Observed | None = None) 
     whole: Trace | None = None
     for k, mine in enumerate(parts):
         forward, backward = _fitted(pair, population[parts[-1 - k]])
-        trace, gained = moved_trace(forward, backward, population.trace[mine], observed, pair.check)
+        trace, gained = moved_trace(forward, backward, population.trace[mine], observed, pair.check, ratio)
         log_factor[mine] = gained
         if whole is None:
             index = torch.zeros(count, dtype=torch.int64)
@@ -153,7 +165,12 @@ def _fitted(pair: Pair, others: Population) -> tuple[Program, Program]:
 
 
 def moved_trace(
-    forward: Program, backward: Program, old: Trace, observed: Observed | None = None, check: bool = False
+    forward: Program,
+    backward: Program,
+    old: Trace,
+    observed: Observed | None = None,
+    check: bool = False,
+    ratio: Callable[[Update], Tensor] = attrgetter("log_ratio"),
 ) -> tuple[Trace, Tensor]:
     """Particles moved by two programs, with a measurement if there is one, and their log factors (N,)."""
     count = old.particles
@@ -165,7 +182,7 @@ def moved_trace(
     values, back = _read(
         chosen.result, chosen.choices, latent, lambda: shown.brought if isinstance(shown, Anticipated) else []
     )
-    new, log_ratio = _updated(old, values, observed)
+    new, log_ratio = _updated(old, values, observed, ratio)
     fresh = [a for a in values if a not in latent]
     reverse = assessed(backward, (new,), back, count)
     refuse_observed_choices("backward", reverse.choices, new)
@@ -214,7 +231,9 @@ def moved_trace(
     return new, torch.where(log_chosen == -torch.inf, -torch.inf, log_factor)
 
 
-def _updated(old: Trace, values: Values, observed: Observed | None) -> tuple[Trace, Tensor]:
+def _updated(
+    old: Trace, values: Values, observed: Observed | None, ratio: Callable[[Update], Tensor]
+) -> tuple[Trace, Tensor]:
     """The trace at new values, with a measurement if there is one, and its log ratio (N,)."""
     if observed is None:
         updated = update(old, values)
@@ -222,7 +241,7 @@ def _updated(old: Trace, values: Values, observed: Observed | None) -> tuple[Tra
         return extend(old, observed.args, observed.observations, values)
     else:
         updated = update(old, values, args=observed.args, observations=observed.observations)
-    return updated.trace, updated.log_ratio
+    return updated.trace, ratio(updated)
 
 
 def refuse_observed_choices(which: str, choices: Values, seen: Trace | Anticipated) -> None:

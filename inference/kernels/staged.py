@@ -22,10 +22,8 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals import spread_of
 from bcppl.inference.proposals.coordinates import coordinates_of
 from bcppl.inference.proposals.spread import weighted_places
-from bcppl.inference.targets import Target, cost_of
+from bcppl.inference.targets import PHYSICS, Target, cost_of
 from bcppl.traces import Trace
-
-PHYSICS = 2  # the cost of a site that simulates contact (`bcppl.distributions.lazy`)
 
 
 @dataclass(frozen=True)

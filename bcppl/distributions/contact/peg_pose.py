@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.contact.track import WIDER, TrackDistribution, contaminated, log_gaussian
-from bcppl.distributions.parameters import COUNT, POSITIVE
+from bcppl.distributions.parameters import COUNT, POSITIVE, within
 
 OUTLIER = 0.05
 
@@ -30,6 +30,10 @@ class PegPose(TrackDistribution):
     given scale and, with weight 0.05, of one ten times as wide. The rotation vector of the error is truncated
     at pi. The density is with respect to Lebesgue times the normalised Haar measure.
 
+    Where the simulated peg touches, its place along the contact's force is that of the two surfaces, and
+    across it depends on friction, which is not known well: the scale is `normal_scale` along the force and
+    `translation_scale` across it. Where it does not touch it is where the command is, to `normal_scale`.
+
     The event is (last - first, 7), `world_from_peg`.
 
     Args:
@@ -37,6 +41,7 @@ class PegPose(TrackDistribution):
         translation_scale: metres, along each axis.
         rotation_scale: radians, about each axis.
         every: as for `TrackDistribution`.
+        normal_scale: metres; `translation_scale` in all directions unless given.
     """
 
     broadcasts = True
@@ -45,6 +50,7 @@ class PegPose(TrackDistribution):
     translation_scale: float = field(metadata=POSITIVE)
     rotation_scale: float = field(metadata=POSITIVE)
     every: int = field(default=10, metadata=COUNT)
+    normal_scale: float | None = field(default=None, metadata=within(above=0.0, optional=True))
 
     @property
     def log_prob_bound(self) -> float:
@@ -54,17 +60,41 @@ class PegPose(TrackDistribution):
             return math.inf
         none = torch.zeros(1, dtype=torch.float64)
         stamps = len(range(self.first, self.last)[self.thinned])
-        return stamps * float(self._log_translation(none) + self._log_rotation(none))
+        narrowest = min(self.translation_scale, self.normal_scale or self.translation_scale)
+        translation = self._log_translation(none, none + narrowest, narrowest)
+        return stamps * float(translation + self._log_rotation(none))
 
     def _log_prob(self, value: Tensor) -> Tensor:
         _, simulated = self.track.window(self.first, self.last)
         expected = torch.where(self.track.diverged[:, None, None], poses.identity(), simulated)
         error = poses.local(expected[:, self.thinned], value)
-        translation, rotation = error[..., :3].square().sum(-1), error[..., 3:].square().sum(-1)
-        return (self._log_translation(translation) + self._log_rotation(rotation)).sum(dim=-1)
+        rotation = self._log_rotation(error[..., 3:].square().sum(dim=-1))
+        direction, across, along = self._spread()
+        normal = (error[..., :3] * direction[:, self.thinned]).sum(dim=-1, keepdim=True)
+        rest = error[..., :3] - normal * direction[:, self.thinned]
+        across = across[:, self.thinned]
+        squared = (normal[..., 0] / along).square() + (rest / across[..., None]).square().sum(dim=-1)
+        return (self._log_translation(squared, across, along) + rotation).sum(dim=-1)
 
-    def _log_translation(self, squared: Tensor) -> Tensor:
-        return contaminated(lambda scale: log_gaussian(squared, scale), self.translation_scale, OUTLIER)
+    def _spread(self) -> tuple[Tensor, Tensor, float]:
+        """Unit directions (N, T, 3), 0 for none, and the scales across (N, T) and along them, m."""
+        along = self.normal_scale
+        if along is None:
+            _, pose = self.track.window(self.first, self.last)
+            across = torch.full_like(pose[..., 0], self.translation_scale)
+            return torch.zeros_like(pose[..., :3]), across, self.translation_scale
+        direction = self.track.force_directions(self.first, self.last)
+        touches = torch.isfinite(direction).all(dim=-1)
+        return torch.nan_to_num(direction), torch.where(touches, self.translation_scale, along), along
+
+    def _log_translation(self, squared: Tensor, across: Tensor, along: float) -> Tensor:
+        """Log-density of errors whose whitened squares are given."""
+
+        def gaussian(wider: float) -> Tensor:
+            volume = 2.0 * across.log() + math.log(along) + 3.0 * math.log(wider)
+            return -0.5 * squared / wider**2 - volume - 1.5 * math.log(2.0 * math.pi)
+
+        return contaminated(gaussian, 1.0, OUTLIER)
 
     def _log_rotation(self, squared: Tensor) -> Tensor:
         def truncated(scale: float) -> Tensor:
@@ -82,7 +112,10 @@ class PegPose(TrackDistribution):
             wide = torch.rand(shape, dtype=torch.float64) < OUTLIER
             return torch.where(wide, WIDER * scale, scale)[..., None]
 
-        translation = widths(self.translation_scale) * torch.randn(*shape, 3, dtype=torch.float64)
+        direction, across, along = self._spread()
+        wide, standard = widths(1.0), torch.randn(*shape, 3, dtype=torch.float64)
+        normal = (standard * direction).sum(dim=-1, keepdim=True) * direction
+        translation = wide * (across[..., None] * (standard - normal) + along * normal)
         width = widths(self.rotation_scale).expand(*shape, 3)
         rotation = width * torch.randn(*shape, 3, dtype=torch.float64)
         # Each Gaussian is truncated on its own, so a draw beyond pi is drawn again at the same width.

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from bcppl.geometry.camera import Camera
 from bcppl.rendering.information import pixel_information
-from bcppl.rendering.ray_casting import RayCaster
+from bcppl.rendering.part_renderer import PartRenderer
 from bcppl.sensors.likelihoods.camera_settings import CameraSettings
 from bcppl.sensors.likelihoods.viewpoints import InstrumentError, place_of
 
 
 def information_of_images(
-    renderer: RayCaster,
+    renderer: PartRenderer,
     cameras: Sequence[Camera],
     part: Tensor,
     settings: CameraSettings,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import ChainMap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -28,8 +28,10 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, bin_depth
+from bcppl.geometry.parts import Part
 from bcppl.geometry.turns import box_turns
 from bcppl.rendering.extrinsics_error import apparent_motion, line_of_sight
+from bcppl.rendering.part_renderer import PartRenderer
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.rendering.region_of_interest import region_of_interest
 from bcppl.sensors.depth import View
@@ -70,14 +72,21 @@ class ErringCamera:
         recording: its part, guess and views.
         prior: of the part's pose.
         settings: of the cameras.
+        renderer: makes the renderer of the part, such as `bcppl.rendering.rasterisation.renderer_for`.
 
     Raises:
         InputError: a camera cannot see the part near its guess.
     """
 
-    def __init__(self, recording: Recording, prior: Any, settings: CameraSettings) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        prior: Any,
+        settings: CameraSettings,
+        renderer: Callable[[Part], PartRenderer] = RayCaster,
+    ) -> None:
         self.settings, self.prior = settings, prior
-        self.renderer = RayCaster(recording.part)
+        self.renderer = renderer(recording.part)
         self.looks: dict[str, Look] = {}
         self.viewpoints = viewpoints_of(recording)
         motion = partial(apparent_motion, shift=settings.camera_shift, turn=settings.camera_turn)
