@@ -1,7 +1,7 @@
 """BayesContact's program: a hole is seen by depth cameras, then touched with a peg on a compliant arm.
 
 The part's pose is drawn from the prior. Images are explained as by `look_and_touch` (`ErringCamera`), the
-windows of a probe by contact physics (`SimulatedProbe`).
+windows of a probe by contact physics (`ScreenedProbe`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from bcppl.models.shipped import simulated_in
 from bcppl.rendering.part_renderer import PartRenderer
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors.likelihoods.erring_camera import ErringCamera
-from bcppl.sensors.likelihoods.simulated_probe import ProbeSettings, SimulatedProbe
+from bcppl.sensors.likelihoods.screened_probe import simulated_probe
+from bcppl.sensors.likelihoods.simulated_probe import ProbeSettings
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Prepare, Scene, chosen, likelihoods_for
 from bcppl.traces import Model
@@ -50,7 +51,7 @@ def prepare(
     prior = prior_from_guess(recording.guess)
     likelihoods: dict[str, Prepare] = {
         "view": partial(ErringCamera, prior=prior, settings=cameras, renderer=renderer),
-        "window": partial(SimulatedProbe.prepare, settings=probe),
+        "window": partial(simulated_probe, settings=probe),
     }
     return Scene(prior, likelihoods_for(recording, likelihoods), "peg_in_hole")
 

@@ -92,10 +92,7 @@ class Linearised(Protocol):
 
 @runtime_checkable
 class Screens(Protocol):
-    """A simulated likelihood, and a cheap one of the same measurements, which is the one that is linearised.
-
-    Its measurements bring no latent values.
-    """
+    """A simulated likelihood, and a cheap one of the same measurements, which is what is linearised."""
 
     geometry: Any  # the cheap likelihood
 

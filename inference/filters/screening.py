@@ -47,7 +47,7 @@ def screened(
     Args:
         population: of N particles, whose approximation is given the measurement.
         before: the approximation that is not.
-        observed: the measurement, which brings no latent values.
+        observed: the measurement; latent values that come with it are drawn from the program.
         pair: moves a particle.
         copies: of each particle.
 
@@ -58,14 +58,16 @@ def screened(
 
     def ratio(updated: Update) -> Tensor:
         now, then = _cheap_log_density(updated.trace, after), _cheap_log_density(updated.previous, before)
-        return now - then
+        # What came with the measurement was drawn from the program.
+        return now - then - (updated.trace.log_prob(*updated.drawn) if updated.drawn else 0.0)
 
     many = replicate(population, copies)
     try:
         by_cheap = moved(many, pair, observed, ratio)
         chosen = by_mode(by_cheap, len(population))
-        few = by_cheap.selected(chosen)
-        change = Update(few.trace, many.trace[chosen], {})
+        few, old = by_cheap.selected(chosen), many.trace[chosen]
+        drawn = frozenset(address for address in few.trace.choices if address not in old.choices)
+        change = Update(few.trace, old, {}, drawn)
         return few.reweighed(change.log_ratio - ratio(change)), chosen // copies
     except NoWeightError:
         return None

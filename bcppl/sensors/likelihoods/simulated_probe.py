@@ -1,15 +1,16 @@
-"""Likelihood of a compliant probe by contact physics: BayesContact's Chamfer surrogate and the peg's pose."""
+"""Likelihood of a compliant probe by contact physics: contact locations, the peg's pose, the wrench."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import pyro
-import torch
+import pyro.distributions as dist
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
@@ -18,22 +19,17 @@ from bcppl.contact.nuisances import Nuisances
 from bcppl.contact.physics import PegPhysics
 from bcppl.contact.probe_rollout import ProbeRollout
 from bcppl.contact.sensing.location import ContactSensing
-from bcppl.distributions.contact import ChamferContacts, PegPose
-from bcppl.distributions.episodes import ContactEpisodes
-from bcppl.distributions.episodes.rows import COLUMNS
+from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose, Wrench
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.robot.motion import ProbeWindow
-from bcppl.sensors.capabilities import Approximated
-from bcppl.sensors.likelihoods.contact_probe import ContactProbe, TouchSettings
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Numbered, by_probe, require_positive
-from bcppl.traces.carried import carried
+from bcppl.traces.carried import carried, once
 
-# Gaps that are as unsure as the physics: they lead proposals to where it will weigh them.
-_GEOMETRY = TouchSettings(profile="perfect", gap_noise=0.0001, gap_shared=0.0003)
 # The contact that inference assumes. Worlds that simulate recordings have parameters of their own.
 CONTACT = ContactParameters(time_step=0.004, friction=0.3, time_constant=0.008)
+EVIDENCE = ("contacts", "contacts in time", "pose", "wrench")
 
 
 @dataclass(frozen=True)
@@ -41,35 +37,62 @@ class ProbeSettings:
     """Noise of a simulated probe.
 
     Attributes:
-        contact_scale: sigma of the Chamfer surrogate, metres.
-        one_empty: its cost where only one of the two point sets is empty, square metres.
+        evidence: what of a probe is explained, of `EVIDENCE`: contact locations, by the Chamfer surrogate or
+            by a normalised likelihood; the peg's pose; the wrench.
+        contact_scale: sigma of the Chamfer surrogate, and standard deviation of a location in time, metres.
+        one_empty: the surrogate's cost where only one of the two point sets is empty, square metres.
         translation_scale, rotation_scale: standard deviations of the peg's pose, metres and radians: the
             error of the physics' friction and stiffness, larger than the sensor's noise.
         normal_scale: of its position along the contact's force, and in all directions where it touches
             nothing, metres.
-        pose_every: stride of the stamps at which the peg's pose counts.
+        force_scale, torque_scale: of the wrench, N and N m; `wrench_share` of its size is added.
+        pose_every: stride of the stamps at which pose, wrench and locations in time count.
+        friction: median of a latent coefficient of friction, and the standard deviation of its natural
+            logarithm; None for that of `contact`.
+        time_constant: the same of the contact's, s.
         contact: parameters of the physics.
+
+    Raises:
+        InputError: a number is out of range, or there is no such evidence.
     """
 
+    evidence: tuple[str, ...] = ("contacts", "pose")
     contact_scale: float = 0.003
     one_empty: float = 2.0 * 0.005**2
     translation_scale: float = 0.0012
     rotation_scale: float = 0.005
     normal_scale: float = 0.0003
+    force_scale: float = 1.0
+    torque_scale: float = 0.05
+    wrench_share: float = 0.3
     pose_every: int = 25
+    friction: tuple[float, float] | None = None
+    time_constant: tuple[float, float] | None = None
     contact: ContactParameters = CONTACT
 
     def __post_init__(self) -> None:
-        require_positive(self, "contact_scale", "translation_scale", "rotation_scale", "normal_scale")
+        require_positive(self, *(name for name in type(self).__annotations__ if name.endswith("_scale")))
         number_within("a simulated probe is given one_empty {}", self.one_empty, least=0.0)
+        number_within("a simulated probe is given wrench_share {}", self.wrench_share, least=0.0)
         whole_number("a simulated probe is given pose_every {}", self.pose_every)
+        unknown = [name for name in self.evidence if name not in EVIDENCE]
+        both = {"contacts", "contacts in time"} <= set(self.evidence)
+        if unknown or both or not self.evidence:
+            raise InputError(
+                f"a simulated probe is explained by the evidence {self.evidence}; name one or more of "
+                f"{', '.join(EVIDENCE)}, and contact locations once."
+            )
+        for name in ("friction", "time_constant"):
+            for number in getattr(self, name) or ():
+                number_within(f"the median and the spread of {name} are {{}}", number, above=0.0)
 
 
 class SimulatedProbe:
     """Windows of a probe, simulated for every pose of the part; windows of one probe share one rollout.
 
-    Each window has two sites: `contacts_*`, the contact locations in the peg's frame (a surrogate), and
-    `peg_*`, its pose (a density). A window without contact is evidence that nothing was in the way.
+    Each window has a site for each kind of evidence: `contacts_*`, the contact locations in the peg's frame,
+    `peg_*`, its pose, and `wrench_*`. A window without contact is evidence that nothing was in the way.
+    Parameters of the contact that are latent (`friction`, `time_constant`) come with the first window.
 
     Args:
         recording: its part, peg and probes.
@@ -79,8 +102,6 @@ class SimulatedProbe:
         InputError: the recording has no peg, or the part cannot be touched in simulation.
     """
 
-    __caches__ = ("_rows",)
-
     nuisances: Nuisances | None
 
     def __init__(self, recording: Recording, settings: ProbeSettings) -> None:
@@ -88,17 +109,9 @@ class SimulatedProbe:
             raise InputError("the recording has probe windows but no peg; add the peg that was held.")
         windows = [m.action for m in recording.measurements if isinstance(m.action, ProbeWindow)]
         self.settings, self.nuisances = settings, None
-        self.geometry = ContactProbe(recording, _GEOMETRY)
-        self._rows: dict[bytes, Tensor] = {}
         self.physics = PegPhysics(recording.part, recording.peg, settings.contact)
         rate = 1.0 / float(np.median(np.diff(windows[0].probe.stamps)))
         self.sensing = ContactSensing(recording.peg, rate=rate)
-
-    @classmethod
-    def prepare(cls, recording: Recording, settings: ProbeSettings) -> SimulatedProbe | None:
-        """The likelihood of a recording's probes; None for one without."""
-        touched = any(isinstance(m.action, ProbeWindow) for m in recording.measurements)
-        return cls(recording, settings) if touched else None
 
     @property
     def efforts(self) -> Mapping[str, Effort]:
@@ -115,69 +128,58 @@ class SimulatedProbe:
         other.nuisances = nuisances
         return other
 
-    def rollout(self, action: ProbeWindow, world_from_part: Tensor) -> ProbeRollout:
-        """The rollout of a window's probe for parts at poses (N, 7), which all its windows share."""
+    def rollout(
+        self, action: ProbeWindow, world_from_part: Tensor, latent: Mapping[str, Tensor] | None = None
+    ) -> ProbeRollout:
+        """The rollout of a window's probe for parts at poses (N, 7), which all its windows share.
+
+        `latent` are parameters of the contact (N,) by name.
+        """
         nuisances = self.nuisances
+        if latent:
+            nuisances = replace(nuisances or Nuisances(), **latent)
         own = () if nuisances is None else (nuisances,)
         begin = partial(ProbeRollout.start, self.physics, self.sensing, world_from_part, action.probe, *own)
         return carried(f"probe {action.probe.name}", begin)
 
     def observe(self, number: int, action: ProbeWindow, world_from_part: Tensor) -> None:
-        """Sample `contacts_*` and `peg_*`."""
-        settings = self.settings
-        window = (self.rollout(action, world_from_part), action.first, action.last)
-        pyro.sample(
-            f"contacts_{number}", ChamferContacts(*window, settings.contact_scale, settings.one_empty)
-        )
-        peg = PegPose(
-            *window,
-            settings.translation_scale,
-            settings.rotation_scale,
-            settings.pose_every,
-            settings.normal_scale,
-        )
-        pyro.sample(f"peg_{number}", peg)
+        """Sample the sites of the evidence, and with the first window the contact's latent parameters."""
+        settings, latent = self.settings, self._latent()
+        window = (self.rollout(action, world_from_part, latent), action.first, action.last)
+        for kind in settings.evidence:
+            if kind == "contacts":
+                contacts = ChamferContacts(*window, settings.contact_scale, settings.one_empty)
+                pyro.sample(f"contacts_{number}", contacts)
+            elif kind == "contacts in time":
+                in_time = ContactsInTime(*window, settings.contact_scale, every=settings.pose_every)
+                pyro.sample(f"contacts_{number}", in_time)
+            elif kind == "pose":
+                scales = settings.translation_scale, settings.rotation_scale, settings.pose_every
+                pyro.sample(f"peg_{number}", PegPose(*window, *scales, settings.normal_scale))
+            else:
+                spread = settings.force_scale, settings.torque_scale, settings.wrench_share
+                pyro.sample(f"wrench_{number}", Wrench(*window, *spread, every=settings.pose_every))
+
+    def _latent(self) -> Mapping[str, Tensor]:
+        known: dict[str, Tensor] = once("parameters of the contact", dict)
+        for name in ("friction", "time_constant"):
+            prior = getattr(self.settings, name)
+            if prior is not None and name not in known:
+                known[name] = pyro.sample(name, dist.LogNormal(math.log(prior[0]), prior[1]))
+        return known
 
     def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
-        """Contact locations and peg poses, by address; each probe's wrench is filtered whole."""
-        values: dict[str, Tensor] = {}
+        """Contact locations, peg poses and tared wrenches, by address; a probe's wrench is filtered whole."""
+        evidence, values = self.settings.evidence, dict[str, Tensor]()
         for windows in by_probe(measurements):
-            read = self.sensing.measure([measurement.observation for _, measurement in windows])
-            for (number, _), (contacts, peg) in zip(windows, read, strict=True):
-                values[f"contacts_{number}"], values[f"peg_{number}"] = contacts, peg
-        rows = self.geometry.observed(measurements)
-        for number, _ in measurements:
-            own = rows.get(self.geometry.address(number), torch.empty(0, COLUMNS, dtype=torch.float64))
-            self._rows[_key(values[self.address(number)])] = own
+            touches = [measurement.observation for _, measurement in windows]
+            tared = self.sensing.tared(touches) if "wrench" in evidence else touches
+            read = zip(windows, self.sensing.measure(touches), tared, strict=True)
+            for (number, _), (contacts, peg), wrench in read:
+                each = {"contacts": contacts, "contacts in time": contacts, "pose": peg, "wrench": wrench}
+                for kind in evidence:
+                    values[f"{_SITES[kind]}_{number}"] = each[kind]
         return values
 
-    # ---- what geometry says of the same touches (`bcppl.sensors.capabilities.Linearised`, `Contacts`)
 
-    def address(self, number: int) -> str:
-        """The address of the site by whose value a window is known."""
-        return f"peg_{number}"
-
-    def _geometric(self, measurements: Sequence[Approximated]) -> list[Approximated]:
-        return [each._replace(value=self._rows[_key(each.value)]) for each in measurements]
-
-    def is_informative(self, action: ProbeWindow, value: Tensor, part: Tensor) -> bool:
-        """Whether the peg came near parts at poses (M, 7)."""
-        return self.geometry.is_informative(action, self._rows[_key(value)], part)
-
-    def sites(
-        self, measurements: Sequence[Approximated], part: Tensor, blur: float
-    ) -> Iterator[tuple[ContactEpisodes, Tensor]]:
-        """The likelihood of all probes' gaps at poses (S, 7), and their rows."""
-        return self.geometry.sites(self._geometric(measurements), part, blur)
-
-    def new_contact(self, measurements: Sequence[Approximated], newest: bool) -> bool:
-        """Whether contact begins in one of the windows, or in the newest of them."""
-        return self.geometry.new_contact(self._geometric(measurements), newest)
-
-    def heading(self, measurements: Sequence[Approximated]) -> Tensor | None:
-        """The direction (3,) in which the peg moved when contact last began; None without contact."""
-        return self.geometry.heading(self._geometric(measurements))
-
-
-def _key(value: Tensor) -> bytes:
-    return value.numpy().tobytes()
+_SITES = {"contacts": "contacts", "contacts in time": "contacts", "pose": "peg", "wrench": "wrench"}
