@@ -134,6 +134,49 @@ def test_the_pose_likelihood_s_samples_have_its_scales() -> None:
     )
 
 
+class Pressed(Felt):
+    """The peg is pushed along y of the world in the first half of the particles, and touches nothing else."""
+
+    def force_directions(self, first: int, last: int) -> torch.Tensor:
+        direction = torch.full((len(self), last - first, 3), math.nan, dtype=torch.float64)
+        direction[: len(self) // 2] = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+        return direction
+
+
+def test_along_the_contact_s_force_the_pose_counts_by_a_scale_of_its_own() -> None:
+    """In contact along the force, without one in all directions; what is drawn has the density's spread."""
+    torch.manual_seed(4)
+    pose, scales = poses.identity(800, 40), {"translation_scale": 0.004, "normal_scale": 0.001}
+    site = PegPose(Pressed(torch.zeros(800, 40, 3), pose), 0, 40, rotation_scale=0.01, every=1, **scales)
+    error = poses.local(pose, site.sample())[..., :3].abs()
+    middle = [half.reshape(-1, 3).quantile(0.5, dim=0).tolist() for half in (error[:400], error[400:])]
+    assert middle[0] == pytest.approx([0.0029, 0.00072, 0.0029], rel=0.06)
+    assert middle[1] == pytest.approx([0.00072] * 3, rel=0.06)
+    one = PegPose(Pressed(torch.zeros(2, 1, 3), pose[:2, :1]), 0, 1, rotation_scale=0.01, every=1, **scales)
+    off = [poses.retract(poses.identity(1), torch.eye(6).double()[[axis]] * 0.003) for axis in range(3)]
+    lost = [(one.log_prob(poses.identity(1)) - one.log_prob(each)).tolist() for each in off]
+    # Half the square of three deviations along the force, and of three quarters of one across it.
+    assert [round(pressed, 1) for pressed, _ in lost] == [0.3, 4.5, 0.3]
+    assert all(free == pytest.approx(lost[1][0], rel=0.02) for _, free in lost)
+    assert float(one.log_prob(poses.identity(1)).max()) == pytest.approx(one.log_prob_bound, abs=1e-9)
+    # Normalised over a translation: a grid about the pose.
+    line = torch.linspace(-0.06, 0.06, 61, dtype=torch.float64)
+    grid = torch.cartesian_prod(line, 0.25 * line, line)
+    places = torch.cat([grid, poses.identity(1)[:, 3:].expand(len(grid), 4)], dim=1)
+    many = PegPose(
+        Pressed(torch.zeros(2 * len(grid), 1, 3), poses.identity(2 * len(grid), 1)),
+        0,
+        1,
+        rotation_scale=0.01,
+        every=1,
+        **scales,
+    )
+    density = many.log_prob(places.repeat(2, 1)[:, None])[: len(grid)]
+    rotation = one._log_rotation(torch.zeros(1, dtype=torch.float64))
+    cell = float(0.25 * (line[1] - line[0]) ** 3)
+    assert float((density - rotation).exp().sum()) * cell == pytest.approx(1.0, abs=0.12)
+
+
 def test_the_pose_likelihood_looks_at_every_nth_stamp_of_the_probe() -> None:
     pose = poses.identity(2, 30)
     pose[1, :, 0] = 0.001

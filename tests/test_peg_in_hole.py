@@ -10,10 +10,12 @@ import pytest
 import torch
 
 from bcppl.cli import loading
-from bcppl.inference.filters import bayes_contact
+from bcppl.errors import InputError
+from bcppl.inference.filters import bayes_contact, guided_smc
 from bcppl.models import peg_in_hole
 from bcppl.models.worlds import peg_in_hole as world
 from bcppl.recordings import ProbeWindow, Recording
+from bcppl.sensors.capabilities import Screens
 from bcppl.sensors.likelihoods.simulated_probe import CONTACT
 from bcppl.sensors.scene import Scene
 from bcppl.traces import Trace, extend, generate, simulate, update
@@ -127,3 +129,40 @@ def test_same_seed_same_belief_to_the_bit(infer) -> None:  # type: ignore[no-unt
     torch.rand(3)
     assert torch.equal(first, last(5))
     assert not torch.equal(first, last(6))
+
+
+def test_geometry_guides_and_physics_finds_the_hole() -> None:
+    """On the shipped recording, to a millimetre or two; a run that is resumed goes on to the same bits."""
+    *_, last = guided_smc.infer(peg_in_hole.model, recorded(), particles=20, seed=1)
+    points = recorded().part.surface_points()
+    assert last.belief.weighted_add(points, recorded().truth) < 0.003
+    short = dataclasses.replace(recorded(), measurements=recorded().measurements[:10])
+    steps = list(guided_smc.infer(peg_in_hole.model, short, particles=10, seed=2))
+    *_, again = guided_smc.infer(peg_in_hole.model, short, particles=10, seed=2, start=steps[-2])
+    assert torch.equal(steps[-1].belief.world_from_part, again.belief.world_from_part)
+    assert torch.equal(steps[-1].belief.log_weights, again.belief.log_weights)
+
+
+def test_what_is_explained_of_a_probe_is_a_setting() -> None:
+    """Sites, latent parameters of the contact, and what cannot be told."""
+    measurements, count = recorded().measurements[:9], 3
+    given = {"evidence": ("contacts in time", "pose", "wrench"), "friction": (0.3, 0.4)}
+    chosen = peg_in_hole.prepare(recorded(), **given)
+    actions, values = [m.action for m in measurements], chosen.observed(measurements)
+    trace, _ = generate(peg_in_hole.peg_in_hole, (chosen, actions), values, count)
+    kinds = {address.split("_")[0] for address in trace.observations}
+    assert kinds == {"depth", "contacts", "peg", "wrench"}
+    assert "friction" in trace.choices and "time_constant" not in trace.choices
+    assert values["wrench_8"].shape == (50, 6) and bool(torch.isfinite(trace.log_prob("wrench_8")).all())
+    slippery = trace.at({"friction": torch.full((count,), 0.01, dtype=torch.float64)})
+    assert not torch.equal(slippery.log_prob("wrench_8"), trace.log_prob("wrench_8"))
+    for wrong in ((), ("force",), ("contacts", "contacts in time")):
+        with pytest.raises(InputError, match="is explained by the evidence"):
+            peg_in_hole.prepare(recorded(), evidence=wrong)
+    with pytest.raises(InputError, match="median and the spread of friction are -1"):
+        peg_in_hole.prepare(recorded(), friction=(-1.0, 0.3))
+
+
+def test_a_probe_whose_pose_does_not_count_has_no_geometry() -> None:
+    blind = peg_in_hole.prepare(recorded(), evidence=("contacts", "wrench")).likelihoods["window"]
+    assert not isinstance(blind, Screens) and isinstance(scene().likelihoods["window"], Screens)

@@ -114,11 +114,11 @@ class GaussianPrograms:
         return conditional_proposal(approximation), joint_random_walk(approximation)
 
 
-def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]]) -> Kernel:
+def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: bool = True) -> Kernel:
     """A random walk of one other latent value, the approximation's proposals, and a random walk of the pose.
 
     `proposals` are those that go with the approximation that the population carries. Where the program runs
-    physics, proposals of the pose are decided by the approximated sites first (`approximated`).
+    physics and these are to `screen`, what is approximated decides first (`approximated`).
     """
 
     def moved(population: Population) -> Move:
@@ -126,7 +126,7 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]]) -> Kernel:
         walks = [metropolis_hastings(drift(other, WALK)) for other in others]
         of_pose: list[Any] = [*proposals(population.approximation), drift(pose, WALK)]
         guided = [metropolis_hastings(proposal) for proposal in of_pose]
-        if runs_physics(population.trace):
+        if screen and runs_physics(population.trace):
             guided = [delayed_acceptance(move, surrogate=approximated) for move in guided]
         # One for all: chosen for each particle, every walk would have to run.
         chosen = [walks[int(torch.randint(len(walks), ()))]] if walks else []
@@ -142,6 +142,7 @@ def guided(
     *,
     sweeps: int = 1,
     share: float = 0.5,
+    screen: bool = True,
     search: Callable[[Population, Trace], Population] | None = None,
 ) -> StepFunction:
     """A step that assimilates a measurement by SMCP3, resamples when needed, and moves the particles.
@@ -152,6 +153,7 @@ def guided(
         moves: of every particle after each step.
         sweeps: how many of them.
         share: particles are resampled below this effective sample size, as a share of N.
+        screen: whether a cheap likelihood of what is simulated chooses among copies of the particles.
         search: given the population after each step and the trace before it, returns that population or
             another that takes its place.
     """
@@ -180,7 +182,7 @@ def guided(
         population = population.with_approximation(after)
         least = SEVERAL if after.is_ambiguous else 1
         pair = programs.pair(before, after, action)
-        if after.screens(action):
+        if screen and after.screens(action):
             assimilated = assimilate_screened(population, before, observed, pair)
         else:
             assimilated = assimilate(population, observed, pair, least)
@@ -309,6 +311,7 @@ def infer(
     seed: int = 0,
     sweeps: int = 1,
     share: float = 0.5,
+    screen: bool = True,
     scene: Any = None,
     start: Step | None = None,
 ) -> Iterator[Step]:
@@ -321,6 +324,8 @@ def infer(
         seed: same seed, same beliefs.
         sweeps: moves of every particle after each measurement.
         share: particles are resampled below this effective sample size, as a share of N.
+        screen: whether a cheap likelihood of what is simulated chooses among copies of the particles and
+            decides their moves first (`bcppl.inference.filters.screening`), where the model has one.
         scene: `model.prepare(recording)` unless given.
         start: a step to continue from, as for `bcppl.inference.smc`.
 
@@ -335,7 +340,7 @@ def infer(
     def gaussian(scene: Any) -> GaussianApproximation:
         return GaussianApproximation(model.pose, scene)
 
-    moves = kernel(model.pose, programs.proposals)
+    moves = kernel(model.pose, programs.proposals, screen=screen)
 
     def refitted(trace: Trace, near: Tensor) -> GaussianApproximation:
         scene, actions = trace.args
@@ -350,5 +355,5 @@ def infer(
                 return searched_by_climbing(population, model.pose, refitted, independent_proposal)
         return searched(population, independent_proposal)
 
-    step = guided(gaussian, programs, moves, sweeps=sweeps, share=share, search=search)
+    step = guided(gaussian, programs, moves, sweeps=sweeps, share=share, screen=screen, search=search)
     return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)

@@ -85,7 +85,8 @@ class PegPose(TrackDistribution):
             return torch.zeros_like(pose[..., :3]), across, self.translation_scale
         direction = self.track.force_directions(self.first, self.last)
         touches = torch.isfinite(direction).all(dim=-1)
-        return torch.nan_to_num(direction), torch.where(touches, self.translation_scale, along), along
+        across = torch.where(touches, direction.new_tensor(self.translation_scale), along)
+        return torch.nan_to_num(direction), across, along
 
     def _log_translation(self, squared: Tensor, across: Tensor, along: float) -> Tensor:
         """Log-density of errors whose whitened squares are given."""
