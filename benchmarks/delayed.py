@@ -20,7 +20,8 @@ from matplotlib.figure import Figure
 from report import Row, finish, options, show
 
 from bcppl import poses
-from bcppl.inference.filters.tempered_smc import infer
+from bcppl.inference.filters.guided_smc import infer
+from bcppl.inference.filters.screening import approximated
 from bcppl.inference.kernels import (
     Kernel,
     Move,
@@ -73,6 +74,8 @@ WITH: dict[str, Kernel] = {
     "delayed: walk, depth first": delayed_acceptance(WALK),
     "delayed: walk, window by window": delayed_acceptance(WALK, stages=WINDOWS),
     "delayed: 4 long walks, surrogate": repeat(delayed_acceptance(LONG_WALK, surrogate=student_t(POSE)), 4),
+    "delayed: walk, geometry": delayed_acceptance(WALK, surrogate=approximated),
+    "delayed: 4 long walks, geometry": repeat(delayed_acceptance(LONG_WALK, surrogate=approximated), 4),
     "delayed: independent, window by window": delayed_acceptance(INDEPENDENT, stages=WINDOWS),
     "delayed: 2 independent, surrogate": repeat(
         delayed_acceptance(INDEPENDENT, surrogate=student_t(POSE)), 2

@@ -10,7 +10,7 @@ import numpy as np
 from jobs import each
 from report import Row, finish, options, show
 
-from bcppl.inference.filters.tempered_smc import infer
+from bcppl.inference.filters.guided_smc import infer
 from bcppl.models.peg_in_hole import model
 from bcppl.models.worlds.peg_in_hole import simulate_recording
 
@@ -20,8 +20,6 @@ PARTICLES = 75
 class Result(NamedTuple):
     """One run: weighted ADD (mm) at three times, the belief at the end, and what it cost (s).
 
-    `moved` is the smallest displacement after a resampling once there is contact, in variances on the axis on
-    which the particles came least.
     `simulated` counts seconds of the rollouts' own clocks, `wall` is from the prior to the last belief.
     """
 
@@ -31,7 +29,6 @@ class Result(NamedTuple):
     truth_gap: float
     effective: float
     distinct: int
-    moved: float
     wall: float
     rendering: float
     physics: float
@@ -45,7 +42,6 @@ COLUMNS = (
     "truth gap",
     "ESS",
     "distinct",
-    "moved",
     "wall s",
     "rendering s",
     "physics s",
@@ -71,7 +67,6 @@ def run(seed: int) -> Result:
         last.truth_gap,
         last.effective_sample_size,
         last.distinct,
-        min(step.info.step.displacement for step in steps[1:] if step.info.step.displacement >= 0),
         wall,
         sum(e["rendering"].seconds for e in efforts),
         sum(e["physics"].seconds for e in efforts),
@@ -118,7 +113,6 @@ def main() -> None:
             Row("truth gap at the end, worst", float(columns["truth_gap"].min()), "nats", -5.0, "min"),
             Row("ESS at the end, median", median("effective"), "particles", direction="min"),
             Row("distinct at the end, fewest", float(columns["distinct"].min()), "particles", 60.0, "min"),
-            Row("moved since a resampling, least", float(columns["moved"].min()), "variances", 0.5, "min"),
             Row("wall, median", median("wall"), "s", 20.0 if alone else None),
             Row("rendering, median", median("rendering"), "s"),
             Row("physics, median", median("physics"), "s"),
