@@ -5,8 +5,8 @@ world's friction and stiffness differ from those that inference assumes. Without
 model as it is, beside the number of the paper (BayesContact: 0.8 mm with 75 particles). `--ways` compares it
 with others on the same recordings: less evidence or more of it, other proposals, other physics. `--noise`
 gives the measured pose of the peg more noise, and compares geometry alone (`look_and_touch`), physics without
-that pose, and both. With `--file` results are written as they are done, and a later call adds the missing
-ones.
+that pose, and both; `--double` does so where a peg touches in two places at once (`double_contacts.py`). With
+`--file` results are written as they are done, and a later call adds the missing ones.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import curves
+from double_contacts import PLANS
 from jobs import in_order
 from kept import added, recorded
 from report import Row, finish, options, show
@@ -39,7 +40,7 @@ GOALS = (0.8, 0.4)  # mm, of the median at the end
 NINTH, HELD, SECONDS = 2.0, 80.0, 15.0  # mm of 90 % of the scenes; % of 90 % regions; s of a scene
 NOISE = 0.00005  # m, of the peg's measured position
 FRICTION = (0.25, 0.6)
-DEFAULT, GEOMETRY, WITHOUT_POSE = "default", "geometry alone", "no pose"
+DEFAULT, GEOMETRY, WITHOUT_POSE, USUAL = "default", "geometry alone", "no pose", "3-2-1"
 
 Settings = dict[str, Any]
 Infer = Callable[..., Any]
@@ -74,11 +75,15 @@ WAYS = {
 
 
 class Task(NamedTuple):
-    """A scene, the noise (m) of the peg's measured position, and a way of `WAYS`, or geometry alone."""
+    """A scene, the noise (m) of the peg's measured position, a way of `WAYS` or geometry alone, and a probe.
+
+    The probe is one of `PLANS`, or "3-2-1".
+    """
 
     seed: int
     noise: float
     way: str
+    probe: str = USUAL
 
 
 class Outcome(NamedTuple):
@@ -123,9 +128,11 @@ def model_of(way: str, noise: float) -> Model:
 
 
 @cache
-def recorded_scene(seed: int, noise: float) -> tuple[BenchScene, Recording]:
-    """A scene and its recording, planned by the default model's vision."""
+def recorded_scene(seed: int, noise: float, probe: str) -> tuple[BenchScene, Recording]:
+    """A scene and its recording; the usual probe is planned by the default model's vision."""
     scene = bench_scene(seed, BenchParameters(peg_noise=noise))
+    if probe in PLANS:
+        return scene, scene.probe(PLANS[probe](scene))
     *_, seen = default_run(scene.look(), PARTICLES, seed)
     return scene, scene.probe(three_two_one(seen.belief, scene.part, scene.peg))
 
@@ -140,7 +147,7 @@ def outcome(task: Task) -> Outcome:
 
 def followed(task: Task) -> Outcome:
     """One recording explained in one way."""
-    scene, recording = recorded_scene(task.seed, task.noise)
+    scene, recording = recorded_scene(task.seed, task.noise, task.probe)
     model, infer = model_of(task.way, task.noise), WAYS.get(task.way, WAYS[DEFAULT]).infer
     prepared, curve, vision = model.prepare(recording), Curve([], [], []), math.inf
     begun = time.perf_counter()
@@ -217,11 +224,13 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, help=f"how many; {SCENES}, {COMPARED} with --ways or --noise")
     parser.add_argument("--ways", nargs="*", choices=list(WAYS), help="compare these; all if none is named")
     parser.add_argument("--noise", nargs="*", type=float, help="of the peg's position, mm; 0.05, 0.3 and 1")
+    parser.add_argument("--double", action="store_true", help="two contacts at once, by geometry and physics")
     parser.add_argument("--jobs", type=int, default=1, help="scenes at a time, of one thread each")
     parser.add_argument("--file", type=Path, help="where the outcome of each scene is kept")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="ADD over time of all scenes")
     arguments = parser.parse_args()
-    compared = arguments.ways is not None or arguments.noise is not None
+    compared = arguments.ways is not None or arguments.noise is not None or arguments.double
+    probes = list(PLANS) if arguments.double else [USUAL]
     count = arguments.scenes or (1 if arguments.quick else COMPARED if compared else SCENES)
     if arguments.noise is not None:
         noises, ways = (
@@ -230,20 +239,22 @@ def main() -> None:
         )
     else:
         noises, ways = [NOISE], list(WAYS) if arguments.ways == [] else arguments.ways or [DEFAULT]
+    if arguments.double:
+        ways = [GEOMETRY, DEFAULT, "and the wrench"]
     seeds = range(arguments.seed, arguments.seed + count)
-    tasks = [Task(seed, noise, way) for seed in seeds for noise in noises for way in ways]
+    groups = [(noise, way, probe) for probe in probes for noise in noises for way in ways]
+    tasks = [Task(seed, *group) for seed in seeds for group in groups]
     outcomes: dict[Task, Outcome] = {}
     done = in_order(partial(known, file=arguments.file), tasks, arguments.jobs)
     for task, one in zip(tasks, done, strict=True):
         outcomes[task] = one
         print(*task, one.missed or f"{one.end:.3f} mm in {one.seconds:.1f} s", flush=True)
     lines, rows = [], []
-    for noise in noises:
-        for way in ways:
-            name = f"{way}, noise {1e3 * noise:g} mm"
-            several = [outcomes[Task(seed, noise, way)] for seed in seeds]
-            lines.append(line(name, several))
-            rows += rows_of(name, several, arguments.jobs, asked=way == DEFAULT and not compared)
+    for noise, way, probe in groups:
+        name = f"{way}, {probe}, noise {1e3 * noise:g} mm"
+        several = [outcomes[Task(seed, noise, way, probe)] for seed in seeds]
+        lines.append(line(name, several))
+        rows += rows_of(name, several, arguments.jobs, asked=way == DEFAULT and not compared)
     columns = ["", "scenes", "missed", "vision mm", "end mm", "90 %", "99 %", "worst", *REGIONS]
     show(
         f"weighted ADD, {PARTICLES} particles; 50 and 90 % regions that hold the truth, %",
