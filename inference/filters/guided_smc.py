@@ -18,7 +18,7 @@ likelihood is tempered.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
@@ -27,6 +27,7 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import NoWeightError
+from bcppl.inference.approximations.approximation import Approximation
 from bcppl.inference.approximations.gaussian import GaussianApproximation
 from bcppl.inference.filters.screening import approximated, by_mode, runs_physics, screened
 from bcppl.inference.filters.second_search import searched
@@ -63,35 +64,6 @@ MOST, ROOM = 40, 40_000
 # Where images leave several modes: of 75 particles 20 stay effective, too few for the modes' shares.
 SEVERAL = 8
 LEAST = 0.03  # of N: where even with so many copies less would be left, the measurement is tempered
-
-
-class Approximation(Protocol):
-    """What guides the filter; `GaussianApproximation` is one. It is immutable.
-
-    One that inherits from this class has a single mode unless it states otherwise.
-    """
-
-    def including(self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]) -> Any:
-        """The approximation given one more measurement."""
-
-    def deferring(self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]) -> Any:
-        """The same for a measurement that all particles predict with certainty."""
-
-    def updated(self) -> Any:
-        """The approximation with all that was deferred."""
-
-    @property
-    def is_ambiguous(self) -> bool:
-        """Whether it may have several modes before any contact; more copies are then made of a particle."""
-        return False
-
-    def screens(self, action: Any) -> bool:
-        """Whether it has a cheap likelihood of a measurement that is simulated."""
-        return False
-
-    def stratum(self, trace: Trace) -> Tensor:
-        """The mode of each particle (N,), int64."""
-        return torch.zeros(len(trace), dtype=torch.int64)
 
 
 class Programs(Protocol):

@@ -1,0 +1,40 @@
+"""What guides a filter's proposals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from bcppl.traces import Trace
+
+
+class Approximation(Protocol):
+    """What guides the filter; `GaussianApproximation` is one. It is immutable.
+
+    One that inherits from this class has a single mode unless it states otherwise.
+    """
+
+    def including(self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]) -> Any:
+        """The approximation given one more measurement."""
+
+    def deferring(self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]) -> Any:
+        """The same for a measurement that all particles predict with certainty."""
+
+    def updated(self) -> Any:
+        """The approximation with all that was deferred."""
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether it may have several modes before any contact; more copies are then made of a particle."""
+        return False
+
+    def screens(self, action: Any) -> bool:
+        """Whether it has a cheap likelihood of a measurement that is simulated."""
+        return False
+
+    def stratum(self, trace: Trace) -> Tensor:
+        """The mode of each particle (N,), int64."""
+        return torch.zeros(len(trace), dtype=torch.int64)
