@@ -111,6 +111,26 @@ class Contacts(Protocol):
         """The direction (3,) of motion when contact last began; None without contact."""
 
 
+class InHole(NamedTuple):
+    """Poses of a part that have a peg in its hole.
+
+    Attributes:
+        part: (K, 7).
+        information: (K, 6, 6) of the room that the hole leaves the peg, in the tangent space there.
+    """
+
+    part: Tensor
+    information: Tensor
+
+
+@runtime_checkable
+class EntersHole(Protocol):
+    """Measurements of a held peg, which may have gone into the part's hole."""
+
+    def in_hole(self, measurements: Sequence[Approximated], part: Tensor) -> InHole:
+        """Poses near some (M, 7) that have the hole where the peg would lie deep in the material."""
+
+
 @runtime_checkable
 class Defers(Protocol):
     """Measurements that may have no site of their own: a later one brings what they inform."""

@@ -40,7 +40,7 @@ from bcppl.inference.approximations.laplace import (
     together,
 )
 from bcppl.inference.targets import PHYSICS, cost_of
-from bcppl.sensors.capabilities import Approximated, Contacts, FitsPose, Linearised, Screens
+from bcppl.sensors.capabilities import Approximated, Contacts, EntersHole, FitsPose, Linearised, Screens
 
 _MODES, _FAINT = 8, 10.0  # that views leave: at most so many, within so many nats of the most probable
 UNSURE = 0.0005  # m: beyond this standard deviation the contact may be with another place of the part
@@ -134,7 +134,10 @@ class GaussianApproximation:
         for k, (center, covariance) in enumerate(zip(known.centers, known.covariances, strict=True)):
             mine = None if before is None or not bool((own == k).any()) else before[own == k]
             normal = Normal(center[None], torch.linalg.inv(covariance)[None])
-            each.append(quadratic_approximation(sites, normal, mine, heading, everywhere))
+            near = center[None] if mine is None else torch.cat([center[None], mine])
+            inside = [sensor.in_hole(c, near) for sensor, c in by_sensor if isinstance(sensor, EntersHole)]
+            inside = [places for places in inside if len(places.part)]
+            each.append(quadratic_approximation(sites, normal, mine, heading, everywhere, inside))
         quadratic = each[0] if len(each) == 1 else together(each, known)
         return replace(self, quadratic=quadratic, relevant=relevant, stale=False)
 

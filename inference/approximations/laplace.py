@@ -10,6 +10,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.pose_normals import GaussianMixture
+from bcppl.sensors.capabilities import InHole
 
 # Standard deviations (m) that are added to the errors, one for each Gauss-Newton step: of starts about the
 # prior mean, from outside the part, and from many places.
@@ -72,6 +73,7 @@ def quadratic_approximation(
     before: Tensor | None = None,
     heading: Tensor | None = None,
     everywhere: bool = False,
+    inside: Sequence[InHole] = (),
 ) -> QuadraticApproximation:
     """The quadratic approximation around the posterior modes that Gauss-Newton reaches.
 
@@ -87,6 +89,7 @@ def quadratic_approximation(
         before: (M, 7) modes given fewer measurements; None for none.
         heading: (3,) the direction of motion at the last contact; None for none.
         everywhere: whether to search for all modes.
+        inside: poses that have the peg in a hole, of which each leads to a mode.
     """
     center, precision = prior
     scale = torch.linalg.cholesky(torch.linalg.inv(precision[0]))
@@ -105,18 +108,33 @@ def quadratic_approximation(
     if others:
         each, _ = gauss_newton(sites, torch.cat(others), prior, FINE, _LEFT)
         best = torch.cat([best, each])
-    return _distinct(_quadratic(sites, best), prior)
+    modes = [_quadratic(sites, best), *(_in_hole(sites, each, prior) for each in inside)]
+    return _distinct(
+        QuadraticApproximation(*(torch.cat(values) for values in zip(*modes, strict=True))), prior
+    )
+
+
+def _in_hole(sites: Sites, inside: InHole, prior: Normal) -> QuadraticApproximation:
+    """The modes that have the peg in a hole, within which a likelihood without contact is flat."""
+    there, _ = gauss_newton(sites, inside.part, prior, FINE, len(inside.part))
+    found = _quadratic(sites, there)
+    # Gauss-Newton orders what it reaches, and moves it by no more than the hole's room: any of them will do.
+    return found._replace(information=found.information + inside.information[:1])
 
 
 def together(each: Sequence[QuadraticApproximation], prior: GaussianMixture) -> QuadraticApproximation:
     """The modes reached from each of a prior's components, without those that hardly weigh beside others."""
-    modes = QuadraticApproximation(*(torch.cat(values) for values in zip(*each, strict=True)))
+    modes = _joined(each)
     own = torch.arange(len(each)).repeat_interleave(torch.tensor([len(one.around) for one in each]))
     weight = modes.posterior_each(prior.centers[own], torch.linalg.inv(prior.covariances[own])).log_weights
     weight = weight + prior.log_weights[own]
     order = weight.argsort(descending=True)
     kept = order[weight[order] > weight[order[0]] - _REFUTED]
     return QuadraticApproximation(*(values[kept] for values in modes))
+
+
+def _joined(each: Sequence[QuadraticApproximation]) -> QuadraticApproximation:
+    return QuadraticApproximation(*(torch.cat(values) for values in zip(*each, strict=True)))
 
 
 def gauss_newton(

@@ -10,7 +10,7 @@ from torch import Tensor
 from bcppl.distributions.episodes import ContactEpisodes
 from bcppl.distributions.episodes.rows import COLUMNS
 from bcppl.robot.motion import ProbeWindow
-from bcppl.sensors.capabilities import Approximated
+from bcppl.sensors.capabilities import Approximated, InHole
 from bcppl.sensors.likelihoods.contact_probe import ContactProbe, TouchSettings
 from bcppl.sensors.likelihoods.simulated_probe import ProbeSettings, SimulatedProbe
 from bcppl.sensors.measurements import Recording
@@ -69,6 +69,10 @@ class ScreenedProbe(SimulatedProbe):
     def heading(self, measurements: Sequence[Approximated]) -> Tensor | None:
         """The direction (3,) in which the peg moved when contact last began; None without contact."""
         return self.geometry.heading(self._in_rows(measurements))
+
+    def in_hole(self, measurements: Sequence[Approximated], part: Tensor) -> InHole:
+        """Poses near some (M, 7) that have the hole where the peg would lie deep in the material."""
+        return self.geometry.in_hole(self._in_rows(measurements), part)
 
     def _in_rows(self, measurements: Sequence[Approximated]) -> list[Approximated]:
         return [each._replace(value=self._rows[_key(each.value)]) for each in measurements]
