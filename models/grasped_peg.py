@@ -1,19 +1,20 @@
 """A peg whose pose in the hand is not as planned: the grasp is latent, like the part's pose.
 
-`peg_in_hole` with one more site. Commands, the measured peg pose, the wrench and contact locations are all in
-the frame of the grip, in which a peg held as planned would lie; only the peg's surface is displaced, by
-`grip_from_peg`. While the hand keeps its orientation, a peg displaced by a millimetre to the left gives the
-same contacts as a part displaced by a millimetre to the right. The camera separates the two, or a second
-touch with the hand turned: half a turn about the peg's axis changes the sign of one displacement and not of
-the other. That holds across the axis and not along it: the depth of the peg in the hand is separated from the
-part's height by the camera alone, to the accuracy of its extrinsics.
+`peg_in_hole` with one more site, and cameras without latent errors. Commands, the measured peg pose, the
+wrench and contact locations are all in the frame of the grip, in which a peg held as planned would lie; only
+the peg's surface is displaced, by `grip_from_peg`. While the hand keeps its orientation, a peg displaced by a
+millimetre to the left gives the same contacts as a part displaced by a millimetre to the right. The camera
+separates the two, or a second touch with the hand turned: half a turn about the peg's axis changes the sign
+of one displacement and not of the other. That holds across the axis and not along it: the depth of the peg in
+the hand is separated from the part's height by the camera alone, to the accuracy of its extrinsics.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import pyro
@@ -21,13 +22,37 @@ import torch
 
 from bcppl import poses
 from bcppl.arguments import number_within
-from bcppl.distributions.poses import NormalPose
-from bcppl.models import peg_in_hole
+from bcppl.distributions.poses import NormalPose, prior_from_guess
+from bcppl.geometry.parts import Part
 from bcppl.models.shipped import simulated_in
+from bcppl.rendering.part_renderer import PartRenderer
+from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors.capabilities import Grasping
+from bcppl.sensors.likelihoods.cameras import CalibratedCamera
+from bcppl.sensors.likelihoods.screened_probe import simulated_probe
+from bcppl.sensors.likelihoods.simulated_probe import ProbeSettings
 from bcppl.sensors.measurements import Recording
-from bcppl.sensors.scene import Scene
+from bcppl.sensors.scene import Scene, chosen, likelihoods_for, require_positive
 from bcppl.traces import Model
+
+
+@dataclass(frozen=True)
+class DepthSettings:
+    """Noise of a depth image.
+
+    Attributes:
+        depth_scale: of the Laplace noise, metres.
+        outlier: the probability that a pixel shows something else than the rendered scene.
+        effective_pixels: the number of independent pixels that an image is worth; the error of a camera's
+            pose is common to all.
+    """
+
+    depth_scale: float = 0.003
+    outlier: float = 0.1
+    effective_pixels: float = 50.0
+
+    def __post_init__(self) -> None:
+        require_positive(self, "depth_scale")
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +73,29 @@ def grasped_peg(scene: GraspScene, actions: Sequence[Any]) -> None:
         sensor.observe(number, action, hole)
 
 
+def by_known_cameras(
+    recording: Recording, name: str, renderer: Callable[[Part], PartRenderer] = RayCaster, **settings: Any
+) -> Scene:
+    """The scene of a recording whose cameras have no latent errors, for tempered SMC, under a model's name.
+
+    Args:
+        recording: of depth images and probe windows.
+        name: of the model, for messages.
+        renderer: makes the renderer of the part, such as `bcppl.rendering.rasterisation.renderer_for`.
+        settings: fields of `DepthSettings` and `ProbeSettings`.
+
+    Raises:
+        InputError: a setting is unknown or out of range, there are probe windows and no peg, or the part
+            cannot be touched.
+    """
+    depth, probe = chosen(name, settings, DepthSettings(), ProbeSettings())
+    noise = {"scale": depth.depth_scale, "outlier": depth.outlier, "effective_pixels": depth.effective_pixels}
+    camera = CalibratedCamera(recording, renderer(recording.part), **noise)
+    windows = partial(simulated_probe, settings=probe)
+    likelihoods = likelihoods_for(recording, {"view": lambda _: camera, "window": windows})
+    return Scene(prior_from_guess(recording.guess), likelihoods, name)
+
+
 def prepare(
     recording: Recording, grip_shift: float = 0.0015, grip_turn: float = math.radians(1.5), **settings: Any
 ) -> GraspScene:
@@ -57,11 +105,11 @@ def prepare(
         recording: of depth images and probe windows.
         grip_shift: standard deviation of the peg's position in the hand along each axis of the grip, metres.
         grip_turn: standard deviation of its orientation about each axis, radians.
-        settings: as for `peg_in_hole.prepare`.
+        settings: as for `by_known_cameras`.
 
     Raises:
         InputError: a spread is not positive, grip_shift is longer than the peg or grip_turn beyond pi; or as
-            `peg_in_hole.prepare`.
+            `by_known_cameras`.
     """
     longest = math.inf if recording.peg is None else float(recording.peg.extent.max())
     for name, value, most in (("grip_shift", grip_shift, longest), ("grip_turn", grip_turn, math.pi)):
@@ -70,7 +118,7 @@ def prepare(
         )
         number_within(what, value, above=0.0, most=most)
     spread = torch.tensor([grip_shift] * 3 + [grip_turn] * 3, dtype=torch.float64)
-    known = peg_in_hole.prepare(recording, **settings)
+    known = by_known_cameras(recording, "grasped_peg", **settings)
     return GraspScene(known.prior, known.likelihoods, "grasped_peg", NormalPose(poses.identity(), spread))
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.errors import InputError
-from bcppl.models import peg_in_hole
+from bcppl.models.grasped_peg import by_known_cameras
 from bcppl.models.shipped import simulated_in
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Scene
@@ -59,11 +59,11 @@ def prepare(
     Args:
         recording: of depth images and probe windows; its part's frame is in the first hole.
         holes: positions of the holes, x and y in the part's frame, metres.
-        settings: as for `peg_in_hole.prepare`.
+        settings: as for `grasped_peg.by_known_cameras`.
 
     Raises:
         InputError: there are fewer than two holes, the first is not at the origin, two are at one place, or
-            one is beside the part; or as `peg_in_hole.prepare`.
+            one is beside the part; or as `grasped_peg.by_known_cameras`.
     """
     try:
         places = np.asarray(holes, dtype=np.float64).reshape(-1, 2)
@@ -84,7 +84,7 @@ def prepare(
         )
     hole_from_part = poses.identity(len(places))
     hole_from_part[:, :2] = -torch.from_numpy(places)
-    scene = peg_in_hole.prepare(recording, **settings)
+    scene = by_known_cameras(recording, "which_hole", **settings)
     return PlateScene(scene.prior, scene.likelihoods, "which_hole", hole_from_part)
 
 

@@ -105,7 +105,7 @@ def shipped_or(smaller: Smaller) -> pytest.MarkDecorator:
 @shipped_or(
     {
         "recording": [NEAR],
-        "vision": [("particles=75, seed=0", "particles=24, seed=0, sweeps=(6, 3), share=(0.6, 0.4)")],
+        "vision": [("particles=75, seed=0", "particles=24, seed=0")],
     }
 )
 def test_first_belief_runs_and_finds_the_part(kernel: Any, smaller: Smaller) -> None:
