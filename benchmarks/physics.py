@@ -112,7 +112,7 @@ MISSED = Outcome(math.inf, math.inf, [[False] * len(MASSES)] * len(REGIONS), mat
 
 
 def model_of(way: str, noise: float) -> Model:
-    """The model of a way where the peg's position is measured with a noise, which it is told."""
+    """The model of a way where the peg's position is measured with a noise, which is stated to it."""
     if way == GEOMETRY:
         return look_and_touch.model.with_settings(profile="perfect", gap_noise=max(noise, 0.00006))
     settings, own = WAYS[way].settings, ProbeSettings()

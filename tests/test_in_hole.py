@@ -59,7 +59,7 @@ def test_a_peg_that_would_be_deep_in_the_material_is_in_the_hole_instead() -> No
     assert 0.1 * scene().clearance < float(torch.linalg.eigvalsh(width)[0].sqrt()) < scene().clearance
     off = poses.local(truth, inside.part[0])
     across = poses.rotation_matrix(truth).T @ off[:3]
-    # Along the hole's axis and about it nothing is told; the mouth is as far off as the yaw turns it.
+    # Along the hole's axis and about it nothing is known; the mouth is as far off as the yaw turns it.
     assert float(across[:2].abs().max()) < 2e-4 and float(off[3:5].abs().max()) < 1e-3
     assert abs(float(off[5]) - float(OFF[5])) < 2e-3
     # Beside the believed part, or above it, nothing has to be explained.
