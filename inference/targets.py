@@ -38,6 +38,11 @@ def cost_of(site: Any) -> int:
     return int(getattr(site, "cost", 0))
 
 
+def runs_physics(trace: Trace) -> bool:
+    """Whether a site of a trace simulates contact."""
+    return any(cost_of(site) >= PHYSICS for site in trace.distributions.values())
+
+
 @dataclass(frozen=True)
 class Target:
     """The unnormalised log-density of a trace, with some sites tempered.

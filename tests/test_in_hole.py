@@ -62,6 +62,22 @@ def test_a_peg_that_would_be_deep_in_the_material_is_in_the_hole_instead() -> No
     # Along the hole's axis and about it nothing is known; the mouth is as far off as the yaw turns it.
     assert float(across[:2].abs().max()) < 2e-4 and float(off[3:5].abs().max()) < 1e-3
     assert abs(float(off[5]) - float(OFF[5])) < 2e-3
+    # The room is that of mouth and tip across the hole's axis: by differences.
+    part, rows = inside.part[0], lowered()
+    deepest = rows[int(sensor.gap(believed, rows[:, :7]).distance[0].argmin()), :7]
+    low = torch.tensor([[0.0, 0.0, float(scene().peg.vertices[:, 2].min())]], dtype=torch.float64)
+    ends = torch.cat(
+        [
+            torch.from_numpy(hole_of(scene().part).part_from_hole[None, :3]),
+            poses.transform(poses.compose(poses.inverse(part), deepest), low),
+        ]
+    )
+    moved = poses.retract(part, 1e-7 * torch.eye(6, dtype=torch.float64))
+    slopes = (poses.transform(moved, ends) - poses.transform(part, ends)) / 1e-7  # (6, 2, 3)
+    axis = poses.rotation_matrix(deepest)[:, 2]
+    beside = slopes - (slopes @ axis)[..., None] * axis
+    expected = torch.einsum("akc,bkc->ab", beside, beside) / (scene().clearance ** 2 / 12.0)
+    torch.testing.assert_close(inside.information[0], expected, rtol=1e-4, atol=1e-4 * float(expected.max()))
     # Beside the believed part, or above it, nothing has to be explained.
     assert len(sensor.in_hole(measured, torch.from_numpy(scene().truth)[None]).part) == 0
     assert len(sensor.in_hole([Approximated(2, None, lowered(0.2))], believed).part) == 0

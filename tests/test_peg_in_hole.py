@@ -144,7 +144,7 @@ def test_geometry_guides_and_physics_finds_the_hole() -> None:
 
 
 def test_what_is_explained_of_a_probe_is_a_setting() -> None:
-    """Sites, latent parameters of the contact, and what cannot be told."""
+    """Sites, latent parameters of the contact, and what is refused."""
     measurements, count = recorded().measurements[:9], 3
     given = {"evidence": ("contacts in time", "pose", "wrench"), "friction": (0.3, 0.4)}
     chosen = peg_in_hole.prepare(recorded(), **given)

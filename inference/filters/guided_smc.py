@@ -29,7 +29,7 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.errors import NoWeightError
 from bcppl.inference.approximations.approximation import Approximation
 from bcppl.inference.approximations.gaussian import GaussianApproximation
-from bcppl.inference.filters.screening import approximated, by_mode, runs_physics, screened
+from bcppl.inference.filters.screening import approximated, by_mode, screened
 from bcppl.inference.filters.second_search import searched
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair, moved as moved_by_pair
@@ -49,7 +49,7 @@ from bcppl.inference.proposals.approximated import (
 )
 from bcppl.inference.proposals.coordinates import continuous_addresses
 from bcppl.inference.sizing import replicate
-from bcppl.inference.targets import POSTERIOR
+from bcppl.inference.targets import POSTERIOR, runs_physics
 from bcppl.sensors.capabilities import Defers, FitsPose
 from bcppl.traces import Model, Trace, extend
 

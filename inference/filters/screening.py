@@ -99,11 +99,6 @@ def screened_draws(
     return few.reweighed(POSTERIOR(few.trace) - _cheap_log_density(few.trace, approximation))
 
 
-def runs_physics(trace: Trace) -> bool:
-    """Whether a site simulates contact."""
-    return any(cost_of(site) >= PHYSICS for site in trace.distributions.values())
-
-
 def by_mode(population: Population, count: int) -> Tensor:
     """Systematic ancestors (count,), so that each mode keeps its share but for one particle."""
     order = population.approximation.stratum(population.trace).argsort(stable=True)

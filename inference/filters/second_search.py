@@ -13,10 +13,11 @@ from collections.abc import Callable
 from typing import Any
 
 from bcppl.errors import NoWeightError
-from bcppl.inference.filters.screening import runs_physics, screened_draws
+from bcppl.inference.filters.screening import screened_draws
 from bcppl.inference.filters.searching import joined
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.population import Population
+from bcppl.inference.targets import runs_physics
 
 MISSED = 10.0  # nats by which a mode is better than every particle: of 75 in six dimensions the best lacks 1
 COPIES = 20  # draws for each particle: the approximation leaves some per cent of them effective

@@ -39,7 +39,7 @@ from bcppl.inference.proposals import Program, drift, independent, prior, spread
 from bcppl.inference.proposals.climbing import Modes, jumps, modes
 from bcppl.inference.proposals.coordinates import continuous_addresses
 from bcppl.inference.proposals.walk import joint_drift
-from bcppl.inference.targets import PHYSICS, cost_of
+from bcppl.inference.targets import runs_physics
 from bcppl.traces import Model, Series, Trace, generate
 
 
@@ -144,7 +144,7 @@ def infer(
     moves = (6 if model.proposals else 12, enough) if sweeps is None else sweeps
 
     def by_physics(trace: Trace) -> int:
-        return int(any(cost_of(site) >= PHYSICS for site in trace.distributions.values()))
+        return int(runs_physics(trace))
 
     def step(population: Population, observed: Observed) -> Stepped:
         centres, along = None, []
