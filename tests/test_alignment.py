@@ -208,7 +208,7 @@ class Spring:
     def window(self, first: int, last: int) -> tuple[Tensor, Tensor]:
         return self.contacts[:, first:last], self.peg[:, first:last]
 
-    def force_directions(self, first: int, last: int) -> Tensor:
+    def contact_normals(self, first: int, last: int) -> Tensor:
         return self.upward[:, first:last]
 
 

@@ -137,7 +137,7 @@ def test_the_pose_likelihood_s_samples_have_its_scales() -> None:
 class Pressed(Felt):
     """The peg is pushed along y of the world in the first half of the particles, and touches nothing else."""
 
-    def force_directions(self, first: int, last: int) -> torch.Tensor:
+    def contact_normals(self, first: int, last: int) -> torch.Tensor:
         direction = torch.full((len(self), last - first, 3), math.nan, dtype=torch.float64)
         direction[: len(self) // 2] = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
         return direction

@@ -19,7 +19,7 @@ _IN_VAIN = 30  # particles times stamps that cost as much as one more run
 
 @dataclass(frozen=True, eq=False)
 class FreeMotion:
-    """A probe in free motion: sensor rows (T, 13) at the stamps, and whether it did not diverge.
+    """A probe in free motion: sensor rows (T, 16) at the stamps, and whether it did not diverge.
 
     States and the number of steps (T+1,) are those after 0, 1, ... T stamps; the path (S, 7) is the peg's at
     all steps, at which alone contacts are detected.

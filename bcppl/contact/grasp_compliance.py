@@ -32,10 +32,10 @@ def springs_in_series(nuisances: Mapping[str, Array], stiffness: Array) -> dict[
 
 
 def readings_at_grip(rows: Array, compliance: Array) -> Array:
-    """Poses of the grip in the world, and the wrench in its frame about its origin, (N, T, 13).
+    """Rows (N, T, C) of the grip's poses in the world, and the wrench in its frame about its origin.
 
-    From rows of the peg's poses in the world and the environment's wrench on it in its frame, and the grasp's
-    compliance (N, 6) along and about the grip's axes.
+    From rows of the peg's poses (7) in the world, the environment's wrench (6) on it in its frame, and others
+    that stay, and the grasp's compliance (N, 6) along and about the grip's axes.
     """
     at_grip = rows.copy()
     compliant = (compliance > 0).any(axis=1)
@@ -43,16 +43,16 @@ def readings_at_grip(rows: Array, compliance: Array) -> Array:
     finite = np.isfinite(flat).all(axis=1)
     peg = flat[finite]
     # The environment pushes the peg into the hand: grip_from_peg is the springs' deflection.
-    deflection = np.repeat(compliance[compliant], rows.shape[1], axis=0)[finite] * peg[:, 7:]
+    deflection = np.repeat(compliance[compliant], rows.shape[1], axis=0)[finite] * peg[:, 7:13]
     turned = Rotation.from_rotvec(deflection[:, 3:])
     force = turned.apply(peg[:, 7:10])
     world_from_grip = Rotation.from_quat(peg[:, [4, 5, 6, 3]]) * turned.inv()
-    flat[finite] = np.concatenate(
+    flat[finite, :13] = np.concatenate(
         [
             peg[:, :3] - world_from_grip.apply(deflection[:, :3]),
             world_from_grip.as_quat()[:, [3, 0, 1, 2]],
             force,
-            turned.apply(peg[:, 10:]) + np.cross(deflection[:, :3], force),
+            turned.apply(peg[:, 10:13]) + np.cross(deflection[:, :3], force),
         ],
         axis=1,
     )

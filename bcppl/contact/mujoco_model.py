@@ -16,7 +16,8 @@ from bcppl.errors import InputError
 from bcppl.geometry.parts import Part, Piece
 from bcppl.robot.motion import Probe
 
-SENSOR_COLUMNS = 13  # of a sensor row: position 3, quaternion 4, force 3, torque 3
+SENSOR_COLUMNS = 16  # of a sensor row: position 3, quaternion 4, force 3, torque 3, normal 3
+_LARGEST_FORCE = 2  # of the ways in which MuJoCo's contact sensor chooses one of several contacts
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,9 @@ def build_model(part: Part, peg: Part, parameters: ContactParameters) -> mujoco.
     Six actuators pull the peg's origin to the command's, along and about the command's axes:
     force = control - stiffness * displacement - damping * velocity; `set_controller` sets the two constants.
     Sensors, in order: the peg's position and quaternion, and the flange's force and torque on the peg, in the
-    peg's frame about its origin: the negative of the environment's wrench on the peg. Gravity is compensated.
+    peg's frame about its origin: the negative of the environment's wrench on the peg; and the normal of the
+    contact with the largest force, from the part into the peg, in the world, 0 without any. Gravity is
+    compensated.
     The state is position, velocity and time.
 
     Raises:
@@ -164,6 +167,15 @@ def build_model(part: Part, peg: Part, parameters: ContactParameters) -> mujoco.
     kinds = mujoco.mjtSensor
     for kind in (kinds.mjSENS_FRAMEPOS, kinds.mjSENS_FRAMEQUAT, kinds.mjSENS_FORCE, kinds.mjSENS_TORQUE):
         spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="grip")
+    body, normal = mujoco.mjtObj.mjOBJ_BODY, 1 << int(mujoco.mjtConDataField.mjCONDATA_NORMAL)
+    spec.add_sensor(
+        type=kinds.mjSENS_CONTACT,
+        objtype=body,
+        objname="part",
+        reftype=body,
+        refname="peg",
+        intprm=[normal, _LARGEST_FORCE, 1],
+    )
     model: mujoco.MjModel = spec.compile()
     return model
 

@@ -20,7 +20,7 @@ from bcppl.contact.free_motion import FreeMotion, first_possible_contact, simula
 from bcppl.contact.grasp_compliance import springs_in_series
 from bcppl.contact.mujoco_model import SENSOR_COLUMNS, ContactParameters, build_model, check_probe
 from bcppl.contact.nuisances import CONTACT_ONLY, Nuisances
-from bcppl.contact.stepping import POSE, WRENCH, SimulationState, Stepper
+from bcppl.contact.stepping import NORMAL, POSE, WRENCH, SimulationState, Stepper
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
@@ -107,7 +107,7 @@ class ProbeSimulation:
 
 @dataclass(frozen=True, eq=False)
 class _Particles(ArrayRecord):
-    """The state of N rollouts: poses (N, 7), nuisances (N, ...), and sensor rows (N, count, 13) so far.
+    """The state of N rollouts: poses (N, 7), nuisances (N, ...), and sensor rows (N, count, 16) so far.
 
     `free` (N,) counts stamps of shared free motion; `level` (N,) is `_FULL`, `_HALVED` or `_DIVERGED`.
     """
@@ -156,6 +156,14 @@ class Rollout:
         In the peg's frame about its origin, as a wrist sensor measures them; NaN after divergence.
         """
         return self._particles.rows[..., WRENCH]
+
+    @property
+    def normals(self) -> Array:
+        """(N, count, 3) the normal of the contact with the largest force, from the part into the peg.
+
+        In the world; of a stamp between two steps the mean of both; 0 without contact, NaN after divergence.
+        """
+        return self._particles.rows[..., NORMAL]
 
     @property
     def world_from_peg(self) -> Array:

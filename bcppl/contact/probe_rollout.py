@@ -11,7 +11,6 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bcppl import poses
 from bcppl.arrays import Array, ArrayRecord
 from bcppl.contact.nuisances import Nuisances
 from bcppl.contact.physics import PegPhysics, Rollout, Selection, rows_of
@@ -112,17 +111,15 @@ class ProbeRollout:
         self.advance(last)
         return torch.from_numpy(self.rollout.wrench[:, first:last].copy())
 
-    def force_directions(self, first: int, last: int) -> Tensor:
-        """Unit directions (N, last-first, 3), in the world, of the part's force on the peg.
+    def contact_normals(self, first: int, last: int) -> Tensor:
+        """Unit normals (N, last-first, 3), in the world, of the contact with the largest force.
 
-        NaN where there is none, or the physics diverged.
+        From the part into the peg; NaN where there is no contact, or the physics diverged.
         """
-        force, pose = self.wrench(first, last)[..., :3], self.window(first, last)[1]
-        size = force.norm(dim=-1, keepdim=True)
-        lost = torch.isnan(pose).any(dim=-1, keepdim=True)
-        rotation = poses.rotation_matrix(torch.where(lost, poses.identity(), pose))
-        direction = (rotation @ force[..., None])[..., 0] / size
-        return torch.where(lost | (size == 0.0), torch.nan, direction)
+        self.advance(last)
+        normal = torch.from_numpy(self.rollout.normals[:, first:last].copy())
+        size = normal.norm(dim=-1, keepdim=True)
+        return torch.where(size > 0.0, normal / size, torch.nan)
 
     def stored(self) -> dict[str, npt.NDArray[Any]]:
         """The numbers of all that has been simulated, by name (`bcppl.traces.carried.Storable`)."""

@@ -23,7 +23,7 @@ _CONTROL = int(
 )
 _CONTROLS = 20  # six forces, then the positions of command and part, then their quaternions
 _BLOCK = 32 * 2**20  # bytes that one call of mujoco.rollout may fill
-POSE, WRENCH = slice(0, 7), slice(7, 13)  # columns of a sensor row
+POSE, WRENCH, NORMAL = slice(0, 7), slice(7, 13), slice(13, 16)  # columns of a sensor row
 
 
 @functools.cache
@@ -37,7 +37,7 @@ class SimulationState(ArrayRecord):
 
     Attributes:
         state: (N, S) MuJoCo's full physics state: time, position 7, velocity 6.
-        tail: (N, 2, 13) the last two sensor rows, between which the next stamp may lie.
+        tail: (N, 2, 16) the last two sensor rows, between which the next stamp may lie.
     """
 
     state: Array
@@ -80,10 +80,11 @@ class Stepper:
         first: int,
         last: int,
     ) -> tuple[Array, SimulationState]:
-        """Sensor rows (N, last-first, 13) at stamps `first` to `last` (exclusive), and the states after them.
+        """Sensor rows (N, last-first, 16) at stamps `first` to `last` (exclusive), and the states after them.
 
-        A row is the peg's pose and the environment's wrench on it. The simulations begin in the states after
-        `first` stamps, with nuisances (N, ...) from `grasp_compliance.springs_in_series`.
+        A row is the peg's pose, the environment's wrench on it, and the contact's normal. The simulations
+        begin in the states after `first` stamps, with nuisances (N, ...) from
+        `grasp_compliance.springs_in_series`.
         """
         start, stop = self.step_after(first), self.step_after(last)
         sensed = np.empty((len(begin.state), stop - start, SENSOR_COLUMNS))
@@ -100,7 +101,7 @@ class Stepper:
     def trajectory(self, world_from_part: Array, stamps: int) -> tuple[Array, SimulationState, Array]:
         """One simulation from the beginning, for a pose (1, 7) of the part.
 
-        Sensor rows (stamps, 13), the states after 0, 1, ... `stamps` stamps, and the peg's poses (S, 7) at
+        Sensor rows (stamps, 16), the states after 0, 1, ... `stamps` stamps, and the peg's poses (S, 7) at
         all steps.
         """
         begin, stop = self.at_rest(1), self.step_after(stamps)
@@ -122,7 +123,7 @@ class Stepper:
         return timely & np.isfinite(reached.state).all(axis=1)
 
     def _at_stamps(self, rows: Array, shift: int, first: int, last: int) -> Array:
-        """Sensor rows (N, last-first, 13) at stamps, from rows of which row k is of step k - shift."""
+        """Sensor rows (N, last-first, 16) at stamps, from rows of which row k is of step k - shift."""
         low, weight = rows[:, self._low[first:last] + shift], self._weight[first:last, None]
         if weight.any():
             high = rows[:, self._high[first:last] + shift]
@@ -143,7 +144,7 @@ class Stepper:
         """Steps `first` to `last` (exclusive) in blocks.
 
         Of each: its first step and the one after its last, the states (N, steps, S) after each step, and the
-        raw sensor rows (N, steps, 13). A sensor row describes the state before its step: row k is at time
+        raw sensor rows (N, steps, 16). A sensor row describes the state before its step: row k is at time
         k * time_step.
         """
         particles = len(state)

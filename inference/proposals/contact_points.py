@@ -86,7 +86,7 @@ def _equations(trace: Trace, address: str, measured: str) -> tuple[Equations, Te
     check_pose("contact_alignment", address, measured, torch.equal(track.inputs[0], pose))
     contacts, world_from_peg = track.window(site.first, site.last)
     contacts, world_from_peg = contacts[:, site.thinned], world_from_peg[:, site.thinned]
-    push = track.force_directions(site.first, site.last)[:, site.thinned]
+    push = track.contact_normals(site.first, site.last)[:, site.thinned]
     value = value[..., site.thinned, :]
     known = torch.isfinite(torch.cat([contacts, push, value.expand(len(pose), -1, -1)], dim=-1)).all(dim=-1)
     contacts, push, value = (torch.nan_to_num(x) for x in (contacts, push, value))

@@ -13,7 +13,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bcppl.arrays import Array
-from bcppl.contact.mujoco_model import ContactParameters, build_model, interpolated_command
+from bcppl.contact.mujoco_model import (
+    SENSOR_COLUMNS,
+    ContactParameters,
+    build_model,
+    interpolated_command,
+)
 from bcppl.contact.stepping import POSE, WRENCH, SimulationState, Stepper
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
@@ -156,7 +161,7 @@ def execute(
     probe = command_of(plan, stops)
     stepper = Stepper(model, reality.driven(probe), contact.time_step)
     state = stepper.at_rest(1) if after is None else after.state
-    rows, pegs = np.empty((len(stamps), WRENCH.stop)), np.empty((len(stamps), 7))
+    rows, pegs = np.empty((len(stamps), SENSOR_COLUMNS)), np.empty((len(stamps), 7))
     parts, earlier = np.empty((len(stamps), 7)), None if after is None else after.wrench
     motion = np.clip(np.searchsorted(plan.times, stamps + 1e-9, side="right") - 1, 0, len(manners) - 1)
     count, contact_pose = len(stamps), None

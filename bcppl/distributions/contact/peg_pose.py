@@ -30,9 +30,9 @@ class PegPose(TrackDistribution):
     given scale and, with weight 0.05, of one ten times as wide. The rotation vector of the error is truncated
     at pi. The density is with respect to Lebesgue times the normalised Haar measure.
 
-    Where the simulated peg touches, its place along the contact's force is that of the two surfaces, and
-    across it depends on friction, which is not known well: the scale is `normal_scale` along the force and
-    `translation_scale` across it. Where it does not touch it is where the command is, to `normal_scale`.
+    Where the simulated peg touches, its place along the contact's normal is that of the two surfaces, and
+    across it depends on friction, which is not known well: the scale is `normal_scale` along the normal and
+    `translation_scale` across it. Where it does not touch it is where the command is, to `free_scale`.
 
     The event is (last - first, 7), `world_from_peg`.
 
@@ -42,6 +42,7 @@ class PegPose(TrackDistribution):
         rotation_scale: radians, about each axis.
         every: as for `TrackDistribution`.
         normal_scale: metres; `translation_scale` in all directions unless given.
+        free_scale: metres; `normal_scale` unless given.
     """
 
     broadcasts = True
@@ -51,6 +52,7 @@ class PegPose(TrackDistribution):
     rotation_scale: float = field(metadata=POSITIVE)
     every: int = field(default=10, metadata=COUNT)
     normal_scale: float | None = field(default=None, metadata=within(above=0.0, optional=True))
+    free_scale: float | None = field(default=None, metadata=within(above=0.0, optional=True))
 
     @property
     def log_prob_bound(self) -> float:
@@ -60,8 +62,8 @@ class PegPose(TrackDistribution):
             return math.inf
         none = torch.zeros(1, dtype=torch.float64)
         stamps = len(range(self.first, self.last)[self.thinned])
-        narrowest = min(self.translation_scale, self.normal_scale or self.translation_scale)
-        translation = self._log_translation(none, none + narrowest, narrowest)
+        narrowest = none + min(self.translation_scale, *self._along)
+        translation = self._log_translation(none, narrowest, narrowest)
         return stamps * float(translation + self._log_rotation(none))
 
     def _log_prob(self, value: Tensor) -> Tensor:
@@ -69,30 +71,35 @@ class PegPose(TrackDistribution):
         expected = torch.where(self.track.diverged[:, None, None], poses.identity(), simulated)
         error = poses.local(expected[:, self.thinned], value)
         rotation = self._log_rotation(error[..., 3:].square().sum(dim=-1))
-        direction, across, along = self._spread()
-        normal = (error[..., :3] * direction[:, self.thinned]).sum(dim=-1, keepdim=True)
-        rest = error[..., :3] - normal * direction[:, self.thinned]
-        across = across[:, self.thinned]
+        direction, across, along = (each[:, self.thinned] for each in self._spread())
+        normal = (error[..., :3] * direction).sum(dim=-1, keepdim=True)
+        rest = error[..., :3] - normal * direction
         squared = (normal[..., 0] / along).square() + (rest / across[..., None]).square().sum(dim=-1)
         return (self._log_translation(squared, across, along) + rotation).sum(dim=-1)
 
-    def _spread(self) -> tuple[Tensor, Tensor, float]:
-        """Unit directions (N, T, 3), 0 for none, and the scales across (N, T) and along them, m."""
-        along = self.normal_scale
-        if along is None:
-            _, pose = self.track.window(self.first, self.last)
-            across = torch.full_like(pose[..., 0], self.translation_scale)
-            return torch.zeros_like(pose[..., :3]), across, self.translation_scale
-        direction = self.track.force_directions(self.first, self.last)
-        touches = torch.isfinite(direction).all(dim=-1)
-        across = torch.where(touches, direction.new_tensor(self.translation_scale), along)
-        return torch.nan_to_num(direction), across, along
+    @property
+    def _along(self) -> tuple[float, float]:
+        """The scales along a contact's normal, and in free motion."""
+        normal = self.normal_scale or self.translation_scale
+        return normal, self.free_scale or normal
 
-    def _log_translation(self, squared: Tensor, across: Tensor, along: float) -> Tensor:
+    def _spread(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Unit normals (N, T, 3), 0 for none, and the scales across and along them (N, T), m."""
+        if self.normal_scale is None and self.free_scale is None:
+            _, pose = self.track.window(self.first, self.last)
+            same = torch.full_like(pose[..., 0], self.translation_scale)
+            return torch.zeros_like(pose[..., :3]), same, same
+        direction = self.track.contact_normals(self.first, self.last)
+        touches = torch.isfinite(direction).all(dim=-1)
+        normal, free = (direction.new_tensor(scale) for scale in self._along)
+        across = torch.where(touches, direction.new_tensor(self.translation_scale), free)
+        return torch.nan_to_num(direction), across, torch.where(touches, normal, free)
+
+    def _log_translation(self, squared: Tensor, across: Tensor, along: Tensor) -> Tensor:
         """Log-density of errors whose whitened squares are given."""
 
         def gaussian(wider: float) -> Tensor:
-            volume = 2.0 * across.log() + math.log(along) + 3.0 * math.log(wider)
+            volume = 2.0 * across.log() + along.log() + 3.0 * math.log(wider)
             return -0.5 * squared / wider**2 - volume - 1.5 * math.log(2.0 * math.pi)
 
         return contaminated(gaussian, 1.0, OUTLIER)
@@ -116,7 +123,7 @@ class PegPose(TrackDistribution):
         direction, across, along = self._spread()
         wide, standard = widths(1.0), torch.randn(*shape, 3, dtype=torch.float64)
         normal = (standard * direction).sum(dim=-1, keepdim=True) * direction
-        translation = wide * (across[..., None] * (standard - normal) + along * normal)
+        translation = wide * (across[..., None] * (standard - normal) + along[..., None] * normal)
         width = widths(self.rotation_scale).expand(*shape, 3)
         rotation = width * torch.randn(*shape, 3, dtype=torch.float64)
         # Each Gaussian is truncated on its own, so a draw beyond pi is drawn again at the same width.

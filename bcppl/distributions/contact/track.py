@@ -31,8 +31,8 @@ class Track(Protocol):
     def window(self, first: int, last: int) -> tuple[Tensor, Tensor]:
         """Contacts (N, T, 3) in the peg's frame, NaN where none, and peg poses (N, T, 7), of some stamps."""
 
-    def force_directions(self, first: int, last: int) -> Tensor:
-        """Unit directions (N, T, 3) in the world of the force on the peg, NaN where there is none."""
+    def contact_normals(self, first: int, last: int) -> Tensor:
+        """Unit normals (N, T, 3) of contact in the world, into the peg, NaN where there is none."""
 
     def wrench(self, first: int, last: int) -> Tensor:
         """Force (N) and torque (N m) on the peg (N, T, 6), in its frame about its origin, of some stamps."""
