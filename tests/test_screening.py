@@ -63,9 +63,9 @@ class Cheap(Approximation):
     count: int
     pose: str = "part"
 
-    def log_likelihood(self, pose: Tensor) -> Tensor:
+    def log_likelihood(self, trace: Trace) -> Tensor:
         values = torch.tensor(SEEN[: self.count], dtype=torch.float64)
-        return dist.Normal(pose[:, :1] + BIAS, CRUDE).log_prob(values).sum(dim=1)
+        return dist.Normal(trace["part"][:, :1] + BIAS, CRUDE).log_prob(values).sum(dim=1)
 
 
 def around(x: float, spread: float) -> Any:

@@ -82,7 +82,9 @@ def window_of(recording: Recording) -> tuple[Any, Approximated]:
     return scene.likelihoods["window"], Approximated(0, recording.measurements[0].action, value)
 
 
-def approximated(everywhere: bool, before: Tensor | None = None) -> tuple[Normal, QuadraticApproximation]:
+def approximated(
+    everywhere: bool, before: GaussianMixture | None = None
+) -> tuple[Normal, QuadraticApproximation]:
     recording = touched()
     sensor, window = window_of(recording)
     spread = torch.tensor([0.006, 0.002, 1e-4, 0.001, 0.001, 0.005], dtype=torch.float64)
@@ -111,7 +113,7 @@ def test_a_search_everywhere_reaches_both_modes_with_equal_weights_and_keeps_the
     assert sorted(round(1e3 * float(x), 1) for x in modes.centers[:, 0]) == [1e3 * INNER, 1e3 * OUTER]
     # They guide proposals; each is that of a mixture over the contacts' compliance, by its two moments.
     assert float((modes.log_weights[0] - modes.log_weights[1]).abs()) < 0.5
-    _, again = approximated(False, both.around)
+    _, again = approximated(False, modes)
     assert len(again.around) == 2
 
 

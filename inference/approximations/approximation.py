@@ -31,6 +31,10 @@ class Approximation(Protocol):
         """Whether it may have several modes before any contact; more copies are then made of a particle."""
         return False
 
+    def is_far(self, number: int) -> bool:
+        """Whether a measurement, of those given, is made too far from the part to depend on its pose."""
+        return False
+
     def screens(self, action: Any) -> bool:
         """Whether it has a cheap likelihood of a measurement that is simulated."""
         return False

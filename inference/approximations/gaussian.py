@@ -100,7 +100,7 @@ class GaussianApproximation:
             fits = {**self.fits, name: Fitted(action, sensor.fit(number, action, observations, self.near))}
             # The estimate moves, so it is asked again which contacts are informative there.
             return replace(self, scene=scene, fits=fits, relevant={})
-        if isinstance(sensor, Linearised):
+        if isinstance(sensor, Linearised) and sensor.address(number) in observations:
             contact = Approximated(number, action, observations[sensor.address(number)])
             return replace(self, scene=scene, contacts=(*self.contacts, contact), stale=True)
         return replace(self, scene=scene)
@@ -127,14 +127,16 @@ class GaussianApproximation:
                 yield from sensor.sites(own, pose, blur)
 
         known, everywhere = self.prior, ambiguous and self._is_unsure()
-        before = None if self.quadratic is None else self.quadratic.around
-        own = torch.zeros(0) if before is None else known.component(before)
+        before = None if self.quadratic is None else self.mixture
+        own = torch.zeros(0) if before is None else known.component(before.centers)
         heading = next((heading for heading in headings if heading is not None), None)
         each = []
         for k, (center, covariance) in enumerate(zip(known.centers, known.covariances, strict=True)):
-            mine = None if before is None or not bool((own == k).any()) else before[own == k]
+            mine = None
+            if before is not None and bool((own == k).any()):
+                mine = GaussianMixture(*(values[own == k] for values in before))
             normal = Normal(center[None], torch.linalg.inv(covariance)[None])
-            near = center[None] if mine is None else torch.cat([center[None], mine])
+            near = center[None] if mine is None else torch.cat([center[None], mine.centers])
             inside = [sensor.in_hole(c, near) for sensor, c in by_sensor if isinstance(sensor, EntersHole)]
             inside = [places for places in inside if len(places.part)]
             each.append(quadratic_approximation(sites, normal, mine, heading, everywhere, inside))
@@ -207,6 +209,14 @@ class GaussianApproximation:
         """Whether the instruments leave several modes."""
         return len(self.prior.log_weights) > 1
 
+    def is_far(self, number: int) -> bool:
+        """Whether a contact, of those given, is too far from where the instruments place the part."""
+        for contact in self.contacts[-1:]:
+            sensor = self.scene.sensor(contact.action)
+            if contact.number == number and isinstance(sensor, Contacts):
+                return not sensor.is_informative(contact.action, contact.value, self.prior.centers)
+        return False
+
     def screens(self, action: Any) -> bool:
         """Whether a measurement is simulated, and what is approximated is a cheap likelihood of it."""
         return isinstance(self.scene.sensor(action), Screens)
@@ -231,16 +241,21 @@ class GaussianApproximation:
 
         best = self.quadratic.log_likelihood + log_prior(self.quadratic.around)
         reached = log_prior(trace[self.pose])
-        if any(cost_of(trace.distributions[a]) >= PHYSICS for a in sites):
-            reached = reached + self.log_likelihood(trace[self.pose])
-        elif sites:
-            reached = reached + trace.log_prob(*sites)
+        cheap = [address for address in sites if cost_of(trace.distributions[address]) < PHYSICS]
+        reached = reached + self.log_likelihood(trace)
+        if cheap:
+            reached = reached + trace.log_prob(*cheap)
         return float(best.max() - reached.max())
 
-    def log_likelihood(self, pose: Tensor) -> Tensor:
-        """That of all informative contacts at poses (N, 7), by the sites that are approximated."""
-        total = pose.new_zeros(len(pose))
-        for sensor, own in self._by_sensor(self._informative):
+    def log_likelihood(self, trace: Any) -> Tensor:
+        """Of the informative contacts that run physics in a trace (N,), by what is approximated of them."""
+        pose = trace[self.pose]
+        total, sites = pose.new_zeros(len(pose)), trace.distributions
+
+        def simulated(contact: Approximated) -> bool:
+            return cost_of(sites[self.scene.sensor(contact.action).address(contact.number)]) >= PHYSICS
+
+        for sensor, own in self._by_sensor(tuple(c for c in self._informative if simulated(c))):
             for site, value in sensor.sites(own, pose, 0.0):
                 total = total + site.log_prob(value)
         return total

@@ -145,9 +145,9 @@ def guided(
         before = population.approximation
         if before is None:
             before = _given_all(start(scene), population.trace, actions[:-1])
-        certain = _certain(population, observed)
+        later = before.deferring(scene, len(actions) - 1, action, values)
+        certain = _certain(population, observed, later.is_far(len(actions) - 1))
         if certain is not None:
-            later = before.deferring(scene, len(actions) - 1, action, values)
             return Stepped(certain.with_approximation(later), _info(population, certain))
         before = before.updated()
         after = before.including(scene, len(actions) - 1, action, values)
@@ -240,19 +240,26 @@ def _given_all(approximation: Any, trace: Trace, actions: Sequence[Any]) -> Any:
     return approximation
 
 
-def _certain(population: Population, observed: Observed) -> Population | None:
-    """The particles as they are, where all predict the measurement with certainty; None where not."""
+def _certain(population: Population, observed: Observed, far: bool) -> Population | None:
+    """The particles as they are, where all predict the measurement with certainty; None where not.
+
+    Where it is made `far` from the part, it is enough that all predict it equally well. Elsewhere that may
+    mean that all predict it badly.
+    """
     alive = (population.log_weights > -torch.inf).nonzero()[:, 0]
     few = population.trace.chosen(alive[:ASKED])
     with torch.random.fork_rng(devices=[]):
         longer, gained = extend(few, *observed)
-    if len(longer.choices) == len(few.choices) and not bool((gained.abs() < CERTAIN).all()):
+    if len(longer.choices) == len(few.choices) and not _equal(gained, far):
         return None  # the usual case, decided by a few particles
     longer, gained = extend(population.trace, *observed)
     if len(longer.choices) > len(population.trace.choices):
         return None
-    certain = bool((gained[alive].abs() < CERTAIN).all())
-    return population.with_trace(longer).reweighed(gained) if certain else None
+    return population.with_trace(longer).reweighed(gained) if _equal(gained[alive], far) else None
+
+
+def _equal(log_likelihood: Tensor, far: bool) -> bool:
+    return bool((log_likelihood - (log_likelihood[:1] if far else 0.0)).abs().lt(CERTAIN).all())
 
 
 def _info(

@@ -107,5 +107,5 @@ def by_mode(population: Population, count: int) -> Tensor:
 
 def _cheap_log_density(trace: Trace, approximation: Any) -> Tensor:
     cheap = [address for address, site in trace.distributions.items() if cost_of(site) < PHYSICS]
-    likelihood: Tensor = approximation.log_likelihood(trace[approximation.pose])
+    likelihood: Tensor = approximation.log_likelihood(trace)
     return trace.log_prob(*cheap) + likelihood
