@@ -41,6 +41,7 @@ NINTH, HELD, SECONDS = 2.0, 80.0, 15.0  # mm of 90 % of the scenes; % of 90 % re
 NOISE = 0.00005  # m, of the peg's measured position
 FRICTION = (0.25, 0.6)
 DEFAULT, GEOMETRY, WITHOUT_POSE, USUAL = "default", "geometry alone", "no pose", "3-2-1"
+WRENCH = "and the wrench"
 
 Settings = dict[str, Any]
 Infer = Callable[..., Any]
@@ -60,12 +61,11 @@ def with_step(seconds: float) -> Way:
 
 WAYS = {
     DEFAULT: Way({}),
-    "no wrench": Way({"evidence": ("pose",)}),
-    WITHOUT_POSE: Way(
-        {"evidence": ("contacts", "wrench"), "friction": FRICTION, "pose_every": 5}, tempered_smc.infer
-    ),
-    "and the wrench": Way({"evidence": ("contacts", "pose", "wrench"), "friction": FRICTION}),
-    "locations in time": Way({"evidence": ("contacts in time", "pose")}),
+    "no wrench": Way({"evidence": ("gaps",)}),
+    "pose by physics": Way({"evidence": ("contacts", "pose")}),
+    WITHOUT_POSE: Way({"evidence": ("contacts", "wrench"), "friction": FRICTION}),
+    WRENCH: Way({"evidence": ("gaps", "contacts", "wrench"), "friction": FRICTION}),
+    "locations in time": Way({"evidence": ("gaps", "contacts in time")}),
     "no screening": Way({}, partial(guided_smc.infer, screen=False)),
     "no proposals": Way({}, tempered_smc.infer),
     "the paper's filter": Way({}, bayes_contact.infer),
@@ -115,13 +115,13 @@ def model_of(way: str, noise: float) -> Model:
     """The model of a way where the peg's position is measured with a noise, which is stated to it."""
     if way == GEOMETRY:
         return look_and_touch.model.with_settings(profile="perfect", gap_noise=max(noise, 0.00006))
-    settings, own = WAYS[way].settings, ProbeSettings()
+    settings, own = {"gap_noise": max(noise, 0.00006), **WAYS[way].settings}, ProbeSettings()
     if noise > NOISE:
         # The error of physics is common to stamps that noise is not common to.
         every = own.pose_every // 5
         wider = {
             name: math.hypot(math.sqrt(own.pose_every / every) * getattr(own, name), noise)
-            for name in ("normal_scale", "translation_scale")
+            for name in ("normal_scale", "free_scale", "translation_scale")
         }
         settings = {"pose_every": every, **wider, **settings}
     return peg_in_hole.model.with_settings(**settings)

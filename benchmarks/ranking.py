@@ -4,7 +4,9 @@ Thirty-two touches and slides of 2 s, laid out around the belief after vision of
 bench, for all its particles. Physics is MuJoCo at 2 ms, the free approach simulated for each particle; what a
 ranking takes is measured by its time. Ranked are, by each way: Algorithm 1 of BayesContact (particles
 reweighed, the entropy of their weights), and information added up in the tangent space; both on what physics
-makes of each probe, and on what its quasi-static stand-in does.
+makes of each probe, and on what its quasi-static stand-in does. `--choices N` goes through N scenes: whether
+Algorithm 1 on physics chooses the same probe as the default ranking, and where not, which of the two probes,
+carried out in the world, tells more.
 """
 
 from __future__ import annotations
@@ -12,10 +14,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jobs import in_order
 from report import Row, cores, finish, options, show
 from scenes import model
 from scipy.stats import spearmanr
@@ -170,13 +174,96 @@ def growth(counts: Sequence[int], seconds: Sequence[float]) -> float:
     return float(np.polyfit(np.log(counts), np.log(seconds), 1)[0])
 
 
+class Choice(NamedTuple):
+    """The probes that two rankings choose in one scene, and what came of each.
+
+    Attributes:
+        seed: of the scene.
+        numbers: of the probes, by Algorithm 1 on physics and by the default ranking.
+        lost: nats that each choice lacks to the best probe by the information that physics adds up.
+        entropies: differential entropy of the belief after each probe, nats, by its Gaussian.
+        adds: ADD averaged over the particles by weight, mm.
+    """
+
+    seed: int
+    numbers: tuple[int, int]
+    lost: tuple[float, float]
+    entropies: tuple[float, float]
+    adds: tuple[float, float]
+
+
+def choice(seed: int, count: int) -> Choice:
+    """What both rankings choose of `count` probes, and how each choice ends."""
+    setting, plans = after_vision(seed, PARTICLES)
+    some, world = plans[:count], bench_scene(seed)
+    physics = Physics(setting, some)
+    numbers = tuple(
+        ranking.best.number for ranking in (reweighed(setting, some, physics), added_up(setting, some))
+    )
+    truth = gains(added_up(setting, some, physics))
+
+    def carried_out(number: int) -> tuple[float, float]:
+        recording = world.probe(some[number])
+        *_, last = infer(model, recording, particles=PARTICLES, seed=seed)
+        entropy = 0.5 * float(torch.logdet(2.0 * torch.pi * torch.e * last.belief.covariance))
+        return entropy, 1e3 * last.belief.weighted_add(world.part.surface_points(), world.truth)
+
+    ended = {number: carried_out(number) for number in set(numbers)}
+    first, second = numbers
+    return Choice(
+        seed,
+        (first, second),
+        (float(truth.max() - truth[first]), float(truth.max() - truth[second])),
+        (ended[first][0], ended[second][0]),
+        (ended[first][1], ended[second][1]),
+    )
+
+
+def compare_choices(seeds: Sequence[int], count: int, jobs: int) -> list[Row]:
+    """The table of choices, and their rows."""
+    found: list[Choice] = []
+    for one in in_order(partial(choice, count=count), seeds, jobs):
+        found.append(one)
+        print(*one, flush=True)
+    same = [one.numbers[0] == one.numbers[1] for one in found]
+    differ = [one for one, agreed in zip(found, same, strict=True) if not agreed]
+    show(
+        f"one of {count} probes, by Algorithm 1 on physics / by the default ranking",
+        ["scene", "probe", "nats lost", "entropy after", "weighted ADD mm"],
+        [
+            [one.seed, *(" / ".join(f"{x:.3g}" for x in both) for both in one[1:])]  # type: ignore[attr-defined]
+            for one in found
+        ],
+    )
+    rows = [Row("the same choice", 100.0 * float(np.mean(same)), "%", 90.0, "min")]
+    for k, name in enumerate(("Algorithm 1 on physics", "the default ranking")):
+        lost = [one.lost[k] for one in found]
+        rows.append(Row(f"{name}: nats lost by its choice, median", float(np.median(lost)), "nats"))
+        rows.append(Row(f"{name}: nats lost by its choice, worst", max(lost), "nats"))
+    if differ:
+        told = [one.entropies[0] - one.entropies[1] for one in differ]
+        rows += [
+            Row("where they differ: nats that the default ranking's probe told more", np.mean(told), "nats"),
+            Row("standard error of that", float(np.std(told) / max(1, len(told) - 1) ** 0.5), "nats"),
+            Row("where they differ: it told more in", 100.0 * float(np.mean(np.array(told) > 0)), "%"),
+        ]
+    return rows
+
+
 def main() -> None:
-    arguments = options(__doc__ or "").parse_args()
+    parser = options(__doc__ or "")
+    parser.add_argument("--choices", type=int, metavar="N", help="compare the choices in N scenes")
+    parser.add_argument("--jobs", type=int, default=1, help="of these at a time")
+    arguments = parser.parse_args()
     torch.set_num_threads(
         1
     )  # its threads wait for one another where cores are shared; simulators have theirs
     particles = 25 if arguments.quick else PARTICLES
     count = 8 if arguments.quick else CANDIDATES
+    if arguments.choices:
+        seeds = range(arguments.seed, arguments.seed + arguments.choices)
+        finish(compare_choices(seeds, count, arguments.jobs), arguments.json)
+        return
     setting, plans = after_vision(arguments.seed, particles)
     some = plans[:count]
     added_up(setting, some[:1])  # what is compiled or built once

@@ -35,6 +35,8 @@ from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Scene, chosen, likelihoods_for, require_positive
 from bcppl.traces import Model
 
+PROBE = ProbeSettings(evidence=("contacts", "pose"), normal_scale=0.0003)
+
 
 @dataclass(frozen=True)
 class DepthSettings:
@@ -88,7 +90,7 @@ def by_known_cameras(
         InputError: a setting is unknown or out of range, there are probe windows and no peg, or the part
             cannot be touched.
     """
-    depth, probe = chosen(name, settings, DepthSettings(), ProbeSettings())
+    depth, probe = chosen(name, settings, DepthSettings(), PROBE)
     noise = {"scale": depth.depth_scale, "outlier": depth.outlier, "effective_pixels": depth.effective_pixels}
     camera = CalibratedCamera(recording, renderer(recording.part), **noise)
     windows = partial(simulated_probe, settings=probe)

@@ -19,7 +19,7 @@ from bcppl.models.shipped import simulated_in
 from bcppl.rendering.part_renderer import PartRenderer
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors.likelihoods.erring_camera import ErringCamera
-from bcppl.sensors.likelihoods.screened_probe import simulated_probe
+from bcppl.sensors.likelihoods.screened_probe import TOUCHES, simulated_probe
 from bcppl.sensors.likelihoods.simulated_probe import ProbeSettings
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Prepare, Scene, chosen, likelihoods_for
@@ -41,17 +41,17 @@ def prepare(
     Args:
         recording: of depth images and probe windows.
         renderer: makes the renderer of the part, such as `bcppl.rendering.rasterisation.renderer_for`.
-        settings: fields of `CameraSettings` and `ProbeSettings`.
+        settings: fields of `CameraSettings`, `ProbeSettings` and `TouchSettings`.
 
     Raises:
         InputError: a setting is unknown or out of range, a camera cannot see the part near its guess, there
             are probe windows and no peg, or the part cannot be touched.
     """
-    cameras, probe = chosen("peg_in_hole", settings, CAMERAS, ProbeSettings())
+    cameras, probe, touches = chosen("peg_in_hole", settings, CAMERAS, ProbeSettings(), TOUCHES)
     prior = prior_from_guess(recording.guess)
     likelihoods: dict[str, Prepare] = {
         "view": partial(ErringCamera, prior=prior, settings=cameras, renderer=renderer),
-        "window": partial(simulated_probe, settings=probe),
+        "window": partial(simulated_probe, settings=probe, touches=touches),
     }
     return Scene(prior, likelihoods_for(recording, likelihoods), "peg_in_hole")
 

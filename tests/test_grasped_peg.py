@@ -76,7 +76,8 @@ def test_a_peg_held_as_planned_is_that_of_peg_in_hole() -> None:
     pose = torch.from_numpy(recorded().truth).expand(2, 7).clone()
     pose[1, 2] += 0.001
     held = constrained(pose, poses.identity(2))
-    plain_scene, measurements = peg_in_hole.prepare(recorded()), recorded().measurements
+    own = {"evidence": ("contacts", "pose"), "normal_scale": 0.0003}
+    plain_scene, measurements = peg_in_hole.prepare(recorded(), **own), recorded().measurements
     empty, _ = generate(peg_in_hole.peg_in_hole, (plain_scene, []), {}, 2)
     moved = update(empty, {"hole": pose}).trace
     values = plain_scene.observed(measurements)

@@ -75,7 +75,7 @@ def test_the_truth_explains_the_probe_and_no_shifted_pose_does_better() -> None:
     for axis in range(3):
         shifts[1 + 2 * axis, axis], shifts[2 + 2 * axis, axis] = 0.003, -0.003
     trace = constrained(truth + shifts)
-    sites = [a for a in trace.addresses if a.startswith(("contacts", "peg"))]
+    sites = [a for a in trace.addresses if a.startswith(("contacts", "touch"))]
     score = trace.log_prob(*sites)
     assert (score[0] > score[1:] + 2.0).all(), score
 
@@ -84,9 +84,12 @@ def test_the_program_simulates_what_it_explains() -> None:
     torch.manual_seed(0)
     actions = [m.action for m in recorded().measurements[:10]]
     simulated = simulate(peg_in_hole.peg_in_hole, (scene(), actions), 2)
-    values = {a: simulated[a][0] for a in simulated.addresses if a.startswith(("depth", "contacts", "peg"))}
+    values = {a: simulated[a][0] for a in simulated.addresses if a.startswith(("depth", "contacts", "touch"))}
     assert values["depth_0"].shape == scene().observed(recorded().measurements[:1])["depth_0"].shape
-    assert values["contacts_8"].shape == (50, 3) and values["peg_8"].shape == (50, 7)
+    assert (
+        values["contacts_8"].shape == (50, 3)
+        and values["touch_8"].shape == scene().observed(recorded().measurements)["touch_8"].shape
+    )
     poses = simulated["hole"].clone()
     poses[1] = poses[0]
     poses[1, 2] += 0.01
@@ -112,7 +115,7 @@ def test_windows_of_one_probe_share_one_rollout_per_particle() -> None:
         values = scene().observed(measurements)
         new = {a: v for a, v in values.items() if a not in pieces}
         pieces, _ = extend(pieces, (scene(), [m.action for m in measurements]), new)
-    sites = [a for a in whole.addresses if a.startswith(("contacts", "peg"))]
+    sites = [a for a in whole.addresses if a.startswith("contacts")]
     for site in sites:
         assert torch.equal(pieces.log_prob(site), whole.log_prob(site)[[2, 0, 1]]), site
 
@@ -163,6 +166,22 @@ def test_what_is_explained_of_a_probe_is_a_setting() -> None:
         peg_in_hole.prepare(recorded(), friction=(-1.0, 0.3))
 
 
-def test_a_probe_whose_pose_does_not_count_has_no_geometry() -> None:
-    blind = peg_in_hole.prepare(recorded(), evidence=("contacts", "wrench")).likelihoods["window"]
+def test_contact_locations_alone_have_no_geometry() -> None:
+    blind = peg_in_hole.prepare(recorded(), evidence=("contacts",)).likelihoods["window"]
     assert not isinstance(blind, Screens) and isinstance(scene().likelihoods["window"], Screens)
+
+
+@pytest.mark.parametrize("evidence", [("contacts", "pose"), ("contacts", "wrench"), ("gaps", "wrench")])
+def test_geometry_guides_whatever_is_explained(evidence: tuple[str, ...]) -> None:
+    """Where gaps are no evidence they only propose: their likelihood is not in the target."""
+    short = dataclasses.replace(recorded(), measurements=recorded().measurements[:9])
+    model = peg_in_hole.model.with_settings(evidence=evidence)
+    *_, last = guided_smc.infer(model, short, particles=10, seed=2)
+    trace = last.population.trace
+    assert any(a.startswith("touch") for a in trace.addresses) == ("gaps" in evidence)
+    assert bool(torch.isfinite(last.population.log_weights).all())
+
+
+def test_gaps_of_a_peg_that_may_be_off_in_the_hand_are_refused() -> None:
+    with pytest.raises(InputError, match='name "pose" in place of "gaps"'):
+        scene().likelihoods["window"].grasping(torch.zeros(2, 7))

@@ -29,7 +29,7 @@ from bcppl.traces.carried import carried, once
 
 # The contact that inference assumes. Worlds that simulate recordings have parameters of their own.
 CONTACT = ContactParameters(time_step=0.004, friction=0.3, time_constant=0.008)
-EVIDENCE = ("contacts", "contacts in time", "pose", "wrench")
+EVIDENCE = ("contacts", "contacts in time", "pose", "gaps", "wrench")
 
 
 @dataclass(frozen=True)
@@ -38,15 +38,18 @@ class ProbeSettings:
 
     Attributes:
         evidence: what of a probe is explained, of `EVIDENCE`: contact locations, by the Chamfer surrogate or
-            by a normalised likelihood; the peg's pose; the wrench.
+            by a normalised likelihood; the peg's pose, by physics or by its gaps to the part, which needs
+            none (`ContactProbe`); the wrench.
         contact_scale: sigma of the Chamfer surrogate, and standard deviation of a location in time, metres.
         one_empty: the surrogate's cost where only one of the two point sets is empty, square metres.
         translation_scale, rotation_scale: standard deviations of the peg's pose, metres and radians: the
             error of the physics' friction and stiffness, larger than the sensor's noise.
-        normal_scale: of its position along the contact's force, and in all directions where it touches
-            nothing, metres.
+        normal_scale: of its position along the contact's normal, metres.
+        free_scale: of its position where it touches nothing, metres.
         force_scale, torque_scale: of the wrench, N and N m; `wrench_share` of its size is added.
-        pose_every: stride of the stamps at which pose, wrench and locations in time count.
+        pose_every: stride of the stamps at which the pose counts.
+        wrench_every: of those at which wrench and locations in time count. The error of physics is common to
+            the stamps of one touch: more would make the belief surer than it may be.
         friction: median of a latent coefficient of friction, and the standard deviation of its natural
             logarithm; None for that of `contact`.
         time_constant: the same of the contact's, s.
@@ -56,16 +59,18 @@ class ProbeSettings:
         InputError: a number is out of range, or there is no such evidence.
     """
 
-    evidence: tuple[str, ...] = ("contacts", "pose")
+    evidence: tuple[str, ...] = ("gaps", "contacts")
     contact_scale: float = 0.003
     one_empty: float = 2.0 * 0.005**2
     translation_scale: float = 0.0012
     rotation_scale: float = 0.005
-    normal_scale: float = 0.0003
+    normal_scale: float = 0.00006
+    free_scale: float = 0.0003
     force_scale: float = 1.0
     torque_scale: float = 0.05
     wrench_share: float = 0.3
     pose_every: int = 25
+    wrench_every: int = 25
     friction: tuple[float, float] | None = None
     time_constant: tuple[float, float] | None = None
     contact: ContactParameters = CONTACT
@@ -75,6 +80,7 @@ class ProbeSettings:
         number_within("a simulated probe is given one_empty {}", self.one_empty, least=0.0)
         number_within("a simulated probe is given wrench_share {}", self.wrench_share, least=0.0)
         whole_number("a simulated probe is given pose_every {}", self.pose_every)
+        whole_number("a simulated probe is given wrench_every {}", self.wrench_every)
         unknown = [name for name in self.evidence if name not in EVIDENCE]
         both = {"contacts", "contacts in time"} <= set(self.evidence)
         if unknown or both or not self.evidence:
@@ -151,14 +157,15 @@ class SimulatedProbe:
                 contacts = ChamferContacts(*window, settings.contact_scale, settings.one_empty)
                 pyro.sample(f"contacts_{number}", contacts)
             elif kind == "contacts in time":
-                in_time = ContactsInTime(*window, settings.contact_scale, every=settings.pose_every)
+                in_time = ContactsInTime(*window, settings.contact_scale, every=settings.wrench_every)
                 pyro.sample(f"contacts_{number}", in_time)
             elif kind == "pose":
                 scales = settings.translation_scale, settings.rotation_scale, settings.pose_every
-                pyro.sample(f"peg_{number}", PegPose(*window, *scales, settings.normal_scale))
-            else:
+                along = settings.normal_scale, settings.free_scale
+                pyro.sample(f"peg_{number}", PegPose(*window, *scales, *along))
+            elif kind == "wrench":
                 spread = settings.force_scale, settings.torque_scale, settings.wrench_share
-                pyro.sample(f"wrench_{number}", Wrench(*window, *spread, every=settings.pose_every))
+                pyro.sample(f"wrench_{number}", Wrench(*window, *spread, every=settings.wrench_every))
 
     def _latent(self) -> Mapping[str, Tensor]:
         known: dict[str, Tensor] = once("parameters of the contact", dict)
@@ -177,7 +184,7 @@ class SimulatedProbe:
             read = zip(windows, self.sensing.measure(touches), tared, strict=True)
             for (number, _), (contacts, peg), wrench in read:
                 each = {"contacts": contacts, "contacts in time": contacts, "pose": peg, "wrench": wrench}
-                for kind in evidence:
+                for kind in each.keys() & set(evidence):
                     values[f"{_SITES[kind]}_{number}"] = each[kind]
         return values
 
