@@ -246,6 +246,30 @@ def test_the_normalised_contact_likelihood_samples_from_its_density() -> None:
     assert float(drawn[:, ::2][felt[:, ::2]].std()) == pytest.approx(0.05, rel=0.03)
 
 
+class Pulled(Felt):
+    """The peg is pushed with 2 N in the first half of the stamps, with 20 N in the others."""
+
+    def wrench(self, first: int, last: int) -> torch.Tensor:
+        wrench = torch.zeros(len(self), last - first, 6, dtype=torch.float64)
+        wrench[:, : (last - first) // 2, 2], wrench[:, (last - first) // 2 :, 2] = 2.0, 20.0
+        return wrench
+
+
+def test_a_location_is_as_unsure_as_the_torque_s_noise_over_the_force() -> None:
+    torch.manual_seed(6)
+    contacts, never = torch.zeros(300, 100, 3, dtype=torch.float64), 1e-9
+    rare = {"missed": never, "false_alarm": never, "outlier": never, "every": 1}
+    site = ContactsInTime(Pulled(contacts), 0, 100, 0.001, torque_noise=0.01, **rare)
+    drawn = site.sample()
+    expected = [math.hypot(0.001, 0.01 / force) for force in (2.0, 20.0)]
+    for stamps, scale in zip((slice(50), slice(50, 100)), expected, strict=True):
+        assert float(drawn[:, stamps].std()) == pytest.approx(scale, rel=0.03)
+    normal = torch.distributions.Normal(0.0, torch.tensor(expected).double().repeat_interleave(50)[:, None])
+    torch.testing.assert_close(
+        site.log_prob(drawn), normal.log_prob(drawn).sum(dim=(1, 2)), rtol=1e-5, atol=1e-3
+    )
+
+
 def test_locations_anywhere_are_in_the_pegs_frame_wherever_the_peg_is() -> None:
     contacts = torch.stack([points((0, 0, -50)), torch.full((1, 3), NAN, dtype=torch.float64)])
     here, far = poses.identity(2, 1), poses.identity(2, 1)

@@ -82,7 +82,7 @@ class Exact(Approximation):
     total: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
 
     def including(self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]) -> Exact:
-        return Exact(self.count + 1, self.total + observations[f"seen_{number}"])
+        return type(self)(self.count + 1, self.total + observations[f"seen_{number}"])
 
     deferring = including
 
@@ -225,6 +225,34 @@ def test_a_model_without_sensors_and_numbers_out_of_range_are_refused_in_a_sente
     for numbers in ({"particles": 0}, {"sweeps": 0}, {"share": 1.5}):
         with pytest.raises(InputError):
             infer(MODEL, RECORDING, **numbers)
+
+
+def unrelated(scene: Any, actions: Sequence[Any]) -> None:
+    part = pyro.sample("part", NormalPose(poses.identity(), torch.diag(PRIOR**2), SLIDING))
+    for k in range(len(actions)):
+        pyro.sample(f"seen_{k}", dist.Normal(torch.full_like(part[:, :3], 0.01), NOISE).to_event(1))
+
+
+class Far(Exact):
+    """Every measurement is made far from the part."""
+
+    def is_far(self, number: int) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(("start", "stays"), [(Far, True), (Exact, False)])
+def test_what_all_particles_explain_alike_moves_none_only_far_from_the_part(
+    start: type[Exact], stays: bool
+) -> None:
+    """Near it all may explain it badly. Its evidence counts."""
+    count = 20
+    model = Model(unrelated, lambda recording: None, observe, "part")
+    step = guided(lambda scene: start(), WIDER, kernel("part", WIDER.proposals))
+    first, *_, last = smc(model, RECORDING, step=step, particles=count, seed=0)
+    assert torch.equal(first.belief.world_from_part, last.belief.world_from_part) == stays
+    if stays:
+        expected = float(dist.Normal(0.01, NOISE).log_prob(SEEN).sum())
+        assert last.info.log_evidence == pytest.approx(expected)
 
 
 # ---------------------------------------------------------------- look_and_touch

@@ -70,6 +70,22 @@ def test_a_side_touch_stops_at_the_face() -> None:
     assert -0.05 - 1e-4 <= torque[1] / force[0] <= -0.02 + 1e-4
 
 
+@pytest.mark.parametrize("friction", [0.1, 0.6])
+def test_a_contact_s_normal_is_the_face_s_and_not_the_force_s(friction: float) -> None:
+    """A peg is pressed on a leaning block and dragged along it: its force leans by the friction's angle."""
+    lean = Rotation.from_euler("y", 10, degrees=True)
+    pose = at((0.0, 0.0, 0.0))
+    pose[0, 3:] = torch.from_numpy(lean.as_quat(scalar_first=True))
+    probe = path((0, 0, 0, 0.06), (0.5, 0, 0, 0.047), (1.5, 0.01, 0, 0.047))
+    physics = PegPhysics(block((0.1, 0.1, 0.02)), ball(0.008, 0.05), ContactParameters(friction=friction))
+    rollout = physics.start(pose, probe).advance(150)
+    assert (rollout.normals[0, :10] == 0.0).all(), "in free motion there is none"
+    np.testing.assert_allclose(rollout.normals[0, 100], lean.apply([0, 0, 1]), atol=0.02)
+    force = rollout.wrench[0, 100, :3]
+    across = np.linalg.norm(np.cross(force, lean.apply([0, 0, 1]))) / np.linalg.norm(force)
+    assert across == pytest.approx(np.sin(np.arctan(friction)), rel=0.1)
+
+
 def test_free_motion_is_read_at_the_right_time() -> None:
     probe = path((0, 0, 0, 0.2), (1.0, 0.2, 0, 0.2), (2.0, 0.2, 0.1, 0.2), stamps=np.arange(0.5, 1.0, 0.0137))
     rollout = PegPhysics(block((0.1, 0.1, 0.02)), SQUARE).start(at((0, 0, 0)), probe).advance(30)

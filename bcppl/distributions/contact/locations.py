@@ -96,6 +96,9 @@ class ContactsInTime(TrackDistribution):
     frame with the standard deviation `reach` along each axis. The density is with respect to counting measure
     on "none" plus Lebesgue measure on locations (cubic metres), at each stamp that enters it.
 
+    A line of action is off by the torque's noise over the force (Bicchi, Salisbury and Brock 1993), which
+    `torque_noise` adds to the scale, with the simulated force.
+
     The event is (last - first, 3): locations in the peg's frame, a row of NaN where there is no contact.
 
     Args:
@@ -105,6 +108,7 @@ class ContactsInTime(TrackDistribution):
         false_alarm: probability that one is detected where there is none.
         outlier: probability that a contact is detected at a wrong place.
         reach: metres.
+        torque_noise: standard deviation of the measured torque about each axis, N m.
         every: as for `TrackDistribution`.
     """
 
@@ -116,14 +120,26 @@ class ContactsInTime(TrackDistribution):
     false_alarm: float = field(default=0.02, metadata=PROBABILITY)
     outlier: float = field(default=0.05, metadata=PROBABILITY)
     reach: float = field(default=0.05, metadata=POSITIVE)
+    torque_noise: float = field(default=0.0, metadata=NONNEGATIVE)
     every: int = field(default=10, metadata=COUNT)
+
+    @property
+    def _scale(self) -> Tensor:
+        """The standard deviations of locations, (N, T) or (), m."""
+        own = torch.tensor(self.scale, dtype=torch.float64)
+        if self.torque_noise == 0.0:
+            return own
+        force = self.track.wrench(self.first, self.last)[..., :3].norm(dim=-1)
+        # Without a force there is no contact, and the scale does not count.
+        return torch.hypot(own, self.torque_noise / torch.where(force > 0.0, force, math.inf))
 
     def _log_prob(self, value: Tensor) -> Tensor:
         contacts = self.track.window(self.first, self.last)[0][:, self.thinned]
+        scale = self._scale if self.torque_noise == 0.0 else self._scale[:, self.thinned]
         touching, detected = torch.isfinite(contacts).all(dim=-1), torch.isfinite(value).all(dim=-1)
         value = torch.nan_to_num(value)
         anywhere = log_gaussian(value.square().sum(dim=-1), self.reach)
-        near = log_gaussian((value - torch.nan_to_num(contacts)).square().sum(dim=-1), self.scale)
+        near = log_gaussian((value - torch.nan_to_num(contacts)).square().sum(dim=-1), scale)
         here = torch.logaddexp(near + math.log1p(-self.outlier), anywhere + math.log(self.outlier))
         of_touch = torch.where(detected, here + math.log1p(-self.missed), math.log(self.missed))
         of_none = torch.where(detected, anywhere + math.log(self.false_alarm), math.log1p(-self.false_alarm))
@@ -141,5 +157,5 @@ class ContactsInTime(TrackDistribution):
         detected = torch.where(touching, ~happens(self.missed), happens(self.false_alarm))
         astray = (~touching | happens(self.outlier))[..., None]
         noise = torch.randn(*shape, 3, dtype=torch.float64)
-        location = torch.where(astray, self.reach * noise, contacts + self.scale * noise)
+        location = torch.where(astray, self.reach * noise, contacts + self._scale[..., None] * noise)
         return torch.where(detected[..., None], location, math.nan)

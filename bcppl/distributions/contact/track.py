@@ -86,9 +86,10 @@ class TrackDistribution(LazyDistribution):
         raise NotImplementedError
 
 
-def log_gaussian(squared: Tensor, scale: float) -> Tensor:
+def log_gaussian(squared: Tensor, scale: float | Tensor) -> Tensor:
     """Log-density of an isotropic Gaussian in three dimensions at a squared distance."""
-    return -0.5 * squared / scale**2 - 3.0 * math.log(scale) - 1.5 * math.log(2.0 * math.pi)
+    width = torch.as_tensor(scale, dtype=torch.float64)
+    return -0.5 * squared / width**2 - 3.0 * width.log() - 1.5 * math.log(2.0 * math.pi)
 
 
 def contaminated(log_density: Callable[[S], Tensor], scale: S, outlier: float) -> Tensor:

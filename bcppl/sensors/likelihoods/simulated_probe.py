@@ -41,6 +41,7 @@ class ProbeSettings:
             by a normalised likelihood; the peg's pose, by physics or by its gaps to the part, which needs
             none (`ContactProbe`); the wrench.
         contact_scale: sigma of the Chamfer surrogate, and standard deviation of a location in time, metres.
+        torque_noise: of the sensor, N m: over the force it adds to the deviation of a location in time.
         one_empty: the surrogate's cost where only one of the two point sets is empty, square metres.
         translation_scale, rotation_scale: standard deviations of the peg's pose, metres and radians: the
             error of the physics' friction and stiffness, larger than the sensor's noise.
@@ -61,6 +62,7 @@ class ProbeSettings:
 
     evidence: tuple[str, ...] = ("gaps", "contacts")
     contact_scale: float = 0.003
+    torque_noise: float = 0.005
     one_empty: float = 2.0 * 0.005**2
     translation_scale: float = 0.0012
     rotation_scale: float = 0.005
@@ -77,6 +79,7 @@ class ProbeSettings:
 
     def __post_init__(self) -> None:
         require_positive(self, *(name for name in type(self).__annotations__ if name.endswith("_scale")))
+        number_within("a simulated probe is given torque_noise {}", self.torque_noise, least=0.0)
         number_within("a simulated probe is given one_empty {}", self.one_empty, least=0.0)
         number_within("a simulated probe is given wrench_share {}", self.wrench_share, least=0.0)
         whole_number("a simulated probe is given pose_every {}", self.pose_every)
@@ -157,7 +160,8 @@ class SimulatedProbe:
                 contacts = ChamferContacts(*window, settings.contact_scale, settings.one_empty)
                 pyro.sample(f"contacts_{number}", contacts)
             elif kind == "contacts in time":
-                in_time = ContactsInTime(*window, settings.contact_scale, every=settings.wrench_every)
+                noise, every = settings.torque_noise, settings.wrench_every
+                in_time = ContactsInTime(*window, settings.contact_scale, torque_noise=noise, every=every)
                 pyro.sample(f"contacts_{number}", in_time)
             elif kind == "pose":
                 scales = settings.translation_scale, settings.rotation_scale, settings.pose_every
