@@ -13,6 +13,9 @@ from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.row_errors import Hypothesis
 from bcppl.distributions.manifold import FARTHEST
 
+# Factors of the rows' own errors, after their probabilities: a peg that bounces off an edge or sinks into it
+# touches less exactly than one that is pressed on a face.
+NOISES = ((0.85, 1.0), (0.15, 2.5))
 # Nodes of the compliance, in decades from its median: they are closer than `varying` is wide.
 _DECADES = torch.linspace(-1.25, 1.25, 11, dtype=torch.float64)
 # Standard deviations, m and rad, of the pose about which a likelihood is approximated: far wider than what
@@ -23,10 +26,17 @@ WIDE = torch.tensor([0.1] * 3 + [1.0] * 3, dtype=torch.float64)
 # The same for all windows and poses, which are many.
 @lru_cache(maxsize=64)
 def nodes_of(compliance: float, uncertain: float, every: int = 1) -> tuple[Hypothesis, ...]:
-    """Each `every`-th node of a compliance with a median, m/N, and a deviation of its decimal logarithm."""
-    weights = (-0.5 * (_DECADES / uncertain) ** 2).log_softmax(dim=0).tolist()
-    nodes = (compliance * 10.0**_DECADES).tolist()
-    return tuple(Hypothesis(w, c) for w, c in zip(weights, nodes, strict=True))[::every]
+    """Each `every`-th node of a compliance with a median, m/N, and a deviation of its decimal logarithm.
+
+    Each with each scale of `NOISES`.
+    """
+    weights = (-0.5 * (_DECADES / uncertain) ** 2).log_softmax(dim=0)[::every].tolist()
+    nodes = (compliance * 10.0**_DECADES)[::every].tolist()
+    return tuple(
+        Hypothesis(weight + math.log(share), node, noise)
+        for share, noise in NOISES
+        for weight, node in zip(weights, nodes, strict=True)
+    )
 
 
 @lru_cache(maxsize=64)

@@ -27,12 +27,13 @@ from bcppl.distributions.episodes import (
     PartSlides,
     Size,
 )
+from bcppl.distributions.episodes.prior import NOISES
 from bcppl.errors import InputError
 
 Point = tuple[float, float, float]
 
-# Factors of the noise and of the shared errors, after their probabilities: some benches are half as good.
-NOISES, SCALES = ((0.85, 1.0), (0.15, 2.5)), ((0.65, 1.0), (0.35, 2.2))
+# Factors of the shared errors, after their probabilities: some benches are half as good.
+SCALES = ((0.65, 1.0), (0.35, 2.2))
 
 
 @dataclass(frozen=True)
