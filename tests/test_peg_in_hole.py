@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from bcppl.beliefs import Belief
 from bcppl.cli import loading
 from bcppl.errors import InputError
+from bcppl.inference.design.rules import can_be_linearised
 from bcppl.inference.filters import bayes_contact, guided_smc
-from bcppl.models import peg_in_hole
+from bcppl.inference.planning.metrology import three_two_one
+from bcppl.models import look_and_touch, peg_in_hole
 from bcppl.models.worlds import peg_in_hole as world
 from bcppl.recordings import ProbeWindow, Recording
 from bcppl.sensors.capabilities import Screens
@@ -180,6 +183,15 @@ def test_geometry_guides_whatever_is_explained(evidence: tuple[str, ...]) -> Non
     trace = last.population.trace
     assert any(a.startswith("touch") for a in trace.addresses) == ("gaps" in evidence)
     assert bool(torch.isfinite(last.population.log_weights).all())
+
+
+def test_probes_by_physics_are_ranked_by_reweighted_particles() -> None:
+    """Contact locations have no quadratic approximation, though the gaps that guide the filter have one."""
+    truth = torch.from_numpy(recorded().truth)
+    certain = Belief(truth.expand(4, 7).clone(), torch.zeros(4, dtype=torch.float64))
+    plan = three_two_one(certain, recorded().part, recorded().peg)
+    assert not can_be_linearised(scene(), [plan])
+    assert can_be_linearised(look_and_touch.prepare(recorded()), [plan])
 
 
 def test_gaps_of_a_peg_that_may_be_off_in_the_hand_are_refused() -> None:

@@ -22,7 +22,7 @@ from bcppl.inference.planning.motions import expected_contacts
 from bcppl.inference.planning.touching import leading_point
 from bcppl.inference.population import Population
 from bcppl.sensors.candidates import Candidate, action_of, motion_of
-from bcppl.sensors.capabilities import Informative, Linearised, SharesErrors
+from bcppl.sensors.capabilities import Informative, Linearised, Screens, SharesErrors
 
 # Ranks candidates for a population, given a scene of the model that knows their cameras.
 AcquisitionRule = Callable[[Population, Sequence[Candidate], Any], Ranking]
@@ -70,7 +70,10 @@ def _held_peg(scene: Any) -> HeldPeg | None:
 def can_be_linearised(scene: Any, candidates: Sequence[Candidate]) -> bool:
     """Whether `by_linearised_gain` can rank these candidates with the sensors of a scene."""
     sensors = [scene.sensor(action_of(each)) for each in candidates] if hasattr(scene, "sensor") else []
-    return bool(sensors) and all(isinstance(each, Informative | Linearised) for each in sensors)
+    # Of what is simulated only the cheap likelihood of the same measurements is linearised.
+    return bool(sensors) and all(
+        isinstance(each, Informative | Linearised) and not isinstance(each, Screens) for each in sensors
+    )
 
 
 def by_reweighted_gain(pose: str, **settings: Any) -> AcquisitionRule:
