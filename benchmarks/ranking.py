@@ -6,7 +6,7 @@ ranking takes is measured by its time. Ranked are, by each way: Algorithm 1 of B
 reweighed, the entropy of their weights), and information added up in the tangent space; both on what physics
 makes of each probe, and on what its quasi-static stand-in does. `--choices N` goes through N scenes: whether
 Algorithm 1 on physics chooses the same probe as the default ranking, and where not, which of the two probes,
-carried out in the world, tells more.
+carried out in the world, leaves less entropy.
 """
 
 from __future__ import annotations
@@ -241,11 +241,11 @@ def compare_choices(seeds: Sequence[int], count: int, jobs: int) -> list[Row]:
         rows.append(Row(f"{name}: nats lost by its choice, median", float(np.median(lost)), "nats"))
         rows.append(Row(f"{name}: nats lost by its choice, worst", max(lost), "nats"))
     if differ:
-        told = [one.entropies[0] - one.entropies[1] for one in differ]
+        gained = [one.entropies[0] - one.entropies[1] for one in differ]
         rows += [
-            Row("where they differ: nats that the default ranking's probe told more", np.mean(told), "nats"),
-            Row("standard error of that", float(np.std(told) / max(1, len(told) - 1) ** 0.5), "nats"),
-            Row("where they differ: it told more in", 100.0 * float(np.mean(np.array(told) > 0)), "%"),
+            Row("where they differ: entropy less after the default's probe", float(np.mean(gained)), "nats"),
+            Row("standard error of that", float(np.std(gained) / max(1, len(gained) - 1) ** 0.5), "nats"),
+            Row("where they differ: it is less in", 100.0 * float(np.mean(np.array(gained) > 0)), "%"),
         ]
     return rows
 

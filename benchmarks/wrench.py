@@ -23,14 +23,15 @@ WORLD = ContactParameters(time_step=0.0015, friction=0.2, time_constant=0.003)  
 TIGHT = {"force_scale": 0.3, "torque_scale": 0.02, "wrench_share": 0.15}
 LOOSE = {"force_scale": 4.0, "torque_scale": 0.2, "wrench_share": 0.3}
 BOTH = {"evidence": ("contacts", "pose", "wrench")}
+PLAIN = {"evidence": ("contacts", "pose")}
 # Settings of `peg_in_hole`.
 VARIANTS: dict[str, dict[str, Any]] = {
-    "contacts and pose": {},
+    "contacts and pose": PLAIN,
     "and wrench": {**BOTH, **TIGHT},
     "and wrench, loose": {**BOTH, **LOOSE},
     "and wrench, loose, latent friction": {**BOTH, **LOOSE, "friction": (0.25, 0.6)},
     "wrench and pose, loose": {"evidence": ("pose", "wrench"), **LOOSE},
-    "contacts and pose, the world's friction": {"contact": WORLD},
+    "contacts and pose, the world's friction": {**PLAIN, "contact": WORLD},
     "and wrench, the world's friction": {**BOTH, **TIGHT, "contact": WORLD},
 }
 

@@ -23,7 +23,7 @@ from bcppl.contact.sensing.episodes import EpisodeExtractor, Rows
 from bcppl.contact.touch import Touch
 from bcppl.distributions.episodes import ContactEpisodes, Grasp, Hypothesis, LinearErrors
 from bcppl.distributions.episodes.prior import NOISES, WIDE
-from bcppl.distributions.episodes.rows import COLUMNS, GIVEN, new_rows
+from bcppl.distributions.episodes.rows import COLUMNS, FELT, FORCE, GIVEN, TIME, WRENCH, new_rows
 from bcppl.distributions.manifold import FARTHEST
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.parts import Guess
@@ -347,3 +347,25 @@ def test_part_and_grasp_move_together_in_the_joint_covariance() -> None:
     assert float(apart @ covariance @ apart) < 1e-8
     given = torch.linalg.inv(likelihood.quadratic(MIXED).information[0] + torch.diag(WIDE**-2))
     torch.testing.assert_close(covariance[:6, :6], given, rtol=1e-6, atol=1e-14)
+
+
+def test_a_peg_that_is_levered_is_pressed_harder_than_its_force() -> None:
+    """A couple of 0.15 N m, as of two walls that press 15 mm apart, is worth 10 N."""
+    recording = probed(100)
+    (whole,) = recording.measurements
+    levered = whole.observation.wrench.copy()
+    levered[50:, 3] += 0.15
+    touch = replace(whole.observation, wrench=levered)
+    loads = []
+    for each in (recording, replace(recording, measurements=[Measurement(whole.action, touch)])):
+        rows = new_rows(values_of(each)[1][-1][1])
+        loads.append(rows[rows[:, FELT] == 1.0])
+    plain, other = loads
+    torch.testing.assert_close(plain[:, TIME], other[:, TIME])
+    tip = poses.identity()[:3].new_tensor([0.0, 0.0, float(recording.peg.vertices[:, 2].min())])
+    force, torque = other[:, WRENCH][:, :3], other[:, WRENCH][:, 3:]
+    about_tip = torque - torch.linalg.cross(tip.expand_as(force), force)
+    torch.testing.assert_close(
+        other[:, FORCE], force.norm(dim=1) + about_tip.norm(dim=1) / 0.015, rtol=0.02, atol=0.02
+    )
+    assert float((other[:, FORCE] - plain[:, FORCE]).median()) == pytest.approx(10.0, abs=3.0)

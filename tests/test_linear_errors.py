@@ -38,7 +38,6 @@ from bcppl.distributions.episodes.rows import (
     FORCE,
     GIVEN,
     SECONDS,
-    TIME,
     WRENCH,
     late,
     new_rows,
@@ -261,28 +260,6 @@ def pressed_with_the_peg_off(shift: float) -> Recording:
     measured[:, 2] += shift
     touch = replace(whole.observation, world_from_peg=measured)
     return replace(recording, measurements=[Measurement(whole.action, touch)])
-
-
-def test_a_peg_that_is_levered_is_pressed_harder_than_its_force() -> None:
-    """A couple of 0.15 N m, as of two walls that press 15 mm apart, is worth 10 N."""
-    recording = probed(100)
-    (whole,) = recording.measurements
-    levered = whole.observation.wrench.copy()
-    levered[50:, 3] += 0.15
-    touch = replace(whole.observation, wrench=levered)
-    loads = []
-    for each in (recording, replace(recording, measurements=[Measurement(whole.action, touch)])):
-        rows = new_rows(values_of(each)[1][-1][1])
-        loads.append(rows[rows[:, FELT] == 1.0])
-    plain, other = loads
-    torch.testing.assert_close(plain[:, TIME], other[:, TIME])
-    tip = poses.identity()[:3].new_tensor([0.0, 0.0, float(recording.peg.vertices[:, 2].min())])
-    force, torque = other[:, WRENCH][:, :3], other[:, WRENCH][:, 3:]
-    about_tip = torque - torch.linalg.cross(tip.expand_as(force), force)
-    torch.testing.assert_close(
-        other[:, FORCE], force.norm(dim=1) + about_tip.norm(dim=1) / 0.015, rtol=0.02, atol=0.02
-    )
-    assert float((other[:, FORCE] - plain[:, FORCE]).median()) == pytest.approx(10.0, abs=3.0)
 
 
 def test_the_pose_relative_to_the_peg_is_sure_where_that_in_the_world_is_not() -> None:

@@ -31,8 +31,8 @@ class Approximation(Protocol):
         """Whether it may have several modes before any contact; more copies are then made of a particle."""
         return False
 
-    def is_far(self, number: int) -> bool:
-        """Whether a measurement, of those given, is made too far from the part to depend on its pose."""
+    def is_far(self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]) -> bool:
+        """Whether a measurement is made too far from the part to depend on its pose."""
         return False
 
     def screens(self, action: Any) -> bool:

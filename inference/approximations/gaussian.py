@@ -209,13 +209,13 @@ class GaussianApproximation:
         """Whether the instruments leave several modes."""
         return len(self.prior.log_weights) > 1
 
-    def is_far(self, number: int) -> bool:
-        """Whether a contact, of those given, is too far from where the instruments place the part."""
-        for contact in self.contacts[-1:]:
-            sensor = self.scene.sensor(contact.action)
-            if contact.number == number and isinstance(sensor, Contacts):
-                return not sensor.is_informative(contact.action, contact.value, self.prior.centers)
-        return False
+    def is_far(self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]) -> bool:
+        """Whether a contact is too far from where the instruments place the part to depend on its pose."""
+        sensor = scene.sensor(action)
+        if not (isinstance(sensor, Contacts) and isinstance(sensor, Linearised)):
+            return False
+        value = observations.get(sensor.address(number))
+        return value is not None and not sensor.is_informative(action, value, self.prior.centers)
 
     def screens(self, action: Any) -> bool:
         """Whether a measurement is simulated, and what is approximated is a cheap likelihood of it."""

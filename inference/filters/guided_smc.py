@@ -145,9 +145,9 @@ def guided(
         before = population.approximation
         if before is None:
             before = _given_all(start(scene), population.trace, actions[:-1])
-        later = before.deferring(scene, len(actions) - 1, action, values)
-        certain = _certain(population, observed, later.is_far(len(actions) - 1))
+        certain = _certain(population, observed, before.is_far(scene, len(actions) - 1, action, values))
         if certain is not None:
+            later = before.deferring(scene, len(actions) - 1, action, values)
             return Stepped(certain.with_approximation(later), _info(population, certain))
         before = before.updated()
         after = before.including(scene, len(actions) - 1, action, values)
