@@ -20,7 +20,6 @@ from scenes import (
     followed,
     model,
     moment_of,
-    one_line,
     quantile,
     timed,
 )
@@ -39,6 +38,7 @@ from bcppl.inference.resampling import adaptive, systematic
 from bcppl.models import peg_in_hole
 from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.sensors import Recording, View
+from bcppl.sweeps import one_line
 
 DEFAULT, SEEN, FREE_SPACE = "default", "vision only", "no free-space evidence"
 MANY, FEW = 1000, 10  # particles that only so many scenes are run with

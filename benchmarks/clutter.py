@@ -15,13 +15,11 @@ import json
 import math
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jobs import each
 from report import DATA, Row, finish, options, show
 
 from bcppl.beliefs import average_distance, average_nearest_distance
@@ -30,6 +28,7 @@ from bcppl.cli.predictive_checks import PredictiveChecks
 from bcppl.inference.filters.default import infer
 from bcppl.models.part_in_view import model
 from bcppl.recordings.importers.bop import command
+from bcppl.sweeps import key_of, swept
 
 SCENE = DATA / "lmo_scene2_frame3"
 OBJECTS = (1, 5, 8, 10)
@@ -90,19 +89,6 @@ def run(asked: tuple[int, int, dict[str, Any]]) -> Result:
     )
 
 
-def recorded(file: Path | None, asked: tuple[int, int, dict[str, Any]]) -> Result:
-    """The result of a run, read from a file of runs where it is there, and added to it where it is not."""
-    kept = [] if file is None or not file.exists() else file.read_text(encoding="utf-8").splitlines()
-    for of_run, result in map(json.loads, kept):
-        if of_run == list(asked):
-            return Result(*result)
-    result = run(asked)
-    if file is not None:
-        with file.open("a", encoding="utf-8") as lines:
-            lines.write(json.dumps([asked, result]) + "\n")
-    return result
-
-
 def setting(text: str) -> tuple[str, float]:
     """A setting of the model, NAME=NUMBER."""
     name, _, value = text.partition("=")
@@ -118,7 +104,8 @@ def rows_of(
 ) -> list[Row]:
     """Looks for every object from the guess of every seed, and shows a line for each."""
     asked = [(object_id, seed, settings) for object_id in objects for seed in seeds]
-    results = each(partial(recorded, file), asked, jobs)
+    done = {key_of(one): Result(*values) for one, values in swept(run, asked, file=file, jobs=jobs)}
+    results = [done[key_of(one)] for one in asked]
 
     honest, rows = 0, list[Row]()
     lines: list[list[Any]] = []

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch
-from jobs import each
 from matplotlib.figure import Figure
 from report import Row, finish, options, show
 
@@ -37,6 +36,7 @@ from bcppl.inference.resampling import always
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.models.peg_in_hole import model
 from bcppl.models.worlds.peg_in_hole import simulate_recording
+from bcppl.sweeps import in_order
 from bcppl.traces import Trace
 
 PARTICLES = 75
@@ -199,7 +199,7 @@ def main() -> None:
     arguments = parser.parse_args()
     probes, sweeps = (1, 6) if arguments.quick else (4, 40)
     seeds = range(arguments.seed, arguments.seed + probes)
-    results = each(compare, [(seed, sweeps) for seed in seeds], arguments.jobs)
+    results = list(in_order(compare, [(seed, sweeps) for seed in seeds], arguments.jobs))
 
     def median(name: str, field: str) -> float:
         return float(np.median([getattr(result[name], field) for result in results]))

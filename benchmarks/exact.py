@@ -30,13 +30,12 @@ import numpy as np
 import torch
 from exact_kernels import FEW, KERNELS, REASONS, UNLEARNED, WIDE
 from exact_problems import PROBLEMS, Problem
-from jobs import each
-from kept import keep
 from report import Row, finish, options, show
 
 from bcppl.arrays import Array
 from bcppl.beliefs import normalised
 from bcppl.inference import tempered_importance_sampling
+from bcppl.sweeps import in_order, keep, kept
 
 COUNTS = (75, 1000, 10_000)
 LEAST = 3  # runs of a cell, for a standard error
@@ -166,15 +165,16 @@ def outcome_of(
     if missing and longest <= limit and spend is not None:
         seeds, outcome = measured(cell._replace(seeds=missing), spend)
         known.append(outcome)
-        keep(file, cell._replace(seeds=seeds), outcome)
+        if file is not None:
+            keep(file, cell._replace(seeds=seeds), outcome)
     return pooled(known) if known else None
 
 
 def held_by(file: Path | None) -> Mapping[tuple[str, str, int], Mapping[tuple[int, ...], list[float]]]:
     """What a file holds, by problem, kernel and number of particles, and by seeds."""
     held: dict[tuple[str, str, int], dict[tuple[int, ...], list[float]]] = {}
-    for line in file.read_text(encoding="utf-8").splitlines() if file and file.exists() else []:
-        (problem, kernel, particles, seeds), outcome = json.loads(line)
+    for key, outcome in ({} if file is None else kept(file)).items():
+        problem, kernel, particles, seeds = json.loads(key)
         held.setdefault((problem, kernel, particles), {})[tuple(seeds)] = outcome
     return held
 
@@ -250,7 +250,8 @@ def main() -> None:
     others = tuple(range(arguments.seed + runs, arguments.seed + runs + arguments.confirm))
     kernels_on = [[Cell(p, k, n, seeds) for n in sorted(counts)] for p in problems for k in kernels]
     limit = -1.0 if arguments.recorded else arguments.limit
-    outcomes = each(partial(in_turn, arguments.file, limit, arguments.seconds), kernels_on, arguments.jobs)
+    work = partial(in_turn, arguments.file, limit, arguments.seconds)
+    outcomes = in_order(work, kernels_on, arguments.jobs)
     done = dict(zip(chain(*kernels_on), chain(*outcomes), strict=True))
     rows: list[Row] = []
     for problem in problems:

@@ -24,8 +24,6 @@ import numpy as np
 import torch
 from foreign_faults import FAULTS, recut, resampled
 from foreign_world import CONTACTS, MANNERS, RATES, kept, scene_of
-from jobs import each, in_order
-from kept import added, recorded
 from report import Row, finish, options, show
 from scenes import model
 
@@ -33,6 +31,7 @@ import bcppl
 from bcppl.beliefs import Belief, rotation_deviation, translation_deviation
 from bcppl.cli.predictive_checks import MARK, PredictiveChecks
 from bcppl.sensors.measurements import Recording
+from bcppl.sweeps import in_order, swept
 
 SCENES, QUICK = 50, 1
 PARTICLES = 75
@@ -91,15 +90,9 @@ class Result(NamedTuple):
         return self.add > FAR and not self.warned and not self.held[HELD.index(("translation", 0.9))]
 
 
-def known(case: Case, particles: int, folder: Path | None, file: Path | None) -> Result:
-    """The result of one recording, from a file where it is there."""
-    key = [particles, *case]
-    values = recorded(file, key) or added(file, key, lambda: inferred(case, particles, folder))
-    return Result(case, *values[1:])
-
-
-def inferred(case: Case, particles: int, folder: Path | None) -> Result:
-    """The result of one recording."""
+def inferred(asked: Sequence[Any], folder: Path | None) -> Result:
+    """The result of one recording, a case after the number of particles."""
+    particles, case = asked[0], Case(*asked[1:])
     recording = changed(kept(*case[:4], folder), case.change)
     points, begun = recording.part.surface_points(), time.perf_counter()
     try:
@@ -254,7 +247,7 @@ def main() -> None:
         lines = []
         for kind in kinds:
             cases = [Case(seed, *kind) for seed in seeds]
-            several = each(partial(checked, folder=given.keep), cases, given.jobs)
+            several = list(in_order(partial(checked, folder=given.keep), cases, given.jobs))
             lines.append([f"{kind[0]}, {kind[1]}, {kind[2]} Hz", *foreign_check.summary(several)])
         show("gap between peg and part at the true pose", ["", *foreign_check.COLUMNS], lines)
         return
@@ -269,8 +262,10 @@ def main() -> None:
         for k in range(given.seeds)
     ]
     results: list[Result] = []
-    work = partial(known, particles=given.particles, folder=given.keep, file=given.file)
-    for one in in_order(work, cases, given.jobs):
+    work = partial(inferred, folder=given.keep)
+    cells = [[given.particles, *case] for case in cases]
+    for (_, *case), (_, *values) in swept(work, cells, file=given.file, jobs=given.jobs):
+        one = Result(Case(*case), *values)
         results.append(one)
         end = one.error or f"{one.add:.3f} mm, vision {one.vision:.2f} mm, {one.distance:.1f} squared"
         print(*one.case, end, "warned" if one.warned else "", f"{one.seconds:.1f} s", flush=True)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from report import Row, cores, finish, options, show
 from rich.console import Console
-from scenes import PARTICLES, default_run, every, model, one_line
+from scenes import PARTICLES, default_run, every, model
 from scipy.stats import binomtest
 
 from bcppl import poses
@@ -32,6 +32,7 @@ from bcppl.models.worlds.bench.arm import BenchArm
 from bcppl.models.worlds.bench.parameters import BenchParameters
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.sensors.candidates import Candidate
+from bcppl.sweeps import one_line
 
 CLEARANCES = BenchParameters().clearances
 VISION, FIXED, CHOSEN = "vision", "3-2-1 probe", "chosen probes"

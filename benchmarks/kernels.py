@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from beside import TIMED, beside, timed
 from evidence import PROBLEMS, Method, Outcome, effective, run
-from jobs import each
 from kernel_table import POSES, VECTORS
 from report import DATA, Row, finish, options, show
 
@@ -28,6 +27,7 @@ from bcppl.inference.filters.smc import smc, tempered
 from bcppl.inference.kernels import Kernel
 from bcppl.models import part_in_view
 from bcppl.recordings.importers.bop import command
+from bcppl.sweeps import in_order
 
 SCENE = DATA / "lmo_scene2_frame3"
 OBJECT = 5
@@ -155,7 +155,7 @@ def images(seed: int, runs: int, jobs: int) -> list[Row]:
     if not SCENE.is_dir():
         print(f"the real image is left out: the scene is not at {SCENE}.")
         return []
-    results = each(look, [(name, seed, seed + k) for name in POSES for k in range(runs)], jobs)
+    results = list(in_order(look, [(name, seed, seed + k) for name in POSES for k in range(runs)], jobs))
     rows: list[Row] = []
     lines: list[list[Any]] = []
     for k, name in enumerate(POSES):

@@ -19,10 +19,8 @@ import numpy as np
 import torch
 from foreign_faults import mapped, part_mirrored, part_moved, truth_outside
 from honesty import symmetric
-from jobs import each
-from kept import added, recorded
 from report import Row, finish, options, show
-from scenes import PARTICLES, default_run, one_line
+from scenes import PARTICLES, default_run
 from scipy.spatial.transform import Rotation
 
 from bcppl.cli.predictive_checks import PredictiveChecks
@@ -35,6 +33,7 @@ from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.sensors.likelihoods.bench_profiles import PROFILES
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.probe import ProbeWindow, Touch
+from bcppl.sweeps import in_order, keep, kept, key_of, one_line
 
 GOOD = "none"
 NAMED, WARNED, SILENT = 0.9, 0.98, 0.03  # shares of the scenes: of mistakes, of mistakes, of good scenes
@@ -141,16 +140,18 @@ class Outcome(NamedTuple):
 def outcomes(seed: int, profile: str, names: tuple[str, ...], file: Path | None) -> dict[str, Outcome]:
     """The outcomes of one scene, by mistake; those that cannot be made of it, or are none, are left out."""
     keys = {name: [seed, profile, name] for name in names}
-    known = {name: recorded(file, key) for name, key in keys.items()}
-    missing = [name for name, kept in known.items() if kept is None]
+    there = {} if file is None else kept(file)
+    known = {name: there.get(key_of(key)) for name, key in keys.items()}
+    missing = [name for name, one in known.items() if one is None]
     if missing:
         scene = bench_scene(seed)
         *_, seen = default_run(scene.look(), PARTICLES, seed)
         good = scene.probe(three_two_one(seen.belief, scene.part, scene.peg, ROCKED))
         for name in missing:
-            work = partial(outcome, good, name, seed, profile)
-            known[name] = added(file, keys[name], lambda work=work: [work()])
-    return {name: Outcome(*kept[0]) for name, kept in known.items() if kept[0]}
+            known[name] = [outcome(good, name, seed, profile)]
+            if file is not None:
+                keep(file, keys[name], known[name])
+    return {name: Outcome(*one[0]) for name, one in known.items() if one[0]}
 
 
 def outcome(good: Recording, name: str, seed: int, profile: str) -> Outcome | None:
@@ -189,7 +190,7 @@ def main() -> None:
     names = (GOOD, "forces of the wrong sign") if arguments.quick else tuple(arguments.only)
     seeds = list(range(arguments.seed, arguments.seed + (1 if arguments.quick else arguments.scenes)))
     work = partial(outcomes, profile=arguments.profile, names=names, file=arguments.file)
-    scenes = each(work, seeds, arguments.jobs)
+    scenes = list(in_order(work, seeds, arguments.jobs))
     rows, lines = [], []
     for name in names:
         several = [found[name] for found in scenes if name in found]

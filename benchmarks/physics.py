@@ -21,10 +21,8 @@ from typing import Any, NamedTuple
 
 import curves
 from double_contacts import PLANS
-from jobs import in_order
-from kept import added, recorded
 from report import Row, finish, options, show
-from scenes import MASSES, PARTICLES, REGIONS, Curve, Probed, default_run, one_line, quantile, regions_of
+from scenes import MASSES, PARTICLES, REGIONS, Curve, Probed, default_run, quantile, regions_of
 
 from bcppl.inference import bayes_contact, guided_smc, tempered_smc
 from bcppl.inference.planning.metrology import three_two_one
@@ -33,6 +31,7 @@ from bcppl.models.worlds.bench.parameters import BenchParameters
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.sensors.likelihoods.simulated_probe import CONTACT, ProbeSettings
 from bcppl.sensors.measurements import Recording
+from bcppl.sweeps import one_line, swept
 from bcppl.traces import Model
 
 SCENES, COMPARED = 100, 25
@@ -165,11 +164,6 @@ def followed(task: Task) -> Outcome:
     return Outcome(vision, curve.adds[-1], holds, seconds, simulated, *curve)
 
 
-def known(task: Task, file: Path | None) -> Outcome:
-    """The outcome of a task, from a file where it is there."""
-    return Outcome(*(recorded(file, task) or added(file, task, partial(outcome, task))))
-
-
 def line(name: str, several: Sequence[Outcome]) -> list[Any]:
     """A group's line of the table."""
     ends = [one.end for one in several]
@@ -245,9 +239,8 @@ def main() -> None:
     groups = [(noise, way, probe) for probe in probes for noise in noises for way in ways]
     tasks = [Task(seed, *group) for seed in seeds for group in groups]
     outcomes: dict[Task, Outcome] = {}
-    done = in_order(partial(known, file=arguments.file), tasks, arguments.jobs)
-    for task, one in zip(tasks, done, strict=True):
-        outcomes[task] = one
+    for task, values in swept(outcome, tasks, file=arguments.file, jobs=arguments.jobs):
+        one = outcomes[task] = Outcome(*values)
         print(*task, one.missed or f"{one.end:.3f} mm in {one.seconds:.1f} s", flush=True)
     lines, rows = [], []
     for noise, way, probe in groups:

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jobs import each
 from report import Row, finish, options, show
 
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.models.peg_in_hole import model
 from bcppl.models.worlds.peg_in_hole import simulate_recording
+from bcppl.sweeps import in_order
 
 PARTICLES = 75
 
@@ -81,7 +81,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + (2 if arguments.quick else 20))
-    results = each(run, seeds, arguments.jobs)
+    results = list(in_order(run, seeds, arguments.jobs))
     columns = {
         name: np.array(column, dtype=float)
         for name, column in zip(Result._fields, zip(*results, strict=True), strict=True)

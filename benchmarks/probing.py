@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from report import Row, cores, finish, options, show
 from rich.console import Console
-from scenes import PARTICLES, every, model, one_line, quantile
+from scenes import PARTICLES, every, model, quantile
 
 from bcppl.beliefs import Belief
 from bcppl.contact.touch import Touch
@@ -48,6 +48,7 @@ from bcppl.models.worlds.bench.parameters import BenchParameters
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.sensors.candidates import Candidate, name_of
 from bcppl.sensors.likelihoods.bench_profiles import PROFILES
+from bcppl.sweeps import one_line
 from bcppl.traces import Model
 
 SCENES, PROBES = 50, 3

@@ -12,18 +12,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jobs import each
-from kept import added, recorded
 from report import Row, cores, finish, options, show
 from touches import LOGS, OTHER, errors, explained, groups, learnt
 
 from bcppl.sensors.likelihoods.point_finger import FingerSettings
+from bcppl.sweeps import swept
 
 LEARNT = "as learnt"
 # The settings of the model in place of those that are learnt.
@@ -65,11 +63,6 @@ def run(asked: tuple[str, str, int, int, int]) -> list[float]:
     return list(result)
 
 
-def kept(file: Path | None, asked: tuple[str, str, int, int, int]) -> Result:
-    """The same, from the file where it is there, and added to it where not."""
-    return Result(*(recorded(file, asked) or added(file, asked, partial(run, asked))))
-
-
 def ratio(deviations: list[float], off: list[float]) -> float:
     """The root mean square of stated deviations over that of errors."""
     return float(np.sqrt(np.mean(np.square(deviations)) / np.mean(np.square(off))))
@@ -89,7 +82,8 @@ def main() -> None:
     count, most = arguments.pushes, 2 if arguments.quick else 50 // arguments.pushes
     seeds = range(arguments.seed, arguments.seed + (1 if arguments.quick else arguments.seeds))
     asked = [(v, log, count, g, s) for v in VARIANTS for log in OTHER for g in range(most) for s in seeds]
-    results = dict(zip(asked, each(partial(kept, arguments.file), asked, arguments.jobs), strict=True))
+    done = swept(run, asked, file=arguments.file, jobs=arguments.jobs)
+    results = {one: Result(*values) for one, values in done}
 
     rows, lines = list[Row](), list[list[Any]]()
     for log in OTHER:

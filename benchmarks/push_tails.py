@@ -11,14 +11,11 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jobs import each
-from kept import added, recorded
 from report import Row, cores, finish, options, show
 from touches import LOGS, OTHER, errors, held, learnt
 
@@ -26,6 +23,7 @@ from bcppl.cli.predictive_checks import PredictiveChecks
 from bcppl.inference import infer
 from bcppl.models.point_probe import model
 from bcppl.recordings.importers.point_probe import command
+from bcppl.sweeps import swept
 
 PATTERNS = {"10_90": "10_90_10_10*", "10_130": "10_130_10_10*", "wood": "wood_30_63*"}
 PUSHES = 20  # drawn, of which the first are assimilated
@@ -81,11 +79,6 @@ def run(asked: tuple[str, int, int]) -> list[Run]:
     return results
 
 
-def kept(file: Path | None, asked: tuple[str, int, int]) -> list[Run]:
-    """The same, from the file where it is there, and added to it where not."""
-    return [Run(*one) for one in recorded(file, asked) or added(file, asked, partial(run, asked))]
-
-
 def summary(runs: Sequence[Run]) -> list[float | int]:
     """One line of the table."""
     position = np.array([one.position for one in runs])
@@ -123,7 +116,8 @@ def main() -> None:
         for seed in range(seeds)
     ]
     torch.set_num_threads(1)
-    results = [one for runs in each(partial(kept, arguments.file), asked, arguments.jobs) for one in runs]
+    done = swept(run, asked, file=arguments.file, jobs=arguments.jobs)
+    results = [Run(*one) for _, runs in done for one in runs]
 
     rows: list[Row] = []
     lines: list[list[float | int | str]] = []

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jobs import each
 from report import Row, cores, finish, options, show
 from touches import LOGS, OTHER, PARTICLES, errors, explained, learnt, pushes
+
+from bcppl.sweeps import in_order
 
 LOG = "10_90"
 COUNTS = (1, 2, 3, 5, 10, 20)
@@ -88,7 +89,7 @@ def main() -> None:
     draws, counts = (3, (1, 3, 10)) if arguments.quick else (20, COUNTS)
     seeds = range(arguments.seed, arguments.seed + draws)
     asked = [(variant, seed, counts) for variant in VARIANTS for seed in seeds]
-    results = each(run, asked, arguments.jobs)
+    results = list(in_order(run, asked, arguments.jobs))
 
     rows: list[Row] = []
     lines: list[list[Any]] = []

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jobs import in_order
 from report import Row, cores, finish, options, show
 from scenes import model
 from scipy.stats import spearmanr
@@ -40,6 +39,7 @@ from bcppl.sensors.candidates import action_of
 from bcppl.sensors.likelihoods.contact_probe import PREDICTED
 from bcppl.sensors.likelihoods.probe_rows import capacity, step_of
 from bcppl.sensors.scene import Scene
+from bcppl.sweeps import in_order
 from bcppl.traces import Trace
 
 PARTICLES, CANDIDATES = 75, 32

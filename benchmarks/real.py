@@ -24,7 +24,6 @@ import clutter
 import numpy as np
 import numpy.typing as npt
 import torch
-from jobs import each
 from peer import ask
 from report import Row, finish, options, show
 from scipy.stats import binomtest, bootstrap
@@ -45,6 +44,7 @@ from touches import (
 
 from bcppl import poses
 from bcppl.distributions.poses import prior_from_guess
+from bcppl.sweeps import in_order
 
 COUNTS = (5, 10, 20)
 JUDGED = 10  # pushes, where the goals are
@@ -192,7 +192,7 @@ def of_pushes(draws: int, seed: int, jobs: int, beside: bool) -> list[Row]:
     """Errors of bcppl and of least squares at every number of pushes, of CHSEL at ten."""
     seeds = range(seed, seed + draws)
     asked = [(log, s, COUNTS if s < seed + FEW else (JUDGED,)) for log in OTHER for s in seeds]
-    results = each(answers, asked, jobs)
+    results = list(in_order(answers, asked, jobs))
 
     def of(way: str, count: int, log: str | None = None) -> list[Answer]:
         return [
@@ -257,7 +257,7 @@ def calibration(jobs: int, seed: int = 0, divisions: int = 4, count: int = JUDGE
     asked = [(log, count, s) for s in range(seed, seed + divisions) for log in OTHER]
     groups = [
         (log, group)
-        for (log, *_), one in zip(asked, each(coverage, asked, jobs), strict=True)
+        for (log, *_), one in zip(asked, list(in_order(coverage, asked, jobs)), strict=True)
         for group in one
     ]
     rows, lines = [], []

@@ -14,16 +14,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jobs import in_order
-from kept import added, recorded
 from report import Row, finish, options, show
-from scenes import PARTICLES, default_run, one_line, quantile
+from scenes import PARTICLES, default_run, quantile
 from scipy.stats import binomtest
 from torch import Tensor
 
@@ -41,6 +38,7 @@ from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.sensors.likelihoods.bench_profiles import PROFILES
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.probe import ProbeWindow
+from bcppl.sweeps import one_line, swept
 
 NAMES = ("none", *FAULTS, "real")
 MASSES = (0.5, 0.9)
@@ -202,12 +200,6 @@ def least(of_points: Tensor, covariance: Tensor) -> float:
     return 1e3 * float(torch.einsum("kij,dj->dki", of_points, drawn).norm(dim=-1).mean())
 
 
-def known(task: Task, file: Path | None) -> Outcome:
-    """The outcome of a task, from a file where it is there."""
-    world, relative, *others = recorded(file, task) or added(file, task, partial(outcome, task))
-    return Outcome(Pose(*world), Pose(*relative), *others)
-
-
 def coverage(several: Sequence[Pose], mass: int, region: int) -> float:
     """The share, %, of poses whose region of a mass holds the truth: both by their places in `Pose.holds`."""
     return 100.0 * float(np.mean([pose.holds[mass][region] for pose in several]))
@@ -282,9 +274,8 @@ def main() -> None:
     seeds = range(arguments.seed, arguments.seed + count)
     tasks = [Task(seed, *group) for seed in seeds for group in groups]
     outcomes: dict[Task, Outcome] = {}
-    done = in_order(partial(known, file=arguments.file), tasks, arguments.jobs)
-    for task, one in zip(tasks, done, strict=True):
-        outcomes[task] = one
+    for task, (world, relative, *others) in swept(outcome, tasks, file=arguments.file, jobs=arguments.jobs):
+        one = outcomes[task] = Outcome(Pose(*world), Pose(*relative), *others)
         print(*task, summary(one), flush=True)
     lines, rows = [], []
     clearances = [bench_scene(seed).clearance for seed in seeds]

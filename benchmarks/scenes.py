@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-import os
 import resource
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeVar
@@ -23,7 +21,6 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 import torch
-from jobs import THREADS
 from torch import Tensor
 
 from bcppl import poses
@@ -43,6 +40,7 @@ from bcppl.models import look_and_touch
 from bcppl.models.worlds.bench.parameters import BenchParameters
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.sensors.measurements import Recording
+from bcppl.sweeps import Failure, as_they_end, one_line
 
 # Where a bench is perfect the model is given that: the peg is where it is measured.
 model = look_and_touch.model.with_settings(profile="perfect")
@@ -286,11 +284,6 @@ def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
         seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - begun
 
 
-def one_line(error: BaseException) -> str:
-    """The message of an exception, in one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"[:200]
-
-
 def every(
     function: Callable[[Task], Value], tasks: Sequence[Task], jobs: int, lost: Callable[[Task, str], Value]
 ) -> Iterator[Value]:
@@ -302,37 +295,14 @@ def every(
         jobs: how many at a time; with one everything stays in this process, with all its threads.
         lost: the result of a task whose process died, and why.
     """
-    if jobs == 1:
-        yield from map(function, tasks)
-        return
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    left = list(tasks)
-    try:
-        with _pool(jobs) as pool:
-            asked = {pool.submit(function, task): task for task in tasks}
-            for future in as_completed(asked):
-                result = future.result()
-                left.remove(asked[future])
-                yield result
-    except BrokenProcessPool:
-        # Which of those under way killed its process is unknown: each that is left has one of its own.
-        for task in left:
-            try:
-                with _pool(1) as pool:
-                    yield pool.submit(function, task).result()
-            except BrokenProcessPool as error:
-                yield lost(task, one_line(error))
+    for task, result in as_they_end(function, tasks, jobs):
+        yield lost(task, result.reason) if isinstance(result, Failure) else result
 
 
 def apart(function: Callable[..., Value], *arguments: Any) -> Value:
     """A function's result in a process of its own with all its threads, so that its memory is its own."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(function, *arguments).result()
-
-
-def _pool(jobs: int) -> ProcessPoolExecutor:
-    spawned = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(jobs, spawned, torch.set_num_threads, (1,))
 
 
 def quantile(values: Sequence[float] | Array, level: float) -> float:

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jobs import each
 from report import Row, cores, finish, options, show
 from torch import Tensor
 from touches import LOGS, OTHER, learnt
@@ -41,6 +40,7 @@ from bcppl.models.point_probe import model
 from bcppl.recordings.importers.point_probe import command
 from bcppl.sensors import Push, Recording
 from bcppl.sensors.likelihoods.point_finger import contact_of
+from bcppl.sweeps import in_order
 from bcppl.traces import Trace, extend
 
 LOG = "10_90"
@@ -191,7 +191,7 @@ def main() -> None:
         outer_samples=arguments.outer_samples,
         every=arguments.every,
     )
-    results = each(choose, range(arguments.seed, arguments.seed + draws), arguments.jobs)
+    results = list(in_order(choose, range(arguments.seed, arguments.seed + draws), arguments.jobs))
     rows, lines = [], []
     for k, name in enumerate(WAYS):
         own = [one[k] for one in results]

@@ -13,7 +13,6 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,10 +20,8 @@ import numpy as np
 import torch
 from foreign_mechanisms import MECHANISMS, made
 from foreign_world import scene_of
-from jobs import in_order
-from kept import added, recorded
 from report import Row, finish, options, show
-from scenes import PARTICLES, default_run, one_line, quantile
+from scenes import PARTICLES, default_run, quantile
 from torch import Tensor
 
 from bcppl import poses
@@ -33,6 +30,7 @@ from bcppl.beliefs.regions import rotation_deviation, translation_deviation
 from bcppl.cli.predictive_checks import PredictiveChecks
 from bcppl.models.look_and_touch import model
 from bcppl.sensors.likelihoods.bench_profiles import PROFILES
+from bcppl.sweeps import one_line, swept
 
 MASSES = (0.5, 0.9)
 REGIONS = {"translation": translation_deviation, "rotation": rotation_deviation}
@@ -125,12 +123,6 @@ def judged(belief: Belief, truth: Tensor) -> Pose:
     return Pose((1e3 * errors[0], math.degrees(errors[1])), tuple(deviations), tuple(holds))
 
 
-def known(task: Task, file: Path | None) -> Outcome:
-    """The outcome of a task, from a file where it is there."""
-    world, relative, *others = recorded(file, task) or added(file, task, partial(outcome, task))
-    return Outcome(Pose(*world), Pose(*relative), *others)
-
-
 def coverage(several: Sequence[Pose], region: int, mass: int) -> float:
     """The share, %, of poses whose region of a mass holds the truth: both by their places in `Pose.holds`."""
     return 100.0 * float(np.mean([pose.holds[region][mass] for pose in several]))
@@ -184,8 +176,8 @@ def main() -> None:
     seeds = range(arguments.seed, arguments.seed + count)
     tasks = [Task(seed, name, arguments.profile) for seed in seeds for name in arguments.mechanism]
     outcomes: dict[str, list[Outcome]] = {name: [] for name in arguments.mechanism}
-    done = in_order(partial(known, file=arguments.file), tasks, arguments.jobs)
-    for task, one in zip(tasks, done, strict=True):
+    for task, (world, relative, *others) in swept(outcome, tasks, file=arguments.file, jobs=arguments.jobs):
+        one = Outcome(Pose(*world), Pose(*relative), *others)
         outcomes[task.mechanism].append(one)
         print(*task, summary(one), flush=True)
     lines = [line(name, several, which) for name, several in outcomes.items() for which in POSES]

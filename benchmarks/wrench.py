@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jobs import each
 from report import Row, finish, options, show
 
 from bcppl import poses
@@ -15,6 +14,7 @@ from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.models import peg_in_hole
 from bcppl.models.worlds.peg_in_hole import simulate_recording
+from bcppl.sweeps import in_order
 
 PARTICLES = 75
 WORLD = ContactParameters(time_step=0.0015, friction=0.2, time_constant=0.003)  # the world's own friction
@@ -84,7 +84,7 @@ def main() -> None:
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + (1 if arguments.quick else arguments.runs))
     tasks = [(name, seed) for seed in seeds for name in arguments.variants]
-    found = dict(zip(tasks, each(run, tasks, arguments.jobs), strict=True))
+    found = dict(zip(tasks, list(in_order(run, tasks, arguments.jobs)), strict=True))
     lines, rows = [], []
     for name in arguments.variants:
         lines += [[f"{name}, seed {seed}", *found[name, seed]] for seed in seeds]

@@ -107,4 +107,4 @@ def test_a_process_that_dies_takes_no_other_scene_with_it():
     found = list(scenes.every(signal.raise_signal, asked, 2, lambda number, why: (number, why)))
     assert found.count(None) == 2
     ((number, why),) = [one for one in found if one is not None]
-    assert number == signal.SIGKILL and why.startswith("BrokenProcessPool")
+    assert number == signal.SIGKILL and why.startswith("TerminatedWorkerError")

@@ -181,10 +181,12 @@ def test_in_several_processes_it_gives_the_same() -> None:
     assert np.array_equal(one.ranks, two.ranks) and np.allclose(one.posterior, two.posterior, rtol=1e-12)
 
 
-def test_what_cannot_be_sent_to_another_process_is_refused() -> None:
+def test_functions_of_a_notebook_run_in_other_processes_and_open_files_do_not(tmp_path: Path) -> None:
     inference = partial(normal_inference, exact)
-    with pytest.raises(InputError, match="rounds cannot be sent to another process"):
-        calibrate(NORMAL, lambda data: inference(data), 2, processes=2)
+    one, two = (calibrate(NORMAL, lambda data: inference(data), 2, processes=k) for k in (1, 2))
+    assert np.array_equal(one.ranks, two.ranks)
+    with (tmp_path / "log").open("w") as log, pytest.raises(InputError, match="cannot be sent to another"):
+        calibrate(NORMAL, lambda data: print(data, file=log), 2, processes=2)
 
 
 def test_quantities_of_ones_own_are_ranked(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The command line: `bcppl run`, `probe`, `check`, `import`, `simulate`.
+"""The command line: `bcppl run`, `probe`, `sweep`, `check`, `import`, `simulate`.
 
 A command imports what it computes with when it is called, so that `bcppl --help` answers at once.
 """
@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from bcppl.cli import probe, recordings, run
+from bcppl.cli import probe, recordings, run, sweep
 from bcppl.errors import InferenceError, InputError
 
 app = typer.Typer(
@@ -40,6 +40,7 @@ def _options(
 
 app.command("run")(run.run)
 app.command("probe")(probe.probe)
+app.command("sweep")(sweep.sweep)
 app.command("check")(recordings.check)
 app.command("simulate")(recordings.simulate)
 app.add_typer(recordings.import_app, name="import")

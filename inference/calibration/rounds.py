@@ -2,62 +2,52 @@
 
 from __future__ import annotations
 
-import pickle
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
-from bcppl.errors import InputError
+from bcppl.errors import InferenceError, InputError
 from bcppl.inference.progress import watched
 from bcppl.recordings.file import replacing
+from bcppl.sweeps import Failure, as_they_end
+
+Result = TypeVar("Result")
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
 def gathered(
-    job: Callable[[int], Any], seeds: Sequence[int], processes: int = 1, progress: bool = True
-) -> Iterator[tuple[int, Any]]:
+    job: Callable[[int], Result], seeds: Sequence[int], processes: int = 1, progress: bool = True
+) -> Iterator[tuple[int, Result]]:
     """The number of each seed and `job(seed)`, in the order in which they end.
 
     Args:
-        job: with several processes a function of a module, or an object that can be pickled.
+        job: of a seed.
         seeds: of the rounds.
-        processes: above 1, fresh ones, of one thread each.
+        processes: above 1, others than this one, of one thread each.
         progress: show a bar, on a terminal or in a notebook.
 
     Raises:
         InputError: the job cannot be sent to another process.
+        InferenceError: a process has ended.
     """
-    if processes == 1:
-        for number, seed in enumerate(watched(seeds, description="rounds", progress=progress)):
-            yield number, job(seed)
-        return
-    try:
-        pickle.dumps(job)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise InputError(
-            f"rounds cannot be sent to another process ({error}); give functions of a module, or "
-            "functools.partials of them."
-        ) from error
-    # MuJoCo's threads do not survive a fork.
-    with ProcessPoolExecutor(
-        processes, get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
-    ) as pool:
-        numbers = {pool.submit(job, seed): number for number, seed in enumerate(seeds)}
-        ending = as_completed(numbers)
-        try:
-            for done in watched(ending, total=len(seeds), description="rounds", progress=progress):
-                yield numbers[done], done.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    numbered = list(enumerate(seeds))
+    ending = as_they_end(partial(_of_seed, job), numbered, processes)
+    for (number, seed), result in watched(
+        ending, total=len(numbered), description="rounds", progress=progress
+    ):
+        if isinstance(result, Failure):
+            raise InferenceError(f"the process of the round with seed {seed} has ended: {result.reason}")
+        yield number, result
+
+
+def _of_seed(job: Callable[[int], Result], numbered: tuple[int, int]) -> Result:
+    return job(numbered[1])
 
 
 def kept(path: Path) -> Arrays | None:
