@@ -67,6 +67,7 @@ class GaussianApproximation:
     relevant: Mapping[int, bool] = field(default_factory=dict)
     stale: bool = False  # whether contacts were added after `quadratic` was computed
     near: Tensor | None = None  # (K, 7) poses that fits of measurements follow too
+    thorough: bool = True  # whether modes are searched for from many places where there may be several
 
     def __post_init__(self) -> None:
         if not hasattr(self.scene, "prior") or not hasattr(self.scene, "sensor"):
@@ -126,7 +127,7 @@ class GaussianApproximation:
             for sensor, own in by_sensor:
                 yield from sensor.sites(own, pose, blur)
 
-        known, everywhere = self.prior, ambiguous and self._is_unsure()
+        known, everywhere = self.prior, self.thorough and ambiguous and self._is_unsure()
         before = None if self.quadratic is None else self.mixture
         own = torch.zeros(0) if before is None else known.component(before.centers)
         heading = next((heading for heading in headings if heading is not None), None)
