@@ -21,9 +21,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from bcppl import quaternions
+from bcppl import pose_kernels as kernels, quaternions
 from bcppl.arguments import pose_problem
 from bcppl.errors import InputError
+from bcppl.pose_kernels import fused
 
 LOG_8_PI_SQUARED = math.log(8.0 * math.pi**2)
 
@@ -79,17 +80,23 @@ def from_rotation_vector(translation: Tensor, vector: Tensor) -> Tensor:
 
 def rotation_matrix(pose: Tensor) -> Tensor:
     """The rotations of poses (..., 7) as matrices (..., 3, 3)."""
+    if (known := fused(kernels.rotation_matrix, pose, pose, 3, 3)) is not None:
+        return known
     return quaternions.rotation_matrix(quaternion_xyzw(pose))
 
 
 def compose(a_from_b: Tensor, b_from_c: Tensor) -> Tensor:
     """`a_from_c` of two batches of poses (..., 7) that broadcast against each other."""
+    if (known := fused(kernels.compose, a_from_b, b_from_c, 7)) is not None:
+        return known
     turned = (rotation_matrix(a_from_b) @ b_from_c[..., :3, None])[..., 0]
     return _turned(a_from_b, turned, quaternion_xyzw(b_from_c))
 
 
 def inverse(a_from_b: Tensor) -> Tensor:
     """`b_from_a` of poses (..., 7)."""
+    if (known := fused(kernels.inverse, a_from_b, a_from_b, 7)) is not None:
+        return known
     rotation = rotation_matrix(a_from_b)
     translation = -(rotation.transpose(-1, -2) @ a_from_b[..., :3, None])[..., 0]
     return from_translation_quaternion_xyzw(translation, quaternions.conjugate(quaternion_xyzw(a_from_b)))
@@ -102,11 +109,15 @@ def transform(a_from_b: Tensor, points: Tensor) -> Tensor:
 
 def retract(pose: Tensor, tangent: Tensor) -> Tensor:
     """The pose (..., 7) reached from a pose (..., 7) by a tangent (..., 6): metres, then radians."""
+    if (known := fused(kernels.retract, pose, tangent, 7)) is not None:
+        return known
     return _turned(pose, tangent[..., :3], quaternions.from_rotation_vector(tangent[..., 3:]))
 
 
 def local(pose: Tensor, other: Tensor) -> Tensor:
     """The tangent (..., 6) from `pose` to `other`: the inverse of `retract`, rotation angle at most pi."""
+    if (known := fused(kernels.local, pose, other, 6)) is not None:
+        return known
     turn = quaternions.relative(quaternion_xyzw(pose), quaternion_xyzw(other))
     return torch.cat([other[..., :3] - pose[..., :3], quaternions.rotation_vector(turn)], dim=-1)
 

@@ -151,3 +151,23 @@ def test_bad_input_is_one_sentence(make: Callable[[], object], word: str) -> Non
     with pytest.raises(InputError, match=word) as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "shapes", [((), ()), ((5,), (5,)), ((), (5,)), ((1,), (5,)), ((5, 1), (3,)), ((0,), ())]
+)
+def test_with_and_without_a_gradient_the_algebra_is_the_same(shapes: tuple[tuple[int, ...], ...]) -> None:
+    pose, other = (random_poses(max(1, math.prod(s))).reshape(-1, 7)[: math.prod(s)] for s in shapes)
+    pose, other = pose.reshape(*shapes[0], 7), other.reshape(*shapes[1], 7)
+    step = torch.randn(*shapes[1], 6, dtype=torch.float64)
+    followed = pose.clone().requires_grad_()
+    for with_it, without in (
+        (poses.retract(followed, step), poses.retract(pose, step)),
+        (poses.retract(followed, 0.0 * step), poses.retract(pose, 0.0 * step)),
+        (poses.local(followed, other), poses.local(pose, other)),
+        (poses.compose(followed, other), poses.compose(pose, other)),
+        (poses.inverse(followed), poses.inverse(pose)),
+        (poses.rotation_matrix(followed), poses.rotation_matrix(pose)),
+    ):
+        assert with_it.requires_grad and not without.requires_grad
+        torch.testing.assert_close(with_it.detach(), without, rtol=1e-13, atol=1e-14)

@@ -1,0 +1,142 @@
+"""Fused loops over poses: what `bcppl.poses` computes where no gradient is asked for.
+
+A small batch of poses costs by operations, of which one function of `bcppl.poses` takes ten to twenty; each
+of these is one. Rows are poses `[x, y, z, qw, qx, qy, qz]`; an operand with one row goes with all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bcppl.arrays import Array
+from bcppl.compiled import compiled
+
+Kernel = Callable[[Array, Array, Array], None]
+
+
+def fused(kernel: Kernel, first: Tensor, second: Tensor, *shape: int) -> Tensor | None:
+    """A kernel's result (..., *shape) of operands (..., K) that broadcast; None where torch computes it.
+
+    That is where a gradient is asked for, and with numbers of another type.
+    """
+    if first.requires_grad or second.requires_grad:
+        return None
+    if first.dtype is not torch.float64 or second.dtype is not torch.float64:
+        return None
+    batch, other = first.shape[:-1], second.shape[:-1]
+    if batch != other:
+        ones, others = batch.numel() == 1, other.numel() == 1
+        if ones and len(batch) <= len(other):
+            batch = other
+        elif not (others and len(other) <= len(batch)):
+            batch = torch.broadcast_shapes(batch, other)
+            first, second = first.expand(*batch, first.shape[-1]), second.expand(*batch, second.shape[-1])
+    own, rest = first.numpy().reshape(-1, first.shape[-1]), second.numpy().reshape(-1, second.shape[-1])
+    result = np.empty((max(len(own), len(rest)), *shape)) if batch.numel() else np.empty((0, *shape))
+    kernel(own, rest, result)
+    return torch.from_numpy(result.reshape(*batch, *shape))
+
+
+@compiled
+def _turn(quaternion: Array, turn: tuple[float, float, float, float], result: Array) -> None:
+    """Set `result` (4,) to a quaternion w x y z times another, of unit length."""
+    a, b, c, d = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    w, x, y, z = turn
+    result[0] = a * w - b * x - c * y - d * z
+    result[1] = a * x + b * w + c * z - d * y
+    result[2] = a * y - b * z + c * w + d * x
+    result[3] = a * z + b * y - c * x + d * w
+    length = math.sqrt(result[0] ** 2 + result[1] ** 2 + result[2] ** 2 + result[3] ** 2)
+    for k in range(4):
+        result[k] /= length
+
+
+@compiled
+def _rotate(quaternion: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A vector turned by a unit quaternion w x y z."""
+    w, a, b, c = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    p, q, r = 2.0 * (b * z - c * y), 2.0 * (c * x - a * z), 2.0 * (a * y - b * x)
+    return x + w * p + b * r - c * q, y + w * q + c * p - a * r, z + w * r + a * q - b * p
+
+
+@compiled
+def retract(pose: Array, tangent: Array, result: Array) -> None:
+    """Poses (N, 7) moved by tangents (N, 6)."""
+    one, other = len(pose) == 1, len(tangent) == 1
+    for n in range(len(result)):
+        own, step = pose[0 if one else n], tangent[0 if other else n]
+        for k in range(3):
+            result[n, k] = own[k] + step[k]
+        half = 0.5 * math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
+        share = 0.5 * math.sin(half) / half if half > 0.0 else 0.5
+        turn = (math.cos(half), share * step[3], share * step[4], share * step[5])
+        _turn(own[3:], turn, result[n, 3:])
+
+
+@compiled
+def local(pose: Array, goal: Array, result: Array) -> None:
+    """The tangents (N, 6) from poses (N, 7) to others."""
+    one, other = len(pose) == 1, len(goal) == 1
+    for n in range(len(result)):
+        own, there = pose[0 if one else n], goal[0 if other else n]
+        for axis in range(3):
+            result[n, axis] = there[axis] - own[axis]
+        a, b, c, d = own[3], -own[4], -own[5], -own[6]
+        w, x, y, z = there[3], there[4], there[5], there[6]
+        real = a * w - b * x - c * y - d * z
+        i = a * x + b * w + c * z - d * y
+        j = a * y - b * z + c * w + d * x
+        k = a * z + b * y - c * x + d * w
+        half = math.atan2(math.sqrt(i * i + j * j + k * k), abs(real))
+        share = (2.0 if real > 0.0 else -2.0) * (half / math.sin(half) if half > 0.0 else 1.0)
+        result[n, 3], result[n, 4], result[n, 5] = share * i, share * j, share * k
+
+
+@compiled
+def compose(first: Array, second: Array, result: Array) -> None:
+    """Poses (N, 7) one after the other."""
+    one, other = len(first) == 1, len(second) == 1
+    for n in range(len(result)):
+        own, next_ = first[0 if one else n], second[0 if other else n]
+        x, y, z = _rotate(own[3:], next_[0], next_[1], next_[2])
+        result[n, 0], result[n, 1], result[n, 2] = own[0] + x, own[1] + y, own[2] + z
+        _turn(own[3:], (next_[3], next_[4], next_[5], next_[6]), result[n, 3:])
+
+
+@compiled
+def inverse(pose: Array, _: Array, result: Array) -> None:
+    """The inverse of poses (N, 7)."""
+    for n in range(len(result)):
+        own = pose[n]
+        result[n, 3] = own[3]
+        for k in range(4, 7):
+            result[n, k] = -own[k]
+        x, y, z = _rotate(result[n, 3:], own[0], own[1], own[2])
+        result[n, 0], result[n, 1], result[n, 2] = -x, -y, -z
+
+
+@compiled
+def rotation_matrix(pose: Array, _: Array, result: Array) -> None:
+    """The rotations (N, 3, 3) of poses (N, 7)."""
+    for n in range(len(result)):
+        w, x, y, z = pose[n, 3], pose[n, 4], pose[n, 5], pose[n, 6]
+        result[n, 0, 0], result[n, 0, 1], result[n, 0, 2] = (
+            w * w + x * x - y * y - z * z,
+            2.0 * (x * y - w * z),
+            2.0 * (x * z + w * y),
+        )
+        result[n, 1, 0], result[n, 1, 1], result[n, 1, 2] = (
+            2.0 * (x * y + w * z),
+            w * w - x * x + y * y - z * z,
+            2.0 * (y * z - w * x),
+        )
+        result[n, 2, 0], result[n, 2, 1], result[n, 2, 2] = (
+            2.0 * (x * z - w * y),
+            2.0 * (y * z + w * x),
+            w * w - x * x - y * y + z * z,
+        )
