@@ -26,7 +26,7 @@ from bcppl.distributions.poses import NormalPose, prior_from_guess
 from bcppl.geometry.parts import Part
 from bcppl.models.shipped import simulated_in
 from bcppl.rendering.part_renderer import PartRenderer
-from bcppl.rendering.ray_casting import RayCaster
+from bcppl.rendering.rasterisation import renderer_for
 from bcppl.sensors.capabilities import Grasping
 from bcppl.sensors.likelihoods.cameras import CalibratedCamera
 from bcppl.sensors.likelihoods.screened_probe import simulated_probe
@@ -76,14 +76,14 @@ def grasped_peg(scene: GraspScene, actions: Sequence[Any]) -> None:
 
 
 def by_known_cameras(
-    recording: Recording, name: str, renderer: Callable[[Part], PartRenderer] = RayCaster, **settings: Any
+    recording: Recording, name: str, renderer: Callable[[Part], PartRenderer] = renderer_for, **settings: Any
 ) -> Scene:
     """The scene of a recording whose cameras have no latent errors, for tempered SMC, under a model's name.
 
     Args:
         recording: of depth images and probe windows.
         name: of the model, for messages.
-        renderer: makes the renderer of the part, such as `bcppl.rendering.rasterisation.renderer_for`.
+        renderer: makes the renderer of the part; by default the one that is faster for its mesh.
         settings: fields of `DepthSettings` and `ProbeSettings`.
 
     Raises:

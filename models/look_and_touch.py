@@ -19,7 +19,7 @@ from bcppl.distributions.poses import prior_from_guess
 from bcppl.geometry.parts import Part
 from bcppl.models.shipped import simulated_in
 from bcppl.rendering.part_renderer import PartRenderer
-from bcppl.rendering.ray_casting import RayCaster
+from bcppl.rendering.rasterisation import renderer_for
 from bcppl.sensors.likelihoods.camera_settings import CameraSettings
 from bcppl.sensors.likelihoods.contact_probe import ContactProbe, TouchSettings
 from bcppl.sensors.likelihoods.erring_camera import ErringCamera
@@ -38,13 +38,13 @@ def look_and_touch(scene: Scene, actions: Sequence[Any]) -> None:
 
 
 def prepare(
-    recording: Recording, renderer: Callable[[Part], PartRenderer] = RayCaster, **settings: Any
+    recording: Recording, renderer: Callable[[Part], PartRenderer] = renderer_for, **settings: Any
 ) -> Scene:
     """The scene of a recording.
 
     Args:
         recording: of depth images and probe windows.
-        renderer: makes the renderer of the part, such as `bcppl.rendering.rasterisation.renderer_for`.
+        renderer: makes the renderer of the part; by default the one that is faster for its mesh.
         settings: fields of `CameraSettings` and `TouchSettings`.
 
     Raises:

@@ -19,7 +19,7 @@ from bcppl.distributions.poses import prior_from_guess
 from bcppl.geometry.parts import Part
 from bcppl.models.camera_error import conditional_proposal
 from bcppl.rendering.part_renderer import PartRenderer
-from bcppl.rendering.ray_casting import RayCaster
+from bcppl.rendering.rasterisation import renderer_for
 from bcppl.sensors.likelihoods.cameras import ClutteredCamera
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Scene, chosen, likelihoods_for, require_positive
@@ -75,13 +75,13 @@ def part_in_view(scene: Scene, actions: Sequence[Any]) -> None:
 
 
 def prepare(
-    recording: Recording, renderer: Callable[[Part], PartRenderer] = RayCaster, **settings: Any
+    recording: Recording, renderer: Callable[[Part], PartRenderer] = renderer_for, **settings: Any
 ) -> Scene:
     """The scene of a recording.
 
     Args:
         recording: of depth images.
-        renderer: makes the renderer of the part, such as `bcppl.rendering.rasterisation.renderer_for`.
+        renderer: makes the renderer of the part; by default the one that is faster for its mesh.
         settings: fields of `Settings`.
 
     Raises:

@@ -17,7 +17,7 @@ from bcppl.geometry.parts import Part
 from bcppl.models.look_and_touch import CAMERAS
 from bcppl.models.shipped import simulated_in
 from bcppl.rendering.part_renderer import PartRenderer
-from bcppl.rendering.ray_casting import RayCaster
+from bcppl.rendering.rasterisation import renderer_for
 from bcppl.sensors.likelihoods.erring_camera import ErringCamera
 from bcppl.sensors.likelihoods.screened_probe import TOUCHES, simulated_probe
 from bcppl.sensors.likelihoods.simulated_probe import ProbeSettings
@@ -34,13 +34,13 @@ def peg_in_hole(scene: Scene, actions: Sequence[Any]) -> None:
 
 
 def prepare(
-    recording: Recording, renderer: Callable[[Part], PartRenderer] = RayCaster, **settings: Any
+    recording: Recording, renderer: Callable[[Part], PartRenderer] = renderer_for, **settings: Any
 ) -> Scene:
     """The scene of a recording.
 
     Args:
         recording: of depth images and probe windows.
-        renderer: makes the renderer of the part, such as `bcppl.rendering.rasterisation.renderer_for`.
+        renderer: makes the renderer of the part; by default the one that is faster for its mesh.
         settings: fields of `CameraSettings`, `ProbeSettings` and `TouchSettings`.
 
     Raises:

@@ -209,7 +209,6 @@ def renderer_for(part: Part) -> PartRenderer:
     Both take the same calls, and their depths agree to single precision. On one core rasterisation was faster
     than ray casting by factors of 8 to 32 for a ring of 512 faces and of 2.3 to 4.3 for a drill of 16,000
     (75 poses, 128 x 128 to 640 x 480, `benchmarks/render.py`). It is compiled on its first use, once for an
-    installation: 11 s, then 0.6 s to load the code in every process. The shipped models render for about a
-    second in a run, and use `RayCaster`.
+    installation: 11 s, then 0.6 s to load the code in every process; a run saves more.
     """
     return RayCaster(part) if len(part.faces) > MOST_FACES else Rasteriser(part)

@@ -21,7 +21,7 @@ from bcppl.effort import Effort
 from bcppl.geometry.camera import Camera
 from bcppl.rendering.extrinsics_error import line_of_sight
 from bcppl.rendering.part_renderer import PartRenderer
-from bcppl.rendering.ray_casting import RayCaster
+from bcppl.rendering.rasterisation import renderer_for
 from bcppl.sensors.depth import View
 from bcppl.sensors.likelihoods.viewpoints import InstrumentError, Sighting, viewpoints_of
 from bcppl.sensors.measurements import Recording
@@ -39,7 +39,7 @@ class CalibratedCamera:
     """
 
     def __init__(self, recording: Recording, renderer: PartRenderer | None = None, **noise: Any) -> None:
-        self.renderer = RayCaster(recording.part) if renderer is None else renderer
+        self.renderer = renderer_for(recording.part) if renderer is None else renderer
         self.background, self.noise = recording.background, noise
 
     @property

@@ -32,7 +32,7 @@ from bcppl.geometry.parts import Part
 from bcppl.geometry.turns import box_turns
 from bcppl.rendering.extrinsics_error import apparent_motion, line_of_sight
 from bcppl.rendering.part_renderer import PartRenderer
-from bcppl.rendering.ray_casting import RayCaster
+from bcppl.rendering.rasterisation import renderer_for
 from bcppl.rendering.region_of_interest import region_of_interest
 from bcppl.sensors.depth import View
 from bcppl.sensors.likelihoods.camera_information import information_of_images
@@ -72,7 +72,7 @@ class ErringCamera:
         recording: its part, guess and views.
         prior: of the part's pose.
         settings: of the cameras.
-        renderer: makes the renderer of the part, such as `bcppl.rendering.rasterisation.renderer_for`.
+        renderer: makes the renderer of the part; by default the one that is faster for its mesh.
 
     Raises:
         InputError: a camera cannot see the part near its guess.
@@ -83,7 +83,7 @@ class ErringCamera:
         recording: Recording,
         prior: Any,
         settings: CameraSettings,
-        renderer: Callable[[Part], PartRenderer] = RayCaster,
+        renderer: Callable[[Part], PartRenderer] = renderer_for,
     ) -> None:
         self.settings, self.prior = settings, prior
         self.renderer = renderer(recording.part)
