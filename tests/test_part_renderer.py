@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -32,10 +33,15 @@ from tests.rendered_parts import (
     random_poses,
 )
 
-both = pytest.mark.parametrize("kind", [RayCaster, Rasteriser])
+KINDS: list[Callable[[Part], PartRenderer]] = [RayCaster, Rasteriser]
+if find_spec("warp"):  # an optional group
+    from bcppl.rendering.warp_casting import WarpCaster
+
+    KINDS.append(WarpCaster)
+every = pytest.mark.parametrize("kind", KINDS)
 
 
-@both
+@every
 @pytest.mark.parametrize("mesh", [*MESHES.values(), ELL], ids=[*MESHES, "ell"])
 def test_depth_is_that_of_another_ray_caster(
     kind: Callable[[Part], PartRenderer], mesh: trimesh.Trimesh
@@ -46,7 +52,7 @@ def test_depth_is_that_of_another_ray_caster(
     assert agree(image, np.stack([by_trimesh(part, view, p) for p in pose.numpy()])) < 6e-4
 
 
-@both
+@every
 def test_hits_are_the_images_pixels_in_order(kind: Callable[[Part], PartRenderer]) -> None:
     for name in ("ring", "pipe"):
         renderer, view = kind(part_of(MESHES[name])), camera()
@@ -61,7 +67,7 @@ def test_hits_are_the_images_pixels_in_order(kind: Callable[[Part], PartRenderer
 MASKS = {"grid": np.s_[1::4, 2::3], "rows": np.s_[5:20], "none": np.s_[:0], "all": np.s_[:]}
 
 
-@both
+@every
 def test_counted_pixels_are_those_of_the_whole(kind: Callable[[Part], PartRenderer]) -> None:
     view, pose, renderer = camera(), random_poses(20, 8, 0.02), kind(part_of(RING))
     whole = renderer.hits(view, pose, faces=True)
@@ -79,7 +85,7 @@ def test_counted_pixels_are_those_of_the_whole(kind: Callable[[Part], PartRender
                 np.testing.assert_array_equal(getattr(hits, column), getattr(whole, column)[kept])
 
 
-@both
+@every
 @pytest.mark.parametrize("name", ["ring", "turned"])
 def test_faces_contain_the_hits(kind: Callable[[Part], PartRenderer], name: str) -> None:
     part, view, pose = part_of(MESHES[name]), camera(), random_poses(20, 9, 0.02)
@@ -93,7 +99,7 @@ def test_faces_contain_the_hits(kind: Callable[[Part], PartRenderer], name: str)
     assert np.abs(closest - inside).max() < 1e-6
 
 
-@both
+@every
 def test_effort_counts_images_and_rays(kind: Callable[[Part], PartRenderer]) -> None:
     view, renderer = camera(), kind(part_of(RING))
     renderer.hits(view, random_poses(7, 1, 0.01))
@@ -104,7 +110,7 @@ def test_effort_counts_images_and_rays(kind: Callable[[Part], PartRenderer]) -> 
     assert len(hits.depth) <= spent.amount < 3 * len(hits.depth)
 
 
-@both
+@every
 def test_no_particles_and_no_hits(kind: Callable[[Part], PartRenderer]) -> None:
     view, renderer = camera(), kind(part_of(RING))
     assert renderer.images(view, torch.zeros(0, 7)).shape == (0, view.height, view.width)
