@@ -57,12 +57,14 @@ WALK = (0.2, 2.0)  # scales of the random walks
 CERTAIN = 0.01  # nats: a log-likelihood as small for all particles carries no information
 ASKED = 4  # particles that are evaluated first for that
 FEW = 0.2  # the effective sample size that SMCP3 is to leave, as a share of N
+AMPLE = 30.0  # the same, enough for any N
 # Where it does not, it is run again with more copies of each particle, as many as seem needed, until so much
 # of N is left; at most so many of each and in all: memory and time grow with them. N of all are kept.
 ENOUGH = 0.1
 MOST, ROOM = 40, 40_000
-# Where images leave several modes: of 75 particles 20 stay effective, too few for the modes' shares.
-SEVERAL = 8
+# Particles and copies where images leave several modes: of 75 particles 20 stay effective, too few for the
+# modes' shares.
+SEVERAL = 600
 LEAST = 0.03  # of N: where even with so many copies less would be left, the measurement is tempered
 
 
@@ -152,7 +154,7 @@ def guided(
         before = before.updated()
         after = before.including(scene, len(actions) - 1, action, values)
         population = population.with_approximation(after)
-        least = SEVERAL if after.is_ambiguous else 1
+        least = math.ceil(SEVERAL / len(population)) if after.is_ambiguous else 1
         pair = programs.pair(before, after, action)
         if screen and after.screens(action):
             assimilated = assimilate_screened(population, before, observed, pair)
@@ -200,7 +202,7 @@ def assimilate(population: Population, observed: Observed, pair: Pair, least: in
         except NoWeightError:
             return None
 
-    goal, allowed = FEW * count, max(1, min(MOST, ROOM // count))
+    goal, allowed = min(FEW * count, AMPLE), max(1, min(MOST, ROOM // count))
     times = min(least, allowed)
     reached = weighted(population if times == 1 else replicate(population, times))
     while times < allowed and (reached is None or reached.effective_sample_size < goal):
@@ -210,8 +212,8 @@ def assimilate(population: Population, observed: Observed, pair: Pair, least: in
         reached = weighted(replicate(population, times))
         if before and (reached is None or reached.effective_sample_size < before):
             return None  # more copies find what the proposal had missed
-        goal = ENOUGH * count
-    if reached is None or reached.effective_sample_size < LEAST * count * times / MOST:
+        goal = min(ENOUGH * count, AMPLE)
+    if reached is None or reached.effective_sample_size < min(LEAST * count * times / MOST, AMPLE):
         return None
     effective = reached.effective_sample_size
     if times == 1:
