@@ -187,11 +187,12 @@ class ProbeRows:
     def _load(self, rows: Rows) -> Array:
         """How hard the peg is pressed where it touches (R,), N: more than the force where it is levered.
 
-        A peg in a hole touches both walls, and the forces there nearly cancel. Their torque does not.
+        A peg in a hole touches both walls, and the forces there nearly cancel. Their torque does not. It is
+        then larger than that of one contact near the tip, which is the force by a lever of its own.
         """
         tip = np.array([0.0, 0.0, float(self.sensing.peg.vertices[:, 2].min())])
         about_tip = rows.wrench[:, 3:] - np.cross(tip, rows.wrench[:, :3])
-        return np.asarray(rows.force + np.linalg.norm(about_tip, axis=1) / _LEVER)
+        return np.maximum(rows.force, np.linalg.norm(about_tip, axis=1) / _LEVER)
 
     def _rows(self, end: int) -> Tensor:
         """The rows (R, COLUMNS) that are complete at the end of a cell."""
