@@ -22,6 +22,8 @@ from bcppl.distributions.poses import NormalPose, UniformPose
 from bcppl.geometry.extrusion import extruded
 from bcppl.geometry.parts import Part
 from bcppl.geometry.turns import box_turns
+from bcppl.inference.approximations.gaussian import GaussianApproximation
+from bcppl.inference.approximations.laplace import QuadraticApproximation
 from bcppl.inference.filters import second_search
 from bcppl.inference.filters.guided_smc import by_mode, infer
 from bcppl.inference.filters.smc import Step
@@ -125,20 +127,24 @@ def test_the_fit_of_each_image_has_both_ends() -> None:
     approximation = seen(0).population.approximation
     assert [len(each.fit.means) for each in approximation.fits.values()] == [2, 2]
     assert len(approximation.prior.log_weights) == 2
+    # A fit that had not converged gave one end a share of a thousandth.
+    assert all(float(each.fit.log_weights.min()) > math.log(0.15) for each in approximation.fits.values())
     # How much each has depends on the images' noise, which differs between processors: 0.28 or 0.65.
     assert 0.02 < other_share(seen(0)) < 0.98
 
 
 @pytest.mark.long
-def test_both_ends_are_kept_until_a_touch_decides() -> None:
+def test_both_ends_are_kept_and_the_right_one_is_exact_after_touches() -> None:
     shares = [other_share(seen(seed)) for seed in SEEDS]
-    assert min(shares) > 0.1 and max(shares) < 0.6, shares  # 0.285 with 800 particles
+    assert min(shares) > 0.1 and max(shares) < 0.7, shares  # 0.22 to 0.49 with 800 particles
     for seed in SEEDS:
         vision, scene = seen(seed), world()
         touched = scene.probe(three_two_one(vision.belief, scene.part, scene.peg))
         *_, last = infer(model, touched, seed=seed, start=vision)
-        assert other_share(last) < 1e-6
-        assert 1e3 * last.belief.weighted_add(scene.part.surface_points(), scene.truth) < 0.5
+        # Six contacts fit either end with a pose of its own; the modes' weights differ by two nats.
+        right = last.population[~turned(last.population)]
+        assert 1.0 - other_share(last) > 0.15
+        assert 1e3 * right.belief("part").weighted_add(scene.part.surface_points(), scene.truth) < 0.5
 
 
 # ---------------------------------------------------------------- the prior's box
@@ -215,14 +221,55 @@ def around(center: float) -> object:
 def test_a_population_that_misses_the_mode_is_replaced_by_evidence() -> None:
     exact = float(torch.distributions.Normal(0.0, math.sqrt(1.01)).log_prob(torch.tensor(1.0)))
     astray = torch.full((50,), -3.0).double()
-    lost = weighted_at(astray, torch.full((50,), -800.0).double(), SimpleNamespace(shortfall=lambda _: 790.0))
+    lost = weighted_at(
+        astray,
+        torch.full((50,), -800.0).double(),
+        SimpleNamespace(shortfall=lambda _: 790.0, misses_a_mode=lambda _: False),
+    )
     torch.manual_seed(0)
     other = second_search.searched(lost, around(1.0))
     assert float((other["x"] - 1.0 / 1.01).abs().max()) < 0.5 and len(other) == 50
     # The mean of two estimates, one of them nothing.
     assert other.log_evidence == pytest.approx(exact - math.log(2.0), abs=0.05)
     assert other.approximation is lost.approximation
-    kept = weighted_at(astray, torch.zeros(50).double(), SimpleNamespace(shortfall=lambda _: 11.0))
+    kept = weighted_at(
+        astray,
+        torch.zeros(50).double(),
+        SimpleNamespace(shortfall=lambda _: 11.0, misses_a_mode=lambda _: False),
+    )
     assert bool((second_search.searched(kept, around(-4.0))["x"] == -3.0).all())
-    near = weighted_at(astray, torch.zeros(50).double(), SimpleNamespace(shortfall=lambda _: 2.0))
+    near = weighted_at(
+        astray,
+        torch.zeros(50).double(),
+        SimpleNamespace(shortfall=lambda _: 2.0, misses_a_mode=lambda _: False),
+    )
     assert second_search.searched(near, around(1.0)) is near
+    elsewhere = SimpleNamespace(shortfall=lambda _: 2.0, misses_a_mode=lambda _: True)
+    joined = second_search.searched(weighted_at(astray, torch.zeros(50).double(), elsewhere), around(1.0))
+    assert 0 < int((joined["x"] == -3.0).sum()) < 50, "an estimate of 1 beside one of 0.24 keeps its share"
+
+
+def test_a_mode_without_particles_is_missed_if_it_weighs() -> None:
+    """Two narrow modes, 20 mm apart, and particles at one of them or at both."""
+    places = poses.identity(2)
+    places[1, 0] = 0.02
+    scene = SimpleNamespace(prior=UniformPose(poses.identity(), 0.05, 0.5), sensor=None)
+    scales = torch.tensor([1e-4] * 3 + [1e-3] * 3, dtype=torch.float64)
+    steps = scales * torch.randn(40, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    at_first, at_both = (poses.retract(places[which], steps) for which in ([0] * 40, [0, 1] * 20))
+    for second, pose, missed in (
+        (0.0, at_first, True),
+        (0.0, at_both, False),
+        (-1.0, at_first, True),
+        (-6.0, at_first, False),
+        (4.0, at_first, True),
+    ):
+        modes = QuadraticApproximation(
+            places,
+            torch.zeros(2, 6, dtype=torch.float64),
+            torch.diag(scales**-2).expand(2, 6, 6),
+            torch.tensor([0.0, second], dtype=torch.float64),
+        )
+        approximation = GaussianApproximation("part", scene, quadratic=modes)
+        trace, _ = generate(lambda: pyro.sample("part", scene.prior), (), {}, 40, {"part": pose})
+        assert approximation.misses_a_mode(trace) is missed, (second, missed)

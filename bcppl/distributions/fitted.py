@@ -13,7 +13,7 @@ from torch.distributions import MultivariateNormal
 _WIDTHS = (1.2, 3.0)  # of the normals that are drawn from, in deviations of the draws before
 _SHARES = (0.85, 0.15)
 _LEAST = 0.15  # of the draws: their effective number, which bounds how sharp the density may become
-_ROUNDS = 30  # at most
+_ROUNDS = 80  # at most: of two modes that look alike it may take forty until one is left
 _FASTER = 1.1  # by how much sharper it becomes at least
 _ENOUGH = 0.3  # of the draws: so many effective, and the fit is good
 # Of the images of a fit under near symmetries: nats within which one is followed further, and nats within

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bcppl import poses
 from bcppl.distributions.pose_normals import (
     GaussianMixture,
     PoseFactor,
@@ -43,6 +44,9 @@ from bcppl.inference.targets import PHYSICS, cost_of
 from bcppl.sensors.capabilities import Approximated, Contacts, EntersHole, FitsPose, Linearised, Screens
 
 _MODES, _FAINT = 8, 10.0  # that views leave: at most so many, within so many nats of the most probable
+# A mode that particles miss: of at least this share of all modes' weight, at most so many nats less probable
+# than the best particle, and no particle within so many squared standard deviations.
+_SHARE, _LESS, _APART = 0.05, 5.0, 50.0
 UNSURE = 0.0005  # m: beyond this standard deviation the contact may be with another place of the part
 
 
@@ -233,20 +237,37 @@ class GaussianApproximation:
         """
         if self.quadratic is None:
             return -math.inf
+        best, reached = self._at_modes(), self._at_particles(trace)
+        return float(best.max() - reached.max())
+
+    def misses_a_mode(self, trace: Any) -> bool:
+        """Whether some mode has no particle near it, and is about as probable as the best particle."""
+        if self.quadratic is None:
+            return False
+        mixture = self.mixture
+        away = poses.local(mixture.centers, trace[self.pose][:, None])
+        squared = torch.einsum("nmi,mij,nmj->nm", away, torch.linalg.inv(mixture.covariances), away)
+        alone = (squared > _APART).all(dim=0) & (mixture.log_weights.softmax(dim=0) > _SHARE)
+        if not bool(alone.any()):
+            return False
+        return bool(self._at_modes()[alone].max() > self._at_particles(trace).max() - _LESS)
+
+    def _at_modes(self) -> Tensor:
+        """The log-density (M,) of the modes, given all measurements."""
+        assert self.quadratic is not None
+        return self.quadratic.log_likelihood + self._log_prior(self.quadratic.around)
+
+    def _at_particles(self, trace: Any) -> Tensor:
+        """The same (N,) of a trace's particles."""
         informative = self._informative
         sites = [self.scene.sensor(c.action).address(c.number) for c in informative]
-
-        def log_prior(pose: Tensor) -> Tensor:
-            within = self.scene.prior.log_prob(pose) > -torch.inf
-            return torch.where(within, mixture_of(self.prior).log_prob(pose), -torch.inf)
-
-        best = self.quadratic.log_likelihood + log_prior(self.quadratic.around)
-        reached = log_prior(trace[self.pose])
         cheap = [address for address in sites if cost_of(trace.distributions[address]) < PHYSICS]
-        reached = reached + self.log_likelihood(trace)
-        if cheap:
-            reached = reached + trace.log_prob(*cheap)
-        return float(best.max() - reached.max())
+        reached = self._log_prior(trace[self.pose]) + self.log_likelihood(trace)
+        return reached + trace.log_prob(*cheap) if cheap else reached
+
+    def _log_prior(self, pose: Tensor) -> Tensor:
+        within = self.scene.prior.log_prob(pose) > -torch.inf
+        return torch.where(within, mixture_of(self.prior).log_prob(pose), -torch.inf)
 
     def log_likelihood(self, trace: Any) -> Tensor:
         """Of the informative contacts that run physics in a trace (N,), by what is approximated of them."""

@@ -64,7 +64,7 @@ ENOUGH = 0.1
 MOST, ROOM = 40, 40_000
 # Particles and copies where images leave several modes: of 75 particles 20 stay effective, too few for the
 # modes' shares.
-SEVERAL = 600
+SEVERAL = 1800
 LEAST = 0.03  # of N: where even with so many copies less would be left, the measurement is tempered
 
 

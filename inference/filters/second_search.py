@@ -26,15 +26,18 @@ COPIES = 20  # draws for each particle: the approximation leaves some per cent o
 def searched(population: Population, proposal: Callable[[Any], Callable[..., Any]]) -> Population:
     """The population, or one joined with draws of its approximation where that explains all far better.
 
-    It costs nothing where no particle is far from the best mode, and `COPIES` evaluations of all measurements
-    for each particle elsewhere.
+    So it is where no particle is near a mode that is about as probable: particles that all went to another
+    one, which seemed better when less was measured, do not come back by themselves. It costs nothing where
+    particles are near all modes, and `COPIES` evaluations of all measurements for each particle elsewhere.
 
     Args:
-        population: weighted for all measurements of its trace. Its approximation has a method `shortfall`.
+        population: weighted for all measurements of its trace. Its approximation has methods `shortfall` and
+            `misses_a_mode`.
         proposal: of all latent values, given the approximation.
     """
     approximation = population.approximation
-    if approximation.shortfall(population.trace) < MISSED:
+    trace = population.trace
+    if approximation.shortfall(trace) < MISSED and not approximation.misses_a_mode(trace):
         return population
     return joined_with_draws(population, approximation, proposal)
 
