@@ -231,14 +231,15 @@ class GaussianApproximation:
         return self.mixture.component(trace[self.pose])
 
     def shortfall(self, trace: Any) -> float:
-        """By how many nats the best mode explains all measurements better than the best particle does.
+        """By how many nats the best mode explains all measurements better than the median particle does.
 
-        Where the population is spread over the posterior it is about 1 or less; -inf without contacts.
+        Where the population is spread over the posterior it is about 3, half a chi-square of six degrees of
+        freedom; -inf without contacts.
         """
         if self.quadratic is None:
             return -math.inf
         best, reached = self._at_modes(), self._at_particles(trace)
-        return float(best.max() - reached.max())
+        return float(best.max() - reached.median())
 
     def misses_a_mode(self, trace: Any) -> bool:
         """Whether some mode has no particle near it, and is about as probable as the best particle."""
