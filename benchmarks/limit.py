@@ -42,9 +42,9 @@ class Spent(NamedTuple):
 
 
 def explained(recording: Recording, **settings: Any) -> tuple[float, Any]:
-    """Seconds of the default inference, and the scene that it was given."""
-    prepared = model.prepare(recording, **settings)
+    """Seconds of preparation and of the default inference, and the scene that it was given."""
     begun = time.perf_counter()
+    prepared = model.prepare(recording, **settings)
     for _ in default_run(recording, PARTICLES, 0, scene=prepared):
         pass
     return time.perf_counter() - begun, prepared
