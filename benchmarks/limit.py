@@ -23,6 +23,7 @@ from scenes import PARTICLES, default_run
 
 from bcppl import poses
 from bcppl.distributions.episodes import filtered as episodes
+from bcppl.effort import Effort
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
@@ -41,13 +42,15 @@ class Spent(NamedTuple):
     least: float
 
 
-def explained(recording: Recording, **settings: Any) -> tuple[float, Any]:
-    """Seconds of preparation and of the default inference, and the scene that it was given."""
-    begun = time.perf_counter()
+def explained(recording: Recording, **settings: Any) -> tuple[float, Any, dict[str, Effort]]:
+    """Seconds of the default inference, the scene that it was given, and its simulators' efforts."""
     prepared = model.prepare(recording, **settings)
+    before = {name: effort.copy() for name, effort in prepared.efforts.items()}
+    begun = time.perf_counter()
     for _ in default_run(recording, PARTICLES, 0, scene=prepared):
         pass
-    return time.perf_counter() - begun, prepared
+    seconds = time.perf_counter() - begun
+    return seconds, prepared, {n: effort.since(before[n]) for n, effort in prepared.efforts.items()}
 
 
 def best(work: Callable[[], Any]) -> float:
@@ -60,10 +63,10 @@ def best(work: Callable[[], Any]) -> float:
     return min(seconds)
 
 
-def rays(scene: BenchScene, recording: Recording, prepared: Any) -> Spent:
+def rays(scene: BenchScene, recording: Recording, spent: Effort) -> Spent:
     """Rays within the part's outline, of a run that casts them, and Embree's own time for as many."""
-    _, casting = explained(recording, renderer=RayCaster)
-    count = casting.likelihoods["view"].efforts["rendering"].amount
+    _, casting, efforts = explained(recording, renderer=RayCaster)
+    count = efforts["rendering"].amount
     part = scene.part
     embree = EmbreeScene(robust=True)
     TriangleMesh(embree, np.ascontiguousarray(part.vertices[part.faces], dtype=np.float32))
@@ -77,12 +80,11 @@ def rays(scene: BenchScene, recording: Recording, prepared: Any) -> Spent:
     chosen = np.resize(np.flatnonzero(hit), RAYS)
     batch = origins[chosen], directions[chosen]
     second = RAYS / best(lambda: embree.run(*batch, query="DISTANCE"))
-    return Spent(count, prepared.likelihoods["view"].efforts["rendering"].seconds, count / second)
+    return Spent(count, spent.seconds, count / second)
 
 
-def gaps(scene: BenchScene, recording: Recording, prepared: Any) -> Spent:
+def gaps(scene: BenchScene, recording: Recording, prepared: Any, spent: Effort) -> Spent:
     """Pairs of poses whose gap is measured, and the kernel's own time for as many."""
-    effort = prepared.likelihoods["window"].efforts["gap"]
     measured = prepared.likelihoods["window"].gap
     touched = [m.observation.world_from_peg for m in recording.measurements if hasattr(m.action, "probe")]
     peg = torch.from_numpy(np.concatenate(touched)[::5].copy())
@@ -90,12 +92,11 @@ def gaps(scene: BenchScene, recording: Recording, prepared: Any) -> Spent:
     spread = torch.tensor([3e-4] * 3 + [3e-3] * 3, dtype=torch.float64)
     step = spread * torch.randn(500, 6, dtype=torch.float64, generator=generator)
     part = poses.retract(torch.from_numpy(scene.truth), step)
-    amount, seconds = effort.items, effort.seconds
     second = len(part) * len(peg) / best(lambda: measured(part, peg))
-    return Spent(amount, seconds, amount / second)
+    return Spent(spent.items, spent.seconds, spent.items / second)
 
 
-def episodes_of(recording: Recording, **settings: Any) -> tuple[float, Any, Spent]:
+def episodes_of(recording: Recording, **settings: Any) -> tuple[float, Any, dict[str, Effort], Spent]:
     """A run in which the filter's calls are noted, and the time of these calls alone."""
     calls, spent, kernel = list[tuple[Any, ...]](), list[float](), episodes.filtered
 
@@ -108,12 +109,12 @@ def episodes_of(recording: Recording, **settings: Any) -> tuple[float, Any, Spen
 
     episodes.filtered = noted  # type: ignore[assignment]
     try:
-        seconds, prepared = explained(recording, **settings)
+        seconds, prepared, efforts = explained(recording, **settings)
     finally:
         episodes.filtered = kernel
     rows = sum(len(arguments[0].number) * len(arguments[4]) for arguments in calls)
     least = best(lambda: [kernel(*arguments) for arguments in calls])
-    return seconds, prepared, Spent(rows, sum(spent), least)
+    return seconds, prepared, efforts, Spent(rows, sum(spent), least)
 
 
 def main() -> None:
@@ -129,10 +130,10 @@ def main() -> None:
         *_, seen = default_run(scene.look(), PARTICLES, seed)
         recording = scene.probe(three_two_one(seen.belief, scene.part, scene.peg))
         explained(recording, profile=arguments.profile)  # compiles and loads what is compiled
-        whole, prepared, filter_ = episodes_of(recording, profile=arguments.profile)
+        whole, prepared, efforts, filter_ = episodes_of(recording, profile=arguments.profile)
         kernels = {
-            "rays": rays(scene, recording, prepared),
-            "gaps": gaps(scene, recording, prepared),
+            "rays": rays(scene, recording, efforts["rendering"]),
+            "gaps": gaps(scene, recording, prepared, efforts["gap"]),
             "rows of the filter": filter_,
         }
         least = sum(one.least for one in kernels.values())
