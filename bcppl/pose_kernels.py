@@ -28,14 +28,13 @@ def fused(kernel: Kernel, first: Tensor, second: Tensor, *shape: int) -> Tensor 
         return None
     if first.dtype is not torch.float64 or second.dtype is not torch.float64:
         return None
-    batch, other = first.shape[:-1], second.shape[:-1]
-    if batch != other:
-        ones, others = batch.numel() == 1, other.numel() == 1
-        if ones and len(batch) <= len(other):
-            batch = other
-        elif not (others and len(other) <= len(batch)):
-            batch = torch.broadcast_shapes(batch, other)
-            first, second = first.expand(*batch, first.shape[-1]), second.expand(*batch, second.shape[-1])
+    batch = first.shape[:-1]
+    if batch != second.shape[:-1]:
+        batch = torch.broadcast_shapes(batch, second.shape[:-1])
+        first, second = (
+            each if each.shape[:-1].numel() == 1 else each.expand(*batch, each.shape[-1])
+            for each in (first, second)
+        )
     own, rest = first.numpy().reshape(-1, first.shape[-1]), second.numpy().reshape(-1, second.shape[-1])
     result = np.empty((max(len(own), len(rest)), *shape)) if batch.numel() else np.empty((0, *shape))
     kernel(own, rest, result)

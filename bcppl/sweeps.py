@@ -16,7 +16,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
@@ -68,17 +68,22 @@ def swept(
 
     Raises:
         InputError: the file holds something else, or the share is none.
-        InferenceError: cells have failed.
+        InferenceError: (from the iterator) cells have failed.
     """
     number, shares = share
     if not 1 <= number <= shares:
         raise InputError(f"share {number} of {shares} does not exist; give one from 1 of {shares}.")
     mine = {key_of(cell): cell for cell in list(cells)[number - 1 :: shares]}
-    known = {} if file is None else kept(file)
+    return _each(partial(_evaluated, function, file), mine, {} if file is None else kept(file), jobs)
+
+
+def _each(
+    work: Callable[[Any], Any], mine: Mapping[str, Cell], known: Mapping[str, Any], jobs: int
+) -> Iterator[tuple[Cell, Any]]:
     missing = [cell for key, cell in mine.items() if key not in known]
     yield from ((cell, known[key]) for key, cell in mine.items() if key in known)
     failed: list[tuple[Cell, Failure]] = []
-    for cell, result in as_they_end(partial(_evaluated, function, file), missing, jobs):
+    for cell, result in as_they_end(work, missing, jobs):
         if isinstance(result, Failure):
             failed.append((cell, result))
         else:
@@ -149,7 +154,7 @@ def kept(file: Path) -> dict[str, Any]:
         try:
             cell, result = json.loads(line)
         except (ValueError, TypeError) as error:
-            if not line.endswith("\n") or line.startswith("\0"):
+            if not line.endswith("\n"):
                 continue
             raise InputError(
                 f"line {number} of {file} is no result of a sweep ({error}); remove it, or give another file."

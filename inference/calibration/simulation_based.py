@@ -57,8 +57,7 @@ def calibrate(
         posterior_draws: L, among which each truth is ranked. They are resampled from the weighted particles,
             of which there should be at least twice as many; copies of one particle are too alike, and show.
         seed: of all; torch's own generator is left as it was. More draws continue the same ones.
-        processes: above 1, rounds are distributed over fresh processes. Then `joint` and `inference` must be
-            importable there, and a script must keep its own work behind `if __name__ == "__main__":`.
+        processes: above 1, rounds are distributed over so many others, of one thread each.
         folder: each round is kept in a file there; a call that was interrupted, or is to have more draws,
             goes on from them. The first of them is made again, to see that it is of this inference.
 

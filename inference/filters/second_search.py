@@ -19,9 +19,7 @@ from bcppl.inference.importance import importance_sampling
 from bcppl.inference.population import Population
 from bcppl.inference.targets import runs_physics
 
-MISSED = (
-    10.0  # nats by which a mode is better than half of the particles: in six dimensions the median lacks 3
-)
+MISSED = 10.0  # nats by which a mode is better than half of the particles: in six dimensions 3 is usual
 COPIES = 20  # draws for each particle: the approximation leaves some per cent of them effective
 
 
@@ -37,8 +35,7 @@ def searched(population: Population, proposal: Callable[[Any], Callable[..., Any
             `misses_a_mode`.
         proposal: of all latent values, given the approximation.
     """
-    approximation = population.approximation
-    trace = population.trace
+    approximation, trace = population.approximation, population.trace
     if approximation.shortfall(trace) < MISSED and not approximation.misses_a_mode(trace):
         return population
     return joined_with_draws(population, approximation, proposal)
