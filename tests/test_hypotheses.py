@@ -22,6 +22,8 @@ from bcppl.inference.criticism.hypotheses import alternatives, displaced, edges,
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded
 from bcppl.models.worlds.bench.scene import bench_scene
+from bcppl.rendering.part_renderer import PartRenderer
+from bcppl.rendering.rasterisation import Rasteriser
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import generate
 from tests.made_recordings import assert_one_sentence
@@ -50,12 +52,14 @@ def seen(part: Part = SCENE.part) -> Tensor:
     return torch.from_numpy(np.where(np.isfinite(rendered), rendered + noise, np.nan))
 
 
-def belief(prior: Any, middle: Tensor, part: Part = SCENE.part) -> Population:
+def belief(
+    prior: Any, middle: Tensor, part: Part = SCENE.part, renderer: type[PartRenderer] = RayCaster
+) -> Population:
     """Particles within tenths of a millimetre of a pose, clamped to nothing: all have the same weight."""
 
     def program() -> None:
         pose = pyro.sample("part", prior)
-        site = RobustDepth(RayCaster(part), SCENE.cameras[0], pose, 0.002, effective_pixels=300.0)
+        site = RobustDepth(renderer(part), SCENE.cameras[0], pose, 0.002, effective_pixels=300.0)
         pyro.sample("depth", site)
 
     torch.manual_seed(0)
@@ -126,12 +130,16 @@ def other(linear: np.ndarray) -> Part:
     return replace(SCENE.part, vertices=mapped, faces=faces, pieces=())
 
 
-def test_a_mirrored_part_and_a_turned_one_are_named_and_the_right_one_is_not() -> None:
+@pytest.mark.parametrize("renderer", [RayCaster, Rasteriser])
+def test_a_mirrored_part_and_a_turned_one_are_named_and_the_right_one_is_not(
+    renderer: type[PartRenderer],
+) -> None:
     prior = UniformPose(TRUTH, 0.02, 0.3)
-    assert alternatives(belief(prior, TRUTH)) == []
-    mirrored = alternatives(belief(prior, TRUTH, other(np.diag([-1.0, 1.0, 1.0]))))
+    assert alternatives(belief(prior, TRUTH, renderer=renderer)) == []
+    mirrored = alternatives(belief(prior, TRUTH, other(np.diag([-1.0, 1.0, 1.0])), renderer))
     assert "mirrored along x" in likeliest(mirrored) and mirrored[0].gain > 20.0
-    turned = alternatives(belief(prior, TRUTH, other(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]))))
+    quarter = other(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]))
+    turned = alternatives(belief(prior, TRUTH, quarter, renderer))
     assert "turned by -90° about its z" in likeliest(turned) and turned[0].gain > 20.0
 
 

@@ -27,7 +27,7 @@ from bcppl.distributions.poses import SwingTwistPose, UniformPose
 from bcppl.distributions.poses.uniform import tilt_and_yaw
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded, systematic
-from bcppl.rendering.ray_casting import RayCaster
+from bcppl.rendering.part_renderer import PartRenderer
 from bcppl.traces import Trace
 from bcppl.traces.series import SeriesTrace
 
@@ -163,20 +163,21 @@ def alternatives(population: Population, particles: int = PARTICLES) -> list[Alt
     with seeded(0):
         few = _drawn(population, particles)
     sites = [(few.distributions[address], few[address]) for address in _images(few)]
-    images = [(site, image) for site, image in sites if type(site.renderer) is RayCaster]
-    parts = {id(site.renderer.part): site.renderer.part for site, _ in images}
+    images = [(site, image) for site, image in sites if isinstance(site.renderer, PartRenderer)]
+    parts = {id(site.renderer.part): site.renderer for site, _ in images}
     if len(parts) != 1:
         return []
     believed = torch.stack([site.log_prob(image) for site, image in images]).sum(dim=0)
-    (part,) = parts.values()
+    (stated,) = parts.values()
+    part = stated.part
     middle = 0.5 * (part.vertices.min(axis=0) + part.vertices.max(axis=0))
     results = []
     for name, other, turn in _hypotheses(part, middle):
-        renderer = None if other is None else RayCaster(other)
+        renderer = None if other is None else type(stated)(other)
         log_likelihood: Any = 0.0
         for site, image in images:
             pose = poses.compose(site.pose, turn)
-            there = replace(site, pose=pose, renderer=site.renderer if renderer is None else renderer)
+            there = replace(site, pose=pose, renderer=renderer or site.renderer)
             log_likelihood = log_likelihood + there.log_prob(image)
         results.append(Alternative(name, float(log_likelihood.max() - believed.max())))
     return sorted((r for r in results if r.gain > VERY_STRONG), key=lambda each: -each.gain)
