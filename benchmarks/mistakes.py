@@ -4,7 +4,10 @@ A scene of the accuracy bench is seen and touched by a probe that rocks (`ROCKED
 to state something wrong, is run by the default inference, and both what the run warns of and the hypotheses
 that explain its touches (`bcppl.inference.criticism.explanations`) are noted. A mistake is named if a warning
 has its words, or one of the first two hypotheses. Each mistake is made by code of its own, not by the one
-of the hypothesis. With `--file` results are written as they are done, and a later call adds the missing ones.
+of the hypothesis. Beside it stands how much more probable touches are without the mistake: no test of them
+names a mistake that explains them no better than what is stated does, as where a peg that touches every face
+from one side alone may as well be thinner as off in the hand. With `--file` results are written as they are
+done, and a later call adds the missing ones.
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ from bcppl.cli.predictive_checks import PredictiveChecks
 from bcppl.errors import InputError
 from bcppl.geometry.turns import turns_freely
 from bcppl.inference.criticism import explanations
+from bcppl.inference.criticism.hypotheses import VERY_STRONG
+from bcppl.inference.criticism.rival_hypotheses import approximated, log_evidence
 from bcppl.inference.planning.metrology import ROCKED, three_two_one
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench.scene import bench_scene
@@ -34,6 +39,7 @@ from bcppl.sensors.likelihoods.bench_profiles import PROFILES
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.probe import ProbeWindow, Touch
 from bcppl.sweeps import in_order, keep, kept, key_of, one_line
+from bcppl.traces import Model
 
 GOOD = "none"
 NAMED, WARNED, SILENT = 0.9, 0.98, 0.03  # shares of the scenes: of mistakes, of mistakes, of good scenes
@@ -126,11 +132,19 @@ MISTAKES: dict[str, Mistake] = {
 
 
 class Outcome(NamedTuple):
-    """What came of a run: its warnings, the hypotheses by gain, and the error in position, mm."""
+    """What came of a run.
+
+    Attributes:
+        warnings: of the run.
+        hypotheses: that explain its touches, the best first.
+        error: in position, mm.
+        tells: the log Bayes factor of touches without the mistake to those with it, nats.
+    """
 
     warnings: list[str]
     hypotheses: list[str]
     error: float
+    tells: float
 
     def names(self, words: tuple[str, ...]) -> bool:
         """Whether the words are in a warning or in one of the first two hypotheses."""
@@ -147,34 +161,34 @@ def outcomes(seed: int, profile: str, names: tuple[str, ...], file: Path | None)
         scene = bench_scene(seed)
         *_, seen = default_run(scene.look(), PARTICLES, seed)
         good = scene.probe(three_two_one(seen.belief, scene.part, scene.peg, ROCKED))
+        profiled = model.with_settings(profile=profile)
+        right = log_evidence(approximated(profiled, good))
         for name in missing:
-            known[name] = [outcome(good, name, seed, profile)]
+            known[name] = [outcome(good, name, seed, profiled, right)]
             if file is not None:
                 keep(file, keys[name], known[name])
     return {name: Outcome(*one[0]) for name, one in known.items() if one[0]}
 
 
-def outcome(good: Recording, name: str, seed: int, profile: str) -> Outcome | None:
-    """The outcome of one recording with a mistake."""
+def outcome(good: Recording, name: str, seed: int, profiled: Model, right: float) -> Outcome | None:
+    """The outcome of one recording with a mistake; without it its touches have the log evidence `right`."""
     try:
         recording = good if name == GOOD else MISTAKES[name].made(good)
-    except InputError as error:
-        print(f"{name}, seed {seed}: {one_line(error)}", flush=True)
+    except InputError as refused:
+        print(f"{name}, seed {seed}: {one_line(refused)}", flush=True)
         return None
     if symmetric(good, recording):
         return None
     checks = PredictiveChecks()
-    profiled = model.with_settings(profile=profile)
     for step in default_run(recording, PARTICLES, seed, scene=profiled.prepare(recording)):
         checks.cell(step)
     error = 1e3 * float((step.belief.mean[:3] - torch.as_tensor(good.truth)[:3]).norm())
     ranked = explanations(profiled, recording)
     hypotheses = [f"{one.hypothesis} ({one.gain:.0f} nats)" for one in ranked]
-    result = Outcome(checks.warnings(step, model.pose), hypotheses, error)
-    print(
-        f"{name}, seed {seed}: {error:.2f} mm; {hypotheses[:2]}; {len(result.warnings)} warnings",
-        flush=True,
-    )
+    tells = right - log_evidence(approximated(profiled, recording))
+    result = Outcome(checks.warnings(step, model.pose), hypotheses, error, tells)
+    of_it = f"{error:.2f} mm, {tells:.0f} nats to tell it, {len(result.warnings)} warnings"
+    print(f"{name}, seed {seed}: {of_it}; {hypotheses[:2]}", flush=True)
     return result
 
 
@@ -201,14 +215,18 @@ def main() -> None:
         if name == GOOD:
             rows.append(Row("no mistake: warned of", warned, count, SILENT, "max"))
         else:
-            named = float(np.mean([one.names(MISTAKES[name].words) for one in several]))
-            rows.append(Row(f"{name}: named", named, count, NAMED, "min"))
+            names_it = [one.names(MISTAKES[name].words) for one in several]
+            rows.append(Row(f"{name}: named", float(np.mean(names_it)), count, NAMED, "min"))
+            told = [named for named, one in zip(names_it, several, strict=True) if one.tells > VERY_STRONG]
+            if told:
+                share = float(np.mean(told))
+                rows.append(Row(f"{name}: named where touches tell", share, f"of {len(told)}", NAMED, "min"))
             rows.append(Row(f"{name}: warned of", warned, count, WARNED, "min"))
         lines += [
-            [name, k, one.error, len(one.warnings), " | ".join(one.hypotheses[:2])[:120]]
+            [name, k, one.error, one.tells, len(one.warnings), " | ".join(one.hypotheses[:2])[:120]]
             for k, one in enumerate(several)
         ]
-    show("mistakes", ["mistake", "scene", "off mm", "warnings", "hypotheses"], lines)
+    show("mistakes", ["mistake", "scene", "off mm", "tells nats", "warnings", "hypotheses"], lines)
     finish(rows, arguments.json)
 
 
