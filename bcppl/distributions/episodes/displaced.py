@@ -71,7 +71,7 @@ def lines_about(gap: MeasuresGap, pose: Tensor, rows: Tensor, bench: LinearError
     is linear about what the errors seem to be, not about none.
     """
     late, effect = bench.late_effects(rows)
-    twist = torch.einsum("ram,nm->nra", bench.effect(rows).twist, errors)
+    twist = torch.einsum("ram,nm->nra", bench.effect_again(rows).twist, errors)
     turn = poses.rotation_matrix(rows[:, :7])
     moved = torch.einsum("rab,nrb->nra", turn, twist[..., :3])
     peg = rows[:, :7].expand(len(pose), len(rows), 7)

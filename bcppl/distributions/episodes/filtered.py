@@ -83,7 +83,7 @@ class FilteredEpisodes(PredictedEpisodes):
         if not self.bench.errors or not len(rows):
             return known
         errors = mean_of(known.branches)
-        turned = self.bench.effect(rows).twist[:, 3:] @ (errors - known.about).T  # (R, 3, N)
+        turned = self.bench.effect_again(rows).twist[:, 3:] @ (errors - known.about).T  # (R, 3, N)
         far = (turned.abs().amax(dim=(0, 1)) > _TURNED).nonzero()[:, 0]
         if not len(far):
             return known

@@ -151,12 +151,21 @@ class LinearErrors:
         each = [none, *(error.effect(rows) for error in self.errors)]
         return Effect(torch.cat([e.twist for e in each], dim=2), torch.cat([e.offset for e in each], dim=1))
 
+    def effect_again(self, rows: Tensor) -> Effect:
+        """The same, remembered: for rows that many parts are compared at."""
+        return _effect(self, rows.numpy().tobytes())
+
     def late_effects(self, rows: Tensor) -> tuple[Tensor, Effect]:
         """Twists (D, R, 6) of the peg by each delay at rows (R, COLUMNS), and effects (D, R, ...) there."""
         return _late_effects(self, rows.numpy().tobytes())
 
 
 # The same rows are evaluated at many poses of the part.
+@lru_cache(maxsize=64)
+def _effect(bench: LinearErrors, rows: bytes) -> Effect:
+    return bench.effect(torch.frombuffer(bytearray(rows), dtype=torch.float64).view(-1, COLUMNS))
+
+
 @lru_cache(maxsize=256)
 def _late_effects(bench: LinearErrors, rows: bytes) -> tuple[Tensor, Effect]:
     given = torch.frombuffer(bytearray(rows), dtype=torch.float64).view(-1, COLUMNS)
