@@ -316,7 +316,7 @@ def main() -> None:
             print(f"skipped: the scene is not at {clutter.SCENE}.")
     if arguments.only in (None, "xarm"):
         if arm.XARM.is_dir():
-            rows += arm.seen(seeds, {})
+            rows += [row for masked in (False, True) for row in arm.seen(seeds, {}, masked)]
         else:
             print(f"skipped: the xArm's frames are not at {arm.XARM}.")
     if rows:
