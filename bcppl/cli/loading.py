@@ -42,12 +42,16 @@ def recording(name: str) -> Recording:
 
 def model(given: str | None, named: str = "", by: str = "the recording") -> Model:
     """The model that the command line gives (a name, or a file), else the installed one that data names."""
+    return _defined(_trusted(given, named, by, MODEL, "--model"), MODEL)
+
+
+def _trusted(given: str | None, named: str, by: str, word: str, option: str) -> str:
     if given is None and _is_file(named):
         raise InputError(
-            f"{by} names the file {named!r} as its model, and data never runs code; "
-            "if you trust the file, give it with --model."
+            f"{by} names the file {named!r} as its {word}, and data never runs code; "
+            f"if you trust the file, give it with {option}."
         )
-    return _defined(named if given is None else given, MODEL)
+    return named if given is None else given
 
 
 def settings(given: Sequence[str]) -> dict[str, Any]:
@@ -78,10 +82,14 @@ def with_settings(model: Model, settings: Mapping[str, Any], name: str) -> Model
     return model.with_settings(**settings)
 
 
-def inference(given: str | None, chosen: Model) -> tuple[str, Infer]:
-    """The name and the `infer` of an inference program; of the model's own with the model's settings."""
+def inference(given: str | None, chosen: Model, named: str = "", by: str = "the run") -> tuple[str, Infer]:
+    """The name and the `infer` of an inference program; of the model's own with the model's settings.
+
+    The command line gives a name or a file; else it is an installed one that data names, or the model's.
+    """
     name, own = default_inference(chosen)
-    if given is None or given == name:
+    given = _trusted(given, named, by, INFERENCE, "--inference")
+    if given in ("", name):
         return name, own
     infer = _defined(given, INFERENCE)
     try:
@@ -92,6 +100,17 @@ def inference(given: str | None, chosen: Model) -> tuple[str, Infer]:
             "define it as infer(model, recording, *, particles=75, seed=0, scene=None)."
         ) from error
     return given, infer
+
+
+def resuming(infer: Infer, name: str) -> Infer:
+    """An inference program that goes on from a step; InputError where it does not."""
+    try:
+        inspect.signature(infer).bind(None, None, particles=2, seed=0, scene=None, start=None)
+    except TypeError as error:
+        raise InputError(
+            f"{name} cannot go on with a run, its `infer` takes no `start`; run the recording again."
+        ) from error
+    return infer
 
 
 def simulating() -> list[str]:

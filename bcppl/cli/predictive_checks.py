@@ -65,6 +65,16 @@ class PredictiveChecks:
     jump: MeanJump | None = None
     before: Belief | None = None
 
+    @classmethod
+    def resumed(
+        cls, labels: Mapping[str, str], history: Sequence[tuple[str, Belief]], sites: Collection[str]
+    ) -> PredictiveChecks:
+        """The checks of a run that was stopped: `labels` as they were, for the addresses that there are."""
+        checks = cls({address: labels[address] for address in sites if address in labels})
+        for label, belief in history:
+            checks.compare(belief, label)
+        return checks
+
     def cell(self, step: Any) -> str:
         """The p value of a step's measurement, marked where it is small; empty where there is none."""
         population = getattr(step, "population", None)

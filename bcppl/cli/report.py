@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -45,13 +46,22 @@ class Report:
         self.recording = recording
         self.model = model
         self.steps: list[Any] = []
-        self._checks = PredictiveChecks()
+        self.rows = 0
+        self.checks = PredictiveChecks()
+
+    def resume(self, step: Any, rows: Sequence[Mapping[str, str]], checks: PredictiveChecks) -> None:
+        """Print the rows of a run that was stopped after a step, which it goes on from."""
+        self.steps, self.rows, self.checks = [step], len(rows), checks
+        self._print_row({name: name for name in WIDTHS}, style="bold")
+        for row in rows:
+            self._print_row(row)
 
     def row(self, step: Any) -> dict[str, str]:
         """Print a step's row, and give its cells by column."""
-        if not self.steps:
+        if not self.rows:
             self._print_row({name: name for name in WIDTHS}, style="bold")
         self.steps.append(step)
+        self.rows += 1
         info, add = step.info, math.nan
         if self.recording.truth is not None:
             add = 1e3 * step.belief.weighted_add(self.recording.part.surface_points(), self.recording.truth)
@@ -66,7 +76,7 @@ class Report:
             str(len(info.exponents) or ""),
             _number(add, 2),
             _number(info.truth_gap, 2),
-            self._checks.cell(step),
+            self.checks.cell(step),
             _number(simulated, 0),
             _number(info.seconds, 2),
         ]
@@ -74,19 +84,23 @@ class Report:
         self._print_row(row)
         return row
 
-    def _print_row(self, row: dict[str, str], style: str | None = None) -> None:
+    def _print_row(self, row: Mapping[str, str], style: str | None = None) -> None:
         first, *others = (row[name].rjust(width) for name, width in WIDTHS.items())
         line = " ".join([first.strip().ljust(WIDTHS["measurement"]), *others])
         self.console.print(line, style=style, soft_wrap=True, markup=False)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all measurements were assimilated."""
+        return self.rows > len(self.recording.measurements)
 
     def finish(self) -> list[str]:
         """Print the posterior after the last step, and the warnings, which it gives back."""
         last, sites = self.steps[-1], latent_sites.summarised(self.steps[-1])
         total = len(self.recording.measurements)
-        if len(self.steps) <= total:
+        if not self.is_complete:
             self._warn(
-                f"stopped after {last.info.label}: {len(self.steps) - 1} of {total} measurements were "
-                "assimilated."
+                f"stopped after {last.info.label}: {self.rows - 1} of {total} measurements were assimilated."
             )
         self.console.print(self._pose(last.belief))
         others = latent_sites.table(sites, self.model.pose)
@@ -98,7 +112,7 @@ class Report:
                 f"the particles missed the truth, which scores {gap:.0f} nats better than the best of them: "
                 "try more particles or another seed."
             )
-        warnings = [*self._checks.warnings(last, self.model.pose), *piece_errors(self.recording)]
+        warnings = [*self.checks.warnings(last, self.model.pose), *piece_errors(self.recording)]
         for warning in warnings:
             self._warn(warning)
         self._note(self._effort())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,10 +15,14 @@ if TYPE_CHECKING:
     from bcppl.recordings import Recording
 
 FEWEST = 20  # particles, below which a run warns
+OF_THE_RUN = ("particles", "seed", "out", "set_")  # what a run that is resumed has from its folder
 
 
 def run(
-    recording: Annotated[str, typer.Argument(help="A recording (.h5), or the name of a shipped one.")],
+    context: typer.Context,
+    recording: Annotated[
+        str | None, typer.Argument(help="A recording (.h5), or the name of a shipped one.")
+    ] = None,
     model: Annotated[
         str | None, typer.Option(help="A model's name or file; by default the one the recording names.")
     ] = None,
@@ -32,38 +36,50 @@ def run(
     ] = 0,
     out: Annotated[
         Path | None,
-        typer.Option(file_okay=False, help="Folder for beliefs and figures; runs/RECORDING by default."),
+        typer.Option(
+            file_okay=False,
+            help="Folder for beliefs and figures; runs/RECORDING by default, or the next one that is free.",
+        ),
     ] = None,
     set_: Settings = None,
     explain: Annotated[
         bool,
         typer.Option(help="Compare by evidence what could be wrong with the touches; takes about a minute."),
     ] = False,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            file_okay=False, help="The folder of a run that was stopped: go on with it, to the same bits."
+        ),
+    ] = None,
 ) -> None:
     """Estimate the part's pose: a row per measurement, the posterior, and a folder of beliefs and figures."""
     from rich.console import Console
 
     from bcppl.cli import loading
+    from bcppl.cli.predictive_checks import PredictiveChecks
     from bcppl.cli.report import Report
-    from bcppl.cli.run_folder import RunFolder
+    from bcppl.cli.run_folder import STEP, RunFolder, beside, read_record
     from bcppl.inference.progress import sole_bar
+    from bcppl.inference.saved import load_step
 
+    record: dict[str, Any] = {}
+    if resume is not None:
+        record = read_record(resume)
+        given = [name for name in OF_THE_RUN if _is_given(context, name)]
+        if given:
+            option = given[0].strip("_")
+            raise InputError(
+                f"--{option} is that of the run in {resume}; leave it out, or begin another run."
+            )
+        recording, particles, seed = recording or record["recording"], record["particles"], record["seed"]
+    if recording is None:
+        raise InputError("there is nothing to run; give a recording, or the folder of a run by --resume.")
     measured = loading.recording(recording)
-    given = loading.settings(set_ or [])
-    chosen = loading.with_settings(loading.model(model, measured.model), given, model or measured.model)
-    inference, infer = loading.inference(inference, chosen)
-    path = out or Path("runs") / Path(recording).stem
-    blocked = next((p for p in (path, *path.parents) if p.exists() and not p.is_dir()), None)
-    if blocked is not None:
-        raise InputError(f"--out {path} cannot be made, {blocked} is a file; give a folder.")
-    settings = {
-        "recording": recording,
-        "model": model or measured.model,
-        "inference": inference,
-        "particles": particles,
-        "seed": seed,
-        "settings": given,
-    }
+    settings = record.get("settings") or loading.settings(set_ or [])
+    named, by = record.get("model", measured.model), f"the run in {resume}" if record else "the recording"
+    chosen = loading.with_settings(loading.model(model, named, by), settings, model or named)
+    inference, infer = loading.inference(inference, chosen, record.get("inference", ""), by)
     scene = chosen.prepare(measured)
     chosen.observe(scene, measured.measurements)  # refuses what cannot be read before anything is written
     console = Console(highlight=False)
@@ -73,20 +89,50 @@ def run(
             "75 is a good start.",
             style="yellow",
         )
-    report, folder = Report(console, measured, chosen), RunFolder(path, measured, settings)
+    report, options = (
+        Report(console, measured, chosen),
+        {"particles": particles, "seed": seed, "scene": scene},
+    )
+    if resume is not None and (resume / STEP).exists():
+        infer = loading.resuming(infer, inference)
+        start = options["start"] = load_step(resume / STEP, chosen, measured, scene)
+        folder = RunFolder.resumed(resume, record, measured, start.taken)
+        sites = start.population.trace.addresses
+        checks = PredictiveChecks.resumed(record["checked"], folder.history, sites)
+        report.resume(start, folder.rows, checks)
+    else:
+        path = resume or out or beside(Path("runs") / Path(recording).stem)
+        folder = RunFolder(
+            path,
+            measured,
+            {
+                "recording": recording,
+                "model": model or named,
+                "inference": inference,
+                "particles": particles,
+                "seed": seed,
+                "settings": settings,
+            },
+        )
     try:
         with sole_bar(console) as progress:
-            task = progress.add_task("prior", total=len(measured.measurements))
-            steps = infer(chosen, measured, particles=particles, seed=seed, scene=scene)
-            for count, step in enumerate(steps):
-                folder.add(step, report.row(step))
-                progress.update(task, completed=count, description=next_label(measured, count + 1))
+            total = len(measured.measurements)
+            task = progress.add_task(next_label(measured, report.rows), total=total, completed=report.rows)
+            for step in infer(chosen, measured, **options):
+                folder.add(step, report.row(step), report.checks.labels)
+                progress.update(
+                    task, completed=report.rows - 1, description=next_label(measured, report.rows)
+                )
     finally:
         # Whatever stopped the run, what was computed is shown and kept.
         if report.steps:
-            folder.note(warnings=report.finish(), relative_to_peg=report.relative_deviations())
-            folder.draw(report.steps)
-            console.print(f"beliefs and figures are in {path}")
+            folder.note(
+                warnings=report.finish(),
+                relative_to_peg=report.relative_deviations(),
+                complete=report.is_complete,
+            )
+            folder.draw()
+            console.print(f"beliefs and figures are in {folder.path}")
     if explain:
         folder.note(explanations=[each._asdict() for each in report.explain()])
 
@@ -95,3 +141,8 @@ def next_label(recording: Recording, count: int) -> str:
     """The label of the measurement that is assimilated after so many steps, as the table names it."""
     last = min(count, len(recording.measurements))
     return f"{recording.measurements[last - 1].kind} {last}"
+
+
+def _is_given(context: typer.Context, name: str) -> bool:
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"

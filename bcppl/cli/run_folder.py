@@ -1,48 +1,85 @@
-"""The folder of a run: a belief after each measurement, run.json, and two figures."""
+"""The folder of a run: a belief after each measurement, the newest step, run.json, and two figures."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bcppl.beliefs import Belief
 from bcppl.cli import latent_sites
+from bcppl.errors import InputError
+from bcppl.inference.filters.smc import Step
+from bcppl.inference.population import Population
+from bcppl.inference.saved import save_step
 from bcppl.recordings import Recording
-from bcppl.recordings.beliefs import save_belief
+from bcppl.recordings.beliefs import load_belief, load_label, save_belief
 from bcppl.recordings.file import replacing
 from bcppl.recordings.fingerprint import fingerprint
 from bcppl.sensors import sensor_of
 
+RECORD, STEP = "run.json", "step.h5"
+
 
 class RunFolder:
-    """Holds what a run has computed so far, whenever it is stopped; an earlier run's files are removed.
+    """Holds what a run has computed so far, whenever it is stopped.
 
     Args:
-        path: of the folder, made with the first step.
+        path: of the folder, which is made.
         recording: that is run.
         settings: of the run, for run.json.
+
+    Attributes:
+        record: the content of run.json.
+        rows: of the table so far.
+        history: by step so far, its label and belief.
+
+    Raises:
+        InputError: the folder holds a run, or cannot be made.
     """
 
     def __init__(self, path: Path, recording: Recording, settings: Mapping[str, Any]) -> None:
+        if (path / RECORD).exists() and (path / belief_name(0)).exists():
+            raise InputError(
+                f"{path} holds a run already; give another folder by --out, or go on with that run by "
+                f"`bcppl run --resume {path}`."
+            )
+        blocked = next((p for p in (path, *path.parents) if p.exists() and not p.is_dir()), None)
+        if blocked is not None:
+            raise InputError(f"the folder {path} cannot be made, {blocked} is a file; give another by --out.")
         self.path = path
         self.recording = recording
         self.record: dict[str, Any] = {**settings, "version": version("bcppl")}
         self.rows: list[Mapping[str, str]] = []
+        self.history: list[tuple[str, Belief]] = []
+        path.mkdir(parents=True, exist_ok=True)
+        for old in (*path.glob("belief_*.h5"), *path.glob("*.png"), path / STEP):
+            old.unlink(missing_ok=True)
+        self.note(complete=False, rows=[], checked={})
 
-    def add(self, step: Any, row: Mapping[str, str]) -> None:
-        """Write a step's belief, and run.json with the table so far and a summary of every latent site."""
+    @classmethod
+    def resumed(cls, path: Path, record: Mapping[str, Any], recording: Recording, taken: int) -> RunFolder:
+        """The folder of a run that was stopped, as it was after so many measurements."""
+        folder = cls.__new__(cls)
+        folder.path, folder.recording, folder.record = path, recording, dict(record)
+        folder.rows = list(record["rows"][: taken + 1])
+        files = [path / belief_name(number) for number in range(taken + 1)]
+        folder.history = [(load_label(file), load_belief(file)) for file in files]
+        return folder
+
+    def add(self, step: Any, row: Mapping[str, str], checked: Mapping[str, str]) -> None:
+        """Write a step's belief, run.json with the table so far, and the step, from which a run goes on.
+
+        `checked` are the labels of the measurements by address, as of `PredictiveChecks`.
+        """
         number = len(self.rows)
-        if number == 0:
-            self.path.mkdir(parents=True, exist_ok=True)
-            for old in (*self.path.glob("belief_*.h5"), *self.path.glob("*.png")):
-                old.unlink()
         save_belief(
             step.belief,
-            self.path / f"belief_{number:03d}.h5",
+            self.path / belief_name(number),
             label=step.info.label,
             log_evidence=step.info.log_evidence,
             random_state=step.random_state,
@@ -50,27 +87,31 @@ class RunFolder:
             of=fingerprint(self.recording, number),
         )
         self.rows.append(row)
-        self.note(rows=self.rows, latent=latent_sites.summarised(step))
+        self.history.append((step.info.label, step.belief))
+        self.note(rows=self.rows, latent=latent_sites.summarised(step), checked=dict(checked))
+        # Last: whatever stops the run, all that the step follows is there.
+        if isinstance(step, Step) and isinstance(step.population, Population):
+            save_step(step, self.path / STEP, self.recording)
 
     def note(self, **entries: Any) -> None:
         """Add entries to run.json, or replace them."""
         self.record.update(entries)
-        with replacing(self.path / "run.json") as beside:
+        with replacing(self.path / RECORD) as beside:
             beside.write_text(json.dumps(self.record, indent=1), encoding="utf-8")
 
-    def draw(self, steps: Sequence[Any]) -> None:
+    def draw(self) -> None:
         """Draw ADD over the measurements, from the final mean where the truth is unknown, and beliefs."""
         from bcppl.figures import add_over_time, belief_in_3d  # matplotlib takes longer than a first step
 
         recording, points = self.recording, self.recording.part.surface_points()
         known = recording.truth is not None
-        true = recording.truth if known else steps[-1].belief.mean
-        adds = np.stack([step.belief.add(points, true).numpy() for step in steps])
-        weights = np.stack([step.belief.weights.numpy() for step in steps])
-        touching = [sensor_of(m.action).contact for m in recording.measurements][: len(steps) - 1]
-        labels = [step.info.label for step in steps]
+        true = self.history[-1][1].mean if recording.truth is None else recording.truth
+        adds = np.stack([belief.add(points, true).numpy() for _, belief in self.history])
+        weights = np.stack([belief.weights.numpy() for _, belief in self.history])
+        touching = [sensor_of(m.action).contact for m in recording.measurements][: len(self.history) - 1]
+        labels = [label for label, _ in self.history]
         contact = touching.index(True) + 1 if len(set(touching)) > 1 else None
-        figure = add_over_time(np.arange(len(steps), dtype=np.float64), adds, weights, labels, contact)
+        figure = add_over_time(np.arange(len(labels), dtype=np.float64), adds, weights, labels, contact)
         if not known:
             figure.axes[0].set_ylabel("distance from the final mean (mm)")
         figure.savefig(self.path / "add_over_time.png", dpi=150)
@@ -78,9 +119,48 @@ class RunFolder:
         shown = [
             (
                 f"after {labels[k]}" if k else "start",
-                steps[k].belief.world_from_part.numpy(),
-                steps[k].belief.log_weights.numpy(),
+                self.history[k][1].world_from_part.numpy(),
+                self.history[k][1].log_weights.numpy(),
             )
-            for k in dict.fromkeys([0, looked[-1] if looked else len(steps) // 2, len(steps) - 1])
+            for k in dict.fromkeys([0, looked[-1] if looked else len(labels) // 2, len(labels) - 1])
         ]
         belief_in_3d(recording.part, shown, recording.truth).savefig(self.path / "belief_in_3d.png", dpi=150)
+
+
+def belief_name(number: int) -> str:
+    """The file of the belief after so many measurements."""
+    return f"belief_{number:03d}.h5"
+
+
+def beside(path: Path) -> Path:
+    """The folder, or where it is taken the next one: `runs/name`, `runs/name_2`, `runs/name_3`."""
+    number, free = 1, path
+    while free.exists():
+        number += 1
+        free = path.with_name(f"{path.name}_{number}")
+    return free
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """The content of run.json in the folder of a run.
+
+    Raises:
+        InputError: there is none, or it is none that `bcppl run` wrote.
+    """
+    try:
+        record = json.loads((path / RECORD).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(
+            f"there is no run in {path}: it has no {RECORD}; give the folder of a run."
+        ) from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path / RECORD} cannot be read ({error}); run the recording again.") from error
+    kinds = {"recording": str, "model": str, "inference": str, "particles": int, "seed": int}
+    kinds |= {"settings": dict, "rows": list, "checked": dict}
+    wrong = [] if isinstance(record, dict) else ["recording"]
+    wrong = wrong or [name for name, kind in kinds.items() if not isinstance(record.get(name), kind)]
+    if wrong:
+        raise InputError(
+            f"{path / RECORD} has no {wrong[0]} as `bcppl run` writes it; run the recording again."
+        )
+    return record
