@@ -11,7 +11,7 @@ from torch import Tensor
 # is the twist by which that differs within an interval of the delay (`late`), 0 for none.
 FELT, NOISE, FORCE, TIME, EPISODE, GIVEN = range(7, 13)
 WRENCH, WITHIN = slice(13, 19), slice(19, 25)
-SECONDS = (0.006, 0.024, 0.048)  # clocks that agree are common
+SECONDS = (0.006, 0.024, 0.048, 0.096)  # clocks that agree are common
 EARLIER = slice(25, 25 + 6 * len(SECONDS))
 COLUMNS = EARLIER.stop
 
