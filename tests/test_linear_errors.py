@@ -224,8 +224,8 @@ def test_any_cut_gives_the_same_likelihood_with_shared_errors() -> None:
         totals.append(sum(sensor.site(a, pose).log_prob(v) for a, v in values))
         assert isinstance(totals[-1], Tensor)
     for total in totals[1:]:
-        # Gaps are linearised again where a cell of time ends: by a row of it, cuts differ, and so for one pose
-        # in thirty does where another corner of the peg is taken to touch.
+        # Gaps are linearised again where a cell of time ends: by a row of it cuts differ, and for one pose in
+        # thirty so does which corner of the peg is taken to touch.
         apart = (total - totals[0]).abs()
         assert float(apart.quantile(0.9)) < 0.1 and float(apart.max()) < 1.0
     # A row within an episode too: the chain rule.
