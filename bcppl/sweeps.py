@@ -23,6 +23,7 @@ from pathlib import Path
 from pickle import PicklingError
 from typing import Any, NamedTuple, TypeVar
 
+from bcppl import strict_json
 from bcppl.errors import InferenceError, InputError
 
 Argument = TypeVar("Argument")
@@ -152,7 +153,7 @@ def kept(file: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for number, line in enumerate(lines, 1):
         try:
-            cell, result = json.loads(line)
+            cell, result = strict_json.parsed(line, finite=False)
         except (ValueError, TypeError) as error:
             if not line.endswith("\n"):
                 continue

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
+from bcppl import strict_json
 from bcppl.cli import loading
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
@@ -83,15 +83,14 @@ def _read(
 ) -> Posterior:
     """The population of a belief's file, its sites observed as the recording has them."""
     label, belief, latent = load_label(path), load_belief(path), load_latent(path)
-    record = _run_record(path)
+    record = run_record(path)
     of = of or record.get("recording")
     if of is None:
         raise InputError(f"{path} names no recording, nor does a run.json beside it; give --of RECORDING.")
     whole = loading.recording(of)
     by = "the recording" if record.get("model") is None else str(path.parent / "run.json")
     named = record.get("model") or whole.model
-    own = record.get("settings")
-    settings = {**(own if isinstance(own, dict) else {}), **settings}
+    settings = {**record.get("settings", {}), **settings}
     chosen = loading.with_settings(loading.model(model, named, by), settings, model or named)
     chosen = _static(chosen, model or named)
     assimilated = _assimilated(path, label)
@@ -132,10 +131,21 @@ def _assimilated(path: Path, label: str) -> int:
     return int(count)
 
 
-def _run_record(path: Path) -> dict[str, Any]:
-    """The record that `bcppl run` wrote beside a belief; empty where there is none."""
-    try:
-        record = json.loads((path.parent / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+def run_record(path: Path) -> dict[str, Any]:
+    """The recording, model and settings of the run.json that `bcppl run` wrote beside a belief.
+
+    Raises:
+        InputError: it is no run.json of `bcppl run`; where there is none, nothing is wrong.
+    """
+    file, remedy = path.parent / "run.json", "run it again, or remove that file and give --of and --model"
+    if not file.is_file():
         return {}
-    return record if isinstance(record, dict) else {}
+    record = strict_json.read(file, remedy, finite=False)
+    kinds = {"recording": str, "model": str, "settings": dict}
+    if not isinstance(record, dict):
+        raise InputError(f"{file} is no record of a run; {remedy}.")
+    named = {name: record[name] for name in kinds if record.get(name) is not None}
+    for name, value in named.items():
+        if not isinstance(value, kinds[name]):
+            raise InputError(f"{file} has a {name} of type {type(value).__name__}; {remedy}.")
+    return named

@@ -18,8 +18,8 @@ from bcppl.inference.population import Population
 from bcppl.inference.saved import save_step
 from bcppl.recordings import Recording
 from bcppl.recordings.beliefs import load_belief, load_label, save_belief
-from bcppl.recordings.file import replacing
 from bcppl.recordings.fingerprint import fingerprint
+from bcppl.recordings.hdf5 import replacing
 from bcppl.sensors import sensor_of
 
 RECORD, STEP = "run.json", "step.h5"

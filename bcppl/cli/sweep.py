@@ -290,7 +290,7 @@ def _flat(cell: Mapping[str, Any]) -> dict[str, Any]:
 
 def _write(found: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]], path: Path) -> None:
     """All results as a table that other programs read."""
-    from bcppl.recordings.file import replacing
+    from bcppl.recordings.hdf5 import replacing
 
     rows = [{**_flat(cell), **result} for cell, result in found]
     names = list(dict.fromkeys(name for row in rows for name in row))

@@ -21,9 +21,10 @@ from typing import Any
 
 import h5py
 
+from bcppl import strict_json
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
-from bcppl.recordings.file import replacing
+from bcppl.recordings.hdf5 import created, opened, replacing
 from bcppl.sensors.candidates import Candidate, planner_of
 from bcppl.sensors.layout import Layout
 from bcppl.sensors.protocol import Plannable, sensors
@@ -42,17 +43,17 @@ def save_actions(actions: Sequence[Candidate], path: str | os.PathLike[str]) -> 
     """
     path = Path(path)
     _refuse_suffix(path)
-    with replacing(path) as beside:
-        if path.suffix == ".json":
+    if path.suffix == ".json":
+        with replacing(path) as beside:
             beside.write_text(json.dumps(_tree(actions), indent=1) + "\n", encoding="utf-8")
-            return
-        with h5py.File(beside, "w") as file:
-            file.attrs.update(format=FORMAT, schema_version=SCHEMA_VERSION)
-            file.create_group("actions")
-            for k, action in enumerate(actions):
-                group, planner = file.create_group(f"actions/{k:06d}"), planner_of(action)
-                group.attrs["kind"] = planner.candidate_kind
-                planner.candidate.write(group, action)
+        return
+    with created(path) as file:
+        file.attrs.update(format=FORMAT, schema_version=SCHEMA_VERSION)
+        file.create_group("actions")
+        for k, action in enumerate(actions):
+            group, planner = file.create_group(f"actions/{k:06d}"), planner_of(action)
+            group.attrs["kind"] = planner.candidate_kind
+            planner.candidate.write(group, action)
 
 
 def load_actions(path: str | os.PathLike[str]) -> list[Candidate]:
@@ -88,10 +89,10 @@ def _planners() -> dict[str, Plannable]:
 def _read(kind: object, what: str, source: h5py.Group | Mapping[str, Any]) -> Candidate:
     """One action; all that is wrong with it is one sentence that begins with `what`."""
     known = _planners()
-    if kind not in known:
+    if not isinstance(kind, str) or kind not in known:
         words = ", ".join(f'"{each}"' for each in known)
         raise InputError(f"{what} is of kind {kind!r}; give one of {words}.")
-    layout = known[str(kind)].candidate
+    layout = known[kind].candidate
     try:
         return layout.read(source) if isinstance(source, h5py.Group) else _of_fields(source, layout)
     except InputError as error:
@@ -118,10 +119,7 @@ def _tree(actions: Sequence[Candidate]) -> dict[str, Any]:
 
 
 def _from_json(path: Path) -> list[Candidate]:
-    try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} is no valid JSON ({error}); write it again.") from error
+    tree = strict_json.read(path, "write it again")
     if not isinstance(tree, dict) or not isinstance(tree.get("actions"), list):
         raise InputError(f'{path} holds no list of "actions"; see `bcppl.recordings.action_file` for one.')
     _refuse_header(path, tree)
@@ -143,20 +141,10 @@ def _of_fields(fields: Mapping[str, Any], layout: Layout[Any]) -> Candidate:
 
 
 def _from_hdf5(path: Path) -> list[Candidate]:
-    try:
-        with h5py.File(path, "r") as file:
-            header = dict(file.attrs)
-            if "format" not in header:
-                raise InputError(f"{path} is an HDF5 file but holds no actions; give one of plans and views.")
-            _refuse_header(path, header)
-            entries = [entry for _, entry in sorted(file["actions"].items())]
-            return [
-                _read(entry.attrs.get("kind"), f"action {k} of {path}", entry)
-                for k, entry in enumerate(entries)
-            ]
-    except InputError:
-        raise
-    except KeyError as error:
-        raise InputError(f"{path} lacks its group of actions; make it again.") from error
-    except (OSError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path} is damaged or no HDF5 file ({error}); make it again.") from error
+    with opened(path, "make it again") as file:
+        header = dict(file.attrs)
+        if "format" not in header:
+            raise InputError(f"{path} is an HDF5 file but holds no actions; give one of plans and views.")
+        _refuse_header(path, header)
+        entries = [file["actions"][f"{k:06d}"] for k in range(len(file["actions"]))]
+        return [_read(e.attrs.get("kind"), f"action {k} of {path}", e) for k, e in enumerate(entries)]

@@ -2,7 +2,9 @@
 
 Layout, schema version 2 (SI units, in each dataset's attribute `units`; frames are in the datasets' names):
 
-    /                         attributes format, schema_version, model, source
+    /                         attributes format, schema_version, model, source; sha256: a checksum of the
+                              content, which earlier versions did not write, and without which a file is
+                              read all the same
     /part, /peg               attributes name, source; vertices, faces, pieces/0000.. (kind, size, center)
     /guess                    world_from_part, translation, tilt, yaw, angle (absent where tilt and yaw rule)
     /truth                    world_from_part (the group is absent where the truth is unknown)
@@ -22,39 +24,28 @@ lose it.
 
 from __future__ import annotations
 
+import hashlib
 import os
-import re
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from urllib.parse import unquote
 
 import h5py
-import numpy as np
 
+from bcppl.arguments import whole_number
 from bcppl.errors import InputError
-from bcppl.geometry.parts import Guess, Part, Piece
-from bcppl.sensors.layout import POSE_UNITS, TEXT, Layout, SharedObjects, link, number, numbers
+from bcppl.geometry.parts import Part
+from bcppl.recordings.fingerprint import add, fingerprint
+from bcppl.recordings.hdf5 import created, opened
+from bcppl.recordings.layouts import DEPTH, GUESS, PART, PIECE, POSE
+from bcppl.sensors.layout import SharedObjects, link, text
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.protocol import sensor_named, sensor_of
 
 FORMAT = "bcppl recording"
 SCHEMA_VERSION = 2
 ALWAYS = ("background", "cameras", "probes", "measurements")  # groups that a reader of version 1 asks for
-
-PART = Layout(Part, {"name": TEXT, "source": TEXT, "vertices": numbers("m"), "faces": numbers("1", np.int64)})
-PIECE = Layout(Piece, {"kind": TEXT, "size": numbers("m"), "center": numbers("m")})
-GUESS = Layout(
-    Guess,
-    {
-        "world_from_part": numbers(POSE_UNITS),
-        "translation": numbers("m"),
-        **{name: number("rad") for name in ("tilt", "yaw", "angle")},
-    },
-    optional={"angle": 1},
-)
-POSE = numbers(POSE_UNITS)
-DEPTH = numbers("m", np.float32)
+KNOWN = {*ALWAYS, "part", "peg", "guess", "truth"}
+CHECKSUM = "sha256"
 
 
 def save(recording: Recording, path: str | os.PathLike[str]) -> None:
@@ -66,31 +57,9 @@ def save(recording: Recording, path: str | os.PathLike[str]) -> None:
         InputError: the folder is missing or not writable, two cameras or probes share a name but differ, an
             action is of no known kind, or the recording holds something that is no number.
     """
-    with replacing(path) as beside, h5py.File(beside, "w") as file:
+    with created(path) as file:
         _write(file, recording)
-
-
-@contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A new file beside `path`, which is moved there once it is written, and removed if that fails.
-
-    Raises:
-        InputError: the folder is missing, or what is written raises an error of the system, type or value.
-    """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"{path} cannot be written: there is no folder {path.parent}; make it first.")
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        yield beside
-        os.replace(beside, path)
-    except InputError:
-        raise
-    except (OSError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path} cannot be written: {_one_line(error)}.") from error
-    finally:
-        with suppress(OSError, ValueError):  # a name that is too long can be neither made nor removed
-            beside.unlink(missing_ok=True)
+        file.attrs[CHECKSUM] = _checksum(recording)
 
 
 def load(path: str | os.PathLike[str]) -> Recording:
@@ -104,30 +73,38 @@ def load(path: str | os.PathLike[str]) -> Recording:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} is not a file; give the path of a recording (.h5).")
-    try:
-        with h5py.File(path, "r") as file:
-            _refuse_header(file)
-            return _read(file)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    except (KeyError, OSError, RuntimeError, TypeError, ValueError, AttributeError) as error:
-        missing = re.search(r"'([^']+)'", str(error)) if isinstance(error, KeyError) else None
-        if missing is not None:
-            raise InputError(f"{path} lacks {missing.group(1)!r}; make the recording again.") from error
-        if not h5py.is_hdf5(path):
-            raise InputError(f"{path} is not an HDF5 file; give a recording written by bcppl.") from error
-        what = f"{path} is damaged or cut off ({_one_line(error)})"
-        raise InputError(f"{what}; copy or make it again.") from error
+    with opened(path) as file:
+        _refuse_header(file)
+        recording = _read(file)
+        if file.attrs.get(CHECKSUM, _checksum(recording)) != _checksum(recording):
+            raise InputError(
+                f"{path} was changed after it was saved; make it again, or, if you changed it, delete its "
+                f"attribute {CHECKSUM!r}."
+            )
+    return recording
 
 
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()).rstrip(".") or type(error).__name__
+def is_checked(path: str | os.PathLike[str]) -> bool:
+    """Whether a recording's file carries a checksum of its content; those of earlier versions do not."""
+    with opened(path) as file:
+        return CHECKSUM in file.attrs
+
+
+def _checksum(recording: Recording) -> str:
+    """A checksum of all that a recording's file holds, whoever compressed it and however."""
+    labels = [recording.model, recording.source]
+    for part in (recording.part, recording.peg):
+        labels += [] if part is None else [part.name, part.source]
+    truth = None if recording.truth is None else POSE.stored(recording.truth)
+    digest = hashlib.sha256()
+    add(digest, [fingerprint(recording, len(recording.measurements)), labels, truth])
+    return digest.hexdigest()
 
 
 def _refuse_header(file: h5py.File) -> None:
     if file.attrs.get("format") != FORMAT or "schema_version" not in file.attrs:
         raise InputError("the file is an HDF5 file but not a bcppl recording; give one written by bcppl.")
-    version = int(file.attrs["schema_version"])
+    version = whole_number("the file has schema version {}", file.attrs["schema_version"])
     if not 1 <= version <= SCHEMA_VERSION:
         known = f"this bcppl reads versions 1 to {SCHEMA_VERSION}"
         raise InputError(f"the file has schema version {version}, {known}; upgrade bcppl.")
@@ -165,26 +142,41 @@ def _write_part(group: h5py.Group, part: Part) -> None:
 
 
 def _read(file: h5py.File) -> Recording:
+    if unknown := set(file) - KNOWN:
+        raise InputError(
+            f"the file holds {min(unknown)!r}, which no recording does; remove it, or correct its name."
+        )
+    for name in ALWAYS:
+        file[name]  # one that is missing is named
     shared = SharedObjects(file)
     return Recording(
         part=_read_part(file["part"]),
         guess=GUESS.read(file["guess"]),
-        measurements=[_read_measurement(group, shared) for _, group in sorted(file["measurements"].items())],
+        measurements=[_read_measurement(group, shared) for group in _numbered(file["measurements"], 6)],
         peg=_read_part(file["peg"]) if "peg" in file else None,
         background={unquote(key): DEPTH.read(file["background"], key) for key in file["background"]},
         truth=POSE.read(file["truth"], "world_from_part") if "truth" in file else None,
-        model=str(file.attrs["model"]),
-        source=str(file.attrs["source"]),
+        model=text(file.attrs["model"]),
+        source=text(file.attrs["source"]),
     )
 
 
+def _numbered(group: h5py.Group, digits: int) -> list[h5py.Group]:
+    """The groups in a group, which are called by their numbers from 0 on.
+
+    Raises:
+        KeyError: one is missing.
+    """
+    return [group[f"{number:0{digits}d}"] for number in range(len(group))]
+
+
 def _read_part(group: h5py.Group) -> Part:
-    pieces = tuple(PIECE.read(piece) for _, piece in sorted(group["pieces"].items()))
+    pieces = tuple(PIECE.read(piece) for piece in _numbered(group["pieces"], 4))
     return PART.read(group, pieces=pieces)
 
 
 def _read_measurement(group: h5py.Group, shared: SharedObjects) -> Measurement:
-    sensor = sensor_named(str(group.attrs["kind"]))
+    sensor = sensor_named(text(group.attrs["kind"]))
     return Measurement(
         sensor.action.read(group["action"], shared), sensor.observation.read(group["observation"], shared)
     )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bcppl.recordings.file import DEPTH, GUESS, PART, PIECE
+from bcppl.recordings.layouts import DEPTH, GUESS, PART, PIECE
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.protocol import sensor_of
 

@@ -8,6 +8,7 @@ lists the values as a file holds them, for fingerprints. A kind of measurement d
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
@@ -21,6 +22,7 @@ from bcppl.errors import InputError
 
 POSE_UNITS = "m m m 1 1 1 1"  # [x y z qw qx qy qz]
 WRENCH_UNITS = "N N N N m N m N m"
+KIND = "kind"  # an attribute beside the fields that says which layout they are of
 SMALLEST_COMPRESSED = 256  # entries: below it gzip's chunk index outweighs what it saves
 
 T = TypeVar("T")
@@ -63,43 +65,94 @@ class Field:
 
         Raises:
             KeyError: it is missing.
-            ValueError, TypeError: it is of another form, or in other units.
+            ValueError: it is of another form, or in other units, or in none.
         """
-        if key in group.attrs:
-            return self.parsed(group.attrs[key])
+        if key in group.attrs and not self.units:
+            return _named(key, self.parsed, group.attrs[key])
         kept = group[key]
-        units = kept.attrs.get("units", self.units) if isinstance(kept, h5py.Dataset) else "a group"
-        if units != self.units:
-            raise ValueError(f"{key} is in {units!r}; give a dataset in {self.units!r}")
-        return self.parsed(kept[()] if self.units else kept.asstr()[()])
+        held = kept.attrs.get("units") if isinstance(kept, h5py.Dataset) else "a group"
+        if (held is not None or self.units) and not (isinstance(held, str) and held == self.units):
+            stated = "states no units" if held is None else f"is in {held!r}"
+            raise ValueError(f"{key} {stated}; give a dataset in {self.units!r}, and state it as its units")
+        return _named(key, self.parsed, kept[()] if self.units else kept.asstr()[()])
+
+
+def _named(key: str, parsed: Callable[[Any], Any], kept: Any) -> Any:
+    """A value parsed; a refusal begins with its key."""
+    try:
+        return parsed(kept)
+    except InputError:
+        raise
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{key} {error}") from error
 
 
 def numbers(units: str, dtype: npt.DTypeLike = np.float64) -> Field:
     """An array of numbers; one that a file holds as float32 is read as float64."""
-    read_as = np.float64 if np.dtype(dtype).kind == "f" else dtype
-    return Field(lambda value: np.asarray(value, dtype), lambda kept: np.asarray(kept, read_as), units)
+    read_as = np.dtype(np.float64 if np.dtype(dtype).kind == "f" else dtype)
+
+    def parsed(kept: Any) -> Any:
+        held = np.asarray(kept)
+        if held.dtype.kind not in ("iuf" if read_as.kind == "f" or not held.size else "iu"):
+            raise TypeError(f"holds {held.dtype.name}, not numbers of type {read_as.name}")
+        made = np.asarray(held, read_as)
+        if read_as.kind != "f" and not np.array_equal(made, held):
+            raise ValueError(f"holds a number that {read_as.name} does not")
+        return made
+
+    return Field(lambda value: np.asarray(value, dtype), parsed, units)
 
 
 def number(units: str, dtype: npt.DTypeLike = np.float64) -> Field:
     """One number. JSON's stays as it is, so that its owner refuses a string by the field's name."""
-    return Field(
-        lambda value: np.asarray(value, dtype),
-        lambda kept: kept.item() if isinstance(kept, np.ndarray | np.generic) else kept,
-        units,
-    )
+
+    def parsed(kept: Any) -> Any:
+        if not isinstance(kept, np.ndarray | np.generic):
+            return kept
+        if kept.shape or kept.dtype.kind not in ("iuf" if np.dtype(dtype).kind == "f" else "iu"):
+            raise TypeError(f"holds {kept.dtype.name} of shape {kept.shape}, not one {np.dtype(dtype).name}")
+        return kept.item()
+
+    return Field(lambda value: np.asarray(value, dtype), parsed, units)
 
 
 def shared(group: str, layout: Layout[Any]) -> Field:
     """An object that several measurements share, kept once as `/GROUP/NAME`."""
 
     def refuse(kept: Any) -> Any:
-        raise TypeError(f"{kept!r} refers to an object that is not here")
+        raise TypeError(f"refers to {kept!r}, an object that is not here")
 
     return Field(lambda thing: {"name": thing.name, **layout.stored(thing)}, refuse, "", group, layout)
 
 
-TEXT, COUNT = Field(str, str), Field(int, int)
-WORDS = Field(list, lambda kept: tuple(map(str, kept)))
+def text(kept: Any) -> str:
+    """Text of a file.
+
+    Raises:
+        TypeError: it is something else.
+        ValueError: it is no Unicode.
+    """
+    if isinstance(kept, bytes):
+        return kept.decode()
+    if not isinstance(kept, str):
+        raise TypeError(f"is of type {type(kept).__name__}, not text")
+    kept.encode()  # JSON can spell half of a character
+    return str(kept)
+
+
+def _words(kept: Any) -> tuple[str, ...]:
+    if not isinstance(kept, list | tuple | np.ndarray) or np.ndim(kept) != 1:
+        raise TypeError("is no list of words")
+    return tuple(map(text, kept))
+
+
+def _count(kept: Any) -> int:
+    if isinstance(kept, bool | np.bool_):
+        raise TypeError("is true or false, not a whole number")
+    return operator.index(kept)
+
+
+TEXT, COUNT, WORDS = Field(str, text), Field(int, _count), Field(list, _words)
 
 
 class SharedObjects:
@@ -194,10 +247,15 @@ class Layout(Generic[T]):
 
         def value(key: str, kept: Field) -> Any:
             if kept.layout is not None and objects is not None:
-                return objects.read(kept, str(group.attrs[key]))
+                return objects.read(kept, _named(key, text, group.attrs[key]))
             return kept.read(group, key)
 
-        return self._made(value, {*group, *group.attrs}, given)
+        present = {*group, *group.attrs}
+        if unknown := present - {self.key(name) for name in self.fields} - set(given) - {KIND}:
+            raise ValueError(
+                f"a {self.type.__name__} has no field {min(unknown)!r}; remove it, or correct its name"
+            )
+        return self._made(value, present, given)
 
     def tree(self, thing: T) -> dict[str, Any]:
         """The object as JSON has it."""
@@ -205,7 +263,7 @@ class Layout(Generic[T]):
 
     def parsed(self, tree: Mapping[str, Any]) -> T:
         """The object of JSON; raises as `read` does."""
-        return self._made(lambda key, kept: kept.parsed(tree[key]), set(tree), {})
+        return self._made(lambda key, kept: _named(key, kept.parsed, tree[key]), set(tree), {})
 
     def stored(self, thing: T) -> dict[str, Any]:
         """The values as a file holds them, by key: they are the same before and after an object was saved."""

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.progress import watched
-from bcppl.recordings.file import replacing
+from bcppl.recordings.hdf5 import replacing
 from bcppl.sweeps import Failure, as_they_end
 
 Result = TypeVar("Result")
@@ -59,10 +59,19 @@ def kept(path: Path) -> Arrays | None:
     if not path.is_file():
         return None
     try:
+        with zipfile.ZipFile(path) as packed:
+            if sum(each.file_size for each in packed.infolist()) > path.stat().st_size:
+                raise ValueError("it is compressed")
+            if damaged := packed.testzip():
+                raise ValueError(f"the checksum of {damaged} is wrong")
         with np.load(path, allow_pickle=False) as file:
-            return dict(file)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path} is no round of a calibration ({error}); remove it.") from error
+            arrays = dict(file)
+        if not all(isinstance(each, np.ndarray) for each in arrays.values()):
+            raise ValueError("it holds something else than arrays")
+        return arrays
+    except Exception as error:  # zip files and numpy have errors of many types
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path} is no round of a calibration ({reason}); remove it.") from error
 
 
 def keep(path: Path, arrays: Arrays) -> None:

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from bcppl import strict_json
 from bcppl.arguments import seed_number, whole_number
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.arviz import population_of
@@ -30,7 +31,7 @@ from bcppl.inference.calibration.result import Calibration
 from bcppl.inference.calibration.rounds import Arrays, gathered, keep, kept
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded, systematic
-from bcppl.recordings.file import replacing
+from bcppl.recordings.hdf5 import replacing
 
 Inference = Callable[[Any], Any]
 SETTINGS = "settings.json"
@@ -114,8 +115,8 @@ def _prepared(folder: Path, seed: int, ranked: int) -> Path:
     path = folder / SETTINGS
     if path.is_file():
         try:
-            there = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError:
+            there = strict_json.read(path, "give another folder")
+        except InputError:
             there = None
         if there != settings:
             raise InputError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,7 +11,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import h5py
 import torch
 from torch import Tensor
 
@@ -19,8 +19,8 @@ from bcppl.inference.population import Population, refuse_no_population
 from bcppl.inference.saved import plain
 from bcppl.inference.saved.approximations import approximation_content, approximation_of
 from bcppl.inference.saved.traces import Arguments, Content, content_of, trace_of
-from bcppl.recordings.beliefs import is_belief
-from bcppl.recordings.file import replacing
+from bcppl.recordings.beliefs import FORMAT as BELIEF
+from bcppl.recordings.hdf5 import created, opened as opened_file
 from bcppl.traces import Series
 from bcppl.traces.run import Program
 
@@ -163,7 +163,7 @@ def given_arguments(args: Any, content: Content) -> Arguments:
 
 def write(path: Location, content: Content, state: Tensor) -> None:
     """Write content with torch's random state and a hash, all or nothing."""
-    with replacing(path) as beside, h5py.File(beside, "w") as file:
+    with created(path) as file:
         file.attrs.update(format=FORMAT, schema_version=SCHEMA_VERSION, written_by=_version())
         plain.write(file, {**content, "random_state": state})
 
@@ -184,22 +184,16 @@ def opened(path: Location) -> Iterator[Content]:
     """
     if not isinstance(path, str | os.PathLike) or not (path := Path(path)).is_file():
         raise InputError(f"there is no file {path}; give one that `save` wrote.")
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT:
-                held = "a belief and no population" if is_belief(path) else "no population"
-                raise InputError(f"it holds {held}; give a file that `save` or `save_step` wrote.")
-            number = int(file.attrs["schema_version"])
-            if not 1 <= number <= SCHEMA_VERSION:
-                raise InputError(
-                    f"it has schema version {number}, this bcppl reads {SCHEMA_VERSION}; upgrade bcppl."
-                )
-            content = plain.read(file)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    except (OSError, LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-        reason = " ".join(str(error).split()).rstrip(".")
-        raise InputError(f"{path} is damaged or no file of bcppl ({reason}); save it again.") from error
+    with opened_file(path, "save it again") as file:
+        if file.attrs.get("format") != FORMAT:
+            held = "a belief and no population" if file.attrs.get("format") == BELIEF else "no population"
+            raise InputError(f"it holds {held}; give a file that `save` or `save_step` wrote.")
+        number = operator.index(file.attrs["schema_version"])
+        if not 1 <= number <= SCHEMA_VERSION:
+            raise InputError(
+                f"it has schema version {number}, this bcppl reads {SCHEMA_VERSION}; upgrade bcppl."
+            )
+        content = plain.read(file)
     try:
         yield content
     except InputError as error:
