@@ -201,8 +201,11 @@ def read_seatings(folder: str | Path) -> list[Tensor]:
     for file in files:
         try:
             read.append(torch.from_numpy(np.loadtxt(file, delimiter=",", ndmin=2)))
-        except ValueError as error:
-            raise InputError(f"{file} must hold rows of joint angles ({error}).") from error
+        except (OSError, ValueError) as error:
+            reason = " ".join(str(error).split()).rstrip(".")
+            raise InputError(f"{file} must hold rows of joint angles ({reason}); record it again.") from error
+        if not bool(torch.isfinite(read[-1]).all()):
+            raise InputError(f"{file} holds an angle that is not finite; leave its row out.")
         if len(read[-1]) < 2:
             raise InputError(f"{file} holds {len(read[-1])} stamps; a seating needs at least two postures.")
     return read

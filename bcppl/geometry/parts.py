@@ -15,6 +15,7 @@ from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.arrays import Array, Indices
 from bcppl.errors import InputError
+from bcppl.geometry.mesh_file import read_mesh
 
 if TYPE_CHECKING:
     import trimesh
@@ -125,7 +126,7 @@ class Part:
             raise InputError(f"part {self.name!r} has a face without vertices; export its mesh again.")
         if self.extent.max() > LARGEST_EXTENT:
             raise InputError(
-                f"part {self.name!r} is {self.extent.max():.0f} m long, probably in millimetres; rescale it."
+                f"part {self.name!r} is {self.extent.max():.4g} m long, probably in millimetres; rescale it."
             )
         if not closed:
             return
@@ -203,7 +204,7 @@ class Guess:
 def load_mesh(
     path: str | Path, name: str | None = None, scale: float | None = None, source: str = ""
 ) -> Part:
-    """A part from an OBJ, STL, PLY or other mesh file that trimesh reads, checked, without convex pieces.
+    """A part from an OBJ, STL, PLY, OFF or DAE file, checked, without convex pieces.
 
     Duplicate vertices, as of STL files and of seams of normals or textures, are merged: otherwise most closed
     meshes look open. All bodies of a file become one part. A mesh that is inside out is inverted, with a
@@ -218,22 +219,14 @@ def load_mesh(
         source: attribution and licence.
 
     Raises:
-        InputError: there is no such file, it holds no mesh, or the mesh is empty, open, or in millimetres.
+        InputError: there is no such file, it holds no mesh or is damaged, or the mesh is empty, open, or in
+            millimetres.
     """
     factor = 1.0 if scale is None else number_within(f"mesh file {path} has scale {{}}", scale, above=0.0)
     path = Path(path)
     if not path.is_file():
         raise InputError(f"there is no mesh file {path}; give the path of an OBJ, STL or PLY file.")
-    import trimesh
-
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:  # every format has its own reader with its own errors
-        raise InputError(
-            f"mesh file {path} cannot be read ({error}); export it again as OBJ or STL."
-        ) from error
-    if not isinstance(mesh, trimesh.Trimesh):
-        raise InputError(f"mesh file {path} holds no triangles; export it again as OBJ or STL.")
+    mesh = read_mesh(path)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     mesh.remove_unreferenced_vertices()
     if len(mesh.faces) and mesh.is_watertight and mesh.volume < 0:
@@ -243,7 +236,10 @@ def load_mesh(
         )
     vertices = factor * np.asarray(mesh.vertices, dtype=np.float64)
     part = Part(name or path.stem, vertices, np.asarray(mesh.faces, dtype=np.int64), (), source)
-    part.check()
+    try:
+        part.check()
+    except InputError as error:
+        raise InputError(f"mesh file {path}: {error}") from error
     if scale is None and part.extent.max() > LARGEST_UNSCALED:
         raise InputError(
             f"mesh file {path} is {part.extent.max():.3g} m long if it is in metres; give scale=0.001 if it "

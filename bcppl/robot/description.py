@@ -23,7 +23,9 @@ from scipy.spatial.transform import Rotation
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
+from bcppl.geometry.mesh_file import read_mesh
 from bcppl.geometry.parts import Part
+from bcppl.plain_xml import refuse_entities
 
 MOVING = ("revolute", "continuous", "prismatic")
 MESHES = (".stl", ".obj", ".dae", ".ply")
@@ -89,7 +91,9 @@ def read(file: str | Path) -> Description:
     try:
         # The parser prints unknown elements (transmissions, xacro) to standard error.
         with contextlib.redirect_stderr(ignored), contextlib.redirect_stdout(ignored):
-            robot = urdf.URDF.from_xml_string(file.read_bytes())
+            text = file.read_bytes()
+            refuse_entities(text)
+            robot = urdf.URDF.from_xml_string(text)
         for kind, named in (("joint", robot.joints), ("link", robot.links)):
             for name, count in Counter(each.name for each in named).items():
                 if count > 1:
@@ -123,9 +127,12 @@ def _ordered(file: Path, links: Sequence[str], joints: Mapping[str, Joint], coun
         raise InputError(
             f"{file} has a joint to the link {min(unknown)!r}, which it does not define; add the link."
         )
+    children: dict[str, list[str]] = {}
+    for child, joint in joints.items():
+        children.setdefault(joint.parent, []).append(child)
     ordered = roots[:1]
     for name in ordered:
-        ordered += [child for child, joint in joints.items() if joint.parent == name]
+        ordered += children.get(name, [])
     if len(roots) != 1 or len(ordered) != len(links) or count != len(joints):
         raise InputError(
             f"{file} does not describe one tree of links (base links: {', '.join(roots) or 'none'}); "
@@ -225,7 +232,10 @@ def part_of(description: Description, link: str, shapes: Sequence[Shape], folder
         faces=np.asarray(whole.faces, dtype=np.int64),
         source=f"link of {description.name}; licence as of {description.file.name}",
     )
-    part.check(closed=False)
+    try:
+        part.check(closed=False)
+    except InputError as error:
+        raise InputError(f"{description.file}: {error}") from error
     return part
 
 
@@ -259,14 +269,7 @@ def _mesh(description: Description, shape: Shape, folders: Sequence[Path]) -> An
             f"link {shape.link!r} of {description.file} needs the mesh {geometry.filename}, "
             f"which is in none of {searched}; {advice}."
         )
-    try:
-        # "mesh" also places the nodes of a scene (DAE) and converts its stated unit.
-        mesh: Any = trimesh.load(file, force="mesh")
-    except Exception as error:  # every format has its own loader and its own errors
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(
-            f"{file} cannot be read as a mesh ({reason}); give an STL, OBJ or DAE file."
-        ) from error
+    mesh = read_mesh(file, process=True)  # which also places the nodes of a scene (DAE) and converts its unit
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     if geometry.scale is not None:
         mesh.apply_scale(geometry.scale)

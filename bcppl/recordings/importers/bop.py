@@ -6,23 +6,24 @@ The world's frame is the camera's. BOP scenes are judged by ADD under a tenth of
 sensor and ground truth differ by up to 6.5 mm along the ray.
 """
 
-import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
-import trimesh
 import typer
 from PIL import Image
 from scipy.optimize import brentq
 
+from bcppl import strict_json
 from bcppl.arguments import LARGEST_SEED, number_within
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
+from bcppl.geometry.mesh_file import read_mesh
 from bcppl.geometry.parts import Guess, Part
 from bcppl.poses import from_rotation_matrix, identity, retract
 from bcppl.sensors import DepthImage, Measurement, Recording, View
@@ -32,6 +33,9 @@ HELP = (
     "One object in a frame of a BOP scene (depth image, ground truth, mesh), the guess drawn about the truth."
 )
 
+DEPTH_MODES, COLOUR_MODES = ("I;16", "I"), ("RGB",)
+MOST = 1e9  # of any number in the files
+MOST_PIXELS = 8 << 20  # beyond one for each byte of the file: an image of depth takes 64 MB
 NEAR, FAR = 0.2, 2.5  # m: a structured-light sensor's range
 
 
@@ -51,30 +55,32 @@ def command(
     scene = Path(scene)
     number_within("the prior's half width is {} m", translation, least=0.0)
     number_within("the prior's angle is {} degrees", angle, above=0.0, most=180.0)
-    try:
-        return _read(scene, object_id, frame, seed, translation, math.radians(angle))
-    except InputError:
-        raise
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        details = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        what = f"{scene} is not laid out as a BOP scene ({details})"
-        raise InputError(f"{what}; compare its files with the format.") from error
+    return _read(scene, object_id, frame, seed, translation, math.radians(angle))
 
 
 def _read(
     scene: Path, object_id: int, frame: int | None, seed: int, translation: float, angle: float
 ) -> Recording:
-    truths = _json(scene / "scene_gt.json")
+    listed = scene / "scene_gt.json"
+    truths = _json(listed)
+    if strange := [name for name in truths if not (name.isascii() and name.isdecimal())]:
+        raise InputError(f"{listed} has a frame {strange[0]!r}; name frames by their numbers.")
     number = min(map(int, truths), default=-1) if frame is None else frame
     if str(number) not in truths:
         raise InputError(f"{scene} has no frame {number}; give --frame one of {', '.join(truths) or 'none'}.")
-    present = {entry["obj_id"]: entry for entry in reversed(truths[str(number)])}
+    entries = truths[str(number)]
+    if not isinstance(entries, list) or not all(_has_id(each) for each in entries):
+        what = f"{scene} is not laid out as a BOP scene (in {listed} an object has no obj_id)"
+        raise InputError(f"{what}; compare its files with the format.")
+    present = {each["obj_id"]: each for each in reversed(entries)}
     if object_id not in present:
         ids = ", ".join(map(str, sorted(present)))
         raise InputError(f"{scene} holds no object {object_id}; give --object one of {ids}.")
     instance = present[object_id]
-    rotation = np.reshape(instance["cam_R_m2c"], (3, 3)).astype(np.float64)
-    moved = 1e-3 * np.asarray(instance["cam_t_m2c"], dtype=np.float64)
+    rotation = _numbers(instance, "cam_R_m2c", 9, listed).reshape(3, 3)
+    moved = 1e-3 * _numbers(instance, "cam_t_m2c", 3, listed)
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 0.02 or np.linalg.det(rotation) < 0:
+        raise InputError(f"{listed} has a cam_R_m2c that is no rotation; copy it again.")
     # Ground truth is printed with eight digits; its rotation is orthogonal to that.
     left, _, right = np.linalg.svd(rotation)
     truth = from_rotation_matrix(torch.from_numpy(moved), torch.from_numpy(left @ right))
@@ -112,14 +118,18 @@ def draw(seed: int, translation: float, angle: float) -> Array:
 
 
 def _view(scene: Path, frame: int) -> tuple[Camera, DepthImage]:
-    intrinsics = _json(scene / "camera.json")
-    depth = _image(scene / f"depth_{frame:06d}.png").astype(np.float64)
-    if depth.ndim != 2:
-        raise InputError(f"{scene} has a depth image of shape {depth.shape}; give one of a single channel.")
+    file = scene / "camera.json"
+    intrinsics = _json(file)
+    depth = _image(scene / f"depth_{frame:06d}.png", DEPTH_MODES).astype(np.float64)
     colour = scene / f"rgb_{frame:06d}.png"
-    rgb = _image(colour).astype(np.uint8) if colour.is_file() else None
+    rgb = _image(colour, COLOUR_MODES) if colour.is_file() else None
     height, width = depth.shape
-    k = np.reshape(intrinsics["cam_K"], (3, 3)).astype(np.float64)
+    if rgb is not None and rgb.shape[:2] != depth.shape:
+        raise InputError(
+            f"{colour} is of another size than the depth image; give both as one camera took them."
+        )
+    k = _numbers(intrinsics, "cam_K", 9, file).reshape(3, 3)
+    scale = _numbers({"depth_scale": [intrinsics.get("depth_scale", 1.0)]}, "depth_scale", 1, file)
     camera = Camera(
         name="sensor",
         width=width,
@@ -132,7 +142,7 @@ def _view(scene: Path, frame: int) -> tuple[Camera, DepthImage]:
         near=NEAR,
         far=FAR,
     )
-    metres = 1e-3 * float(intrinsics.get("depth_scale", 1.0)) * depth
+    metres = 1e-3 * float(scale[0]) * depth
     metres[depth == 0] = np.nan
     # As float32, so that a recording is the same before and after it was saved.
     return camera, DepthImage(metres.astype(np.float32).astype(np.float64), rgb)
@@ -141,7 +151,7 @@ def _view(scene: Path, frame: int) -> tuple[Camera, DepthImage]:
 def _part(path: Path, object_id: int) -> Part:
     if not path.is_file():
         raise InputError(f"{path} is missing: the scene has no mesh of object {object_id}; put it there.")
-    mesh: Any = trimesh.load(path, process=False, force="mesh")
+    mesh = read_mesh(path)
     return Part(
         name=f"object {object_id}",
         vertices=1e-3 * np.asarray(mesh.vertices, dtype=np.float64),
@@ -151,16 +161,51 @@ def _part(path: Path, object_id: int) -> Part:
 
 
 def _json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} is missing or is no JSON; give the folder of a BOP scene.") from error
-    return dict(content)
+    content = strict_json.read(path, "give the folder of a BOP scene")
+    if not isinstance(content, dict):
+        raise InputError(f"{path} holds no object of JSON; give the folder of a BOP scene.")
+    return content
 
 
-def _image(path: Path) -> npt.NDArray[Any]:
+def _has_id(entry: object) -> bool:
+    return isinstance(entry, dict) and type(entry.get("obj_id")) is int
+
+
+def _numbers(entry: dict[str, Any], name: str, count: int, path: Path) -> Array:
+    """The numbers (count,) of a name in a file.
+
+    Raises:
+        InputError: it is missing, or something else.
+    """
+    held = entry.get(name)
+    values = held if isinstance(held, list) else []
+    if len(values) != count or not all(type(each) in (int, float) and abs(each) < MOST for each in values):
+        raise InputError(f"{path} needs a {name} of {count} number{'s' * (count > 1)}; copy it again.")
+    return np.asarray(values, dtype=np.float64)
+
+
+def _image(path: Path, modes: Sequence[str]) -> npt.NDArray[Any]:
+    """The pixels of a PNG file, whose checksums are compared.
+
+    Raises:
+        InputError: it is missing, is no PNG of such modes, is damaged, or too large for the bytes it has.
+    """
     try:
-        with Image.open(path) as image:
+        with _opened(path) as image:
+            image.verify()  # reads all chunks, and none of the pixels
+        with _opened(path) as image:
+            if image.mode not in modes:
+                raise ValueError(f"its mode is {image.mode}, not {' or '.join(modes)}")
             return np.asarray(image)
-    except OSError as error:
-        raise InputError(f"{path} is missing or is no image; give the folder of a BOP scene.") from error
+    except Exception as error:  # Pillow raises SyntaxError, struct.error, zlib.error and others
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        what = f"{path} is missing or is no image that can be read ({reason})"
+        raise InputError(f"{what}; give the folder of a BOP scene.") from error
+
+
+def _opened(path: Path) -> Image.Image:
+    """A PNG file whose header alone is read: formats that Pillow gives to other programs are none."""
+    image = Image.open(path, formats=["PNG"])
+    if image.width * image.height > MOST_PIXELS + path.stat().st_size:
+        raise ValueError(f"it claims {image.width} x {image.height} pixels in {path.stat().st_size} bytes")
+    return image

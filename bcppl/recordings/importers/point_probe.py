@@ -7,6 +7,7 @@ PushExp/sensor_log, Apache-2.0.
 """
 
 import math
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -87,8 +88,11 @@ def read_log(path: Path) -> list[LoggedPush]:
         InputError: the file is missing, is no list of numbers, or does not hold the rows that it announces.
     """
     try:
-        numbers = np.array(path.read_text().split(), dtype=np.float64)
-    except (OSError, ValueError) as error:
+        text = path.read_bytes().decode("ascii")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # numpy warns of what it cannot read, and leaves it out
+            numbers = np.fromstring(text, dtype=np.float64, sep=" ")
+    except (OSError, ValueError, DeprecationWarning) as error:
         raise InputError(f"{path} is no push log of whitespace-separated numbers; give one.") from error
     if not np.isfinite(numbers).all():
         raise InputError(f"{path} holds a number that is not finite; copy the log again.")
