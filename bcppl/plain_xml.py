@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, NoReturn
 from xml.parsers import expat
 
-LARGEST = 16 << 20  # bytes: a tree in memory takes tens of times as many
 DEEPEST = 100  # elements within elements
 
 
@@ -13,10 +12,8 @@ def refuse_entities(data: bytes) -> None:
     """Refuse XML that a parser would expand, or follow to other files, or nest without end.
 
     Raises:
-        ValueError: it has a document type, is nested too deeply, is too large, or is no XML.
+        ValueError: it has a document type, is nested too deeply, or is no XML.
     """
-    if len(data) > LARGEST:
-        raise ValueError(f"it is larger than {LARGEST >> 20} MB")
     parser, depth = expat.ParserCreate(), 0
 
     def refuse(*declaration: Any) -> NoReturn:

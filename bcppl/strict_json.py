@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Any, NoReturn
 
 from bcppl.errors import InputError
 
-LARGEST = 32 << 20  # bytes: Python holds JSON in up to twenty times as many
+LARGEST = 16 << 20  # bytes: Python holds JSON in up to twenty times as many
 
 
 def read(path: Path, remedy: str, finite: bool = True) -> Any:
@@ -21,7 +22,7 @@ def read(path: Path, remedy: str, finite: bool = True) -> Any:
         finite: whether NaN and infinite numbers are refused; Python writes them, JSON has none.
 
     Raises:
-        InputError: it is missing, larger than 32 MB, or no JSON, or an object has a name twice.
+        InputError: it is missing, larger than 16 MB, or no JSON, or an object has a name twice.
     """
     try:
         if path.stat().st_size > LARGEST:
@@ -49,8 +50,8 @@ def parsed(text: str, finite: bool = True) -> Any:
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     made = dict(pairs)
     if len(made) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"the name {next(n for n in names if names.count(n) > 1)!r} is given twice")
+        (name, _), *_ = Counter(name for name, _ in pairs).most_common(1)
+        raise ValueError(f"the name {name[:40]!r} is given twice")
     return made
 
 

@@ -182,6 +182,8 @@ HOSTILE: dict[str, list[tuple[str, Callable[[bytes], bytes]]]] = {
         ),
         ("a count of STL", lambda data: bytes(80) + struct.pack("<I", 4_000_000_000) + bytes(500)),
         ("no bytes", lambda data: b""),
+        ("many bodies", lambda data: b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + b"o a\nusemtl b\nf 1 2 3\n" * 50_000),
+        ("many solids", lambda data: b"solid a\nendsolid a\n" * 50_000),
     ],
     "png": [
         ("a bomb", lambda data: png(30000, 12000, 1, 0, 3750)),

@@ -139,7 +139,9 @@ def watched(load: Callable[[Path], Any], path: Path) -> tuple[str, str, float, i
     return said, detail, seconds, memory
 
 
-def _classified(said: str, detail: str, whole: str, path: Path, size: int, memory: int, rule: str) -> str:
+def _classified(
+    said: str, detail: str, whole: str, paths: list[Path], size: int, memory: int, rule: str
+) -> str:
     if said in ("hang", "crash"):
         return said
     if memory > ALLOWANCE + 10 * size or "MemoryError" in detail:
@@ -147,9 +149,8 @@ def _classified(said: str, detail: str, whole: str, path: Path, size: int, memor
     if said == "traceback":
         return "traceback"
     if said == "refused":
-        return (
-            "refused" if "\n" not in detail and path.name in detail and detail.isprintable() else "sentence"
-        )
+        names = any(each.name in detail for each in paths)
+        return "refused" if names and detail.isprintable() and len(detail) < 700 else "sentence"
     if rule == "refuse":
         return "accepted"
     if detail == whole:
@@ -179,7 +180,7 @@ def campaign(count: int, seed: int, kinds: list[str] | None = None) -> Iterator[
             size, (whole, usual) = each.damaged_path.stat().st_size, wholes[each.kind]
             said, detail, seconds, memory = watched(LOADERS[each.loader], each.path)
             memory -= usual
-            outcome = _classified(said, detail, whole, each.damaged_path, size, memory, rule)
+            outcome = _classified(said, detail, whole, [each.path, each.damaged_path], size, memory, rule)
             yield Result(each.kind, case, what, outcome, detail, seconds, memory)
             each.damaged_path.unlink()
             each.damaged_path.write_bytes(original)

@@ -14,6 +14,7 @@ import typer
 
 from bcppl.cli import probe, recordings, run, sweep
 from bcppl.errors import InferenceError, InputError
+from bcppl.visible_text import visible
 
 app = typer.Typer(
     name="bcppl",
@@ -76,6 +77,6 @@ def main() -> None:
 
 
 def _stop(sentence: str, code: int) -> None:
-    sentence = " ".join(sentence.split())
+    sentence = visible(" ".join(sentence.split()))  # it may quote a file
     print(f"bcppl: {sentence}{'' if sentence.endswith(('.', '?')) else '.'}", file=sys.stderr)
     sys.exit(code)

@@ -12,6 +12,7 @@ import typer
 from bcppl.arguments import LARGEST_SEED
 from bcppl.cli.setting_option import Settings
 from bcppl.errors import InputError
+from bcppl.visible_text import visible
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -105,6 +106,7 @@ def probe(
     from bcppl.inference.design.rules import by_linearised_gain, by_reweighted_gain, can_be_linearised
     from bcppl.inference.planning.candidate_layout import require_uncertain
     from bcppl.recordings.action_file import save_actions
+    from bcppl.recordings.hdf5 import replacing
     from bcppl.sensors import sensor_of
     from bcppl.sensors.candidates import duration_of, name_of, named_apart, planner_of, with_candidates
 
@@ -120,7 +122,7 @@ def probe(
     belief = now.population.belief(now.model.pose)
     require_uncertain(belief)
     listed = options.planned(asked, belief, now.recording, constraints, table, seed)
-    console.print(escape(str(listed)), soft_wrap=True)
+    console.print(escape(visible(str(listed))), soft_wrap=True)
     scene = now.model.prepare(with_candidates(now.recording, listed))
     linearised = can_be_linearised(scene, listed)
     if by == "linearised" and not linearised:
@@ -137,12 +139,14 @@ def probe(
     console.print(table_of_best)
     best = named_apart(ranking.best.candidate, now.recording)
     save_actions([best], output)
-    shown = f"next: {name_of(best)}", belief.world_from_part.numpy(), belief.log_weights.numpy()
+    title = visible(name_of(best)).replace("$", r"\$")  # matplotlib reads formulas
+    shown = f"next: {title}", belief.world_from_part.numpy(), belief.log_weights.numpy()
     alike = [c for c in listed if sensor_of(c) is sensor_of(best)]
     others = alike if planner_of(best).needs_peg else []
     figure = action_in_3d(now.recording.part, shown, best, now.recording.peg, others)
-    figure.savefig(picture, dpi=150)
-    console.print(f"the best is in {output}, its picture in {picture}", soft_wrap=True)
+    with replacing(picture) as beside:
+        figure.savefig(beside, dpi=150, format="png")
+    console.print(f"the best is in {output}, its picture in {picture}", soft_wrap=True, markup=False)
 
 
 def _picture(output: Path, given: Sequence[str]) -> Path:
@@ -181,5 +185,5 @@ def _table(ranking: Ranking, top: int) -> Table:
         numbers[1] = f"± {numbers[1]}"
         motion = motion_of(what)
         press = "" if motion is None else f"{pressing_force(motion):.1f}"
-        table.add_row(str(k + 1), escape(name_of(what)), *numbers, press)
+        table.add_row(str(k + 1), escape(visible(name_of(what))), *numbers, press)
     return table

@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 
 from bcppl.arguments import LARGEST_SEED
 from bcppl.errors import InputError
+from bcppl.visible_text import visible
 
 if TYPE_CHECKING:
     from bcppl.recordings import Recording
@@ -25,22 +26,27 @@ def check(
 ) -> None:
     """Describe a recording and list its problems (exit code 2 if there are any)."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     from bcppl.models.shipped import load_recording
     from bcppl.recordings import describe, notes, problems
+    from bcppl.recordings.file import is_checked
 
     loaded = load_recording(recording)
+    remarks = notes(loaded)
+    if Path(recording).is_file() and not is_checked(recording):
+        remarks.append("the file has no checksum, so a changed number goes unnoticed: save it again for one.")
     console = Console()
     table = Table(show_header=False, box=None, pad_edge=False)
     for what, value in describe(loaded):
-        table.add_row(f"[bold]{what}[/bold]", value)
+        table.add_row(f"[bold]{what}[/bold]", escape(visible(value)))
     console.print(table)
-    for note in notes(loaded):
-        console.print(f"[yellow]note:[/yellow] {note}", highlight=False)
+    for note in remarks:
+        console.print(f"[yellow]note:[/yellow] {escape(visible(note))}", highlight=False)
     wrong = problems(loaded)
     for problem in wrong:
-        console.print(f"[red]wrong:[/red] {problem}", highlight=False)
+        console.print(f"[red]wrong:[/red] {escape(visible(problem))}", highlight=False)
     if wrong:
         raise typer.Exit(2)
     console.print("[green]no problem.[/green]")
@@ -72,7 +78,8 @@ def _write(recording: Recording, out: Path) -> None:
     if not out.parent.is_dir():
         raise InputError(f"there is no folder {out.parent} to write {out.name} into; make it first.")
     save(recording, out)
-    Console().print(f"wrote {out}: {dict(describe(recording))['measurements']}", highlight=False)
+    written = f"wrote {out}: {dict(describe(recording))['measurements']}"
+    Console().print(visible(written), highlight=False, markup=False)
 
 
 class Importers(TyperGroup):

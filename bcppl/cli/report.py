@@ -18,6 +18,7 @@ from bcppl.geometry.parts import with_tip_at
 from bcppl.inference.criticism import Explanation, explanations
 from bcppl.recordings import Recording
 from bcppl.traces import Model
+from bcppl.visible_text import visible
 
 WIDTHS = {
     "measurement": 12,
@@ -137,7 +138,7 @@ class Report:
         return None if relative is None else relative.spread.tolist()
 
     def _warn(self, sentence: str) -> None:
-        self.console.print(sentence, style="yellow", markup=False)
+        self.console.print(visible(sentence), style="yellow", markup=False)
 
     def _note(self, sentence: str) -> None:
         self.console.print(sentence, style="dim", markup=False)

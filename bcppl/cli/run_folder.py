@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from bcppl.recordings.hdf5 import replacing
 from bcppl.sensors import sensor_of
 
 RECORD, STEP = "run.json", "step.h5"
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class RunFolder:
@@ -56,7 +58,10 @@ class RunFolder:
         self.record: dict[str, Any] = {**settings, "version": version("bcppl")}
         self.rows: list[Mapping[str, str]] = []
         self.history: list[tuple[str, Belief]] = []
-        path.mkdir(parents=True, exist_ok=True)
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{path} cannot be made ({error.strerror}); give another --out.") from error
         for old in (*path.glob("belief_*.h5"), *path.glob("*.png"), path / STEP):
             old.unlink(missing_ok=True)
         self.note(complete=False, rows=[], checked={})
@@ -114,7 +119,7 @@ class RunFolder:
         figure = add_over_time(np.arange(len(labels), dtype=np.float64), adds, weights, labels, contact)
         if not known:
             figure.axes[0].set_ylabel("distance from the final mean (mm)")
-        figure.savefig(self.path / "add_over_time.png", dpi=150)
+        self._keep(figure, "add_over_time.png")
         looked = [k for k, touches in enumerate(touching, 1) if not touches]
         shown = [
             (
@@ -164,3 +169,8 @@ def read_record(path: Path) -> dict[str, Any]:
             f"{path / RECORD} has no {wrong[0]} as `bcppl run` writes it; run the recording again."
         )
     return record
+        self._keep(belief_in_3d(recording.part, shown, recording.truth), "belief_in_3d.png")
+
+    def _keep(self, figure: Figure, name: str) -> None:
+        with replacing(self.path / name) as beside:
+            figure.savefig(beside, dpi=150, format="png")

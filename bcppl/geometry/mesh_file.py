@@ -17,6 +17,13 @@ if TYPE_CHECKING:
 
 FORMATS = (".obj", ".stl", ".ply", ".off", ".dae")  # no archives, which may hold a thousand times their size
 LARGEST = 512 << 20  # bytes
+LARGEST_TEXT = {
+    ".obj": 32 << 20,
+    ".off": 8 << 20,
+    ".ply": 8 << 20,
+}  # as text, which takes up to 20, 60, 60 times
+MOST_BODIES = 1000  # groups, materials or solids: each takes half a millisecond and 50 kB
+BODY = re.compile(rb"^\s*(?:o|g|usemtl|solid)\b", re.MULTILINE)
 COUNTS = {
     ".ply": re.compile(rb"^\s*element\s+\S+\s+(\d+)", re.MULTILINE),
     ".off": re.compile(rb"\A\s*(?:C?OFF)?\s+(\d+)\s+(\d+)"),
@@ -66,11 +73,16 @@ def read_mesh(path: Path, process: bool = False) -> trimesh.Trimesh:
 
 
 def _refuse_claims(data: bytes, suffix: str) -> None:
-    """Refuse counts in a header that are larger than the file: memory is allocated by them."""
+    """Refuse what takes far more memory or time than the size explains: claims, long text, many bodies."""
+    header = data[: data.find(b"end_header")] if suffix == ".ply" else data[:1000]
     if suffix == ".dae":
         refuse_entities(data)
-    elif suffix in COUNTS:
-        header = data[: data.find(b"end_header")] if suffix == ".ply" else data[:1000]
+    if suffix in COUNTS:
         counts = [int(n) for found in COUNTS[suffix].finditer(header) for n in found.groups()]
         if sum(counts) > len(data):
             raise ValueError(f"it claims {sum(counts)} vertices and faces in {len(data)} bytes")
+    most = LARGEST if suffix == ".ply" and b"ascii" not in header else LARGEST_TEXT.get(suffix, LARGEST)
+    if len(data) > most:
+        raise ValueError(f"it is larger than {most >> 20} MB; binary STL and PLY may have {LARGEST >> 20} MB")
+    if suffix in (".obj", ".stl") and sum(1 for _ in BODY.finditer(data)) > MOST_BODIES:
+        raise ValueError(f"it has more than {MOST_BODIES} bodies, groups or materials")

@@ -91,7 +91,7 @@ def _read(kind: object, what: str, source: h5py.Group | Mapping[str, Any]) -> Ca
     known = _planners()
     if not isinstance(kind, str) or kind not in known:
         words = ", ".join(f'"{each}"' for each in known)
-        raise InputError(f"{what} is of kind {kind!r}; give one of {words}.")
+        raise InputError(f"{what} is of kind {str(kind)[:40]!r}; give one of {words}.")
     layout = known[kind].candidate
     try:
         return layout.read(source) if isinstance(source, h5py.Group) else _of_fields(source, layout)

@@ -165,7 +165,8 @@ def describe(recording: Recording) -> list[tuple[str, str]]:
 
 
 def _described_part(part: Part) -> str:
-    if part.vertices.ndim != 2 or len(part.vertices) == 0 or len(part.faces) == 0:
+    rows = part.vertices.shape[1:], part.faces.shape[1:]
+    if rows != ((3,), (3,)) or len(part.vertices) == 0 or len(part.faces) == 0:
         return f"{part.name}, empty mesh"
     size = " × ".join(f"{1e3 * side:.1f}" for side in part.extent)
     closed = "closed" if part.is_closed else "open"

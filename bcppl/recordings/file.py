@@ -147,7 +147,8 @@ def _read(file: h5py.File) -> Recording:
             f"the file holds {min(unknown)!r}, which no recording does; remove it, or correct its name."
         )
     for name in ALWAYS:
-        file[name]  # one that is missing is named
+        if not isinstance(file[name], h5py.Group):
+            raise InputError(f"{name} is no group; make the recording again.")
     shared = SharedObjects(file)
     return Recording(
         part=_read_part(file["part"]),

@@ -20,6 +20,7 @@ import h5py
 
 from bcppl.errors import InputError
 from bcppl.recordings import structure
+from bcppl.visible_text import visible
 
 MARK = b"\nbcppl sha256 "
 SEAL = re.compile(rb"\nbcppl sha256 ([0-9a-f]{64})\n", re.DOTALL)
@@ -64,7 +65,7 @@ def created(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
         InputError: it cannot be written; an earlier file is left as it was.
     """
     with replacing(path) as beside:
-        with h5py.File("new", "w", driver="core", backing_store=False) as file:
+        with h5py.File(beside, "w", driver="core", backing_store=False) as file:
             yield file
             _bounded(file)
             file.flush()
@@ -125,8 +126,7 @@ def opened(path: str | os.PathLike[str], remedy: str = AGAIN) -> Iterator[h5py.F
 
 def one_line(error: BaseException) -> str:
     """The message of an error in one line that can be printed, without its full stop."""
-    text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    return visible(" ".join(str(error).split()).rstrip(".") or type(error).__name__)
 
 
 def _checksum(path: Path) -> tuple[str, bool | None]:

@@ -46,61 +46,63 @@ def check(file: h5py.File, size: int, read: bool = False) -> None:
     Raises:
         StructureError: says which group or dataset.
     """
-    left, seen, waiting = limit(size), {_address(file)}, [file]
+    left, seen, waiting = limit(size), {_address(file.id)}, [("", h5py.h5g.open(file.id, b"/"))]
     while waiting:
-        group = waiting.pop()
-        left -= _attributes(group)
-        for name in group:
-            where = f"{group.name.rstrip('/')}/{name}"
-            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+        above, group = waiting.pop()
+        left -= _attributes(group, above or "/", read)
+        for key in group:
+            where = f"{above}/{key.decode(errors='replace')}"
+            if group.links.get_info(key).type != h5py.h5l.TYPE_HARD:
                 raise StructureError(f"{where} is a link to another place; a recording holds none")
-            node = group[name]
+            node = h5py.h5o.open(group, key)
             address = _address(node)
             if address in seen:
                 raise StructureError(f"{where} is linked twice; a recording holds each thing once")
             seen.add(address)
-            if isinstance(node, h5py.Group):
-                waiting.append(node)
-            elif isinstance(node, h5py.Dataset):
-                left -= _attributes(node) + _dataset(node, left)
+            if isinstance(node, h5py.h5g.GroupID):
+                waiting.append((where, node))
+            elif isinstance(node, h5py.h5d.DatasetID):
+                left -= _attributes(node, where, read) + _dataset(node, where, left)
                 if left < 0:
                     raise StructureError(f"{where} claims more numbers than a file of {size} bytes explains")
                 if read:
-                    node[()]
+                    h5py.Dataset(node)[()]
             else:
                 raise StructureError(f"{where} is no group and no dataset")
 
 
 def _address(node: Any) -> tuple[int, int]:
-    found = h5py.h5o.get_info(node.id)
+    found = h5py.h5o.get_info(node)
     return found.fileno, found.addr
 
 
-def _attributes(node: Any) -> int:
-    """The bytes of an object's attributes, which are read."""
+def _attributes(node: Any, where: str, read: bool) -> int:
+    """The bytes of an object's attributes."""
     total = 0
-    for name in node.attrs:
-        kept = node.attrs.get_id(name)
+    for index in range(h5py.h5a.get_num_attrs(node)):
+        kept = h5py.h5a.open(node, index=index)
         if kept.get_space().get_simple_extent_type() == h5py.h5s.NULL or not _plain(kept.dtype):
-            raise StructureError(f"attribute {name!r} of {node.name} is neither numbers nor text")
+            raise StructureError(f"attribute {kept.name!r} of {where} is neither numbers nor text")
         total += kept.get_storage_size()
-        node.attrs[name]
+        if read:
+            holder = h5py.Group(node) if isinstance(node, h5py.h5g.GroupID) else h5py.Dataset(node)
+            holder.attrs[kept.name.decode()]
     return total
 
 
-def _dataset(node: h5py.Dataset, left: int) -> int:
+def _dataset(node: Any, where: str, left: int) -> int:
     """The bytes that a dataset's numbers take in memory."""
-    plan = node.id.get_create_plist()
-    if node.shape is None or not _plain(node.dtype):
-        raise StructureError(f"{node.name} holds neither numbers nor text")
-    if node.is_virtual or node.external:
-        raise StructureError(f"{node.name} lies in another file; copy its numbers into this one")
+    plan, dtype = node.get_create_plist(), node.dtype
+    if node.get_space().get_simple_extent_type() == h5py.h5s.NULL or not _plain(dtype):
+        raise StructureError(f"{where} holds neither numbers nor text")
+    layout = plan.get_layout()
+    if layout == h5py.h5d.VIRTUAL or plan.get_external_count():
+        raise StructureError(f"{where} lies in another file; copy its numbers into this one")
     if not {plan.get_filter(k)[0] for k in range(plan.get_nfilters())} <= FILTERS:
-        raise StructureError(f"{node.name} is compressed by a plugin; write it with gzip")
-    chunk = math.prod(node.chunks or ()) * node.dtype.itemsize
-    if chunk > left:
-        raise StructureError(f"{node.name} lies in chunks of {chunk} bytes, more than the file explains")
-    return math.prod(node.shape) * node.dtype.itemsize
+        raise StructureError(f"{where} is compressed by a plugin; write it with gzip")
+    if layout == h5py.h5d.CHUNKED and (chunk := math.prod(plan.get_chunk()) * dtype.itemsize) > left:
+        raise StructureError(f"{where} lies in chunks of {chunk} bytes, more than the file explains")
+    return math.prod(node.shape) * dtype.itemsize
 
 
 def _plain(dtype: Any) -> bool:
@@ -109,14 +111,14 @@ def _plain(dtype: Any) -> bool:
 
 def _limited(size: int) -> None:
     """Let this process take no more memory and time than a file of a size may."""
-    with contextlib.suppress(ImportError, OSError, ValueError):  # Windows has no such limits
+    with contextlib.suppress(ImportError, OSError, ValueError):  # not every system has such limits
         import resource
 
-        with open("/proc/self/statm") as taken:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(seconds(size)),) * 2)
+        with open("/proc/self/statm") as taken:  # Linux alone counts addresses, and keeps to the limit
             now = int(taken.read().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (now + 2 * limit(size),) * 2)
-        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(seconds(size)),) * 2)
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def seconds(size: int) -> float:

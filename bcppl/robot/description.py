@@ -28,6 +28,7 @@ from bcppl.geometry.parts import Part
 from bcppl.plain_xml import refuse_entities
 
 MOVING = ("revolute", "continuous", "prismatic")
+LARGEST = 4 << 20  # bytes of a URDF file: links in memory take tens of times as many
 MESHES = (".stl", ".obj", ".dae", ".ply")
 
 
@@ -91,6 +92,8 @@ def read(file: str | Path) -> Description:
     try:
         # The parser prints unknown elements (transmissions, xacro) to standard error.
         with contextlib.redirect_stderr(ignored), contextlib.redirect_stdout(ignored):
+            if file.stat().st_size > LARGEST:
+                raise ValueError(f"it is larger than {LARGEST >> 20} MB")
             text = file.read_bytes()
             refuse_entities(text)
             robot = urdf.URDF.from_xml_string(text)
@@ -100,24 +103,26 @@ def read(file: str | Path) -> Description:
                     raise InputError(f"{file} has two {kind}s of the name {name!r}; rename one.")
         links = {link.name: link for link in robot.links}
         joints = {j.child: _joint(j) for j in robot.joints}
-    except InputError:
-        raise
+        ordered = _ordered(file, list(links), joints, len(robot.joints))
+        named = [(name, links[name]) for name in ordered]
+        return Description(
+            name=robot.name or file.stem,
+            file=file,
+            links=tuple(ordered),
+            joints=tuple(joints[name] for name in ordered if name in joints),
+            visual=tuple(_shape(n, s) for n, link in named for s in link.visuals if s.geometry is not None),
+            collision=tuple(
+                _shape(n, s) for n, link in named for s in link.collisions if s.geometry is not None
+            ),
+        )
+    except InputError as error:
+        raise (error if str(file) in str(error) else InputError(f"{file}: {error}")) from error
     except Exception as error:  # the parser raises ParseError, XMLSyntaxError, AssertionError, ValueError
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
             f"{file} cannot be read as a URDF ({reason}); "
             "give the robot's URDF file, expanded where it is a xacro."
         ) from error
-    ordered = _ordered(file, list(links), joints, len(robot.joints))
-    named = [(name, links[name]) for name in ordered]
-    return Description(
-        name=robot.name or file.stem,
-        file=file,
-        links=tuple(ordered),
-        joints=tuple(joints[name] for name in ordered if name in joints),
-        visual=tuple(_shape(n, s) for n, link in named for s in link.visuals if s.geometry is not None),
-        collision=tuple(_shape(n, s) for n, link in named for s in link.collisions if s.geometry is not None),
-    )
 
 
 def _ordered(file: Path, links: Sequence[str], joints: Mapping[str, Joint], count: int) -> list[str]:

@@ -72,7 +72,7 @@ class Field:
         kept = group[key]
         held = kept.attrs.get("units") if isinstance(kept, h5py.Dataset) else "a group"
         if (held is not None or self.units) and not (isinstance(held, str) and held == self.units):
-            stated = "states no units" if held is None else f"is in {held!r}"
+            stated = "states no units" if held is None else f"is in {str(held)[:40]!r}"
             raise ValueError(f"{key} {stated}; give a dataset in {self.units!r}, and state it as its units")
         return _named(key, self.parsed, kept[()] if self.units else kept.asstr()[()])
 

@@ -1,0 +1,8 @@
+"""Text that came from a file, as a terminal may show it."""
+
+from __future__ import annotations
+
+
+def visible(text: str) -> str:
+    """The text with all that is not printable spelled out: it can neither colour nor hide words."""
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
