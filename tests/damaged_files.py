@@ -207,15 +207,18 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     start = time.monotonic()
-    results = list(campaign(given.count, given.seed, given.kinds))
+    results = []
+    for each in campaign(given.count, given.seed, given.kinds):
+        results.append(each)
+        if given.json is not None:
+            with given.json.open("a") as lines:
+                lines.write(json.dumps(dataclasses.asdict(each)) + "\n")
     print(table(results))
     print(
         f"{len(results)} files, {time.monotonic() - start:.0f} s, "
         f"slowest {max(each.seconds for each in results):.1f} s, "
         f"most memory {max(each.memory for each in results) >> 20} MB"
     )
-    if given.json is not None:
-        given.json.write_text("".join(json.dumps(dataclasses.asdict(each)) + "\n" for each in results))
     sys.exit(any(each.outcome in BAD for each in results))
 
 

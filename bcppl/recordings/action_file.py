@@ -76,7 +76,9 @@ def _refuse_suffix(path: Path) -> None:
 
 def _refuse_header(path: Path, header: Mapping[str, Any]) -> None:
     if header.get("format", FORMAT) != FORMAT:
-        raise InputError(f"{path} holds a {header['format']}, no actions; give a file of plans and views.")
+        raise InputError(
+            f"{path} holds a {str(header['format'])[:40]}, no actions; give a file of plans and views."
+        )
     version = whole_number(f"{path} has schema_version {{}}", header.get("schema_version", SCHEMA_VERSION))
     if version > SCHEMA_VERSION:
         raise InputError(f"{path} was written by a later bcppl (schema {version}); upgrade bcppl.")

@@ -154,9 +154,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
     if not path.is_file():
         raise InputError(f"there is no belief at {path}; `bcppl run` writes them into its --out folder.")
     with opened(path, "run it again") as file:
-        if (
-            file.attrs.get("format") != FORMAT
-            or operator.index(file.attrs["schema_version"]) > SCHEMA_VERSION
-        ):
+        known = file.attrs.get("format") == FORMAT
+        if not known or not 1 <= operator.index(file.attrs["schema_version"]) <= SCHEMA_VERSION:
             raise InputError(f"{path} holds no belief that this version of bcppl reads; run it again.")
         yield file

@@ -225,8 +225,8 @@ def sensor_named(kind: str) -> Sensor:
     """
     if (sensor := _looked_up(_registered, kind)) is None:
         raise InputError(
-            f"a measurement is of unknown kind {kind!r}; known are {', '.join(_registered)}: install the "
-            "package that registers it."
+            f"a measurement is of unknown kind {kind[:40]!r}; known are {', '.join(_registered)}: "
+            "install the package that registers it."
         )
     return sensor
 
