@@ -17,6 +17,7 @@ from bcppl.visible_text import visible
 
 if TYPE_CHECKING:
     from bcppl.recordings import Recording
+    from bcppl.recordings.importers import Imported
 
 OUT = Annotated[Path, typer.Option("--out", "-o", dir_okay=False, help="The recording to write (.h5).")]
 
@@ -109,12 +110,23 @@ def _commands() -> dict[str, Any]:
     return commands
 
 
-def _importing(command: Callable[..., Recording]) -> Callable[..., None]:
-    """The command of an importer with `--out` added, its other options as the importer declares them."""
+def _importing(command: Callable[..., Recording | Imported]) -> Callable[..., None]:
+    """The command of an importer with `--out` added, its other options as the importer declares them.
+
+    The report is printed before the recording is checked, for it often says why that fails.
+    """
 
     @functools.wraps(command)
     def importing(*, out: Path, **options: Any) -> None:
-        _write(command(**options), out)
+        from rich.console import Console
+
+        from bcppl.recordings.importers import Imported
+
+        made = command(**options)
+        imported = made if isinstance(made, Imported) else Imported(made)
+        for line in imported.report:
+            Console().print(line, highlight=False, markup=False, soft_wrap=True)
+        _write(imported.recording, out)
 
     wrapped: Any = importing
     signature = inspect.signature(command)

@@ -1,15 +1,33 @@
 """Importers: one file each, found by name, so that a new one is a new file and no other change.
 
-A module here defines `NAME` (the word on the command line), `HELP` (one line), and a function
-`command(...) -> Recording` whose parameters are annotated for typer. Importers keep their annotations as
-objects (no `from __future__ import annotations`), so that a command line can extend the signature.
+A module here, or a package, defines `NAME` (the word on the command line), `HELP` (one line), and a
+function `command(...)` whose parameters are annotated for typer. It returns a `Recording`, or an `Imported`
+that also reports how the data were read. Importers keep their annotations as objects (no
+`from __future__ import annotations`), so that a command line can extend the signature.
 """
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Sequence
+from dataclasses import dataclass
 from types import ModuleType
+
+from bcppl.sensors.measurements import Recording
+
+
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """What an importer made of its data.
+
+    Attributes:
+        recording: of the data.
+        report: lines on how they were read: rates, gaps, clocks, and what was assumed or left out.
+    """
+
+    recording: Recording
+    report: Sequence[str] = ()
 
 
 def importers() -> dict[str, ModuleType]:

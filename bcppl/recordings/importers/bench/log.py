@@ -1,0 +1,113 @@
+"""A bench's log, step by step: streams, clocks, common stamps, wrenches on the peg, probes, views."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bcppl.arrays import Array
+from bcppl.errors import InputError
+from bcppl.recordings.importers import Imported
+from bcppl.recordings.importers.bench.bodies import read_guess, read_part, read_peg
+from bcppl.recordings.importers.bench.clocks import on_one_clock
+from bcppl.recordings.importers.bench.config import BenchFields, PoseFields
+from bcppl.recordings.importers.bench.configuration import read_configuration
+from bcppl.recordings.importers.bench.cutting import Command, Rows, probes
+from bcppl.recordings.importers.bench.gravity import without_weight
+from bcppl.recordings.importers.bench.pose_columns import (
+    composed,
+    inverted,
+    read_joints,
+    read_poses,
+    stated_pose,
+)
+from bcppl.recordings.importers.bench.resampling import common_stamps, is_known, poses_at, values_at
+from bcppl.recordings.importers.bench.streams import Stream
+from bcppl.recordings.importers.bench.views import placed, read_views
+from bcppl.recordings.importers.bench.wrenches import IDENTITY, read_wrench, wrench_on_peg
+from bcppl.sensors import Measurement, Recording
+
+
+def imported(path: Path) -> Imported:
+    """The recording of the log that a configuration describes, and a report.
+
+    Raises:
+        InputError: the configuration or a file that it names is missing or wrong, or the streams do not fit.
+    """
+    fields, folder, report = read_configuration(path), path.parent, list[str]()
+    part, peg = read_part(fields.part, folder, report), read_peg(fields.peg, folder, report)
+    frame = _poses(fields, folder, report)
+    touches = _touches(fields, folder, frame, report)
+    views: list[Measurement] = []
+    background: dict[str, Array] = {}
+    for name, camera in fields.cameras.items():
+        seen, empty = read_views(name, camera, folder, frame, report)
+        views += seen
+        background |= empty
+    recording = Recording(
+        part=part,
+        guess=read_guess(fields.guess),
+        measurements=[*views, *touches],
+        peg=peg,
+        background=background,
+        truth=None if fields.truth is None else stated_pose("truth", fields.truth),
+        model=fields.model,
+        source=fields.source or f"bench log, {path.name}",
+    )
+    return Imported(recording, tuple(report))
+
+
+def _poses(fields: BenchFields, folder: Path, report: list[str]) -> Stream:
+    """`world_from_frame` (T, 7), on the clock of its log."""
+    world_from_base = stated_pose("world_from_base", fields.world_from_base)
+    if fields.joints is not None:
+        return placed(read_joints(fields.joints, folder, report), world_from_base)
+    assert fields.pose is not None
+    return placed(read_poses("pose", fields.pose, folder, report), world_from_base)
+
+
+def _touches(fields: BenchFields, folder: Path, frame: Stream, report: list[str]) -> list[Measurement]:
+    """The windows of the log's probes; their stamps count from the first pose."""
+    frame_from_peg = stated_pose("frame_from_peg", fields.frame_from_peg)
+    frame_from_sensor = _stated("frame_from_sensor", fields.frame_from_sensor)
+    start = float(frame.times[0])
+    frame = frame.shifted(-start)
+    wrench = read_wrench(fields.wrench, folder, report).shifted(-start)
+    wrench = on_one_clock(wrench, frame, fields.clock, report)
+    stamps = common_stamps(frame, wrench, fields.cut.rate)
+    if len(stamps) < 2:
+        raise InputError(
+            f"the wrench lasts from {wrench.times[0]:.1f} to {wrench.times[-1]:.1f} s of the pose's "
+            f"log, which lasts {frame.times[-1]:.1f} s: their clocks differ; state clock.wrench_late."
+        )
+    known = is_known(frame, stamps, fields.cut.gap) & is_known(wrench, stamps, fields.cut.gap)
+    world_from_frame = poses_at(frame, stamps)
+    world_from_base = stated_pose("world_from_base", fields.world_from_base)
+    base_from_frame = composed(inverted(world_from_base), world_from_frame)
+    felt = wrench_on_peg(
+        values_at(wrench, stamps), fields.wrench, base_from_frame, frame_from_peg, frame_from_sensor
+    )
+    world_from_peg = composed(world_from_frame, frame_from_peg)
+    peg_from_sensor = composed(inverted(frame_from_peg), frame_from_sensor)
+    felt, words = without_weight(felt, world_from_peg, stamps, fields.gravity, peg_from_sensor)
+    report.append(words)
+    step = float(stamps[1] - stamps[0])
+    report.append(f"common stamps: {len(stamps)} at {1.0 / step:.4g} Hz")
+    command = _command(fields, folder, start, frame_from_peg, report)
+    return probes(Rows(stamps, felt, world_from_peg, known), fields.cut, fields.arm, command, report)
+
+
+def _command(
+    fields: BenchFields, folder: Path, start: float, frame_from_peg: Array, report: list[str]
+) -> Command | None:
+    if fields.command is None:
+        report.append("command: none logged; the measured poses stand for it")
+        return None
+    stream = read_poses("command", fields.command, folder, report)
+    world_from_base = stated_pose("world_from_base", fields.world_from_base)
+    return Command(stream.times - start, composed(composed(world_from_base, stream.values), frame_from_peg))
+
+
+def _stated(name: str, fields: PoseFields | None) -> Array:
+    return np.array(IDENTITY) if fields is None else stated_pose(name, fields)

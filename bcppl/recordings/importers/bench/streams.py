@@ -1,0 +1,117 @@
+"""Streams of a log: rows in order of their stamps, and what was wrong with the stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from bcppl.arrays import Array
+from bcppl.errors import InputError
+from bcppl.recordings.importers.bench.config import StreamFields, factor
+from bcppl.recordings.importers.bench.table import read_columns
+from bcppl.sensors import checks
+
+LOST = 1.5  # median intervals: a longer one has lost rows
+MOST_BACKWARDS = 0.01  # of the rows: more are no few messages that came late
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """Rows of one sensor.
+
+    Attributes:
+        name: of the stream in the configuration.
+        times: (T,) seconds on its own clock, increasing.
+        values: (T, C).
+    """
+
+    name: str
+    times: Array
+    values: Array
+
+    @cached_property
+    def step(self) -> float:
+        """The median interval, s."""
+        return float(np.median(np.diff(self.times)))
+
+    @property
+    def rate(self) -> float:
+        """Rows per second."""
+        return 1.0 / self.step
+
+    def shifted(self, by: float) -> Stream:
+        """The same rows at stamps later by some seconds."""
+        return replace(self, times=self.times + by)
+
+
+def read_stream(name: str, fields: StreamFields, folder: Path, report: list[str]) -> Stream:
+    """The rows of a stream in order; rows without a number, repeated and backward stamps are left out.
+
+    Raises:
+        InputError: the file cannot be read, fewer than ten rows remain, the clock runs backwards at more than
+            a percent of them, or the stamps are in another unit.
+    """
+    table = read_columns(folder / fields.file, [fields.time.column, *fields.columns])
+    times = factor(fields.time.unit) * table[:, 0]
+    stream, left_out = _in_order(name, times, table[:, 1:])
+    for problem in checks.readings(f"{name}'s stamps", stream.times):
+        raise InputError(f"{problem.rstrip('.')} (state {name}.time.unit).")
+    report.append(f"{_described(stream)}{''.join(f'; {each}' for each in left_out)}")
+    return stream
+
+
+def _in_order(name: str, times: Array, values: Array) -> tuple[Stream, list[str]]:
+    left_out = []
+    finite = np.isfinite(times) & np.isfinite(values).all(axis=1)
+    if not finite.all():
+        left_out.append(f"{_rows(int((~finite).sum()))} with a number that is not finite left out")
+        times, values = times[finite], values[finite]
+    if len(times):
+        latest = np.maximum.accumulate(times)
+        # A stamp repeats if it is the latest before it, and runs backwards if it is earlier than that.
+        repeated = np.append(False, times[1:] == latest[:-1])
+        backwards = np.append(False, times[1:] < latest[:-1])
+        if backwards.mean() > MOST_BACKWARDS:
+            row = checks.first(backwards)
+            raise InputError(
+                f"{name}'s stamps run backwards at {_rows(int(backwards.sum()))}, first from "
+                f"{latest[row - 1]:.6f} to {times[row]:.6f} s; cut the log where its clock was set."
+            )
+        if repeated.any():
+            left_out.append(f"{_rows(int(repeated.sum()))} with a repeated stamp left out")
+        if backwards.any():
+            left_out.append(f"{_rows(int(backwards.sum()))} with a stamp before an earlier one left out")
+        times, values = times[~(repeated | backwards)], values[~(repeated | backwards)]
+    if len(times) < 10:
+        raise InputError(f"{name} has {len(times)} usable rows; give a log of ten or more.")
+    return Stream(name, times, values), left_out
+
+
+def _described(stream: Stream) -> str:
+    span = stream.times[-1] - stream.times[0]
+    words = f"{stream.name}: {len(stream.times)} rows at {stream.rate:.4g} Hz over {span:.2f} s"
+    return "".join([words, *_gaps(stream)])
+
+
+def _gaps(stream: Stream) -> Iterator[str]:
+    steps = np.diff(stream.times)
+    gaps = steps > LOST * stream.step
+    if gaps.any():
+        lost = int(np.round(steps[gaps] / stream.step - 1.0).sum())
+        longest = int(steps.argmax())
+        at = stream.times[longest] - stream.times[0]
+        yield (
+            f"; {_rows(lost)} lost in {int(gaps.sum())} gaps, the longest {1000.0 * steps[longest]:.0f} ms "
+            f"at {at:.2f} s"
+        )
+    held = float((np.diff(stream.values, axis=0) == 0.0).all(axis=1).mean())
+    if held > 0.3:
+        yield f"; {100.0 * held:.0f} % of the rows repeat the one before: the sensor is slower"
+
+
+def _rows(count: int) -> str:
+    return f"{count} row{'' if count == 1 else 's'}"
