@@ -144,9 +144,10 @@ class OnsetDetector:
     def _end(self, size: Array, axes: int, first: int, level: float) -> int:
         """The first sample from `first` on without contact, of magnitudes (T,) in standard deviations."""
         if self.threshold is not None:
+            if len(size) - first < self.quiet:  # too few samples to end a contact
+                return len(size)
             low = np.convolve(size[first:] < level, np.ones(self.quiet), mode="valid") > self.quiet - 0.5
-            # Fewer samples than `quiet` at the end do not end a contact.
-            return first + int(low.argmax()) if len(size) - first >= self.quiet and low.any() else len(size)
+            return first + int(low.argmax()) if low.any() else len(size)
         # log 0F1(; D/2; z^2/4), the logarithm of the mean of exp(z cos) over all directions.
         z, order = self.drift * np.clip(size[first:], 1e-9, _LARGEST), 0.5 * axes - 1.0
         mean = np.log(ive(order, z)) + z + gammaln(order + 1.0) - order * np.log(0.5 * z)
