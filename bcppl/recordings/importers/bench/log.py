@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
@@ -13,6 +15,7 @@ from bcppl.recordings.importers.bench.bodies import read_guess, read_part, read_
 from bcppl.recordings.importers.bench.clocks import on_one_clock
 from bcppl.recordings.importers.bench.config import BenchFields, PoseFields
 from bcppl.recordings.importers.bench.configuration import read_configuration
+from bcppl.recordings.importers.bench.contacts import STEP
 from bcppl.recordings.importers.bench.cutting import Command, Rows, probes
 from bcppl.recordings.importers.bench.gravity import without_weight
 from bcppl.recordings.importers.bench.pose_columns import (
@@ -27,6 +30,9 @@ from bcppl.recordings.importers.bench.streams import Stream
 from bcppl.recordings.importers.bench.views import placed, read_views
 from bcppl.recordings.importers.bench.wrenches import IDENTITY, read_wrench, wrench_on_peg
 from bcppl.sensors import Measurement, Recording
+
+_LEAST_SHARED = 1.0  # s that wrench and pose share, or their clocks cannot be compared
+_FREE = 0.1  # s in free air with which a log begins
 
 
 def imported(path: Path) -> Imported:
@@ -69,12 +75,11 @@ def _poses(fields: BenchFields, folder: Path, report: list[str]) -> Stream:
 
 def _touches(fields: BenchFields, folder: Path, frame: Stream, report: list[str]) -> list[Measurement]:
     """The windows of the log's probes; their stamps count from the first pose."""
-    frame_from_peg = stated_pose("frame_from_peg", fields.frame_from_peg)
-    frame_from_sensor = _stated("frame_from_sensor", fields.frame_from_sensor)
+    mounting = _Mounting.of(fields)
     start = float(frame.times[0])
     frame = frame.shifted(-start)
     wrench = read_wrench(fields.wrench, folder, report).shifted(-start)
-    wrench = on_one_clock(wrench, frame, fields.clock, report)
+    wrench = on_one_clock(wrench, *_motion(wrench, frame, mounting), fields.clock, report)
     stamps = common_stamps(frame, wrench, fields.cut.rate)
     if len(stamps) < 2:
         raise InputError(
@@ -82,20 +87,61 @@ def _touches(fields: BenchFields, folder: Path, frame: Stream, report: list[str]
             f"log, which lasts {frame.times[-1]:.1f} s: their clocks differ; state clock.wrench_late."
         )
     known = is_known(frame, stamps, fields.cut.gap) & is_known(wrench, stamps, fields.cut.gap)
-    world_from_frame = poses_at(frame, stamps)
-    world_from_base = stated_pose("world_from_base", fields.world_from_base)
-    base_from_frame = composed(inverted(world_from_base), world_from_frame)
-    felt = wrench_on_peg(
-        values_at(wrench, stamps), fields.wrench, base_from_frame, frame_from_peg, frame_from_sensor
-    )
-    world_from_peg = composed(world_from_frame, frame_from_peg)
-    peg_from_sensor = composed(inverted(frame_from_peg), frame_from_sensor)
-    felt, words = without_weight(felt, world_from_peg, stamps, fields.gravity, peg_from_sensor)
-    report.append(words)
+    felt, world_from_peg, words = mounting.felt(wrench, frame, stamps)
     step = float(stamps[1] - stamps[0])
-    report.append(f"common stamps: {len(stamps)} at {1.0 / step:.4g} Hz")
-    command = _command(fields, folder, start, frame_from_peg, report)
+    report += [words, f"common stamps: {len(stamps)} at {1.0 / step:.4g} Hz"]
+    command = _command(fields, folder, start, mounting.frame_from_peg, report)
     return probes(Rows(stamps, felt, world_from_peg, known), fields.cut, fields.arm, command, report)
+
+
+@dataclass(frozen=True, eq=False)
+class _Mounting:
+    """Where peg and sensor are on the robot's frame, and the base in the world."""
+
+    fields: BenchFields
+    world_from_base: Array
+    frame_from_peg: Array
+    frame_from_sensor: Array
+
+    @classmethod
+    def of(cls, fields: BenchFields) -> _Mounting:
+        return cls(
+            fields,
+            stated_pose("world_from_base", fields.world_from_base),
+            stated_pose("frame_from_peg", fields.frame_from_peg),
+            _stated("frame_from_sensor", fields.frame_from_sensor),
+        )
+
+    def felt(self, wrench: Stream, frame: Stream, stamps: Array) -> tuple[Array, Array, str]:
+        """The wrench on the peg (T, 6) without weight, the peg's pose (T, 7), and words about the weight."""
+        world_from_frame = poses_at(frame, stamps)
+        base_from_frame = composed(inverted(self.world_from_base), world_from_frame)
+        logged = values_at(wrench, stamps)
+        sides = self.frame_from_peg, self.frame_from_sensor
+        on_peg = wrench_on_peg(logged, self.fields.wrench, base_from_frame, *sides)
+        world_from_peg = composed(world_from_frame, self.frame_from_peg)
+        peg_from_sensor = composed(inverted(self.frame_from_peg), self.frame_from_sensor)
+        felt, words = without_weight(on_peg, world_from_peg, stamps, self.fields.gravity, peg_from_sensor)
+        return felt, world_from_peg, words
+
+
+def _motion(wrench: Stream, frame: Stream, mounting: _Mounting) -> tuple[Stream | None, Stream]:
+    """The force on the peg in the world's axes, and the peg's position, each on its own clock.
+
+    The wrench is turned by the pose at the same stamps as if the clocks agreed: in their difference an arm
+    does not turn by as much as matters to when its force begins.
+    """
+    position = Stream(
+        "position", frame.times, composed(frame.values, mounting.frame_from_peg[None])[:, :3].copy()
+    )
+    begin, end = max(wrench.times[0], frame.times[0]), min(wrench.times[-1], frame.times[-1])
+    stamps = np.arange(begin, end, STEP)
+    if len(stamps) * STEP < _LEAST_SHARED:
+        return None, position
+    felt, world_from_peg, _ = mounting.felt(wrench, frame, stamps)
+    free = felt[: round(_FREE / STEP), :3].mean(axis=0)
+    turned = Rotation.from_quat(world_from_peg[:, [4, 5, 6, 3]]).apply(felt[:, :3] - free)
+    return Stream("force", stamps, turned), position
 
 
 def _command(
