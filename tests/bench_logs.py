@@ -91,7 +91,12 @@ class Log:
         start: of the pose's clock, s.
         noise: standard deviations of force (N), torque (N m) and position (m).
         skip: rows of the wrench that are lost: (first, last).
+        drift: of the wrench's clock, ppm.
         bends: m/N by which the encoders go on while the peg rests on the part.
+        in_base: whether the wrench is a controller's: compensated, what the peg exerts, in the base's axes
+            about the flange.
+        seed: of the noise.
+        more: lines of the configuration.
     """
 
     late: float = 0.008
@@ -100,6 +105,7 @@ class Log:
     skip: tuple[tuple[int, int], ...] = ()
     drift: float = 0.0
     bends: float = 0.0
+    in_base: bool = False
     seed: int = 0
     more: dict[str, Any] = field(default_factory=dict)
 
@@ -119,6 +125,15 @@ def sensed(there: Truth) -> Any:
     return np.concatenate([axes.inv().apply(force), axes.inv().apply(moment)], axis=1) + ZERO
 
 
+def sensed_in_base(there: Truth) -> Any:
+    """The wrench (T, 6) that the peg exerts, in the base's axes about the flange's origin."""
+    peg = Rotation.from_quat(there.world_from_peg[:, [4, 5, 6, 3]])
+    _, flange = flanges(there.world_from_peg)
+    force = peg.apply(there.wrench[:, :3])
+    moment = peg.apply(there.wrench[:, 3:]) + np.cross(there.world_from_peg[:, :3] - flange, force)
+    return -np.concatenate([force, moment], axis=1)
+
+
 def flanges(world_from_peg: Any) -> tuple[Rotation, Any]:
     """Rotations and positions (T, 3) of the flange that holds a peg at poses (T, 7)."""
     turn = Rotation.from_quat(world_from_peg[:, [4, 5, 6, 3]]) * FLANGE_FROM_PEG[1].inv()
@@ -129,7 +144,9 @@ def write(folder: Path, there: Truth, log: Log | None = None) -> Path:
     """A folder of files, and the configuration of it; returns that."""
     log = Log() if log is None else log
     rng = np.random.default_rng(log.seed)
-    readings = sensed(there) + rng.normal(size=(len(there.times), 6)) * np.repeat(log.noise[:2], 3)
+    readings = (sensed_in_base if log.in_base else sensed)(there) + rng.normal(
+        size=(len(there.times), 6)
+    ) * np.repeat(log.noise[:2], 3)
     stamps = log.start + there.times * (1.0 + 1e-6 * log.drift) + log.late
     kept = np.ones(len(stamps), dtype=bool)
     for first, last in log.skip:
@@ -153,7 +170,11 @@ def write(folder: Path, there: Truth, log: Log | None = None) -> Path:
         depth = np.nan_to_num(1000.0 * view.observation.depth)
         Image.fromarray(np.round(depth).astype(np.uint16)).save(folder / f"view_{k}.png")
     path = folder / "bench.yaml"
-    path.write_text(configuration(scene) + "".join(f"{k}: {v}\n" for k, v in log.more.items()))
+    text = configuration(scene)
+    if log.in_base:
+        text = text.replace("axes: sensor", "axes: base").replace("about: sensor", "about: frame")
+        text = text.replace("on_peg", "by_peg") + "gravity: {load: compensated}\n"
+    path.write_text(text + "".join(f"{k}: {v}\n" for k, v in log.more.items()), encoding="utf-8")
     return path
 
 

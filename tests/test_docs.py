@@ -141,6 +141,18 @@ def test_a_controllers_log_becomes_the_recording_that_it_is_of() -> None:
         assert np.nanmedian(off) < 0.003  # the hand-eye calibration is off by millimetres
 
 
+def test_a_benchs_log_becomes_the_recording_that_it_is_of() -> None:
+    names = run(ROOT / "docs/import_bench.md", long=False)
+    touched = [m.observation for m in names["imported"].recording.measurements]
+    times, wrench, peg = (
+        np.concatenate([getattr(o, name) for o in touched]) for name in ("times", "wrench", "world_from_peg")
+    )
+    for mine, theirs in ((wrench, names["wrench"]), (peg[:, :3], names["peg"][:, :3])):
+        there = np.stack([np.interp(times, names["times"], column) for column in theirs.T], axis=1)
+        off = np.abs(mine - there)
+        assert np.median(off) < 1e-6 and off[:, :3].max() < 1e-3 * np.abs(there).max()
+
+
 @pytest.mark.long
 def test_an_own_recording_localises_the_part() -> None:
     names = run(ROOT / "docs/own_recording.md", long=True)

@@ -1,4 +1,4 @@
-"""The command line: `bcppl run`, `probe`, `sweep`, `check`, `import`, `simulate`.
+"""The command line: `bcppl run`, `probe`, `sweep`, `check`, `import`, `new`, `simulate`.
 
 A command imports what it computes with when it is called, so that `bcppl --help` answers at once.
 """
@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from bcppl.cli import probe, recordings, run, sweep
+from bcppl.cli import new, probe, recordings, run, sweep
 from bcppl.errors import InferenceError, InputError
 from bcppl.visible_text import visible
 
@@ -45,6 +45,7 @@ app.command("sweep")(sweep.sweep)
 app.command("check")(recordings.check)
 app.command("simulate")(recordings.simulate)
 app.add_typer(recordings.import_app, name="import")
+app.add_typer(new.new_app, name="new")
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 

@@ -26,6 +26,10 @@ _CLEAR = 0.04  # s from the best lag, beyond which others are compared with it
 _DISTINCT = 0.75  # of the best lag's correlation that no other may reach
 _NEAR, _NEARER = 0.015, 0.005  # s by which the lag may be wrong at first, and then
 _LEAST_NOISE = 2e-5  # m: paths differ by as much from what the model of an arm makes of them
+_BLIND, _SLOW = (
+    0.5,
+    0.004,
+)  # of the interval of poses, about which a fit is too sure; s, from which on more so
 MOST_CONTACTS = 24
 KNOWN = 0.004  # s: a lateness of a larger standard deviation is not taken off
 
@@ -76,7 +80,10 @@ def _unknown(found: Lateness | None, within: float) -> str:
 def lateness(force: Stream, position: Stream, within: float, drifts: bool = False) -> Lateness | None:
     """How late a force is relative to a path; None where no lag stands out, or no contact shows it.
 
-    MEASURED
+    In 64 simulated logs (wrench at 1 kHz, poses at 500 Hz, lateness from -50 to 50 ms) the error was 0.25 and
+    0.5 ms (median) where poses scatter by 20 um, by a soft (2500 N/m) and a stiff arm, at most 2.1 ms; 0.75
+    and 1.0 ms where they scatter by 50 um, 90 % within 3.0 and 1.9 ms, at most 4.8. From poses at 125 Hz it
+    was up to 20 ms: their standard deviation says so.
 
     Args:
         force: (T, 3) in the world's axes, N, at even stamps `contacts.STEP` apart, zero in free air.
@@ -99,7 +106,10 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
             return None
         found = fitted(contacts, late, drifts=drifts)
         late = found.late
-    return found
+    if found is None:
+        return None
+    coarse = _BLIND * position.step * max(1.0, position.step / _SLOW)
+    return replace(found, spread=float(np.hypot(found.spread, coarse)))
 
 
 def _coarse(force: Stream, position: Stream, within: float) -> float | None:

@@ -13,7 +13,7 @@ from bcppl.contact.sensing import OnsetDetector
 from bcppl.recordings.importers.bench.streams import Stream
 
 STEP = 0.001  # s between samples of the force
-THRESHOLD = 1.5  # N
+THRESHOLD, REACHED = 1.5, 3.5  # N; a force that stays below the second is the tool's own inertia
 _LASTING, _APART = 0.03, 0.05  # s: a contact lasts, and is at least so far from the next
 _FREE = 0.07  # s of free motion before a contact
 BEFORE, AFTER = 0.04, 0.025  # s of the peg's path about an onset: few arms stop sooner
@@ -21,6 +21,7 @@ _AT_REST = 0.005  # s before the onset, from which on the path may not be straig
 _STOP, _STOPS_AFTER = 4.0, 0.006  # m/s^2 by which an arm begins to stop, s after the onset
 _BENT = 0.3  # share of an approach's acceleration that may be another one after the onset
 _FEWEST = 6  # rows of the approach
+_ROWS = 10.0  # of a slow pose stream that an approach is to have
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,7 @@ class Contact:
     straight: Array
 
     def unexplained(self, moved: Array) -> Array:
-        """What of the path (R, 3) neither a constant acceleration nor a motion (R, 3) m explains; whitened."""
+        """What of the path (R, 3) neither acceleration nor a motion (R, 3) m explains; whitened."""
         rest = self.path - self.weigh @ moved
         return np.asarray(rest - self.straight @ (self.straight.T @ rest))
 
@@ -79,8 +80,9 @@ def _contacts(size: Array) -> tuple[Indices, Indices]:
     begins, ends = edges[::2], edges[1::2]
     kept = np.append(True, begins[1:] - ends[:-1] > _APART / STEP) if len(begins) else np.empty(0, bool)
     begins, ends = begins[kept], ends[np.append(kept[1:], True)[: len(kept)]]
-    lasting = ends - begins >= _LASTING / STEP
-    return begins[lasting], ends[lasting]
+    strong = np.array([size[a:b].max() >= REACHED for a, b in zip(begins, ends, strict=True)], dtype=bool)
+    kept = strong & (ends - begins >= _LASTING / STEP)
+    return begins[kept], ends[kept]
 
 
 def contact_at(
@@ -101,9 +103,8 @@ def contact_at(
     if times[-1] > force.times[-1] or not level.any():
         return None
     columns = [np.interp(times, force.times, c) - c[level].mean() for c in force.values.T]
-    rows = slice(
-        *np.searchsorted(position.times, [onset - late - BEFORE - reach, onset - late + AFTER]).tolist()
-    )
+    before = max(BEFORE, _ROWS * position.step) + reach
+    rows = slice(*np.searchsorted(position.times, [onset - late - before, onset - late + AFTER]).tolist())
     at = position.times[rows]
     since = at - (onset - late)
     approach = since < -_AT_REST

@@ -28,8 +28,11 @@ from bcppl.recordings.importers.bench.contacts import STEP, Contact
 _MEDIANS = np.array([0.0, *np.log([5e3, 300.0, 2.0]), 0.0, 0.0])
 _WIDTHS = np.array([0.02, 3.0, 2.5, 1.2, 3e-5, 5e-5])
 _STEPS = np.array([0.05, 0.2, 0.2, 0.4, 0.3, 0.3])  # of the search, in those standard deviations
-_FARTHEST = np.array([1.0, 1.5, 2.0, 2.5, 6.0, 10.0])
-_STARTS = [(s, damping, mass) for s in (-0.003, 0.004, 0.009) for damping, mass in ((60, 2), (500, 0.4))]
+_FARTHEST = np.array([0.6, 1.5, 2.0, 2.5, 6.0, 10.0])
+# Where a search may start, in s, N/m, N s/m and kg: an impact makes local minima, milliseconds apart.
+_ARMS = ((5e3, 60, 2), (5e3, 300, 2), (5e3, 500, 0.4), (5e4, 500, 2))
+_GRID = [(s, *arm) for s in np.arange(-0.008, 0.0105, 0.001) for arm in _ARMS]
+_SEARCHES = 4
 _WORSE = 4.0  # times the median misfit of contacts: one that is worse is no contact of a rigid part
 _FOLDS = 8  # of the jackknife at most
 _LEAST = 0.0003  # s: standard deviation below which no clock is claimed to be known
@@ -64,14 +67,14 @@ def fitted(contacts: Sequence[Contact], late: float, *, drifts: bool) -> Latenes
     """
     middle = float(np.mean([each.time for each in contacts]))
     problem = _Problem(late, middle, 6 if drifts else 5)
-    best = problem.solved(contacts, problem.starts())
+    best = problem.solved(contacts, problem.starts(contacts))
     while len(contacts) > 2:
         misfits = np.array([np.square(r).mean() for r in problem.residuals(best.x, contacts)])
         worst = int(misfits.argmax())
         if misfits[worst] < _WORSE * np.median(misfits):
             break
         contacts = [each for k, each in enumerate(contacts) if k != worst]
-        best = problem.solved(contacts, [best.x, *problem.starts()[::2]])
+        best = problem.solved(contacts, [best.x, *problem.starts(contacts)])
     rows = sum(r.size for r in problem.residuals(best.x, contacts))
     scale = max(1.0, 2.0 * float(best.cost) / max(rows - 6 - 9 * len(contacts), 1))
     variance = scale * np.diagonal(np.linalg.inv(best.jac.T @ best.jac))
@@ -99,9 +102,11 @@ class _Problem:
         """All six, in SI; those that are not sought at their medians."""
         return _MEDIANS + _WIDTHS * np.pad(x, (0, 6 - self.size))
 
-    def starts(self) -> list[Array]:
-        each = [np.array([s, _MEDIANS[1], np.log(d), np.log(m), 0.0, 0.0]) for s, d, m in _STARTS]
-        return [((start - _MEDIANS) / _WIDTHS)[: self.size] for start in each]
+    def starts(self, contacts: Sequence[Contact]) -> list[Array]:
+        each = [np.array([s, *np.log([k, d, m]), 0.0, 0.0]) for s, k, d, m in _GRID]
+        each = [((start - _MEDIANS) / _WIDTHS)[: self.size] for start in each]
+        costs = [sum(float(np.square(r).sum()) for r in self.residuals(x, contacts)) for x in each]
+        return [each[k] for k in np.argsort(costs)[:_SEARCHES]]
 
     def residuals(self, x: Array, contacts: Sequence[Contact]) -> list[Array]:
         late, *logarithms, compliance, drift = self.numbers(x)

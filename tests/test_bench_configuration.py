@@ -1,0 +1,204 @@
+"""Every mistake in a bench's configuration, and in the files that it names, is one sentence."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from bcppl.errors import InputError
+from bcppl.recordings.importers.bench.configuration import read_configuration
+from bcppl.recordings.importers.bench.pose_columns import stated_pose
+from bcppl.recordings.importers.bench.table import read_columns
+from bcppl.recordings.importers.bench.views import read_depth
+from tests.made_recordings import assert_one_sentence
+
+TEMPLATE = (
+    Path(__file__).parents[1] / "bcppl/recordings/importers/bench/template.yaml"
+).read_text(encoding="utf-8")  # fmt: skip
+
+
+def changed(*place: Any, value: Any = None) -> str:
+    """The template with another value at a place; without one, the field is left out."""
+    content: Any = yaml.safe_load(TEMPLATE)
+    inner = content
+    for key in place[:-1]:
+        inner = inner[key]
+    if value is None:
+        del inner[place[-1]]
+    else:
+        inner[place[-1]] = value
+    return yaml.safe_dump(content)
+
+
+WRONG = {
+    "lacks 'file'": changed("wrench", "file"),
+    r"wrench has no field 'fil'; did you mean 'file'\?": changed("wrench", "fil", value="a.csv"),
+    r"wrench.axes is 'senor'; give 'sensor', 'frame' or 'base'": changed("wrench", "axes", value="senor"),
+    "wrench.columns has 5 entries; give at least 6": changed("wrench", "columns", value=list("abcde")),
+    "wrench.columns is 3; give a list": changed("wrench", "columns", value=3),
+    "wrench is 'w.csv'; give fields of its own": changed("wrench", value="w.csv"),
+    "pose has 7 columns for the rotation 'matrix'; give 12 or 16": changed(
+        "pose", "rotation", value="matrix"
+    ),
+    "guess.tilt is -1; give a number of at least 0": changed("guess", "tilt", value=-1),
+    "guess.tilt is '1e-3', which YAML reads as text; write 0.001": changed("guess", "tilt", value="1e-3"),
+    "guess.tilt is 'ten'; give a number": changed("guess", "tilt", value="ten"),
+    "guess.tilt is inf; give a finite number": changed("guess", "tilt", value=float("inf")),
+    "frame_from_peg has its rotation as xyzw and as vector": changed(
+        "frame_from_peg", "xyzw", value=[0, 0, 0, 1]
+    ),
+    "the configuration needs either pose .* or joints": changed("pose"),
+    "the configuration lacks frame_from_sensor": changed("frame_from_sensor"),
+    r"cameras.wrist needs either unit .* or scale": changed("cameras", "wrist", "unit"),
+    r"cameras.wrist is on the arm: give its image view_0.png": changed(
+        "cameras", "wrist", "images", 0, "time"
+    ),
+    "gravity needs mass": changed("gravity", value={"load": "stated"}),
+    "part needs one of mesh": changed("part", "mesh"),
+    "holds no fields": "just text",
+    "is no valid YAML": "a: [1, 2",
+    "the field 'a' stands there twice": "a: 1\na: 2\n",
+    "could not determine a constructor": "a: !!python/object/apply:os.system ['false']\n",
+}
+
+
+@pytest.mark.parametrize("words", [words for words, text in WRONG.items() if text is not None])
+def test_each_mistake_is_one_sentence(words: str, tmp_path: Path) -> None:
+    path = tmp_path / "bench.yaml"
+    text = WRONG[words]
+    assert text is not None
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=words) as failure:
+        read_configuration(path)
+    assert_one_sentence(str(failure.value))
+    assert "bench.yaml" in str(failure.value)
+
+
+def test_the_template_is_a_configuration(tmp_path: Path) -> None:
+    path = tmp_path / "bench.yaml"
+    path.write_text(TEMPLATE, encoding="utf-8")
+    fields = read_configuration(path)
+    assert fields.wrench.sign == "on_peg" and fields.cut.window == 0.5 and fields.clock.wrench_late is None
+    with pytest.raises(InputError, match="there is no configuration"):
+        read_configuration(tmp_path / "none.yaml")
+
+
+def test_poses_are_read_as_they_are_stated(tmp_path: Path) -> None:
+    path = tmp_path / "bench.yaml"
+    half = np.sqrt(0.5)
+    expected = [0.1, 0.2, 0.3, half, 0.0, 0.0, half]  # a quarter turn about z
+    for rotation in (
+        {"xyz": [100, 200, 300], "length": "mm", "xyzw": [0, 0, half, half]},
+        {"xyz": [10, 20, 30], "length": "cm", "wxyz": [half, 0, 0, half]},
+        {"xyz": [0.1, 0.2, 0.3], "vector": [0, 0, 90], "angle": "deg"},
+        {"matrix": [0, -1, 0, 0.1, 1, 0, 0, 0.2, 0, 0, 1, 0.3]},
+        {"matrix": [0, -1, 0, 100, 1, 0, 0, 200, 0, 0, 1, 300, 0, 0, 0, 1], "length": "mm"},
+    ):
+        path.write_text(changed("frame_from_peg", value=rotation), encoding="utf-8")
+        pose = stated_pose("frame_from_peg", read_configuration(path).frame_from_peg)
+        np.testing.assert_allclose(pose, expected, atol=1e-7)
+    path.write_text(changed("frame_from_peg", value={"xyzw": [0, 0, 1, 1]}), encoding="utf-8")
+    with pytest.raises(InputError, match=r"frame_from_peg has a quaternion of length 1\.414"):
+        stated_pose("frame_from_peg", read_configuration(path).frame_from_peg)
+
+
+# ---- tables
+
+ROWS = np.arange(12.0).reshape(4, 3)
+
+
+def test_columns_are_the_same_from_every_kind_of_file(tmp_path: Path) -> None:
+    def check(name: str, names: list[str | int]) -> None:
+        np.testing.assert_array_equal(read_columns(tmp_path / name, names), ROWS[:, [2, 0]])
+
+    (tmp_path / "a.csv").write_text("t,x,frame,y\n" + "".join(f"{a},{b},tool,{c}\n" for a, b, c in ROWS))
+    check("a.csv", ["y", "t"])
+    np.savetxt(tmp_path / "b.csv", ROWS, delimiter=";", header="t;x;y")  # "# t;x;y"
+    check("b.csv", ["y", "t"])
+    np.savetxt(tmp_path / "c.txt", ROWS)
+    check("c.txt", [2, 0])
+    np.save(tmp_path / "d.npy", ROWS)
+    check("d.npy", [2, 0])
+    structured = np.array([tuple(row) for row in ROWS], dtype=[(n, "f8") for n in "txy"])
+    np.save(tmp_path / "e.npy", structured)
+    check("e.npy", ["y", "t"])
+    np.savez(tmp_path / "f.npz", t=ROWS[:, 0], w=ROWS[:, 1:])
+    check("f.npz", ["w[1]", "t"])
+
+
+def test_parquet_files_are_read_where_pyarrow_is_installed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.parquet"
+    path.write_bytes(b"")
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pyarrow", None)
+        with pytest.raises(InputError, match=r"needs pyarrow: pip install 'bcppl\[bench\]'"):
+            read_columns(path, ["t"])
+    arrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    parquet.write_table(arrow.table({n: ROWS[:, k] for k, n in enumerate("txy")}), path)
+    np.testing.assert_array_equal(read_columns(path, ["y", "t"]), ROWS[:, [2, 0]])
+    with pytest.raises(InputError, match="has no column 'z'"):
+        read_columns(path, ["z"])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "columns", "words"),
+    [
+        ("a.csv", "t,fx\n0,1\n1,2\n", ["t", "fy"], r"no column 'fy'; did you mean 'fx'\?"),
+        ("a.csv", "t,fx\n0,1\n1,\n", ["t", "fx"], "holds what is no number .*; write nan"),
+        ("a.csv", "t,fx\n0,one\n1,2\n", ["t", "fx"], "holds what is no number .*'one'"),
+        ("a.csv", "0,1\n1,2\n", ["t"], "has no names of columns; give 't' as its number"),
+        ("a.csv", "0,1\n1,2\n", [5], "has 2 columns, and none of the number 5"),
+        ("a.csv", "t,t\n0,1\n1,2\n", ["t"], "has the column 't' twice"),
+        ("a.csv", "t\n0\n", ["t"], "holds 1 rows"),
+        ("a.xlsx", "", ["t"], r"ends in '\.xlsx'"),
+        ("a.npy", "no array", ["t"], "holds no plain numbers"),
+    ],
+)
+def test_a_wrong_table_is_refused(
+    name: str, content: str, columns: list[Any], words: str, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=words) as failure:
+        read_columns(tmp_path / name, columns)
+    assert_one_sentence(str(failure.value))
+
+
+def test_pickled_objects_are_not_read(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.array([{"a": 1}, None], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="holds no plain numbers"):
+        read_columns(tmp_path / "a.npy", ["a"])
+
+
+# ---- images
+
+
+def test_depth_images_of_other_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "bench.yaml"
+    path.write_text(changed("cameras", "wrist", "unit", value="m"), encoding="utf-8")
+    fields = read_configuration(path).cameras["wrist"]
+    depth = np.array([[0.5, 0.0], [np.nan, 0.75]])
+    np.save(tmp_path / "a.npy", depth)
+    np.testing.assert_array_equal(read_depth(tmp_path / "a.npy", fields), [[0.5, np.nan], [np.nan, 0.75]])
+    np.save(tmp_path / "b.npy", 1000.0 * depth)
+    with pytest.raises(InputError, match="median depth of 625 m .* state the unit"):
+        read_depth(tmp_path / "b.npy", fields)
+    (tmp_path / "c.exr").write_bytes(b"")
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "OpenEXR", None)
+        with pytest.raises(InputError, match="needs OpenEXR"):
+            read_depth(tmp_path / "c.exr", fields)
+    exr = pytest.importorskip("OpenEXR")
+    channels = {"Z": depth.astype(np.float32)}
+    exr.File({"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, channels).write(
+        str(tmp_path / "d.exr")
+    )
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.exr", fields), [[0.5, np.nan], [np.nan, 0.75]])
