@@ -121,9 +121,8 @@ def _coarse(force: Stream, position: Stream, within: float) -> float | None:
     felt = np.stack([np.interp(stamps, force.times, c) for c in force.values.T], axis=1)
     felt *= np.minimum(1.0, _CLIP / np.maximum(np.linalg.norm(felt, axis=1, keepdims=True), 1e-9))
     path = values_at(position, stamps)
-    agreement = sum(
-        correlate(_bends(felt[:, k]), _bends(path[:, k]), mode="full", method="fft") for k in range(3)
-    )
+    axes = [correlate(_bends(felt[:, k]), _bends(path[:, k]), mode="full", method="fft") for k in range(3)]
+    agreement = np.sum(axes, axis=0)
     lags = STEP * (np.arange(len(agreement)) - (len(stamps) - 1))
     near = np.abs(lags) <= within + _CLEAR
     lags, agreement = lags[near], agreement[near]

@@ -82,7 +82,7 @@ def _sentence(error: ValidationError, content: dict[Any, Any]) -> str:
     if kind == "extra_forbidden":
         known = _known(place[:-1])
         close = get_close_matches(place[-1], known, 1)
-        meant = f"did you mean {close[0]!r}?" if close else f"its fields are {', '.join(known)}."
+        meant = f"write {close[0]!r} if that is meant." if close else f"its fields are {', '.join(known)}."
         return f"{_dotted(place[:-1]) or 'the configuration'} has no field {place[-1]!r}; {meant}"
     if kind == "literal_error":
         return f"{where} is {given!r}; give {first['ctx']['expected']}."

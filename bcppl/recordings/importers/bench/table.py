@@ -106,7 +106,7 @@ def _missing(path: Path, name: str, known: Sequence[str]) -> str:
     if not known:
         return f"{path} has no names of columns; give {name!r} as its number from 0."
     close = get_close_matches(name, known, 1)
-    meant = f"did you mean {close[0]!r}?" if close else f"its columns are {', '.join(known)}."
+    meant = f"write {close[0]!r} if that is meant." if close else f"its columns are {', '.join(known)}."
     return f"{path} has no column {name!r}; {meant}"
 
 
@@ -114,9 +114,7 @@ def _load(path: Path) -> Any:
     try:
         return np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise InputError(
-            f"{path} holds no plain numbers ({error}); save it again without objects."
-        ) from error
+        raise InputError(f"{path} holds no plain numbers; save it again, without objects.") from error
 
 
 def _npy(path: Path, names: Names) -> Array:

@@ -92,7 +92,7 @@ def _pixels(path: Path) -> Array:
         try:
             pixels = np.load(path, allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"{path} holds no plain numbers ({error}); save it again.") from error
+            raise InputError(f"{path} holds no plain numbers; save it again.") from error
     elif kind in (".png", ".tif", ".tiff"):
         try:
             with Image.open(path) as image:

@@ -132,7 +132,7 @@ class _Problem:
                 np.clip(start, -0.99 * bound, 0.99 * bound),
                 bounds=(-bound, bound),
                 x_scale=scale,
-                diff_step=1e-5,
+                diff_step=[1e-5] * self.size,
                 max_nfev=_EVALUATIONS,
             )
             for start in starts
