@@ -18,7 +18,8 @@ from bcppl.sensors import Measurement
 TARE = 10  # rows that a probe begins with in free air, as `ContactSensing` tares
 LONGEST_HOLE = 0.25  # s without rows within a probe
 SUSTAINED = 0.02  # s of force that make a touch: an impact of the tool's motion is shorter
-PRESSED = 1.0  # N above the log's zero: a probe that begins so begins in contact
+PRESSED = 1.0  # N from the log's zero: a probe that begins so may begin in contact
+FORGOTTEN = 2.0  # s over which the zero of free motion follows a sensor that drifts
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +71,12 @@ def probes(
         if lost := int(inside.sum() - kept.sum()):
             report.append(
                 f"{name}: {lost} of {int(inside.sum())} stamps are left out, for a stream lacks rows"
+            )
+        first = rows.wrench[kept][:TARE, :3].mean(axis=0)
+        if (away := float(np.linalg.norm(first - rows.wrench[rows.known][:TARE, :3].mean(axis=0)))) > PRESSED:
+            report.append(
+                f"{name}: begins {away:.1f} N from the log's first rows; unless the sensor's zero drifted "
+                "so far, begin the span earlier, in free air"
             )
         measurements += _windows(name, rows, kept, fields.window, arm, command)
     return measurements
@@ -136,12 +143,23 @@ def _spans(rows: Rows, fields: CutFields, report: list[str]) -> list[tuple[float
     return spans
 
 
+def _pressed(force: Array, threshold: float, share: float) -> Mask:
+    """Whether forces (T, 3) exceed a threshold (N) from a zero that follows those that do not."""
+    zero = force[:TARE].mean(axis=0)
+    pressed = np.zeros(len(force), dtype=bool)
+    for k, each in enumerate(force):
+        away = each - zero
+        pressed[k] = away @ away > threshold**2
+        if not pressed[k]:
+            zero = zero + share * away
+    return pressed
+
+
 def _touches(rows: Rows, fields: CutFields) -> Iterator[tuple[float, float]]:
     """From `before` each touch until `after` it; touches between which no free stretch fits are one."""
     stamps, wrench = rows.stamps[rows.known], rows.wrench[rows.known]
-    zero = wrench[:TARE, :3].mean(axis=0)
     step = float(np.median(np.diff(stamps)))
-    pressed = np.linalg.norm(wrench[:, :3] - zero, axis=1) > fields.force
+    pressed = _pressed(wrench[:, :3], fields.force, step / FORGOTTEN)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], pressed, [False]])))
     begin = end = None
     for first, last in zip(edges[::2], edges[1::2], strict=True):
