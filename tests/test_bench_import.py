@@ -91,6 +91,15 @@ def test_a_controllers_wrench_in_the_bases_axes(tmp_path: Path) -> None:
     assert not agrees(command(path), there)
 
 
+def test_a_stated_drift_is_taken_off(tmp_path: Path) -> None:
+    there = bench_logs.truth(0)
+    stated = {"clock": "{wrench_late: 8, unit: ms, drift: 300}"}
+    path = bench_logs.write(tmp_path, there, bench_logs.Log(drift=300.0, more=stated))
+    assert agrees(command(path), there)
+    path.write_text(path.read_text().replace("drift: 300", "drift: -300"))
+    assert not agrees(command(path), there)
+
+
 def test_a_stated_load_is_given_in_the_sensors_frame(written: tuple[Path, bench_logs.Truth]) -> None:
     path, there = written
     stated = path.with_name("stated.yaml")

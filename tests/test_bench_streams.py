@@ -12,7 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from bcppl import poses
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bench.config import JointFields, StreamFields, TimeFields
+from bcppl.recordings.importers.bench.config import (
+    ArmFields,
+    CutFields,
+    JointFields,
+    StreamFields,
+    TimeFields,
+)
+from bcppl.recordings.importers.bench.cutting import Rows, probes
 from bcppl.recordings.importers.bench.pose_columns import read_joints
 from bcppl.recordings.importers.bench.resampling import common_stamps, is_known, poses_at, values_at
 from bcppl.recordings.importers.bench.streams import Stream, read_stream
@@ -109,3 +116,19 @@ def test_joint_angles_become_poses_of_the_tip(tmp_path: Path) -> None:
     short = fields.model_copy(update={"columns": list(columns)[:-1]})
     with pytest.raises(InputError, match="give one column for each of"):
         read_joints(short, tmp_path, [])
+
+
+def test_touches_are_found_while_the_sensors_zero_drifts() -> None:
+    stamps = np.arange(0.0, 60.0, 0.01)
+    wrench = np.zeros((len(stamps), 6))
+    wrench[:, 0] = 6.0 * stamps / 60.0  # N: three times the threshold
+    for begin in (20.0, 40.0):
+        wrench[(stamps >= begin) & (stamps < begin + 1.5), 2] += 5.0
+    pose = np.tile([0.5, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0], (len(stamps), 1))
+    rows = Rows(stamps, wrench, pose, np.ones(len(stamps), dtype=bool))
+    report: list[str] = []
+    windows = probes(rows, CutFields(find="touches"), ArmFields(), None, report)
+    made = {m.action.probe.name: m.action.probe.stamps for m in windows}
+    for found, begin in zip(made.values(), (20.0, 40.0), strict=True):
+        assert found[[0, -1]] == pytest.approx([begin - 0.5, begin + 1.5 + 0.3], abs=0.03)
+    assert "2 stretches with touches" in report[0] and "touches 2: begins 4.0 N" in report[-1]

@@ -51,8 +51,8 @@ def on_one_clock(
     if fields.wrench_late is not None:
         late, drift = unit * fields.wrench_late, 1e-6 * fields.drift
         report.append(f"clocks: the wrench is {1000.0 * late:.4g} ms late, as stated, which is taken off")
-        times = wrench.times - late
-        return replace(wrench, times=times - drift * (times - position.times[0]))
+        start = float(position.times[0])
+        return replace(wrench, times=start + (wrench.times - late - start) / (1.0 + drift))
     within = unit * fields.within
     found = None if force is None else lateness(force, position, within, fields.estimate != "offset")
     if found is None or found.spread > KNOWN:
