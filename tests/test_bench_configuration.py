@@ -58,6 +58,7 @@ WRONG = {
     r"cameras.wrist is on the arm: give its image view_0.png": changed(
         "cameras", "wrist", "images", 0, "time"
     ),
+    "clock states a drift but not wrench_late": changed("clock", value={"drift": 20.0}),
     "gravity needs mass": changed("gravity", value={"load": "stated"}),
     "part needs one of mesh": changed("part", "mesh"),
     "holds no fields": "just text",

@@ -20,6 +20,7 @@ from bcppl.recordings.importers.bench.resampling import values_at
 from bcppl.recordings.importers.bench.streams import Stream
 from bcppl.recordings.importers.bench.yielding import Lateness, fitted
 
+_WITHIN = 0.1  # s: the largest lateness, either way, that is looked for
 _SMOOTH = 0.015  # s over which curvature is measured
 _CLIP = 3.0  # N: more of a force says no more of when it begins, and an impact would outweigh all else
 _CLEAR = 0.04  # s from the best lag, beyond which others are compared with it
@@ -53,7 +54,7 @@ def on_one_clock(
         report.append(f"clocks: the wrench is {1000.0 * late:.4g} ms late, as stated, which is taken off")
         start = float(position.times[0])
         return replace(wrench, times=start + (wrench.times - late - start) / (1.0 + drift))
-    within = unit * fields.within
+    within = _WITHIN if fields.within is None else unit * fields.within
     found = None if force is None else lateness(force, position, within, fields.estimate != "offset")
     if found is None or found.spread > KNOWN:
         report.append(_unknown(found, within))

@@ -121,14 +121,21 @@ class JointFields(StreamFields):
 class ClockFields(Fields):
     """How late the wrench's stamps are relative to the pose's: stated, or estimated within a limit.
 
-    `drift` is in parts per million: how much faster the wrench's clock runs.
+    `drift` is in parts per million: how much faster the wrench's clock runs. The
+    limit is 0.1 s if none is given.
     """
 
     wrench_late: float | None = None
     drift: float = 0.0
     estimate: Literal["offset", "offset_and_drift"] = "offset"
-    within: Above = 0.1
+    within: Above | None = None
     unit: Time = "s"
+
+    @model_validator(mode="after")
+    def _stated_together(self) -> Self:
+        if self.drift and self.wrench_late is None:
+            raise ValueError("states a drift but not wrench_late; give both, or estimate: offset_and_drift")
+        return self
 
 
 class GravityFields(Fields):
