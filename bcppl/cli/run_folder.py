@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bcppl import strict_json
 from bcppl.beliefs import Belief
 from bcppl.cli import latent_sites
 from bcppl.errors import InputError
@@ -22,9 +23,10 @@ from bcppl.recordings.fingerprint import fingerprint
 from bcppl.recordings.hdf5 import replacing
 from bcppl.sensors import sensor_of
 
-RECORD, STEP = "run.json", "step.h5"
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+RECORD, STEP = "run.json", "step.h5"
 
 
 class RunFolder:
@@ -129,7 +131,11 @@ class RunFolder:
             )
             for k in dict.fromkeys([0, looked[-1] if looked else len(labels) // 2, len(labels) - 1])
         ]
-        belief_in_3d(recording.part, shown, recording.truth).savefig(self.path / "belief_in_3d.png", dpi=150)
+        self._keep(belief_in_3d(recording.part, shown, recording.truth), "belief_in_3d.png")
+
+    def _keep(self, figure: Figure, name: str) -> None:
+        with replacing(self.path / name) as beside:
+            figure.savefig(beside, dpi=150, format="png")
 
 
 def belief_name(number: int) -> str:
@@ -152,14 +158,9 @@ def read_record(path: Path) -> dict[str, Any]:
     Raises:
         InputError: there is none, or it is none that `bcppl run` wrote.
     """
-    try:
-        record = json.loads((path / RECORD).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(
-            f"there is no run in {path}: it has no {RECORD}; give the folder of a run."
-        ) from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path / RECORD} cannot be read ({error}); run the recording again.") from error
+    if not (path / RECORD).is_file():
+        raise InputError(f"there is no run in {path}: it has no {RECORD}; give the folder of a run.")
+    record = strict_json.read(path / RECORD, "run the recording again", finite=False)
     kinds = {"recording": str, "model": str, "inference": str, "particles": int, "seed": int}
     kinds |= {"settings": dict, "rows": list, "checked": dict}
     wrong = [] if isinstance(record, dict) else ["recording"]
@@ -169,8 +170,3 @@ def read_record(path: Path) -> dict[str, Any]:
             f"{path / RECORD} has no {wrong[0]} as `bcppl run` writes it; run the recording again."
         )
     return record
-        self._keep(belief_in_3d(recording.part, shown, recording.truth), "belief_in_3d.png")
-
-    def _keep(self, figure: Figure, name: str) -> None:
-        with replacing(self.path / name) as beside:
-            figure.savefig(beside, dpi=150, format="png")
