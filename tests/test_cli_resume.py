@@ -103,7 +103,7 @@ def test_what_cannot_be_resumed_is_refused(bcppl: Callable[..., Ran], tmp_path: 
     ran = bcppl("run", "--resume", "out")
     assert ran.code == 2 and "has no particles as `bcppl run` writes it" in ran.err
     (tmp_path / "out/run.json").write_text("[" * 10_000)
-    assert "cannot be read" in bcppl("run", "--resume", "out").err
+    assert "run.json is no valid JSON" in bcppl("run", "--resume", "out").err
 
 
 def test_an_inference_program_without_start_is_named(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
