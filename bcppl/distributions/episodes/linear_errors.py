@@ -166,7 +166,7 @@ def _effect(bench: LinearErrors, rows: bytes) -> Effect:
     return bench.effect(torch.frombuffer(bytearray(rows), dtype=torch.float64).view(-1, COLUMNS))
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=64)
 def _late_effects(bench: LinearErrors, rows: bytes) -> tuple[Tensor, Effect]:
     given = torch.frombuffer(bytearray(rows), dtype=torch.float64).view(-1, COLUMNS)
     each = [late(given, delay) for delay in bench.delays]

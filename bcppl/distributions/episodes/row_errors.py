@@ -48,7 +48,7 @@ def segments_of(rows: Tensor, errors: RowErrors, hypotheses: tuple[Hypothesis, .
     return _segments(columns.numpy().tobytes(), errors, hypotheses)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=64)
 def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, ...]) -> Segments:
     felt, noise, force, time, episode = (
         torch.frombuffer(bytearray(columns), dtype=torch.float64).view(-1, 5).T
