@@ -12,9 +12,9 @@ import yaml
 
 from bcppl.errors import InputError
 from bcppl.recordings.importers.bench.configuration import read_configuration
+from bcppl.recordings.importers.bench.depth_images import read_depth
 from bcppl.recordings.importers.bench.pose_columns import stated_pose
 from bcppl.recordings.importers.bench.table import read_columns
-from bcppl.recordings.importers.bench.views import read_depth
 from tests.made_recordings import assert_one_sentence
 
 TEMPLATE = (

@@ -20,6 +20,7 @@ from bcppl.recordings.importers.bench.config import (
     TimeFields,
 )
 from bcppl.recordings.importers.bench.cutting import Rows, probes
+from bcppl.recordings.importers.bench.logs import Files
 from bcppl.recordings.importers.bench.pose_columns import read_joints
 from bcppl.recordings.importers.bench.resampling import common_stamps, is_known, poses_at, values_at
 from bcppl.recordings.importers.bench.streams import Stream, read_stream
@@ -32,7 +33,7 @@ def read(folder: Path, times: Any, values: Any, unit: Any = "s") -> tuple[Stream
     np.savez(folder / "log.npz", t=times, v=values)
     fields = StreamFields(file="log.npz", time=TimeFields(column="t", unit=unit), columns=["v"])
     report: list[str] = []
-    return read_stream("pose", fields, folder, report), report[0]
+    return read_stream("pose", fields, Files(folder), report), report[0]
 
 
 def test_repeated_backward_and_unknown_rows_are_left_out_and_counted(tmp_path: Path) -> None:
@@ -110,12 +111,12 @@ def test_joint_angles_become_poses_of_the_tip(tmp_path: Path) -> None:
         urdf=str(URDF),
         tip=TIP,
     )
-    stream = read_joints(fields, tmp_path, [])
+    stream = read_joints(fields, Files(tmp_path), [])
     expected = robot.base_from_link(TIP, torch.from_numpy(angles))
     np.testing.assert_allclose(stream.values, expected.numpy(), atol=1e-9)
     short = fields.model_copy(update={"columns": list(columns)[:-1]})
     with pytest.raises(InputError, match="give one column for each of"):
-        read_joints(short, tmp_path, [])
+        read_joints(short, Files(tmp_path), [])
 
 
 def test_touches_are_found_while_the_sensors_zero_drifts() -> None:

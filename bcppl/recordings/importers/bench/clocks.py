@@ -14,8 +14,9 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import correlate
 
 from bcppl.arrays import Array
-from bcppl.recordings.importers.bench.config import ClockFields, factor
+from bcppl.recordings.importers.bench.config import ClockFields
 from bcppl.recordings.importers.bench.contacts import STEP, contact_at, onsets
+from bcppl.recordings.importers.bench.field_types import factor
 from bcppl.recordings.importers.bench.resampling import values_at
 from bcppl.recordings.importers.bench.streams import Stream
 from bcppl.recordings.importers.bench.yielding import Lateness, fitted

@@ -1,69 +1,32 @@
 """The fields of a bench's configuration, as pydantic models: strict, and without any that are not known.
 
-A word such as `mm` states a unit, and `factor` what it is in SI. Poses are named after the frames that they
-take from and to; `frame` is the robot's frame whose pose is logged, such as the flange or the tool's centre.
+Poses are named after the frames that they take from and to; `frame` is the robot's frame whose pose is
+logged, such as the flange or the tool's centre.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-Length = Literal["m", "cm", "mm", "um"]
-Angle = Literal["rad", "deg"]
-Time = Literal["s", "ms", "us", "ns"]
-Force = Literal["N", "mN", "kN", "lbf"]
-Torque = Literal["Nm", "Ncm", "Nmm", "lbfin"]
-Rotation = Literal["xyzw", "wxyz", "vector", "matrix"]
+from bcppl.recordings.importers.bench.camera_fields import CameraFields
+from bcppl.recordings.importers.bench.field_types import (
+    Above,
+    Angle,
+    AtLeast,
+    Fields,
+    Force,
+    Length,
+    Name,
+    PoseFields,
+    Rotation,
+    Three,
+    Time,
+    Torque,
+)
 
-_SI = {
-    **{"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
-    **{"rad": 1.0, "deg": 0.017453292519943295},
-    **{"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    **{"N": 1.0, "mN": 1e-3, "kN": 1e3, "lbf": 4.4482216152605},
-    **{"Nm": 1.0, "Ncm": 1e-2, "Nmm": 1e-3, "lbfin": 0.1129848290276167},
-}
-
-Three = Annotated[list[float], Field(min_length=3, max_length=3)]
-Four = Annotated[list[float], Field(min_length=4, max_length=4)]
-Above = Annotated[float, Field(gt=0.0)]
-AtLeast = Annotated[float, Field(ge=0.0)]
-Name = str | int  # of a column, or its number where a file has no names
-
-
-def factor(unit: str) -> float:
-    """What one of a unit is in SI: metres, radians, seconds, newtons, newton metres."""
-    return _SI[unit]
-
-
-class Fields(BaseModel):
-    """Fields that are checked strictly; one that is not known is an error."""
-
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class PoseFields(Fields):
-    """A pose: a translation and one way to write its rotation, or a matrix; without a rotation, no turn."""
-
-    xyz: Three = [0.0, 0.0, 0.0]
-    length: Length = "m"
-    xyzw: Four | None = None
-    wxyz: Four | None = None
-    vector: Three | None = None
-    angle: Angle = "rad"
-    matrix: list[float] | None = None
-
-    @model_validator(mode="after")
-    def _one_rotation(self) -> Self:
-        given = [name for name in ("xyzw", "wxyz", "vector", "matrix") if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise ValueError(f"has its rotation as {' and as '.join(given)}; give one of them")
-        if self.matrix is not None and len(self.matrix) not in (12, 16):
-            raise ValueError(f"has a matrix of {len(self.matrix)} numbers; give 12 or 16, row by row")
-        if self.matrix is not None and any(self.xyz):
-            raise ValueError("has both a matrix and xyz; give the matrix alone")
-        return self
+EVERY_JOINT = "*"  # in place of names: all joints of the robot up to its tip
 
 
 class TimeFields(Fields):
@@ -74,15 +37,31 @@ class TimeFields(Fields):
 
 
 class StreamFields(Fields):
-    """A stream: a file, its stamps, and its columns by name."""
+    """A stream: a file, its stamps and its columns by name; or a topic of a bag, which states them."""
+
+    BY_TOPIC: ClassVar[dict[str, Any]] = {"file": "", "time": {"column": "stamp", "unit": "s"}}
+    UNLESS_STATED: ClassVar[dict[str, Any]] = {}
 
     file: str
+    topic: str = ""
     time: TimeFields
     columns: Annotated[list[Name], Field(min_length=1)]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_a_topic(cls, content: Any) -> Any:
+        if not isinstance(content, dict) or "topic" not in content:
+            return content
+        for name in content.keys() & cls.BY_TOPIC.keys():
+            raise ValueError(f"names a topic, whose messages state {name!r}; leave that out")
+        return {**cls.UNLESS_STATED, **content, **cls.BY_TOPIC}
 
 
 class WrenchFields(StreamFields):
     """The wrench: its units, the axes that it is in, the point that its torques are about, and its sign."""
+
+    BY_TOPIC = {**StreamFields.BY_TOPIC, "columns": ["fx", "fy", "fz", "tx", "ty", "tz"]}
+    UNLESS_STATED = {"force": "N", "torque": "Nm"}
 
     columns: Annotated[list[Name], Field(min_length=6, max_length=6)]
     force: Force
@@ -93,8 +72,20 @@ class WrenchFields(StreamFields):
 
 
 class PoseStreamFields(StreamFields):
-    """Poses of the frame in the robot's base: position and rotation, or a matrix row by row."""
+    """Poses of the frame in the robot's base: position and rotation, or a matrix row by row.
 
+    `parent` and `child` are the two frames among those of a topic of transforms.
+    """
+
+    BY_TOPIC = {
+        **StreamFields.BY_TOPIC,
+        "columns": ["x", "y", "z", "qx", "qy", "qz", "qw"],
+        "rotation": "xyzw",
+    }
+    UNLESS_STATED = {"length": "m"}
+
+    parent: str | None = None
+    child: str | None = None
     rotation: Rotation
     length: Length
     angle: Angle = "rad"
@@ -107,11 +98,20 @@ class PoseStreamFields(StreamFields):
                 f"has {len(self.columns)} columns for the rotation {self.rotation!r}; "
                 f"give {' or '.join(map(str, wanted))}"
             )
+        if (self.parent is None) != (self.child is None):
+            raise ValueError("needs both parent and child, the frames of a topic of transforms")
+        if self.parent is not None and not self.topic:
+            raise ValueError("has parent and child, which are for a topic of transforms; leave them out")
         return self
 
 
 class JointFields(StreamFields):
-    """Joint angles, from the base outwards, and the robot whose link `tip` is the frame."""
+    """Joint angles, from the base outwards, and the robot whose link `tip` is the frame.
+
+    With a topic, columns are the joints' names; by default those of the robot up to its tip.
+    """
+
+    UNLESS_STATED = {"angle": "rad", "columns": [EVERY_JOINT]}
 
     angle: Angle
     urdf: str
@@ -174,53 +174,6 @@ class ArmFields(Fields):
 
     stiffness: Annotated[list[AtLeast], Field(min_length=6, max_length=6)] = [5e4] * 3 + [2.5e3] * 3
     damping: Annotated[list[AtLeast], Field(min_length=6, max_length=6)] = [500.0] * 3 + [25.0] * 3
-
-
-class ImageFields(Fields):
-    """One depth image: when it was taken, or where the frame or the camera was; or of a fixed camera."""
-
-    file: str
-    time: float | None = None
-    world_from_frame: PoseFields | None = None
-
-
-class CameraFields(Fields):
-    """A depth camera: its intrinsics (pixels), the unit of its images, its range (m) and its pose."""
-
-    fx: Above
-    fy: Above
-    cx: float
-    cy: float
-    distortion: list[float] = []
-    unit: Length | None = None
-    scale: Above | None = None
-    near: AtLeast
-    far: Above
-    world_from_camera: PoseFields | None = None
-    frame_from_camera: PoseFields | None = None
-    time_unit: Time = "s"
-    images: Annotated[list[ImageFields], Field(min_length=1)]
-    background: str | None = None
-
-    @model_validator(mode="after")
-    def _placed(self) -> Self:
-        if (self.unit is None) == (self.scale is None):
-            raise ValueError("needs either unit (of its depth) or scale (metres per count)")
-        if (self.world_from_camera is None) == (self.frame_from_camera is None):
-            raise ValueError("needs either world_from_camera (it stands) or frame_from_camera (on the arm)")
-        if self.near >= self.far:
-            raise ValueError(f"has a range from {self.near:g} to {self.far:g} m; give near below far")
-        for image in self.images:
-            placed = (image.time is None) != (image.world_from_frame is None)
-            if self.frame_from_camera is not None and not placed:
-                raise ValueError(
-                    f"is on the arm: give its image {image.file} either time or world_from_frame"
-                )
-            if self.frame_from_camera is None and image.world_from_frame is not None:
-                raise ValueError(f"stands: its image {image.file} has no world_from_frame; leave it out")
-        if self.background is not None and self.world_from_camera is None:
-            raise ValueError("is on the arm: a background is of a camera that stands; leave it out")
-        return self
 
 
 class BodyFields(Fields):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,11 +14,13 @@ from bcppl.errors import InputError
 from bcppl.recordings.importers import Imported
 from bcppl.recordings.importers.bench.bodies import read_guess, read_part, read_peg
 from bcppl.recordings.importers.bench.clocks import on_one_clock
-from bcppl.recordings.importers.bench.config import BenchFields, PoseFields
+from bcppl.recordings.importers.bench.config import BenchFields
 from bcppl.recordings.importers.bench.configuration import read_configuration
 from bcppl.recordings.importers.bench.contacts import STEP
 from bcppl.recordings.importers.bench.cutting import Command, Rows, probes
+from bcppl.recordings.importers.bench.field_types import PoseFields
 from bcppl.recordings.importers.bench.gravity import without_weight
+from bcppl.recordings.importers.bench.logs import Files, Log
 from bcppl.recordings.importers.bench.pose_columns import (
     composed,
     inverted,
@@ -35,20 +38,25 @@ _LEAST_SHARED = 1.0  # s that wrench and pose share, or their clocks cannot be c
 _FREE = 0.1  # s in free air with which a log begins
 
 
-def imported(path: Path) -> Imported:
+def imported(path: Path, open_log: Callable[[BenchFields], Log] | None = None) -> Imported:
     """The recording of the log that a configuration describes, and a report.
+
+    Args:
+        path: of the configuration.
+        open_log: what the fields' streams and images are read from; by default files in its folder.
 
     Raises:
         InputError: the configuration or a file that it names is missing or wrong, or the streams do not fit.
     """
     fields, folder, report = read_configuration(path), path.parent, list[str]()
     part, peg = read_part(fields.part, folder, report), read_peg(fields.peg, folder, report)
-    frame = _poses(fields, folder, report)
-    touches = _touches(fields, folder, frame, report)
+    log = Files(folder) if open_log is None else open_log(fields)
+    frame = _poses(fields, log, report)
+    touches = _touches(fields, log, frame, report)
     views: list[Measurement] = []
     background: dict[str, Array] = {}
     for name, camera in fields.cameras.items():
-        seen, empty = read_views(name, camera, folder, frame, report)
+        seen, empty = read_views(name, camera, log, frame, report)
         views += seen
         background |= empty
     recording = Recording(
@@ -64,21 +72,21 @@ def imported(path: Path) -> Imported:
     return Imported(recording, tuple(report))
 
 
-def _poses(fields: BenchFields, folder: Path, report: list[str]) -> Stream:
+def _poses(fields: BenchFields, log: Log, report: list[str]) -> Stream:
     """`world_from_frame` (T, 7), on the clock of its log."""
     world_from_base = stated_pose("world_from_base", fields.world_from_base)
     if fields.joints is not None:
-        return placed(read_joints(fields.joints, folder, report), world_from_base)
+        return placed(read_joints(fields.joints, log, report), world_from_base)
     assert fields.pose is not None
-    return placed(read_poses("pose", fields.pose, folder, report), world_from_base)
+    return placed(read_poses("pose", fields.pose, log, report), world_from_base)
 
 
-def _touches(fields: BenchFields, folder: Path, frame: Stream, report: list[str]) -> list[Measurement]:
+def _touches(fields: BenchFields, log: Log, frame: Stream, report: list[str]) -> list[Measurement]:
     """The windows of the log's probes; their stamps count from the first pose."""
     mounting = _Mounting.of(fields)
     start = float(frame.times[0])
     frame = frame.shifted(-start)
-    wrench = read_wrench(fields.wrench, folder, report).shifted(-start)
+    wrench = read_wrench(fields.wrench, log, report).shifted(-start)
     wrench = on_one_clock(wrench, *_motion(wrench, frame, mounting), fields.clock, report)
     stamps = common_stamps(frame, wrench, fields.cut.rate)
     if len(stamps) < 2:
@@ -90,7 +98,7 @@ def _touches(fields: BenchFields, folder: Path, frame: Stream, report: list[str]
     felt, world_from_peg, words = mounting.felt(wrench, frame, stamps)
     step = float(stamps[1] - stamps[0])
     report += [words, f"common stamps: {len(stamps)} at {1.0 / step:.4g} Hz"]
-    command = _command(fields, folder, start, mounting.frame_from_peg, report)
+    command = _command(fields, log, start, mounting.frame_from_peg, report)
     return probes(Rows(stamps, felt, world_from_peg, known), fields.cut, fields.arm, command, report)
 
 
@@ -145,12 +153,12 @@ def _motion(wrench: Stream, frame: Stream, mounting: _Mounting) -> tuple[Stream 
 
 
 def _command(
-    fields: BenchFields, folder: Path, start: float, frame_from_peg: Array, report: list[str]
+    fields: BenchFields, log: Log, start: float, frame_from_peg: Array, report: list[str]
 ) -> Command | None:
     if fields.command is None:
         report.append("command: none logged; the measured poses stand for it")
         return None
-    stream = read_poses("command", fields.command, folder, report)
+    stream = read_poses("command", fields.command, log, report)
     world_from_base = stated_pose("world_from_base", fields.world_from_base)
     return Command(stream.times - start, composed(composed(world_from_base, stream.values), frame_from_peg))
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
@@ -11,12 +9,9 @@ from scipy.spatial.transform import Rotation
 from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bench.config import (
-    JointFields,
-    PoseFields,
-    PoseStreamFields,
-    factor,
-)
+from bcppl.recordings.importers.bench.config import JointFields, PoseStreamFields
+from bcppl.recordings.importers.bench.field_types import PoseFields, factor
+from bcppl.recordings.importers.bench.logs import Log
 from bcppl.recordings.importers.bench.streams import Stream, read_stream
 
 UNIT = 0.01  # of a quaternion's length, or a matrix' columns: rounding in a log is less
@@ -40,18 +35,18 @@ def stated_pose(name: str, fields: PoseFields) -> Array:
     return np.append(factor(fields.length) * translation[0], [1.0, 0.0, 0.0, 0.0])
 
 
-def read_poses(name: str, fields: PoseStreamFields, folder: Path, report: list[str]) -> Stream:
+def read_poses(name: str, fields: PoseStreamFields, log: Log, report: list[str]) -> Stream:
     """The stream of poses (T, 7), `base_from_frame`.
 
     Raises:
         InputError: as `read_stream`, or a row is no pose.
     """
-    stream = read_stream(name, fields, folder, report)
+    stream = read_stream(name, fields, log, report)
     values = _poses(name, stream.values, fields.rotation, factor(fields.length), factor(fields.angle))
     return Stream(name, stream.times, values)
 
 
-def read_joints(fields: JointFields, folder: Path, report: list[str]) -> Stream:
+def read_joints(fields: JointFields, log: Log, report: list[str]) -> Stream:
     """The stream of poses (T, 7) of a robot's tip, `base_from_frame`, by its forward kinematics.
 
     Raises:
@@ -59,8 +54,8 @@ def read_joints(fields: JointFields, folder: Path, report: list[str]) -> Stream:
     """
     from bcppl.robot.kinematics import Robot  # reads URDF files, which takes seconds to import
 
-    stream = read_stream("joints", fields, folder, report)
-    robot = Robot(folder / fields.urdf, tip=fields.tip)
+    stream = read_stream("joints", fields, log, report)
+    robot = Robot(log.folder / fields.urdf, tip=fields.tip)
     if len(robot.joints) != stream.values.shape[1]:
         names = ", ".join(joint.name for joint in robot.joints)
         raise InputError(

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bench.config import StreamFields, factor
-from bcppl.recordings.importers.bench.table import read_columns
+from bcppl.recordings.importers.bench.config import StreamFields
+from bcppl.recordings.importers.bench.logs import Log
 from bcppl.sensors import checks
 
 LOST = 1.5  # median intervals: a longer one has lost rows
@@ -48,18 +47,19 @@ class Stream:
         return replace(self, times=self.times + by)
 
 
-def read_stream(name: str, fields: StreamFields, folder: Path, report: list[str]) -> Stream:
+def read_stream(name: str, fields: StreamFields, log: Log, report: list[str]) -> Stream:
     """The rows of a stream in order; rows without a number, repeated and backward stamps are left out.
 
     Raises:
         InputError: the file cannot be read, fewer than ten rows remain, the clock runs backwards at more than
             a percent of them, or the stamps are in another unit.
     """
-    table = read_columns(folder / fields.file, [fields.time.column, *fields.columns])
-    times = factor(fields.time.unit) * table[:, 0]
-    stream, left_out = _in_order(name, times, table[:, 1:])
+    table, notes = log.rows(name, fields)
+    stream, left_out = _in_order(name, table[:, 0], table[:, 1:])
     for problem in checks.readings(f"{name}'s stamps", stream.times):
-        raise InputError(f"{problem.rstrip('.')} (state {name}.time.unit).")
+        remedy = f"see the header stamps of {fields.topic}" if fields.topic else f"state {name}.time.unit"
+        raise InputError(f"{problem.rstrip('.')} ({remedy}).")
+    left_out = [*notes, *left_out]
     report.append(f"{_described(stream)}{''.join(f'; {each}' for each in left_out)}")
     return stream
 

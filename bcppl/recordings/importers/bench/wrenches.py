@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from bcppl.arrays import Array
 from bcppl.contact.sensing import transform_wrench
-from bcppl.recordings.importers.bench.config import WrenchFields, factor
+from bcppl.recordings.importers.bench.config import WrenchFields
+from bcppl.recordings.importers.bench.field_types import factor
+from bcppl.recordings.importers.bench.logs import Log
 from bcppl.recordings.importers.bench.pose_columns import composed, inverted
 from bcppl.recordings.importers.bench.streams import Stream, read_stream
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
-def read_wrench(fields: WrenchFields, folder: Path, report: list[str]) -> Stream:
+def read_wrench(fields: WrenchFields, log: Log, report: list[str]) -> Stream:
     """The stream of wrenches (T, 6), N and N m, of the environment on the peg, in the axes of the log.
 
     Raises:
         InputError: as `read_stream`.
     """
-    stream = read_stream("wrench", fields, folder, report)
+    stream = read_stream("wrench", fields, log, report)
     sign = 1.0 if fields.sign == "on_peg" else -1.0
     units = np.array([factor(fields.force)] * 3 + [factor(fields.torque)] * 3)
     return Stream("wrench", stream.times, sign * units * stream.values)

@@ -1,0 +1,172 @@
+"""Depth images of a bag, those alone that a configuration asks for; and the intrinsics of their camera."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any
+
+import numpy as np
+
+from bcppl.arrays import Array
+from bcppl.errors import InputError
+from bcppl.recordings.importers.bag.reading import Bag, Message
+from bcppl.recordings.importers.bag.rows import unstamped_words
+from bcppl.recordings.importers.bench.camera_fields import CameraFields, ImageFields
+from bcppl.recordings.importers.bench.depth_images import in_metres
+from bcppl.recordings.importers.bench.field_types import Length, factor
+from bcppl.recordings.importers.bench.logs import Shot
+
+NEAR = 0.1  # s from a stated time within which an image must be
+MOST_BYTES = 160_000_000  # of images as they are stored: twice to four times as many in memory
+_DEPTHS: dict[str, tuple[str, Length]] = {
+    "16UC1": ("u2", "mm"),
+    "mono16": ("u2", "mm"),
+    "32FC1": ("f4", "m"),
+}
+_BROWN = ("", "plumb_bob", "rational_polynomial", "none")  # with 5 coefficients; more have to be zero
+
+
+class Images:
+    """The images of one camera nearest to stated times, or `every` so many seconds.
+
+    Args:
+        name: of the camera.
+        fields: its topic, and the times.
+    """
+
+    def __init__(self, name: str, fields: CameraFields) -> None:
+        self._name, self._fields = name, fields
+        unit = factor(fields.time_unit)
+        self._wanted = [unit * (image.time or 0.0) for image in fields.images]
+        self._kept: list[tuple[float, Message] | None] = [None] * len(self._wanted)
+        self._due, self._bytes = -math.inf, 0
+        self._unstamped, self._count = 0, 0
+        self._parse: Any = None
+
+    def add(self, bag: Bag, message: Message) -> None:
+        """Keep an image if it is wanted, as it is stored."""
+        stamp = bag.header_stamp(message)
+        self._count += 1
+        self._unstamped += not stamp
+        stamp, self._parse = stamp or message.received, bag.parsed
+        if self._fields.every is not None:
+            if stamp >= self._due:
+                self._due = stamp + self._fields.every * (1.0 - 1e-3)  # stamps scatter by less
+                self._kept.append((stamp, message))
+                self._weigh(len(message.raw))
+            return
+        for k, time in enumerate(self._wanted):
+            best = self._kept[k]
+            if best is None or abs(stamp - time) < abs(best[0] - time):
+                self._kept[k] = (stamp, message)
+                self._weigh(len(message.raw) - (0 if best is None else len(best[1].raw)))
+
+    def shots(self, fields: CameraFields, size: tuple[int, int] | None) -> tuple[list[Shot], list[str]]:
+        """The images, and how many stamps were zero.
+
+        Args:
+            fields: of the camera.
+            size: height and width of which the intrinsics are, or None.
+
+        Raises:
+            InputError: an image is too far from its time, or nearest to two.
+        """
+        shots = []
+        unit = factor(fields.time_unit)
+        seen: dict[float, int] = {}
+        for k, kept in enumerate(self._kept):
+            assert kept is not None  # a topic without a message is refused before
+            stamp, message = kept
+            where = f"cameras.{self._name}.images[{k}].time"
+            if self._wanted and abs(stamp - self._wanted[k]) > NEAR:
+                raise InputError(
+                    f"{where} is {self._wanted[k]:.3f} s, and the nearest image of {fields.topic} is of "
+                    f"{stamp:.3f} s; give that, or another on the clock of the header stamps."
+                )
+            if stamp in seen:
+                raise InputError(
+                    f"{where} is nearest to the image of {stamp:.3f} s of {fields.topic}, as is that of "
+                    f"images[{seen[stamp]}]; leave one of them out."
+                )
+            seen[stamp] = k
+            label = f"of {stamp:.3f} s in {fields.topic}"
+            read = functools.partial(_depth, f"the image {label}", self._parse, message, fields, size)
+            shots.append(Shot(label, ImageFields(time=stamp / unit), read))
+        return shots, unstamped_words(self._unstamped, self._count)
+
+    def _weigh(self, count: int) -> None:
+        self._bytes += count
+        if self._bytes > MOST_BYTES:
+            kept = sum(each is not None for each in self._kept)
+            raise InputError(
+                f"cameras.{self._name} asks for {kept} images and more of {self._fields.topic}, more than "
+                f"{MOST_BYTES // 1_000_000} MB; give {'a longer every' if self._fields.every else 'fewer'}."
+            )
+
+
+class Intrinsics:
+    """The first message of a camera's information."""
+
+    def __init__(self) -> None:
+        self._first: Any = None
+
+    def add(self, bag: Bag, message: Message) -> None:
+        """Keep the first."""
+        if self._first is None:
+            self._first = bag.parsed(message)
+
+    def of(self, name: str, fields: CameraFields) -> CameraFields:
+        """The fields with the intrinsics that the message states.
+
+        Raises:
+            InputError: it states none, binning or a part of the image, or another model of a lens.
+        """
+        info, remedy = self._first, "state fx, fy, cx, cy and distortion in place of info"
+        matrix = info.K if hasattr(info, "K") else info.k  # as ROS 1 and ROS 2 write it
+        lens = [float(each) for each in (info.D if hasattr(info, "D") else info.d)]
+        where = f"{fields.info}, which cameras.{name}.info names,"
+        if not (np.isfinite(matrix).all() and matrix[0] > 0.0 and matrix[4] > 0.0):
+            raise InputError(f"{where} states no intrinsics (its K is not calibrated); {remedy}.")
+        window = info.roi
+        if max(info.binning_x, info.binning_y) > 1 or window.x_offset or window.y_offset:
+            raise InputError(f"{where} states binning or a part of the image; {remedy} of the image itself.")
+        if any(lens) and (info.distortion_model not in _BROWN or any(lens[5:])):
+            raise InputError(f"{where} has the lens model {info.distortion_model!r}; rectify, and {remedy}.")
+        stated = {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5]}
+        numbers = {key: float(value) for key, value in stated.items()}
+        return fields.model_copy(update={**numbers, "distortion": lens[:5] if any(lens) else []})
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Height and width of the images that the intrinsics are of; None if they are not stated."""
+        size = (int(self._first.height), int(self._first.width))
+        return size if all(size) else None
+
+
+def encoded(message: Any) -> Length | None:
+    """The unit of an image's depth, by its encoding; None if it is no depth."""
+    return _DEPTHS[message.encoding][1] if message.encoding in _DEPTHS else None
+
+
+def _depth(
+    where: str, parse: Any, message: Message, fields: CameraFields, size: tuple[int, int] | None
+) -> Array:
+    image = parse(message)
+    if size is not None and size != (image.height, image.width):
+        raise InputError(
+            f"{where} has {image.width} x {image.height} pixels, and {fields.info} is of {size[1]} x "
+            f"{size[0]}; give the info of these images."
+        )
+    if image.encoding not in _DEPTHS:
+        raise InputError(
+            f"{where} is encoded as {image.encoding!r}, and depth is 16UC1 or 32FC1; name the depth's topic."
+        )
+    kind, unit = _DEPTHS[image.encoding]
+    dtype = np.dtype(f"{'>' if image.is_bigendian else '<'}{kind}")
+    row = image.width * dtype.itemsize
+    if image.step < row or len(image.data) < image.step * image.height or not row * image.height:
+        raise InputError(f"{where} has fewer bytes than its {image.width} x {image.height} pixels need.")
+    data = np.ascontiguousarray(image.data[: image.step * image.height].reshape(image.height, image.step))
+    pixels = np.ascontiguousarray(data[:, :row]).view(dtype).astype(np.float64)
+    return in_metres(where, pixels, fields, unit)
