@@ -51,8 +51,10 @@ def messages(folder: Path, types: Types) -> Iterator[Row]:
             "geometry_msgs/WrenchStamped",
             types("geometry_msgs/WrenchStamped", types.header(stamp), wrench),
         )
-    for row in np.loadtxt(folder / "poses.csv", delimiter=",", skiprows=1):
-        stamp, place, turn = row[0], 1e-3 * row[1:4], Rotation.from_quat(row[4:])
+    rows = np.loadtxt(folder / "poses.csv", delimiter=",", skiprows=1)
+    back = Rotation.from_quat(rows[:, 4:]).apply([0.0, 0.0, 0.1])
+    for row, wrist_to_flange in zip(rows, back, strict=True):
+        stamp, place = row[0], 1e-3 * row[1:4]
         quaternion = types("geometry_msgs/Quaternion", *row[4:])
         pose = types("geometry_msgs/Pose", types("geometry_msgs/Point", *place), quaternion)
         yield (
@@ -62,7 +64,7 @@ def messages(folder: Path, types: Types) -> Iterator[Row]:
             types("geometry_msgs/PoseStamped", types.header(stamp, "base"), pose),
         )
         # base -> wrist is the pose without its last 0.1 m; wrist -> flange, which is fixed, has them
-        wrist = place - turn.apply([0.0, 0.0, 0.1])
+        wrist = place - wrist_to_flange
         moved = types("geometry_msgs/Transform", vector(*wrist), quaternion)
         each = types("geometry_msgs/TransformStamped", types.header(stamp, "base"), "wrist", moved)
         yield stamp, "/tf", "tf2_msgs/TFMessage", types("tf2_msgs/TFMessage", [each])
@@ -79,18 +81,17 @@ def images(folder: Path, types: Types, last: float) -> Iterator[Row]:
     cameras = yaml.safe_load((folder / "bench.yaml").read_text())["cameras"]
     for k, camera in enumerate(cameras.values()):
         depth = np.asarray(Image.open(folder / f"view_{k}.png"))
-        data = depth.astype("<u2") if k == 0 else 1e-3 * depth.astype(np.float64)
         encoding, width = ("16UC1", 2) if k == 0 else ("32FC1", 4)
-        raw = (data if k == 0 else data.astype("<f4")).tobytes()
         height, columns = depth.shape
         lens = [float(camera["fx"]), 0.0, camera["cx"], 0.0, camera["fy"], camera["cy"], 0.0, 0.0, 1.0]
         roi = types("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
         for shift in (-3.0, -2.0, -1.0):
-            blank = raw if shift == -2.0 else bytes(len(raw))
+            seen = depth if shift == -2.0 else np.full_like(depth, 500)
+            raw = seen.astype("<u2") if k == 0 else (1e-3 * seen).astype("<f4")
             header = types.header(last + shift)
             yield last + shift, f"/camera_{k}/depth", "sensor_msgs/Image", types(
                 "sensor_msgs/Image", header, height, columns, encoding, 0, width * columns,
-                np.frombuffer(blank, np.uint8),
+                raw.view(np.uint8).ravel(),
             )  # fmt: skip
             yield last + shift, f"/camera_{k}/info", "sensor_msgs/CameraInfo", types(
                 "sensor_msgs/CameraInfo", header, height, columns, "plumb_bob", np.zeros(5), np.array(lens),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import Progress
 
 from bcppl.arrays import Array
@@ -23,6 +24,7 @@ from bcppl.recordings.importers.bench.config import (
     StreamFields,
 )
 from bcppl.recordings.importers.bench.logs import Files, Shot
+from bcppl.visible_text import visible
 
 _STEP = 1000  # messages between which the bar moves
 
@@ -127,7 +129,7 @@ def _read(bag: Bag, wanted: dict[str, list[Collector]]) -> None:
     console = Console(stderr=True)
     total = sum(bag.topics[name].count for name in wanted)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(bag.path.name, total=total)
+        task = bar.add_task(escape(visible(bag.path.name)), total=total)
         for number, message in enumerate(bag.messages(wanted), 1):
             for collector in wanted[message.topic]:
                 collector.add(bag, message)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from importlib.resources import files
 from pathlib import Path
 
+import yaml
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from bcppl.errors import InputError
@@ -30,13 +32,18 @@ def show(path: Path, write: Path | None) -> None:
         raise InputError(f"there is no folder {write.parent} to write {write.name} into; make it first.")
     console = Console()
     with Bag(path) as bag:
-        table = Table("topic", "type", "messages", "rate", box=None, pad_edge=False)
+        table = Table("topic", "type", "messages", "mean rate", box=None, pad_edge=False)
         for each in sorted(bag.topics.values(), key=lambda topic: topic.name):
-            rate = f"{(each.count - 1) / bag.duration:.4g} Hz" if bag.duration and each.count > 1 else "-"
+            lasts = bag.end - bag.begin
+            rate = f"{(each.count - 1) / lasts:.4g} Hz" if lasts > 0.0 and each.count > 1 else "-"
             kind = each.type.replace("/msg/", "/") or "several"
-            table.add_row(visible(each.name), visible(kind), str(each.count), rate)
+            table.add_row(escape(visible(each.name)), escape(visible(kind)), str(each.count), rate)
         text = configuration(bag)
-    console.print(table, markup=False)
+        span = f"{path}: {bag.end - bag.begin:.2f} s from {bag.begin:.3f} s on, by the recorder's clock"
+        if not bag.topics:
+            raise InputError(f"{path} has no topic; give a bag in which something was recorded.")
+    console.print(visible(span), markup=False, highlight=False, soft_wrap=True)
+    console.print(table)
     if write is None:
         console.print(f"\nA configuration; lines with {GUESS!r} are to be checked:\n", markup=False)
         console.print(text, highlight=False, markup=False, soft_wrap=True)
@@ -116,7 +123,15 @@ def _topic(bag: Bag, kind: str, example: str) -> str:
     if not found:
         return f"  topic: {example}  # none of {kind.replace('/msg/', '/')} was found\n"
     others = f"; others: {', '.join(_plain(t.name) for t in found[1:])}" if found[1:] else ""
-    return f"  topic: {_plain(found[0].name)}  {GUESS}{others}\n"
+    frame = _header_frame(bag, found[0])
+    of = f", in the frame {_plain(frame)}" if frame else ""
+    return f"  topic: {_plain(found[0].name)}  {GUESS}{of}{others}\n"
+
+
+def _header_frame(bag: Bag, topic: Topic) -> str:
+    """The frame that the header of the topic's first message names, if it has one."""
+    first = next(bag.messages([topic.name]), None)
+    return "" if first is None else str(getattr(getattr(bag.parsed(first), "header", None), "frame_id", ""))
 
 
 def _is_depth(bag: Bag, topic: Topic) -> bool:
@@ -148,6 +163,6 @@ def _nearest(topic: str, others: list[str]) -> str | None:
 
 def _plain(name: str) -> str:
     """A name that stands in YAML as it is; one that would not is quoted."""
-    if name and all(each.isalnum() or each in "/_.-" for each in name):
+    if all(each.isalnum() or each in "/_.-" for each in name) and yaml.safe_load(name) == name:
         return name
     return "'" + visible(name).replace("'", "''") + "'"

@@ -60,6 +60,10 @@ class Message:
 class Bag:
     """A bag, open within a `with` statement.
 
+    Attributes:
+        topics: by name.
+        begin, end: when the first and the last message were received, s.
+
     Args:
         path: of a .bag or .mcap file, a .db3 file, or the folder of a ROS 2 bag.
 
@@ -73,14 +77,10 @@ class Bag:
         self.is_ros1 = path.suffix == ".bag"
         try:
             self._reader.open()
+            self.topics = _topics(self._reader.connections)
+            self.begin, self.end = 1e-9 * self._reader.start_time, 1e-9 * self._reader.end_time
         except Exception as error:  # rosbags passes on errors of what it reads with
             raise self._damaged(error) from error
-        topics: dict[str, Topic] = {}
-        for each in self._reader.connections:
-            before = topics.get(each.topic, Topic(each.topic, each.msgtype, 0))
-            kind = each.msgtype if each.msgtype == before.type else ""
-            topics[each.topic] = Topic(each.topic, kind, before.count + each.msgcount)
-        self.topics = topics
 
     def __enter__(self) -> Self:
         return self
@@ -93,11 +93,6 @@ class Bag:
     ) -> None:
         with contextlib.suppress(Exception):
             self._reader.close()
-
-    @property
-    def duration(self) -> float:
-        """Seconds from the first message to the last."""
-        return float(1e-9 * max(self._reader.duration, 0))
 
     def topic(self, field: str, name: str, types: Collection[str]) -> Topic:
         """The topic of a name.
@@ -194,6 +189,15 @@ def stamped(header: Any, received: float) -> tuple[float, bool]:
     """The stamp (s) of a header, and whether it is zero; then it is the time of reception."""
     stamp = header.stamp.sec + 1e-9 * header.stamp.nanosec
     return (stamp, False) if stamp else (received, True)
+
+
+def _topics(connections: Any) -> dict[str, Topic]:
+    topics: dict[str, Topic] = {}
+    for each in connections:
+        before = topics.get(each.topic, Topic(each.topic, each.msgtype, 0))
+        kind = each.msgtype if each.msgtype == before.type else ""
+        topics[each.topic] = Topic(each.topic, kind, before.count + int(each.msgcount))
+    return topics
 
 
 def _opened(path: Path) -> tuple[Any, Any]:

@@ -13,7 +13,10 @@ from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.recordings.importers.bag.reading import Bag, Message, stamped
 from bcppl.recordings.importers.bag.rows import unstamped_words
-from bcppl.recordings.importers.bench.pose_columns import composed, inverted
+from bcppl.recordings.importers.bench.pose_columns import UNIT, composed, inverted
+from bcppl.recordings.importers.bench.resampling import is_known
+from bcppl.recordings.importers.bench.streams import Stream
+from bcppl.recordings.importers.bench.wrenches import IDENTITY
 
 _ORDER = [0, 1, 2, 6, 3, 4, 5]  # x y z and qw qx qy qz of x y z and qx qy qz qw
 _BACK = [0, 1, 2, 4, 5, 6, 3]
@@ -26,7 +29,30 @@ class _Edge:
         self.flat, self.unstamped, self.is_fixed = array("d"), 0, False
 
     def table(self) -> Array:
+        """Stamps, positions and quaternions x y z w (T, 8)."""
         return np.frombuffer(self.flat, dtype=np.float64).reshape(-1, 8)
+
+    @property
+    def holds_still(self) -> bool:
+        """Whether it is fixed, or was sent over and over without a change."""
+        table = self.table()
+        return self.is_fixed or bool((table[:, 1:] == table[0, 1:]).all())
+
+    def stream(self) -> Stream:
+        """Its poses (T, 7) in order, each stamp once."""
+        _, first = np.unique(self.table()[:, 0], return_index=True)
+        table = self.table()[first]
+        return Stream("transform", table[:, 0], table[:, 1:][:, _ORDER])
+
+    def at(self, times: Array) -> Array:
+        """Poses (T, 7), or (1, 7) if it holds still; interpolated along lines and geodesics."""
+        if self.holds_still:
+            return np.asarray(self.table()[-1:, 1:][:, _ORDER])
+        stream = self.stream()
+        within = np.clip(times, stream.times[0], stream.times[-1])
+        turns = Slerp(stream.times, Rotation.from_quat(stream.values[:, [4, 5, 6, 3]]))(within).as_quat()
+        place = [np.interp(within, stream.times, column) for column in stream.values[:, :3].T]
+        return np.column_stack([*place, turns[:, [3, 0, 1, 2]]])
 
 
 class _Fixed:
@@ -67,28 +93,43 @@ class Transforms:
             InputError: there is no way from one frame to the other, or no transform on it moves.
         """
         way = self._way()
-        moving = [each for each, _ in way if not each.is_fixed]
+        for edge, _ in way:
+            self._refuse_wrong(edge)
+        moving = [edge for edge, _ in way if not edge.holds_still]
         if not moving:
             raise InputError(
-                f"{self._name}: no transform from {self._parent!r} to {self._child!r} in {self._topic} is "
-                "repeated; give a child that the arm moves."
+                f"{self._name}: nothing moves from {self._parent!r} to {self._child!r} in {self._topic}; "
+                "give a child that the arm moves."
             )
         fastest = max(moving, key=lambda edge: len(edge.flat))
         times = fastest.table()[:, 0]
-        begin = max(edge.table()[:, 0].min() for edge in moving)
-        end = min(edge.table()[:, 0].max() for edge in moving)
-        times = times[(times >= begin) & (times <= end)]
-        if not len(times):
+        known = np.ones(len(times), dtype=bool)
+        for edge in moving:
+            known &= edge is fastest or is_known(edge.stream(), times, None)
+        if not known.any():
             raise InputError(
                 f"{self._name}: the transforms from {self._parent!r} to {self._child!r} in {self._topic} "
                 "share no time; give frames between which all were sent."
             )
-        pose = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(times), 1))
+        pose = np.tile(IDENTITY, (len(times), 1))
         for edge, forward in way:
-            step = _at(edge, times, begin, end, edge is fastest)
+            step = edge.table()[:, 1:][:, _ORDER] if edge is fastest else edge.at(times)
             pose = composed(pose, step if forward else inverted(step))
-        notes = unstamped_words(sum(each.unstamped for each in moving), sum(len(e.flat) for e in moving) // 8)
-        return np.column_stack([times, pose[:, _BACK]]), [f"{len(way)} transforms composed", *notes]
+        table = np.column_stack([times, pose[:, _BACK]])[known]
+        notes = [f"{len(way)} transforms composed"] if len(way) > 1 else []
+        if not known.all():
+            notes.append(f"{int((~known).sum())} stamps left out, for a slower transform is not known there")
+        unstamped = sum(edge.unstamped for edge in moving), sum(len(edge.flat) // 8 for edge in moving)
+        return table, [*notes, *unstamped_words(*unstamped)]
+
+    def _refuse_wrong(self, edge: _Edge) -> None:
+        table = edge.table()
+        off = ~(np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1.0) < UNIT) | ~np.isfinite(table).all(axis=1)
+        if off.any():
+            raise InputError(
+                f"{self._name}: {self._topic} has a transform without a rotation, with numbers "
+                f"{table[off][0, 1:].tolist()}; filter the bag, or give another topic."
+            )
 
     def _way(self) -> list[tuple[_Edge, bool]]:
         """The edges from parent to child, each with whether it leads from its parent to its child."""
@@ -130,19 +171,3 @@ def _keep(edges: dict[tuple[str, str], _Edge], bag: Bag, message: Message, fixed
         stamp, unstamped = stamped(each.header, message.received)
         edge.unstamped += unstamped
         edge.flat.extend((stamp, at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w))
-
-
-def _at(edge: _Edge, times: Array, begin: float, end: float, own: bool) -> Array:
-    """Poses (T, 7) of an edge at times within its own; its own rows where they are its stamps."""
-    table = edge.table()
-    if own:
-        return np.asarray(table[(table[:, 0] >= begin) & (table[:, 0] <= end)][:, 1:][:, _ORDER])
-    if edge.is_fixed:
-        return np.asarray(table[-1:, 1:][:, _ORDER])
-    _, first = np.unique(table[:, 0], return_index=True)
-    table = table[first]
-    if len(table) == 1:
-        return np.asarray(table[:, 1:][:, _ORDER])
-    turns = Slerp(table[:, 0], Rotation.from_quat(table[:, 4:]))(times).as_quat()
-    place = np.stack([np.interp(times, table[:, 0], column) for column in table[:, 1:4].T], axis=1)
-    return np.column_stack([place, turns[:, [3, 0, 1, 2]]])

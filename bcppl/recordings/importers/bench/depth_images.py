@@ -40,7 +40,9 @@ def in_metres(where: str, pixels: Array, fields: CameraFields, unit: Length = "m
     scale = factor(fields.unit or unit) if fields.scale is None else fields.scale
     depth = scale * pixels
     depth[~np.isfinite(depth) | (depth <= 0.0)] = np.nan
-    middle = float(np.nanmedian(depth)) if np.isfinite(depth).any() else np.nan
+    if not np.isfinite(depth).any():
+        raise InputError(f"{where} has no pixel with a depth; leave it out, or see where its camera looked.")
+    middle = float(np.nanmedian(depth))
     if not fields.near / 3.0 <= middle <= 3.0 * fields.far:
         raise InputError(
             f"{where} has a median depth of {middle:.4g} m, for a camera that sees from {fields.near:g} to "
