@@ -63,14 +63,15 @@ class BagLog(Files):
             if not self._wanted:
                 raise InputError(f"no field names a topic of {path}; name some, or use bcppl import bench.")
             _read(bag, self._wanted)
+        self._wanted.clear()  # what is read is released
 
     def rows(self, name: str, fields: StreamFields) -> tuple[Array, list[str]]:
-        """Stamps in seconds and columns (T, 1 + C) of a stream, and what was left out.
+        """Stamps in seconds and columns (T, 1 + C) of a stream, and what was left out; once for each stream.
 
         Raises:
             InputError: the stream is a file that cannot be read, or no message has what it asks for.
         """
-        return self._streams[name].rows() if fields.topic else super().rows(name, fields)
+        return self._streams.pop(name).rows() if fields.topic else super().rows(name, fields)
 
     def intrinsics(self, name: str, fields: CameraFields) -> CameraFields:
         """The fields of a camera, with the intrinsics that its topic states."""
@@ -81,7 +82,7 @@ class BagLog(Files):
         if not fields.topic:
             return super().shots(name, fields)
         size = self._intrinsics[name].size if fields.info else None
-        return self._images[name].shots(fields, size)
+        return self._images.pop(name).shots(fields, size)
 
     def _keep(self, topic: str, collector: Collector) -> None:
         self._wanted.setdefault(topic, []).append(collector)

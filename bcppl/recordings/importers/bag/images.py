@@ -18,7 +18,7 @@ from bcppl.recordings.importers.bench.field_types import Length, factor
 from bcppl.recordings.importers.bench.logs import Shot
 
 NEAR = 0.1  # s from a stated time within which an image must be
-MOST_BYTES = 60_000_000  # of images as they are stored; with their depth in float64 five times as much
+MOST_BYTES = 50_000_000  # of images as they are stored; with their depth in float64 five times as much
 _DEPTHS: dict[str, tuple[str, Length]] = {
     "16UC1": ("u2", "mm"),
     "mono16": ("u2", "mm"),

@@ -45,7 +45,7 @@ class Rows:
         Raises:
             InputError: none was kept.
         """
-        table = np.frombuffer(self._flat, dtype=np.float64).reshape(max(self._count, 1), -1).copy()
+        table = np.frombuffer(self._flat, dtype=np.float64).reshape(max(self._count, 1), -1)
         return table, unstamped_words(self._unstamped, self._count)
 
     def _keep(self, stamp: float, numbers: Sequence[float]) -> None:

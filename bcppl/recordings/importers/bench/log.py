@@ -35,6 +35,7 @@ from bcppl.recordings.importers.bench.wrenches import IDENTITY, read_wrench, wre
 from bcppl.sensors import Measurement, Recording
 
 _LEAST_SHARED = 1.0  # s that wrench and pose share, or their clocks cannot be compared
+_ROWS = 20_000  # of which frames are changed at once
 _FREE = 0.1  # s in free air with which a log begins
 
 
@@ -123,11 +124,15 @@ class _Mounting:
     def felt(self, wrench: Stream, frame: Stream, stamps: Array) -> tuple[Array, Array, str]:
         """The wrench on the peg (T, 6) without weight, the peg's pose (T, 7), and words about the weight."""
         world_from_frame = poses_at(frame, stamps)
-        base_from_frame = composed(inverted(self.world_from_base), world_from_frame)
-        logged = values_at(wrench, stamps)
+        on_peg = values_at(wrench, stamps)
+        world_from_peg = np.empty_like(world_from_frame)
         sides = self.frame_from_peg, self.frame_from_sensor
-        on_peg = wrench_on_peg(logged, self.fields.wrench, base_from_frame, *sides)
-        world_from_peg = composed(world_from_frame, self.frame_from_peg)
+        base_from_world = inverted(self.world_from_base)
+        for first in range(0, len(stamps), _ROWS):  # all at once, ten minutes at 1 kHz took 400 MB
+            rows = slice(first, first + _ROWS)
+            base_from_frame = composed(base_from_world, world_from_frame[rows])
+            on_peg[rows] = wrench_on_peg(on_peg[rows], self.fields.wrench, base_from_frame, *sides)
+            world_from_peg[rows] = composed(world_from_frame[rows], self.frame_from_peg)
         peg_from_sensor = composed(inverted(self.frame_from_peg), self.frame_from_sensor)
         felt, words = without_weight(on_peg, world_from_peg, stamps, self.fields.gravity, peg_from_sensor)
         return felt, world_from_peg, words

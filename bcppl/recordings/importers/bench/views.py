@@ -50,15 +50,18 @@ def read_views(
     views: list[Measurement] = []
     shape: tuple[int, ...] | None = None
     missing, fastest = 0.0, 0.0
-    for k, shot in enumerate(shots):
+    count = len(shots)
+    shots.reverse()
+    for k in range(count):
+        shot = shots.pop()  # each is released once it is read
         depth = shot.read()
         if shape is not None and depth.shape != shape:
             raise InputError(
                 f"cameras.{name}: image {shot.label} has {depth.shape[1]} x {depth.shape[0]} pixels, those "
                 f"before {shape[1]} x {shape[0]}; make another camera of it, with its own intrinsics."
             )
-        shape, missing = depth.shape, missing + float(np.isnan(depth).mean()) / len(shots)
-        place = _Place(name, f"cameras.{name}.images[{k}]", name if len(shots) == 1 else f"{name} {k}")
+        shape, missing = depth.shape, missing + float(np.isnan(depth).mean()) / count
+        place = _Place(name, f"cameras.{name}.images[{k}]", name if count == 1 else f"{name} {k}")
         camera, speed = _camera(place, fields, shot.image, depth.shape, world_from_frame)
         fastest = max(fastest, speed)
         views.append(Measurement(View(camera), DepthImage(depth)))
