@@ -1,0 +1,72 @@
+"""Doubts about a probe's own numbers, without the part: units of wrenches, and the command."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from bcppl.geometry.parts import Part
+from bcppl.sensors.plausibility.contacts import Felt
+
+FAINTEST, STRONGEST = 0.3, 1000.0  # N: the largest force of a probe that meets something is between
+CLEAR = 20.0  # times the noise: a contact, whatever the unit
+LONGEST, SHORTEST = 10.0, 0.002  # reaches of the peg: the median lever of its contacts is between
+STILL, MOVED = 0.001, 0.005  # m: a command that stands still, a peg that moves
+FEWEST = 10  # stamps in contact, below which they decide nothing
+
+
+def force_unit(felt: Felt) -> tuple[float, str]:
+    """The factor to newtons, and the mistake in words: 1 and "" for newtons."""
+    largest = float(np.quantile(felt.size, 0.98))
+    noise = float(np.linalg.norm(felt.noise[:3]))
+    if largest > STRONGEST:
+        return 1e-3, (
+            f"forces of {largest:.3g} N, which few arms bear: probably millinewtons, scale them by 0.001"
+        )
+    if 0.0 < CLEAR * noise < largest < FAINTEST:
+        return 1e3, (
+            f"forces of at most {largest:.2g} N, but clear contacts: probably kilonewtons, scale them by 1000"
+        )
+    return 1.0, ""
+
+
+def torque_unit(felt: Felt, peg: Part) -> tuple[float, str]:
+    """The factor to newton metres, of a probe with forces in newtons, and the mistake in words."""
+    contact = felt.contact
+    if contact.sum() < FEWEST:
+        return 1.0, ""
+    torque = np.linalg.norm(felt.wrench[contact, 3:], axis=1)
+    lever = float(np.median(torque / felt.size[contact]))
+    reach = float(np.linalg.norm(peg.vertices, axis=1).max())
+    where = f"forces that act {lever:.3g} m from the origin of a peg that ends {reach:.3g} m from it"
+    if lever > LONGEST * reach:
+        return 1e-3, f"{where}: probably the torques are in N mm, scale them by 0.001"
+    if 0.0 < lever < SHORTEST * reach:
+        return 1e3, f"{where}: probably the torques are in kN m, scale them by 1000"
+    return 1.0, ""
+
+
+def in_newtons(felt: Felt, peg: Part) -> tuple[Felt, list[str]]:
+    """The probe in newtons and newton metres, and the mistakes in words."""
+    force, first = force_unit(felt)
+    scaled = replace(felt, wrench=felt.wrench * ([force] * 3 + [1.0] * 3))
+    torque, second = torque_unit(scaled, peg)
+    if first and torque == force:
+        first, second = f"{first}, and torques too", ""
+    scaled = replace(scaled, wrench=scaled.wrench * ([1.0] * 3 + [torque] * 3))
+    return scaled, [words for words in (first, second) if words]
+
+
+def command_doubt(felt: Felt) -> Iterator[str]:
+    """The mistake in words where a command stands still while the peg moves."""
+    command = np.asarray(felt.probe.command, dtype=float)
+    if command.ndim != 2 or command.shape[1:] != (7,):
+        return
+    moved = float(np.ptp(felt.pose[:, :3], axis=0).max())
+    if len(command) == 0 or (float(np.ptp(command[:, :3], axis=0).max()) < STILL and moved > MOVED):
+        yield (
+            f"a command that never changes, while the peg moves by {1e3 * moved:.0f} mm: give the commanded "
+            "poses, or the measured ones where the controller states none"
+        )
