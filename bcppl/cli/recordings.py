@@ -25,7 +25,10 @@ OUT = Annotated[Path, typer.Option("--out", "-o", dir_okay=False, help="The reco
 def check(
     recording: Annotated[str, typer.Argument(help="A recording (.h5), or the name of a shipped one.")],
 ) -> None:
-    """Describe a recording and list its problems (exit code 2 if there are any)."""
+    """Describe a recording and list its problems (exit code 2 if there are any), notes and doubts.
+
+    A doubt is what probably is wrong: it is well formed, but does not fit the part within the guess.
+    """
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -33,6 +36,7 @@ def check(
     from bcppl.models.shipped import load_recording
     from bcppl.recordings import describe, notes, problems
     from bcppl.recordings.file import is_checked
+    from bcppl.sensors.plausibility import doubts
 
     loaded = load_recording(recording)
     remarks = notes(loaded)
@@ -45,11 +49,17 @@ def check(
     console.print(table)
     for note in remarks:
         console.print(f"[yellow]note:[/yellow] {escape(visible(note))}", highlight=False)
+    doubted = doubts(loaded)
+    for doubt in doubted:
+        console.print(f"[yellow]doubt:[/yellow] {escape(visible(doubt))}", highlight=False)
     wrong = problems(loaded)
     for problem in wrong:
         console.print(f"[red]wrong:[/red] {escape(visible(problem))}", highlight=False)
     if wrong:
         raise typer.Exit(2)
+    if doubted:
+        console.print(f"[yellow]no problem, but {len(doubted)} doubt{'s'[: len(doubted) > 1]}.[/yellow]")
+        return
     console.print("[green]no problem.[/green]")
 
 

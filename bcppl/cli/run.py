@@ -10,6 +10,7 @@ import typer
 from bcppl.arguments import LARGEST_SEED
 from bcppl.cli.setting_option import Settings
 from bcppl.errors import InputError
+from bcppl.visible_text import visible
 
 if TYPE_CHECKING:
     from bcppl.recordings import Recording
@@ -62,6 +63,7 @@ def run(
     from bcppl.cli.run_folder import STEP, RunFolder, beside, read_record
     from bcppl.inference.progress import sole_bar
     from bcppl.inference.saved import load_step
+    from bcppl.sensors.plausibility import doubts
 
     record: dict[str, Any] = {}
     if resume is not None:
@@ -89,6 +91,10 @@ def run(
             "75 is a good start.",
             style="yellow",
         )
+    kept = record.get("doubts")
+    doubted = [str(doubt) for doubt in kept] if isinstance(kept, list) else doubts(measured)
+    for doubt in doubted:
+        console.print(f"doubt: {visible(doubt)}", style="yellow", markup=False)
     report, options = (
         Report(console, measured, chosen),
         {"particles": particles, "seed": seed, "scene": scene},
@@ -112,6 +118,7 @@ def run(
                 "particles": particles,
                 "seed": seed,
                 "settings": settings,
+                "doubts": doubted,
             },
         )
     try:

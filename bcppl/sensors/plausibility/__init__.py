@@ -11,10 +11,10 @@ It lies with the sensors, for it asks which kind a measurement is.
 
 from __future__ import annotations
 
+from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors import checks
+from bcppl.sensors.depth import View
 from bcppl.sensors.measurements import Recording
-from bcppl.sensors.plausibility.touches import touch_doubts
-from bcppl.sensors.plausibility.views import view_doubts
 
 __all__ = ["doubts"]
 
@@ -25,8 +25,14 @@ def doubts(recording: Recording) -> list[str]:
     Views and probes are compared with the part within the guess; measurements that cannot be read, and kinds
     other than these, are left out.
     """
-    part, guess = recording.part, recording.guess
+    part, guess, measurements = recording.part, recording.guess, recording.measurements
+    if not any(isinstance(each.action, View | ProbeWindow) for each in measurements):
+        return []
     if list(checks.part(part, closed=False)) or list(checks.pose("", guess.world_from_part)):
         return []
-    lines, start = view_doubts(recording.measurements, part, guess)
-    return lines + touch_doubts(recording.measurements, part, recording.peg, guess, start)
+    # These import torch and the renderer, which take seconds.
+    from bcppl.sensors.plausibility.touches import touch_doubts
+    from bcppl.sensors.plausibility.views import view_doubts
+
+    lines, start = view_doubts(measurements, part, guess)
+    return lines + touch_doubts(measurements, part, recording.peg, guess, start)

@@ -20,12 +20,16 @@ from bcppl.sensors.plausibility.search import Found, best_pose
 ZERO = 10  # rows at a probe's start whose mean is the sensor's zero
 LEAST = 2.0  # N, and
 SHARE = 0.1  # of the largest force: the peg is in contact from there on
-ROWS = 40  # of contact, and of none, at which gaps are evaluated in a search
+ROWS = 24  # of contact, and of none, at which gaps are evaluated in a search
 NEAR = 0.003  # m: scale of a gap in contact, of the search too
 OUTLIERS = 0.1
 SPAN = 0.1  # m, over which a gap may lie that is of no contact with the part
 FULL = math.log(OUTLIERS + (1.0 - OUTLIERS) * SPAN / (2.0 * NEAR))
 FARTHEST = 0.05  # m: a larger gap says no more
+DIRECTED = 2.0  # nats of a contact whose force is along the part's normal
+REACH = np.array(
+    [0.012] * 3 + [0.1, 0.1, 0.3]
+)  # m and rad from where images show the part to where it is felt
 DEEP = -0.002  # m: a free peg is in the part
 
 
@@ -114,17 +118,21 @@ class Contacts:
         self.guess = guess
         self._gap = PegGap(part, peg)
 
-    def score(self, probes: Sequence[Felt], pose: Array) -> Array:
-        """Scores (N,) at poses (N, 7) of the part, nats."""
-        total = np.zeros(len(pose))
+    def score(self, probes: Sequence[Felt], pose: Array, directed: bool = True) -> Array:
+        """Scores (N,) at poses (N, 7) of the part, nats: of gaps, if `directed` of forces' directions too."""
+        total, turn = np.zeros(len(pose)), poses.rotation_matrix(torch.from_numpy(pose)).numpy()
         for felt in probes:
             touching, free = evenly(felt.contact, ROWS), evenly(felt.size < 0.5 * LEAST, ROWS)
             rows = np.concatenate([touching, free])
-            gap = self._gap(torch.from_numpy(pose), torch.from_numpy(felt.pose[rows])).distance.numpy()
-            at, off = gap[:, : len(touching)], gap[:, len(touching) :]
-            density = (1.0 - OUTLIERS) * SPAN / (2.0 * NEAR) * np.exp(-np.abs(at) / NEAR)
-            total += np.log(OUTLIERS + density).sum(axis=1)
-            total -= np.minimum(np.maximum(DEEP - off, 0.0) / NEAR, FULL).sum(axis=1)
+            found = self._gap(torch.from_numpy(pose), torch.from_numpy(felt.pose[rows]))
+            gap, count = found.distance.numpy(), len(touching)
+            near = np.exp(-np.abs(gap[:, :count]) / NEAR)
+            total += np.log(OUTLIERS + (1.0 - OUTLIERS) * SPAN / (2.0 * NEAR) * near).sum(axis=1)
+            total -= np.minimum(np.maximum(DEEP - gap[:, count:], 0.0) / NEAR, FULL).sum(axis=1)
+            if directed:
+                force = felt.force[touching] / felt.size[touching, None]
+                normal = found.normal[:, :count].numpy() @ turn.transpose(0, 2, 1)
+                total += DIRECTED * (near * (normal * force).sum(axis=2)).sum(axis=1)
         return total
 
     def most(self, probes: Sequence[Felt]) -> float:
@@ -146,11 +154,20 @@ class Contacts:
 
     def fit(self, probes: Sequence[Felt], start: Found | None = None) -> Met:
         """The pose that contacts fit best, from a place or from all over the prior."""
-        found = best_pose(lambda pose: self.score(probes, pose), self.guess, start, draws=32)
+        wide = start is None
+        found = best_pose(
+            lambda pose: self.score(probes, pose),
+            self.guess,
+            start,
+            rounds=6 if wide else 4,
+            draws=96 if wide else 32,
+            reach=REACH,
+        )
         pose = torch.from_numpy(np.concatenate([felt.pose for felt in probes]))
         gap = self._gap(torch.from_numpy(found.pose)[None], pose)
         turn = poses.rotation_matrix(torch.from_numpy(found.pose)).numpy()
-        share = found.score / max(self.most(probes), 1e-9)
+        score = float(self.score(probes, found.pose[None], directed=False)[0])
+        share = score / max(self.most(probes), 1e-9)
         return Met(found, share, gap.distance[0].numpy(), gap.normal[0].numpy() @ turn.T)
 
 

@@ -85,7 +85,9 @@ class Images:
         def score(pose: Array) -> Array:
             return np.sum([self.scores(seen, pose)[0] for seen in several], axis=0)
 
-        found = best_pose(score, self.guess, start)
+        # From a start few draws do: those of an enlarged part are of many pixels.
+        draws, rounds = (48, 4) if start is None else (24, 3)
+        found = best_pose(score, self.guess, start, spread=0.4, rounds=rounds, draws=draws)
         totals = [self.scores(seen, found.pose[None]) for seen in several]
         count = sum(int(number[0]) for _, number in totals)
         value = sum(float(total[0]) for total, _ in totals)

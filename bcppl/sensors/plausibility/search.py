@@ -14,6 +14,8 @@ from bcppl.arrays import Array
 from bcppl.geometry.parts import Guess
 
 ELITE = 8  # of the poses of a round, from which the next round is drawn
+OUTERMOST = np.array([2.0] * 3 + [1.1] * 3)  # limits to which a search goes: translations have tails
+WIDEST, STEEPEST = 0.05, 0.6  # m and rad of tilt: a wider guess has too many places that look alike
 NARROWEST = 0.02  # of the limits: spread of a round, at least
 
 
@@ -37,6 +39,12 @@ def limits(guess: Guess) -> Array:
     return np.array([*np.asarray(guess.translation, dtype=float), tilt, tilt, yaw])
 
 
+def is_narrow(guess: Guess) -> bool:
+    """Whether a guess says enough of where the part is for a search to tell right from wrong."""
+    width = limits(guess)
+    return bool(width[:3].max() <= WIDEST and width[3] <= STEEPEST)
+
+
 def poses_at(guess: Guess, place: Array) -> Array:
     """Poses (N, 7) of the part at coordinates (N, 6), in limits of the prior."""
     tangent = place * limits(guess)
@@ -55,6 +63,7 @@ def best_pose(
     spread: float = 0.3,
     rounds: int = 4,
     draws: int = 48,
+    reach: Array | None = None,
 ) -> Found:
     """The best of the poses that are drawn, from round to round about the best (the cross-entropy method).
 
@@ -65,6 +74,7 @@ def best_pose(
         spread: of that.
         rounds: of the search.
         draws: poses of a round.
+        reach: (6,) how far from the start the pose may be, metres and radians; anywhere unless given.
     """
     rng = np.random.default_rng(0)
     place = rng.uniform(-1.0, 1.0, (2 * draws, 6))
@@ -72,9 +82,13 @@ def best_pose(
     if start is not None:
         place = start.place + spread * rng.normal(size=(draws, 6))
         place[0] = start.place
+    low, high = -OUTERMOST, OUTERMOST
+    if start is not None and reach is not None:
+        near = reach / np.maximum(limits(guess), 1e-9)
+        low, high = np.maximum(low, start.place - near), np.minimum(high, start.place + near)
     best = Found(np.asarray(guess.world_from_part, dtype=float), np.zeros(6), -math.inf)
     for _ in range(rounds):
-        place = np.clip(place, -1.1, 1.1)
+        place = np.clip(place, low, high)
         there = poses_at(guess, place)
         scores = score(there)
         order = np.argsort(-scores)

@@ -18,7 +18,7 @@ from bcppl.sensors import checks
 from bcppl.sensors.measurements import Measurement
 from bcppl.sensors.plausibility.contacts import Contacts, Felt, Met, along_axis, felt_by
 from bcppl.sensors.plausibility.images import reordered
-from bcppl.sensors.plausibility.search import Found
+from bcppl.sensors.plausibility.search import Found, is_narrow
 from bcppl.sensors.plausibility.units import FEWEST, command_doubt, in_newtons
 from bcppl.sensors.plausibility.wording import of_probes
 
@@ -31,7 +31,7 @@ TURNED, LEAST_TURN = 0.08, math.radians(25.0)  # the same of a turn: of right sc
 ASKEW = 0.4  # a mean cosine of force and normal below which the force's axes are wrong
 ALONG = np.arange(-0.35, 0.3501, 0.005)  # m along the peg's axis
 SHIFTED = 0.02  # m: a shorter shift is as well the part's place
-CLOCK = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)  # s by which the wrench is late
+CLOCK = (-0.4, -0.3, -0.2, 0.2, 0.3, 0.4)  # s by which the wrench is late
 LATER = 0.03  # of the stamps that a clock has to explain more
 GAPS = (0.001, 0.002, 0.004, 0.006)  # m: limits between contact and none
 
@@ -75,7 +75,7 @@ def touch_doubts(
             by_cause.setdefault(cause, []).append(felt.probe.name)
     lines = [f"{of_probes(names)} has {cause}." for cause, names in by_cause.items()]
     touching = [felt for felt in scaled if felt.contact.sum() >= FEWEST]
-    if touching:
+    if touching and is_narrow(guess):
         try:
             lines += _of_contacts(Contacts(part, peg, guess), touching, start)
         except InputError:  # of a mesh that has a problem, which a check of the recording names
@@ -118,7 +118,8 @@ def _of_contacts(contacts: Contacts, probes: Sequence[Felt], start: Found | None
             f"{best.cosine:.2f}): probably the wrench is not in the peg's frame; turn it there."
         )
         return
-    yield from _clock(contacts, best, who, start)
+    if start is not None:  # touches alone leave room for a part that suits another clock
+        yield from _clock(contacts, best, who, start)
 
 
 def judged(contacts: Contacts, hypothesis: Hypothesis, start: Found | None) -> Judged:
@@ -168,6 +169,8 @@ def _hypotheses(contacts: Contacts, stated: Judged, start: Found | None) -> Iter
                 "compose it with flange_from_peg",
                 each(lambda felt, metres=metres: along_axis(felt, metres)),  # type: ignore[misc]
             )
+        return
+    if start is None:
         return
     angle = _turn(probes, stated.met)
     if abs(angle) >= LEAST_TURN:

@@ -12,13 +12,14 @@ from bcppl.sensors import checks
 from bcppl.sensors.depth import View
 from bcppl.sensors.measurements import Measurement
 from bcppl.sensors.plausibility.images import Fit, Images, Repair, Seen, repairs, thinned
-from bcppl.sensors.plausibility.search import Found
+from bcppl.sensors.plausibility.search import Found, is_narrow
 from bcppl.sensors.plausibility.wording import listed
 
 MOST = 4  # views that are looked at, evenly chosen
 # Shares of 30 right scenes of the bench: 0.45 to 0.77; no repair had more than 0.98 times their score.
 POOR = 0.25  # a share below which the part is not where it should be
 REPAIRED = 0.4  # a share from which on a repair explains the images
+SMALLEST = 5.0  # pixels across the part, below which an image decides nothing
 BETTER = 1.3  # times the score that a repair has to reach
 
 
@@ -26,13 +27,13 @@ def view_doubts(
     measurements: Sequence[Measurement], part: Part, guess: Guess
 ) -> tuple[list[str], Found | None]:
     """Doubts about views, and the pose of the part that they show: None where they show none."""
-    readable = [m for m in measurements if isinstance(m.action, View) and _is_readable(m)]
+    readable = [m for m in measurements if isinstance(m.action, View) and _is_readable(m, part, guess)]
     chosen = (
         [readable[k] for k in np.unique(np.linspace(0, len(readable) - 1, MOST).astype(int))]
         if readable
         else []
     )
-    if not chosen:
+    if not chosen or not is_narrow(guess):
         return [], None
     several = [thinned(m.action.camera, np.asarray(m.observation.depth)) for m in chosen]
     try:
@@ -41,15 +42,16 @@ def view_doubts(
         return [], None
 
 
-def _is_readable(measurement: Measurement) -> bool:
+def _is_readable(measurement: Measurement, part: Part, guess: Guess) -> bool:
     camera, depth = measurement.action.camera, measurement.observation.depth
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    return (
-        np.shape(depth) == (camera.height, camera.width)
-        and bool(np.isfinite(intrinsics).all() and (intrinsics[:2] > 0.0).all())
-        and bool((np.isfinite(depth) & (np.asarray(depth) > 0.0)).any())
-        and not list(checks.pose("", camera.world_from_camera))
-    )
+    if np.shape(depth) != (camera.height, camera.width) or list(checks.pose("", camera.world_from_camera)):
+        return False
+    if not (np.isfinite(intrinsics).all() and (intrinsics[:2] > 0.0).all()):
+        return False
+    away = np.linalg.norm(np.asarray(camera.world_from_camera)[:3] - np.asarray(guess.world_from_part)[:3])
+    across = float(np.median(part.extent)) * min(camera.fx, camera.fy) / max(float(away), 1e-3)
+    return across > SMALLEST and bool((np.isfinite(depth) & (np.asarray(depth) > 0.0)).any())
 
 
 def _doubts(images: Images, several: Sequence[Seen], all_of_them: bool) -> tuple[list[str], Found | None]:
@@ -79,8 +81,8 @@ def _doubts(images: Images, several: Sequence[Seen], all_of_them: bool) -> tuple
     if together is None or together.share < POOR:
         if right:
             lines.append(
-                "the views show the part at different poses within the guess: probably the cameras' poses are "
-                "of different frames, or the part was moved between them."
+                "the views show the part at different poses within the guess: probably the cameras' "
+                "poses are of different frames, or the part was moved between them."
             )
         return lines, None
     return lines, together.found
@@ -96,7 +98,7 @@ def _repaired(images: Images, several: Sequence[Seen], stated: Fit) -> tuple[Rep
         mended = [seen for seen in made if seen is not None]
         if len(mended) < len(made):
             continue
-        fit = images.fit(mended)
+        fit = images.fit(mended, stated.found if repair.enlarges and stated.share >= REPAIRED else None)
         shown = fit.share >= REPAIRED and min(images.shares(mended, fit.found)) >= POOR
         if shown and fit.score > (max(BETTER * stated.score, 0.0) if best is None else best[1].score):
             best = repair, fit
