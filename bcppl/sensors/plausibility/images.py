@@ -79,14 +79,13 @@ class Images:
         each = [self.scores(seen, found.pose[None]) for seen in several]
         return [float(score[0]) / (FULL * max(int(count[0]), FEWEST)) for score, count in each]
 
-    def fit(self, several: Sequence[Seen], start: Found | None = None) -> Fit:
-        """The pose within the prior that all images show best."""
+    def fit(self, several: Sequence[Seen], start: Found | None = None, thorough: bool = False) -> Fit:
+        """The pose within the prior that all images show best: from a start with few draws."""
 
         def score(pose: Array) -> Array:
             return np.sum([self.scores(seen, pose)[0] for seen in several], axis=0)
 
-        # From a start few draws do: those of an enlarged part are of many pixels.
-        draws, rounds = (48, 4) if start is None else (24, 3)
+        draws, rounds = (96, 8) if thorough else (48, 4) if start is None else (24, 3)
         found = best_pose(score, self.guess, start, spread=0.4, rounds=rounds, draws=draws)
         totals = [self.scores(seen, found.pose[None]) for seen in several]
         count = sum(int(number[0]) for _, number in totals)
@@ -97,13 +96,14 @@ class Images:
 class Repair(NamedTuple):
     """What a view would be without a mistake, and the mistake and its cure in words.
 
-    One that enlarges the drawn part may explain more of an image that shows it well as stated.
+    A focal length by a `factor` above 1 enlarges the drawn part, which may explain more of an image that
+    shows it well as stated.
     """
 
     name: str
     made: Callable[[Seen], Seen | None]
     words: str
-    enlarges: bool = False
+    factor: float = 1.0
 
 
 def with_pose(changed: Callable[[Array, Camera], Array | None]) -> Callable[[Seen], Seen | None]:
@@ -185,5 +185,5 @@ def repairs() -> Iterator[Repair]:
             f"focal length {factor:g}",
             _focal(factor),
             f"the focal length is about {factor:g} times the stated one: give fx and fy of this image's size",
-            enlarges=factor > 1.0,
+            factor=factor,
         )

@@ -56,6 +56,8 @@ def _is_readable(measurement: Measurement, part: Part, guess: Guess) -> bool:
 
 def _doubts(images: Images, several: Sequence[Seen], all_of_them: bool) -> tuple[list[str], Found | None]:
     stated = images.fit(several)
+    if min(images.shares(several, stated.found)) < REPAIRED:
+        stated = max(stated, images.fit(several, thorough=True), key=lambda fit: fit.score)
     whole = _repaired(images, several, stated)
     if whole is not None:
         who = "the views" if all_of_them else f"the {len(several)} views that were looked at"
@@ -67,8 +69,8 @@ def _doubts(images: Images, several: Sequence[Seen], all_of_them: bool) -> tuple
     by_cause: dict[str, list[str]] = {}
     right: list[Seen] = []
     for seen in several:
-        alone = images.fit([seen])
-        better = _repaired(images, [seen], alone)
+        alone = max(images.fit([seen]), images.fit([seen], stated.found), key=lambda fit: fit.score)
+        better = _repaired(images, [seen], alone, one_of_several=True)
         mended = seen if better is None else better[0].made(seen)
         if better is not None:
             by_cause.setdefault(better[0].words, []).append(seen.camera.name)
@@ -79,26 +81,26 @@ def _doubts(images: Images, several: Sequence[Seen], all_of_them: bool) -> tuple
     lines = [_of_some(names, cause) for cause, names in by_cause.items()]
     together = images.fit(right) if right else None
     if together is None or together.share < POOR:
-        if right:
-            lines.append(
-                "the views show the part at different poses within the guess: probably the cameras' "
-                "poses are of different frames, or the part was moved between them."
-            )
-        return lines, None
+        return lines, None  # cameras whose errors are larger than a thin part may each be right
     return lines, together.found
 
 
-def _repaired(images: Images, several: Sequence[Seen], stated: Fit) -> tuple[Repair, Fit] | None:
-    """The repair under which each image shows the part, and all clearly better than as stated."""
+def _repaired(
+    images: Images, several: Sequence[Seen], stated: Fit, one_of_several: bool = False
+) -> tuple[Repair, Fit] | None:
+    """The repair under which each image shows the part, and all clearly better than as stated.
+
+    One image alone leaves room for another focal length where the part is beside the guess.
+    """
     best: tuple[Repair, Fit] | None = None
     for repair in repairs():
-        if stated.share >= REPAIRED and not repair.enlarges:
+        if (stated.share >= REPAIRED and repair.factor <= 1.0) or (one_of_several and repair.factor != 1.0):
             continue
         made = [repair.made(seen) for seen in several]
         mended = [seen for seen in made if seen is not None]
         if len(mended) < len(made):
             continue
-        fit = images.fit(mended, stated.found if repair.enlarges and stated.share >= REPAIRED else None)
+        fit = images.fit(mended, stated.found if stated.share >= REPAIRED else None)
         shown = fit.share >= REPAIRED and min(images.shares(mended, fit.found)) >= POOR
         if shown and fit.score > (max(BETTER * stated.score, 0.0) if best is None else best[1].score):
             best = repair, fit
