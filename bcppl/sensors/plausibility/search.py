@@ -14,7 +14,7 @@ from bcppl.arrays import Array
 from bcppl.geometry.parts import Guess
 
 ELITE = 8  # of the poses of a round, from which the next round is drawn
-OUTERMOST = np.array([2.0] * 3 + [1.1] * 3)  # limits to which a search goes: translations have tails
+TAILS, TURNS = 0.02, 1.1  # m beyond the limits, but no more than these, and limits of turns: a search's reach
 WIDEST, STEEPEST = 0.05, 0.6  # m and rad of tilt: a wider guess has too many places that look alike
 NARROWEST = 0.02  # of the limits: spread of a round, at least
 
@@ -82,9 +82,12 @@ def best_pose(
     if start is not None:
         place = start.place + spread * rng.normal(size=(draws, 6))
         place[0] = start.place
-    low, high = -OUTERMOST, OUTERMOST
+    width = limits(guess)
+    beyond = 1.0 + np.minimum(TAILS / np.maximum(width[:3], 1e-9), 1.0)
+    high = np.array([*beyond, TURNS, TURNS, TURNS])
+    low = -high
     if start is not None and reach is not None:
-        near = reach / np.maximum(limits(guess), 1e-9)
+        near = reach / np.maximum(width, 1e-9)
         low, high = np.maximum(low, start.place - near), np.minimum(high, start.place + near)
     best = Found(np.asarray(guess.world_from_part, dtype=float), np.zeros(6), -math.inf)
     for _ in range(rounds):

@@ -18,6 +18,7 @@ from bcppl.sensors.plausibility.wording import listed
 MOST = 4  # views that are looked at, evenly chosen
 # Shares of 30 right scenes of the bench: 0.45 to 0.77; no repair had more than 0.98 times their score.
 POOR = 0.25  # a share below which the part is not where it should be
+SEEN = 0.05  # a share above which one image among several may show the part: a thin one has 0.09
 REPAIRED = 0.4  # a share from which on a repair explains the images
 SMALLEST = 5.0  # pixels across the part, below which an image decides nothing
 BETTER = 1.3  # times the score that a repair has to reach
@@ -59,6 +60,9 @@ def _doubts(images: Images, several: Sequence[Seen], all_of_them: bool) -> tuple
     if min(images.shares(several, stated.found)) < REPAIRED:
         stated = max(stated, images.fit(several, thorough=True), key=lambda fit: fit.score)
     whole = _repaired(images, several, stated)
+    if whole is not None and stated.share >= REPAIRED:
+        stated = max(stated, images.fit(several, thorough=True), key=lambda fit: fit.score)
+        whole = whole if whole[1].score > BETTER * stated.score else None
     if whole is not None:
         who = "the views" if all_of_them else f"the {len(several)} views that were looked at"
         seen_as = "no part where the guess has one" if stated.share < POOR else "the part at another size"
@@ -101,7 +105,7 @@ def _repaired(
         if len(mended) < len(made):
             continue
         fit = images.fit(mended, stated.found if stated.share >= REPAIRED else None)
-        shown = fit.share >= REPAIRED and min(images.shares(mended, fit.found)) >= POOR
+        shown = fit.share >= REPAIRED and min(images.shares(mended, fit.found)) > SEEN
         if shown and fit.score > (max(BETTER * stated.score, 0.0) if best is None else best[1].score):
             best = repair, fit
     return best
