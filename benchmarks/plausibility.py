@@ -34,7 +34,7 @@ from bcppl.sensors.plausibility import doubts
 from bcppl.sensors.probe import ProbeWindow
 
 Array = np.ndarray
-NAMED, SILENT, SECONDS = 95.0, 0.0, 1.0  # %, %, s
+NAMED, SILENT, SECONDS = 90.0, 0.0, 1.0  # %, %, s
 SHIPPED = ("peg_probe", "point_probe_10_pushes")
 
 

@@ -28,7 +28,11 @@ TOUCHING = 0.004  # m: gaps up to which a felt contact is one with the part
 DOUBTED, MORE = 1.65, 0.25  # a quality below which other poses of the peg are tried, and their least gain
 FAR = 0.3  # a share below which contacts are not with the part
 CLEARLY = 0.4  # by which a repair has to raise the sum of share and cosine
-TURNED, LEAST_TURN = 0.05, math.radians(25.0)  # the same of a turn: right scenes have 15 at most
+TURNED, LEAST_TURN, FITS = (
+    0.08,
+    math.radians(25.0),
+    1.72,
+)  # of a turn: its gain, its size, and the sum with it
 ASKEW = 0.4  # a mean cosine of force and normal below which the force's axes are wrong
 ALONG = np.arange(-0.35, 0.3501, 0.005)  # m along the peg's axis
 SHIFTED = 0.02  # m: a shorter shift is as well the part's place
@@ -39,11 +43,15 @@ GAPS = (0.001, 0.002, 0.004, 0.006)  # m: limits between contact and none
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What probes would be without a mistake, and the mistake in words."""
+    """What probes would be without a mistake, and the mistake in words.
+
+    It has to raise the quality by `least`, to `fits` or more.
+    """
 
     words: str
     probes: Sequence[Felt]
     least: float = CLEARLY
+    fits: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -100,7 +108,8 @@ def _of_contacts(contacts: Contacts, probes: Sequence[Felt], start: Found | None
     best = stated
     for hypothesis in _hypotheses(contacts, stated, start):
         other = judged(contacts, hypothesis, start)
-        if other.quality > max(stated.quality + hypothesis.least, best.quality + 0.05):
+        needed = max(stated.quality + hypothesis.least, best.quality + 0.05, hypothesis.fits)
+        if other.quality > needed:
             best = other
     who = of_probes([felt.probe.name for felt in probes])
     if best.hypothesis.words:
@@ -181,6 +190,7 @@ def _hypotheses(contacts: Contacts, stated: Judged, start: Found | None) -> Iter
             "axis: probably its yaw in the hand was left out of world_from_peg or of the wrench's frame",
             each(lambda felt: replace(felt, wrench=_about_z(felt.wrench, angle))),
             TURNED,
+            FITS,
         )
 
 
