@@ -36,10 +36,18 @@ def test_asking_for_help_imports_nothing_that_computes(code: str) -> None:
     assert imported(code).isdisjoint(HEAVY)
 
 
-def test_checking_a_recording_imports_no_simulator_and_no_tensor_library() -> None:
-    modules = imported("from bcppl.cli import app\napp(['check', 'peg_probe'], standalone_mode=False)")
+def test_describing_a_recording_imports_no_simulator_and_no_tensor_library() -> None:
+    code = "from bcppl.models.shipped import load_recording\n"
+    code += "from bcppl.recordings import describe, notes, problems"
+    code += "\nfor each in (describe, notes, problems): each(load_recording('peg_probe'))"
+    modules = imported(code)
     assert "h5py" in modules
     assert modules.isdisjoint({"torch", "pyro", "scipy", "trimesh", "matplotlib", "mujoco", "numba"})
+
+
+def test_checking_a_recording_imports_what_renders_and_measures_gaps_and_no_physics() -> None:
+    modules = imported("from bcppl.cli import app\napp(['check', 'peg_probe'], standalone_mode=False)")
+    assert modules.isdisjoint({"mujoco", "matplotlib", "bcppl.inference"})
 
 
 def test_no_export_imports_the_compiler_of_torch() -> None:
