@@ -217,10 +217,14 @@ def main() -> None:
         else:
             names_it = [one.names(MISTAKES[name].words) for one in several]
             rows.append(Row(f"{name}: named", float(np.mean(names_it)), count, NAMED, "min"))
-            told = [named for named, one in zip(names_it, several, strict=True) if one.tells > VERY_STRONG]
-            if told:
-                share = float(np.mean(told))
-                rows.append(Row(f"{name}: named where touches tell", share, f"of {len(told)}", NAMED, "min"))
+            tellable = [
+                named for named, one in zip(names_it, several, strict=True) if one.tells > VERY_STRONG
+            ]
+            if tellable:
+                share = float(np.mean(tellable))
+                rows.append(
+                    Row(f"{name}: named where touches tell", share, f"of {len(tellable)}", NAMED, "min")
+                )
             rows.append(Row(f"{name}: warned of", warned, count, WARNED, "min"))
         lines += [
             [name, k, one.error, one.tells, len(one.warnings), " | ".join(one.hypotheses[:2])[:120]]

@@ -4,8 +4,8 @@ Scenes of the accuracy bench are seen and touched by a probe that rocks, planned
 wide about the truth, so nothing is inferred. Right recordings are of a bench without errors, and of one with
 all those of a real bench; they are also given with one view or none, with a guess that is wider or beside the
 truth. Then each usual mistake is made in each recording. A mistake is named if a doubt has its words and
-there is no other doubt. Some mistakes cannot be told from what a right recording may hold; their rows have no
-goal.
+there is no other doubt. Some mistakes cannot be distinguished from what a right recording may hold; their
+rows have no goal.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ SHIPPED = ("peg_probe", "point_probe_10_pushes")
 class Mistake(NamedTuple):
     """How a right recording is made a wrong one, and words by which a doubt names it.
 
-    Without words it cannot be told; a doubt with another cause is wrong then too.
+    Without words it cannot be named; a doubt with another cause is wrong then too.
     """
 
     made: Callable[[Recording], Recording]

@@ -30,10 +30,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import plausibility
 
 replace = dataclasses.replace
-TOLD = {name: mistake for name, mistake in plausibility.MISTAKES.items() if mistake.words}
+NAMEABLE = {name: mistake for name, mistake in plausibility.MISTAKES.items() if mistake.words}
 # The benchmark measures the others too.
 LEFT_OUT = re.compile("times 1.3|pose -300|pose -120|pose 50|pose 300|forces in mN")
-TESTED = [name for name in TOLD if not LEFT_OUT.search(name)]
+TESTED = [name for name in NAMEABLE if not LEFT_OUT.search(name)]
 RIGHT = ("as it is", "no view", "guess of ±50 mm", "truth 10 mm outside")
 
 
@@ -48,9 +48,9 @@ def test_a_mistake_is_named_once_and_with_its_cause(name: str) -> None:
     recording = right(3, True)
     if re.search("camera|depth|hand|focal", name):
         recording = plausibility.windows_left_out(recording)
-    wrong = TOLD[name].made(recording)
+    wrong = NAMEABLE[name].made(recording)
     (found,) = doubts(wrong)
-    assert TOLD[name].words in found
+    assert NAMEABLE[name].words in found
     assert_one_sentence(found)
 
 
@@ -88,10 +88,10 @@ def test_several_mistakes_are_named_one_by_one() -> None:
     )
     wrong = right(3, False)
     for name in names:
-        wrong = TOLD[name].made(wrong)
+        wrong = NAMEABLE[name].made(wrong)
     found = doubts(wrong)
     assert len(found) == len(names)
-    assert all(any(TOLD[name].words in line for line in found) for name in names)
+    assert all(any(NAMEABLE[name].words in line for line in found) for name in names)
 
 
 def test_the_same_of_several_views_is_one_line() -> None:
@@ -104,7 +104,7 @@ def test_the_same_of_several_views_is_one_line() -> None:
         for k in range(3)
         for m in views
     ]
-    (found,) = doubts(TOLD["depth scaled twice"].made(replace(recording, measurements=many)))
+    (found,) = doubts(NAMEABLE["depth scaled twice"].made(replace(recording, measurements=many)))
     assert "the 4 views that were looked at" in found and "scaled to metres twice" in found
 
 
@@ -153,7 +153,7 @@ def test_a_check_that_compares_nothing_is_seen(monkeypatch: pytest.MonkeyPatch) 
 
 def test_the_command_line_prints_and_keeps_doubts(tmp_path: Path) -> None:
     wrong = plausibility.windows_left_out(right(3, False))
-    save(TOLD["focal length doubled"].made(wrong), tmp_path / "wrong.h5")
+    save(NAMEABLE["focal length doubled"].made(wrong), tmp_path / "wrong.h5")
     checked = CliRunner().invoke(app, ["check", str(tmp_path / "wrong.h5")])
     assert checked.exit_code == 0
     assert "doubt: the views show" in " ".join(checked.output.split()) and "but 1 doubt." in checked.output

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 
 from bcppl.errors import InputError
 from bcppl.recordings.importers.bench.config import BenchFields
+from bcppl.recordings.importers.bench.table import is_number
 
 _TYPES = {
     "float_type": "a number",
@@ -95,7 +96,7 @@ def _sentence(error: ValidationError, content: dict[Any, Any]) -> str:
         return f"{where} has {len(given)} entries; give {side} {bound}."
     if kind == "finite_number":
         return f"{where} is {given!r}; give a finite number."
-    if kind == "float_type" and isinstance(given, str) and _is_number(given):
+    if kind == "float_type" and isinstance(given, str) and is_number(given):
         return f"{where} is {given!r}, which YAML reads as text; write {float(given)!r}."
     if kind in _TYPES:
         return f"{where} is {given!r}; give {_TYPES[kind]}."
@@ -133,11 +134,3 @@ def _inner(annotation: Any) -> Any:
         if (found := _inner(each)) is not None:
             return found
     return None
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

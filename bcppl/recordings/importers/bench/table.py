@@ -56,7 +56,7 @@ def _csv(path: Path, names: Names) -> Array:
     first = next((k for k in range(len(lines)) if k not in comments), 0)
     delimiter = next((each for each in _DELIMITERS if each in lines[first]), None)
     cells = _cells(lines[first], delimiter)
-    if all(map(_is_number, cells)):
+    if all(map(is_number, cells)):
         # Names may stand in the last comment before the numbers, as numpy writes them.
         above = _cells(lines[first - 1].lstrip("# "), delimiter) if first else []
         known, skipped = (above if len(above) == len(cells) else []), first
@@ -82,7 +82,8 @@ def _cells(line: str, delimiter: str | None) -> list[str]:
     return [cell.strip() for row in csv.reader([line.strip()], delimiter=delimiter) for cell in row]
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Whether text is a number."""
     try:
         float(cell)
     except ValueError:
