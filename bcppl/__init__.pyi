@@ -17,7 +17,7 @@ from bcppl.beliefs import Belief as Belief
 from bcppl.errors import InferenceError as InferenceError, InputError as InputError
 from bcppl.geometry.camera import Camera as Camera
 from bcppl.geometry.parts import Guess as Guess, Part as Part
-from bcppl.inference import Population as Population, infer as infer, smc as smc
+from bcppl.inference import Population as Population, infer as infer, live as live, smc as smc
 from bcppl.recordings import load as load, save as save
 from bcppl.sensors import (
     DepthImage as DepthImage,

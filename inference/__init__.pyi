@@ -7,6 +7,7 @@ from bcppl.inference import (
     design as design,
     kernels as kernels,
     learning as learning,
+    live as live,
     planning as planning,
     proposals as proposals,
     resampling as resampling,

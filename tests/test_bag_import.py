@@ -18,7 +18,7 @@ from bcppl.recordings import load, problems
 from bcppl.recordings.importers import Imported, bag, bench
 from bcppl.recordings.importers.bag.bag_log import BagLog
 from bcppl.recordings.importers.bag.reading import Bag
-from bcppl.recordings.importers.bench.configuration import read_configuration
+from bcppl.recordings.importers.bench.configuration.reading import read_configuration
 from bcppl.recordings.importers.bench.pose_columns import read_joints
 from bcppl.robot.kinematics import Robot
 from tests import bag_logs, bench_logs

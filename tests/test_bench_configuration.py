@@ -11,14 +11,14 @@ import pytest
 import yaml
 
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bench.configuration import read_configuration
+from bcppl.recordings.importers.bench.configuration.reading import read_configuration
 from bcppl.recordings.importers.bench.depth_images import read_depth
 from bcppl.recordings.importers.bench.pose_columns import stated_pose
 from bcppl.recordings.importers.bench.table import read_columns
 from tests.made_recordings import assert_one_sentence
 
 TEMPLATE = (
-    Path(__file__).parents[1] / "bcppl/recordings/importers/bench/template.yaml"
+    Path(__file__).parents[1] / "bcppl/recordings/importers/bench/configuration/template.yaml"
 ).read_text(encoding="utf-8")  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bcppl import poses
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bench.config import (
+from bcppl.recordings.importers.bench.configuration.fields import (
     ArmFields,
     CutFields,
     JointFields,
@@ -20,10 +20,10 @@ from bcppl.recordings.importers.bench.config import (
     TimeFields,
 )
 from bcppl.recordings.importers.bench.cutting import Rows, probes
-from bcppl.recordings.importers.bench.logs import Files
+from bcppl.recordings.importers.bench.in_order import read_stream
 from bcppl.recordings.importers.bench.pose_columns import read_joints
-from bcppl.recordings.importers.bench.resampling import common_stamps, is_known, poses_at, values_at
-from bcppl.recordings.importers.bench.streams import Stream, read_stream
+from bcppl.recordings.importers.bench.sources import Files
+from bcppl.recordings.streams import Stream, common_stamps, is_known, poses_at, values_at
 from bcppl.robot.kinematics import Robot
 
 URDF, TIP = Path(__file__).parents[1] / "models/robots/panda/panda.urdf", "panda_hand_tcp"

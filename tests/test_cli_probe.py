@@ -238,3 +238,35 @@ def load_twice(folder: Path) -> Path:
 def test_help_states_the_default_candidates(bcppl: Callable[..., Ran]) -> None:
     default = ",".join(f"{kind}:{count}" for kind, count in MIXED.items())
     assert f"{default} by default" in " ".join(str(inspect.signature(probe.probe)).split())
+
+
+# ---- bcppl insert
+
+
+def test_an_insertion_is_planned_from_a_belief_within_limits(bcppl: Callable[..., Ran], here: Path) -> None:
+    ran = bcppl("insert", "runs/belief_002.h5", "--simulations", 0, "--speed", 0.004, "--force", 9)
+    assert ran.code == 0, ran.err
+    search, push = load_actions("insertion.json")
+    assert isinstance(search, Plan) and isinstance(push, Plan) and push.force == 9.0
+    for plan in (search, push):
+        for k, manner in enumerate(plan.manners):
+            moved = np.linalg.norm(np.diff(plan.world_from_peg[k : k + 2, :3], axis=0))
+            if manner in ("guarded", "searching") or plan is push:
+                assert moved / (plan.times[k + 1] - plan.times[k]) < 0.0041, (plan.name, k, manner)
+    belief = load_belief(here / "runs/belief_002.h5")
+    assert f"{1e3 * float(belief.mean[0]):.0f}"[:2] in ran.out
+    box = "0 0 0 0.001 0.001 0.001"
+    refused(bcppl("insert", "runs/belief_002.h5", "--workspace", box), "outside --workspace")
+    refused(bcppl("insert", "runs/belief_002.h5", "--workspace", "1 2"), "give six numbers")
+    refused(bcppl("insert", "runs/belief_002.h5", "-o", "plan.txt"), "ending in .h5 or .json")
+    save(short(1), here / "push.h5")
+    refused(bcppl("insert", "push.h5", "--particles", 6), "no peg to insert")
+
+
+def test_a_recording_is_played_and_its_belief_kept(bcppl: Callable[..., Ran], here: Path) -> None:
+    save(short(2), here / "pushes.h5")
+    ran = bcppl("live", "pushes.h5", "--particles", 6, "--speed", 100, "-o", "last.h5", "--deadline", 60)
+    assert ran.code == 0, ran.err
+    assert "2 of 2 updates were done within 60 s" in ran.out and "push 2" in ran.out
+    assert len(load_belief(here / "last.h5")) == 6
+    refused(bcppl("live", "pushes.h5", "-o", "nowhere/last.h5"), "no folder nowhere")

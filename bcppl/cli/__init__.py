@@ -1,4 +1,4 @@
-"""The command line: `bcppl run`, `probe`, `sweep`, `check`, `import`, `new`, `simulate`.
+"""The command line: `bcppl run`, `probe`, `insert`, `live`, `serve`, `sweep`, `check`, `import` and others.
 
 A command imports what it computes with when it is called, so that `bcppl --help` answers at once.
 """
@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from bcppl.cli import new, probe, recordings, run, sweep
+from bcppl.cli import insert, live, new, probe, recordings, run, sweep
 from bcppl.errors import InferenceError, InputError
 from bcppl.visible_text import visible
 
@@ -41,6 +41,9 @@ def _options(
 
 app.command("run")(run.run)
 app.command("probe")(probe.probe)
+app.command("insert")(insert.insert)
+app.command("live")(live.live)
+app.command("serve")(live.serve)
 app.command("sweep")(sweep.sweep)
 app.command("check")(recordings.check)
 app.command("simulate")(recordings.simulate)

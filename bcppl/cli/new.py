@@ -24,7 +24,7 @@ def bench(
     ),
 ) -> None:
     """Write the configuration of a robot bench's log, for `bcppl import bench`."""
-    template = files("bcppl.recordings.importers.bench").joinpath("template.yaml")
+    template = files("bcppl.recordings.importers.bench.configuration").joinpath("template.yaml")
     _write(file, template.read_text(encoding="utf-8"))
     print(f"wrote {file}: edit it, then bcppl import bench {file} -o recording.h5")
 

@@ -104,6 +104,31 @@ class ProbeSensor:
         ]
         return [*rows, ("touching", touches.length([m.observation for m in measurements]))]
 
+    # ---- windows are parts of a probe
+
+    def follows(self, measurement: Measurement, before: Sequence[Measurement]) -> bool:
+        """Whether a window begins its probe, or where the newest of its probe ends."""
+        window = measurement.action
+        same = (m.action for m in reversed(before) if isinstance(m.action, ProbeWindow))
+        newest = next((each for each in same if each.probe.name == window.probe.name), None)
+        return bool(window.first <= (0 if newest is None else newest.last))
+
+    def joined(self, first: Measurement, second: Measurement) -> Measurement | None:
+        """Two windows of a probe as one, by the later one's command."""
+        one, other = first.action, second.action
+        if one.probe.name != other.probe.name or one.last != other.first:
+            return None
+        fields = ("times", "wrench", "world_from_peg")
+        both = [[getattr(m.observation, name) for m in (first, second)] for name in fields]
+        window = ProbeWindow(other.probe, one.first, other.last)
+        return Measurement(window, Touch(*map(np.concatenate, both)))
+
+    def alone(self, measurement: Measurement) -> Measurement:
+        """A window as the whole of a probe."""
+        window = measurement.action
+        probe = replace(window.probe, stamps=window.probe.stamps[window.first : window.last])
+        return Measurement(ProbeWindow(probe, 0, window.last - window.first), measurement.observation)
+
     # ---- candidates: plans
 
     def action_of(self, candidate: Plan) -> ProbeWindow:

@@ -191,6 +191,20 @@ class HasBlank(Protocol):
 
 
 @runtime_checkable
+class InParts(Protocol):
+    """A sensor whose measurements come in parts, such as windows of a probe, each after the one before it."""
+
+    def follows(self, measurement: Measurement, before: Sequence[Measurement]) -> bool:
+        """Whether all parts before a measurement are among others, which are in their order."""
+
+    def joined(self, first: Measurement, second: Measurement) -> Measurement | None:
+        """Two parts as one; None where the second does not begin where the first ends."""
+
+    def alone(self, measurement: Measurement) -> Measurement:
+        """A part as if there were no other, so that it can be checked by itself."""
+
+
+@runtime_checkable
 class HasLikelihood(Protocol):
     """A sensor with a likelihood for models that state none for its kind."""
 

@@ -15,15 +15,15 @@ from bcppl.recordings.importers.bag.images import Images, Intrinsics
 from bcppl.recordings.importers.bag.reading import Bag
 from bcppl.recordings.importers.bag.rows import Collector, JointRows, Rows, pose, wrench
 from bcppl.recordings.importers.bag.transforms import Transforms
-from bcppl.recordings.importers.bench.camera_fields import CameraFields
-from bcppl.recordings.importers.bench.config import (
+from bcppl.recordings.importers.bench.configuration.camera_fields import CameraFields
+from bcppl.recordings.importers.bench.configuration.fields import (
     EVERY_JOINT,
     BenchFields,
     JointFields,
     PoseStreamFields,
     StreamFields,
 )
-from bcppl.recordings.importers.bench.logs import Files, Shot
+from bcppl.recordings.importers.bench.sources import Files, Shot
 from bcppl.visible_text import visible
 
 _STEP = 1000  # messages between which the bar moves

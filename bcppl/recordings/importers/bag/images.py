@@ -12,10 +12,10 @@ from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.recordings.importers.bag.reading import Bag, Message
 from bcppl.recordings.importers.bag.rows import unstamped_words
-from bcppl.recordings.importers.bench.camera_fields import CameraFields, ImageFields
+from bcppl.recordings.importers.bench.configuration.camera_fields import CameraFields, ImageFields
+from bcppl.recordings.importers.bench.configuration.field_types import Length, factor
 from bcppl.recordings.importers.bench.depth_images import in_metres
-from bcppl.recordings.importers.bench.field_types import Length, factor
-from bcppl.recordings.importers.bench.logs import Shot
+from bcppl.recordings.importers.bench.sources import Shot
 
 NEAR = 0.1  # s from a stated time within which an image must be
 MOST_BYTES = 50_000_000  # of images as they are stored; with their depth in float64 five times as much

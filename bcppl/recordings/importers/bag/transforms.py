@@ -14,9 +14,8 @@ from bcppl.errors import InputError
 from bcppl.recordings.importers.bag.reading import Bag, Message, stamped
 from bcppl.recordings.importers.bag.rows import unstamped_words
 from bcppl.recordings.importers.bench.pose_columns import UNIT, composed, inverted
-from bcppl.recordings.importers.bench.resampling import is_known
-from bcppl.recordings.importers.bench.streams import Stream
 from bcppl.recordings.importers.bench.wrenches import IDENTITY
+from bcppl.recordings.streams import Stream, is_known
 
 _ORDER = [0, 1, 2, 6, 3, 4, 5]  # x y z and qw qx qy qz of x y z and qx qy qz qw
 _BACK = [0, 1, 2, 4, 5, 6, 3]

@@ -14,8 +14,8 @@ from bcppl.geometry.decomposition import decomposed
 from bcppl.geometry.extrusion import box_peg, round_peg
 from bcppl.geometry.layers import prismatic
 from bcppl.geometry.parts import Guess, Part, load_mesh
-from bcppl.recordings.importers.bench.config import BodyFields, GuessFields, PegFields
-from bcppl.recordings.importers.bench.field_types import factor
+from bcppl.recordings.importers.bench.configuration.field_types import factor
+from bcppl.recordings.importers.bench.configuration.fields import BodyFields, GuessFields, PegFields
 from bcppl.recordings.importers.bench.pose_columns import stated_pose
 
 

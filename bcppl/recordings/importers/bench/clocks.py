@@ -14,12 +14,11 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import correlate
 
 from bcppl.arrays import Array
-from bcppl.recordings.importers.bench.config import ClockFields
+from bcppl.recordings.importers.bench.configuration.field_types import factor
+from bcppl.recordings.importers.bench.configuration.fields import ClockFields
 from bcppl.recordings.importers.bench.contacts import STEP, contact_at, onsets
-from bcppl.recordings.importers.bench.field_types import factor
-from bcppl.recordings.importers.bench.resampling import values_at
-from bcppl.recordings.importers.bench.streams import Stream
 from bcppl.recordings.importers.bench.yielding import Lateness, fitted
+from bcppl.recordings.streams import Stream, values_at
 
 _WITHIN = 0.1  # s: the largest lateness, either way, that is looked for
 _SMOOTH = 0.015  # s over which curvature is measured

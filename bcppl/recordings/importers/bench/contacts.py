@@ -10,7 +10,7 @@ from scipy.linalg import solve_triangular
 
 from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing import OnsetDetector
-from bcppl.recordings.importers.bench.streams import Stream
+from bcppl.recordings.streams import Stream
 
 STEP = 0.001  # s between samples of the force
 THRESHOLD, REACHED = 1.5, 3.5  # N; a force that stays below the second is the tool's own inertia

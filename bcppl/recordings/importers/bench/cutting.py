@@ -11,7 +11,7 @@ import numpy as np
 from bcppl.arrays import Array, Mask
 from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bench.config import ArmFields, CutFields
+from bcppl.recordings.importers.bench.configuration.fields import ArmFields, CutFields
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors import Measurement
 

@@ -10,8 +10,8 @@ from PIL import Image
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bench.camera_fields import CameraFields
-from bcppl.recordings.importers.bench.field_types import Length, factor
+from bcppl.recordings.importers.bench.configuration.camera_fields import CameraFields
+from bcppl.recordings.importers.bench.configuration.field_types import Length, factor
 
 
 def read_depth(path: Path, fields: CameraFields) -> Array:

@@ -11,8 +11,8 @@ from bcppl.arrays import Array, Indices, Mask
 from bcppl.contact.sensing import ToolLoad, identify_load
 from bcppl.contact.sensing.load import TURNED, gravity_in
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bench.config import GravityFields
-from bcppl.recordings.importers.bench.field_types import factor
+from bcppl.recordings.importers.bench.configuration.field_types import factor
+from bcppl.recordings.importers.bench.configuration.fields import GravityFields
 
 BLOCK = 0.02  # s: readings are means over blocks; in longer ones a tool turns too far
 FEWEST = 12  # blocks without contact

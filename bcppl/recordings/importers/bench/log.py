@@ -14,13 +14,12 @@ from bcppl.errors import InputError
 from bcppl.recordings.importers import Imported
 from bcppl.recordings.importers.bench.bodies import read_guess, read_part, read_peg
 from bcppl.recordings.importers.bench.clocks import on_one_clock
-from bcppl.recordings.importers.bench.config import BenchFields
-from bcppl.recordings.importers.bench.configuration import read_configuration
+from bcppl.recordings.importers.bench.configuration.field_types import PoseFields
+from bcppl.recordings.importers.bench.configuration.fields import BenchFields
+from bcppl.recordings.importers.bench.configuration.reading import read_configuration
 from bcppl.recordings.importers.bench.contacts import STEP
 from bcppl.recordings.importers.bench.cutting import Command, Rows, probes
-from bcppl.recordings.importers.bench.field_types import PoseFields
 from bcppl.recordings.importers.bench.gravity import without_weight
-from bcppl.recordings.importers.bench.logs import Files, Log
 from bcppl.recordings.importers.bench.pose_columns import (
     composed,
     inverted,
@@ -28,10 +27,10 @@ from bcppl.recordings.importers.bench.pose_columns import (
     read_poses,
     stated_pose,
 )
-from bcppl.recordings.importers.bench.resampling import common_stamps, is_known, poses_at, values_at
-from bcppl.recordings.importers.bench.streams import Stream
+from bcppl.recordings.importers.bench.sources import Files, Log
 from bcppl.recordings.importers.bench.views import placed, read_views
 from bcppl.recordings.importers.bench.wrenches import IDENTITY, read_wrench, wrench_on_peg
+from bcppl.recordings.streams import Stream, common_stamps, is_known, poses_at, values_at
 from bcppl.sensors import Measurement, Recording
 
 _LEAST_SHARED = 1.0  # s that wrench and pose share, or their clocks cannot be compared

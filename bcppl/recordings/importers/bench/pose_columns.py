@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bench.config import JointFields, PoseStreamFields
-from bcppl.recordings.importers.bench.field_types import PoseFields, factor
-from bcppl.recordings.importers.bench.logs import Log
-from bcppl.recordings.importers.bench.streams import Stream, read_stream
+from bcppl.recordings.importers.bench.configuration.field_types import PoseFields, factor
+from bcppl.recordings.importers.bench.configuration.fields import JointFields, PoseStreamFields
+from bcppl.recordings.importers.bench.in_order import read_stream
+from bcppl.recordings.importers.bench.sources import Log
+from bcppl.recordings.streams import Stream
 
 UNIT = 0.01  # of a quaternion's length, or a matrix' columns: rounding in a log is less
 _ROWS = 20_000  # of joint angles whose kinematics are computed at once

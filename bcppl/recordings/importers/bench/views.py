@@ -9,13 +9,12 @@ import numpy as np
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
-from bcppl.recordings.importers.bench.camera_fields import CameraFields, ImageFields
+from bcppl.recordings.importers.bench.configuration.camera_fields import CameraFields, ImageFields
+from bcppl.recordings.importers.bench.configuration.field_types import factor
 from bcppl.recordings.importers.bench.depth_images import read_depth
-from bcppl.recordings.importers.bench.field_types import factor
-from bcppl.recordings.importers.bench.logs import Log
 from bcppl.recordings.importers.bench.pose_columns import composed, stated_pose
-from bcppl.recordings.importers.bench.resampling import is_known, poses_at
-from bcppl.recordings.importers.bench.streams import Stream
+from bcppl.recordings.importers.bench.sources import Log
+from bcppl.recordings.streams import Stream, is_known, poses_at
 from bcppl.sensors import DepthImage, Measurement, View
 
 SLOW = 0.005  # m/s: an image is better taken at rest

@@ -6,11 +6,12 @@ import numpy as np
 
 from bcppl.arrays import Array
 from bcppl.contact.sensing import transform_wrench
-from bcppl.recordings.importers.bench.config import WrenchFields
-from bcppl.recordings.importers.bench.field_types import factor
-from bcppl.recordings.importers.bench.logs import Log
+from bcppl.recordings.importers.bench.configuration.field_types import factor
+from bcppl.recordings.importers.bench.configuration.fields import WrenchFields
+from bcppl.recordings.importers.bench.in_order import read_stream
 from bcppl.recordings.importers.bench.pose_columns import composed, inverted
-from bcppl.recordings.importers.bench.streams import Stream, read_stream
+from bcppl.recordings.importers.bench.sources import Log
+from bcppl.recordings.streams import Stream
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 

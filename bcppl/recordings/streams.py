@@ -1,17 +1,51 @@
-"""Streams at common stamps: interpolated where they are slow, averaged where they are fast."""
+"""Streams of rows with stamps, and their values at common stamps.
+
+A slow stream is interpolated at the stamps, a fast one averaged about them.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from bcppl.arrays import Array, Mask
-from bcppl.recordings.importers.bench.streams import Stream
 
 FAST = 1.5  # rows for each stamp: a faster stream is averaged
 BRIDGED = 2.5  # median intervals that are interpolated, by default,
 SHORTEST_BRIDGE = 0.01  # s, and at least these
 LEAST_RATE, MOST_RATE = 100.0, 500.0  # stamps per second, if nothing else is stated
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """Rows of one sensor.
+
+    Attributes:
+        name: of the stream in the configuration.
+        times: (T,) seconds on its own clock, increasing.
+        values: (T, C).
+    """
+
+    name: str
+    times: Array
+    values: Array
+
+    @cached_property
+    def step(self) -> float:
+        """The median interval, s."""
+        return float(np.median(np.diff(self.times)))
+
+    @property
+    def rate(self) -> float:
+        """Rows per second."""
+        return 1.0 / self.step
+
+    def shifted(self, by: float) -> Stream:
+        """The same rows at stamps later by some seconds."""
+        return replace(self, times=self.times + by)
 
 
 def common_stamps(first: Stream, second: Stream, rate: float | None) -> Array:

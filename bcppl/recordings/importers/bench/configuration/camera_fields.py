@@ -6,7 +6,14 @@ from typing import Self
 
 from pydantic import model_validator
 
-from bcppl.recordings.importers.bench.field_types import Above, AtLeast, Fields, Length, PoseFields, Time
+from bcppl.recordings.importers.bench.configuration.field_types import (
+    Above,
+    AtLeast,
+    Fields,
+    Length,
+    PoseFields,
+    Time,
+)
 
 
 class ImageFields(Fields):

@@ -10,8 +10,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from bcppl.recordings.importers.bench.camera_fields import CameraFields
-from bcppl.recordings.importers.bench.field_types import (
+from bcppl.recordings.importers.bench.configuration.camera_fields import CameraFields
+from bcppl.recordings.importers.bench.configuration.field_types import (
     Above,
     Angle,
     AtLeast,

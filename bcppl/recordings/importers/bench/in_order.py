@@ -1,50 +1,20 @@
-"""Streams of a log: rows in order of their stamps, and what was wrong with the stamps."""
+"""The rows of a log's streams in order of their stamps, and what was wrong with the stamps."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bench.config import StreamFields
-from bcppl.recordings.importers.bench.logs import Log
+from bcppl.recordings.importers.bench.configuration.fields import StreamFields
+from bcppl.recordings.importers.bench.sources import Log
+from bcppl.recordings.streams import Stream
 from bcppl.sensors import checks
 
 LOST = 1.5  # median intervals: a longer one has lost rows
 MOST_BACKWARDS = 0.01  # of the rows: more are no few messages that came late
-
-
-@dataclass(frozen=True, eq=False)
-class Stream:
-    """Rows of one sensor.
-
-    Attributes:
-        name: of the stream in the configuration.
-        times: (T,) seconds on its own clock, increasing.
-        values: (T, C).
-    """
-
-    name: str
-    times: Array
-    values: Array
-
-    @cached_property
-    def step(self) -> float:
-        """The median interval, s."""
-        return float(np.median(np.diff(self.times)))
-
-    @property
-    def rate(self) -> float:
-        """Rows per second."""
-        return 1.0 / self.step
-
-    def shifted(self, by: float) -> Stream:
-        """The same rows at stamps later by some seconds."""
-        return replace(self, times=self.times + by)
 
 
 def read_stream(name: str, fields: StreamFields, log: Log, report: list[str]) -> Stream:

@@ -10,7 +10,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bench.config import BenchFields
+from bcppl.recordings.importers.bench.configuration.fields import BenchFields
 from bcppl.recordings.importers.bench.table import is_number
 
 _TYPES = {

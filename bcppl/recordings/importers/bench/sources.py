@@ -10,10 +10,10 @@ from typing import Protocol
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bench.camera_fields import CameraFields, ImageFields
-from bcppl.recordings.importers.bench.config import StreamFields
+from bcppl.recordings.importers.bench.configuration.camera_fields import CameraFields, ImageFields
+from bcppl.recordings.importers.bench.configuration.field_types import factor
+from bcppl.recordings.importers.bench.configuration.fields import StreamFields
 from bcppl.recordings.importers.bench.depth_images import read_depth
-from bcppl.recordings.importers.bench.field_types import factor
 from bcppl.recordings.importers.bench.table import read_columns
 
 

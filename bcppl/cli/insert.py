@@ -1,0 +1,157 @@
+"""`bcppl insert`: a compliant insertion at a belief, its chance, and the file of its plans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from bcppl.arguments import LARGEST_SEED
+from bcppl.cli.setting_option import Settings
+from bcppl.errors import InputError
+
+if TYPE_CHECKING:
+    from bcppl.arrays import Array
+    from bcppl.beliefs import Belief
+    from bcppl.geometry.parts import Part
+    from bcppl.recordings import Recording
+    from bcppl.robot.plan import InsertionPlan
+
+SIX = "x0 y0 z0 x1 y1 z1"
+
+
+def insert(
+    recording: Annotated[
+        str,
+        typer.Argument(
+            help="A recording (.h5), a shipped one's name, or a belief that `bcppl run` wrote (belief_*.h5)."
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", dir_okay=False, help="File for the plans (.json or .h5).")
+    ] = Path("insertion.json"),
+    speed: Annotated[
+        float, typer.Option(min=0.0001, max=0.1, help="m/s at most, where contact is expected.")
+    ] = 0.02,
+    force: Annotated[float, typer.Option(min=0.1, max=200.0, help="N; ends the push.")] = 20.0,
+    workspace: Annotated[
+        str | None,
+        typer.Option(help=f"Corners of the box (m, in the world) that the peg's tip may not leave: {SIX}."),
+    ] = None,
+    simulations: Annotated[
+        int, typer.Option(min=0, help="How many particles the chance is simulated for; 0 for none.")
+    ] = 24,
+    of: Annotated[str | None, typer.Option(help="The recording that a belief is of.")] = None,
+    model: Annotated[str | None, typer.Option(help="A model's name or file, as for `bcppl run`.")] = None,
+    set_: Settings = None,
+    inference: Annotated[
+        str | None, typer.Option(help="An inference program's name or file, as for `bcppl run`.")
+    ] = None,
+    particles: Annotated[int, typer.Option(min=2, help="How many particles; a belief has its own.")] = 75,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same plan.")] = 0,
+) -> None:
+    """Plan an insertion where the hole is believed to be, and say how probable it is to succeed."""
+    from rich.console import Console
+
+    from bcppl.cli import loading
+    from bcppl.cli.posterior import posterior
+    from bcppl.contact.physics import PegPhysics
+    from bcppl.inference.planning.insertion import InsertionParameters, insertion_plan
+    from bcppl.inference.planning.success import success_probability
+    from bcppl.recordings.action_file import SUFFIXES, save_actions
+
+    if output.suffix not in SUFFIXES or not output.parent.is_dir():
+        raise InputError(
+            f"--output is {output}; give a file in a folder that exists, ending in {' or '.join(SUFFIXES)}."
+        )
+    box = None if workspace is None else _box(workspace)
+    console = Console(highlight=False)
+    now = posterior(
+        recording, of, model, loading.settings(set_ or []), inference, particles, seed, console, _refuse
+    )
+    belief, part, peg = now.population.belief(now.model.pose), now.recording.part, now.recording.peg
+    assert peg is not None
+    usual = InsertionParameters()
+    # The press before the search is twice as fast as the landing, and a long spiral as the search.
+    careful = usual._replace(
+        landing_speed=min(usual.landing_speed, 0.5 * speed),
+        search_speed=min(usual.search_speed, 0.5 * speed),
+        push_speed=min(usual.push_speed, speed),
+        push_force=force,
+        contact_force=min(usual.contact_force, force),
+    )
+    plan = insertion_plan(belief, part, peg, parameters=careful)
+    if box is not None:
+        _refuse_outside(plan, peg, box)
+    save_actions([plan.search, plan.push], output)
+    deviation = _deviation(belief, plan)
+    place = 1e3 * plan.world_from_hole[:3]
+    console.print(
+        f"the hole is at {place[0]:.2f} {place[1]:.2f} {place[2]:.2f} mm, sure to {deviation[0]:.2f} mm "
+        f"across and {deviation[1]:.2f} mm along its axis (standard deviations, relative to the peg)."
+    )
+    seconds = sum(float(each.times[-1] - each.times[0]) for each in (plan.search, plan.push))
+    console.print(f"search and push take {seconds:.1f} s at most; a push of {force:g} N ends it.")
+    if simulations:
+        with console.status("simulating"):
+            chance = success_probability(
+                belief, plan, PegPhysics(part, peg), particles=simulations, seed=seed
+            )
+        console.print(
+            f"of {simulations} simulated insertions {100.0 * chance.success:.0f} % end in the hole (standard "
+            f"error {100.0 * chance.standard_error:.0f} %); the search finds it in "
+            f"{100.0 * chance.hole_found:.0f} %."
+        )
+    console.print(f"the plans are in {output}: search, then push from where the search ends.", markup=False)
+
+
+def _refuse(recording: Recording) -> None:
+    if recording.peg is None:
+        raise InputError("the recording holds no peg to insert; add the peg that is held.")
+
+
+def _box(words: str) -> Array:
+    """The lowest and the highest corner (2, 3) of a box, m."""
+    import numpy as np
+
+    try:
+        corners = np.array([float(word) for word in words.replace(",", " ").split()]).reshape(2, 3)
+    except ValueError as error:
+        raise InputError(f"--workspace is {words[:60]!r}; give six numbers in metres: {SIX}.") from error
+    if not (np.isfinite(corners).all() and (corners[0] < corners[1]).all()):
+        raise InputError(f"--workspace is {words[:60]!r}; give the lowest corner, then the highest: {SIX}.")
+    return corners
+
+
+def _refuse_outside(plan: InsertionPlan, peg: Part, box: Array) -> None:
+    """Refuse a plan whose tip leaves a box."""
+    import torch
+
+    from bcppl import poses
+    from bcppl.inference.planning.waypoints import tip_of
+
+    tip = torch.tensor([[0.0, 0.0, tip_of(peg)]], dtype=torch.float64)
+    for each in (plan.search, plan.push):
+        tips = poses.transform(torch.from_numpy(each.world_from_peg), tip)
+        outside = ((tips[:, 0].numpy() < box[0]) | (tips[:, 0].numpy() > box[1])).any(axis=1)
+        if outside.any():
+            where = " ".join(f"{number:.3f}" for number in tips[int(outside.argmax()), 0].tolist())
+            raise InputError(
+                f"the {each.name} leads the peg's tip to {where} m, outside --workspace; give a larger box, "
+                "or check the belief."
+            )
+
+
+def _deviation(belief: Belief, plan: InsertionPlan) -> tuple[float, float]:
+    """Standard deviations of the hole's position as seen from the peg, mm: the larger across, and along."""
+    import torch
+
+    from bcppl import poses
+
+    seen = belief.relative(torch.from_numpy(plan.push.world_from_peg[0]))
+    hole = torch.from_numpy(plan.world_from_hole)
+    turn = poses.rotation_matrix(hole)
+    covariance = turn.T @ seen.covariance[:3, :3] @ turn
+    across = torch.linalg.eigvalsh(covariance[:2, :2]).max()
+    return 1e3 * float(across.sqrt()), 1e3 * float(covariance[2, 2].clamp(min=0.0).sqrt())

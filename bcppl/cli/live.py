@@ -1,0 +1,161 @@
+"""`bcppl live` and `bcppl serve`: a belief that follows measurements while they are made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from bcppl.arguments import LARGEST_SEED
+from bcppl.cli.setting_option import Settings
+from bcppl.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from rich.console import Console
+
+    from bcppl.inference.filters.smc import Step
+    from bcppl.inference.live import Update
+    from bcppl.inference.live.server import Server
+    from bcppl.recordings import Recording
+    from bcppl.traces import Model
+
+NAME = Annotated[str, typer.Argument(help="A recording (.h5), or the name of a shipped one.")]
+MODEL = Annotated[str | None, typer.Option(help="A model's name or file, as for `bcppl run`.")]
+INFERENCE = Annotated[str | None, typer.Option(help="An inference program's name or file.")]
+PARTICLES = Annotated[int, typer.Option(min=2, help="How many particles.")]
+SEED = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of inference.")]
+DEADLINE = Annotated[
+    float,
+    typer.Option(
+        min=0.001, help="s; where updates take longer, windows are joined, then particles are fewer."
+    ),
+]
+
+
+def live(
+    recording: NAME,
+    speed: Annotated[float, typer.Option(min=0.01, help="2 plays twice as fast as it was recorded.")] = 1.0,
+    model: MODEL = None,
+    inference: INFERENCE = None,
+    particles: PARTICLES = 75,
+    seed: SEED = 0,
+    deadline: DEADLINE = 0.5,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", dir_okay=False, help="File for the last belief (.h5).")
+    ] = None,
+    set_: Settings = None,
+) -> None:
+    """Play a recording as if it were being made, and follow it: how late each update was, and the belief."""
+    from rich.console import Console
+
+    from bcppl.cli.report import Report
+    from bcppl.inference.live import Filter, play
+    from bcppl.recordings.beliefs import save_belief
+    from bcppl.recordings.fingerprint import fingerprint
+
+    if out is not None and not out.parent.is_dir():
+        raise InputError(f"there is no folder {out.parent} to write {out.name} into; make it first.")
+    console = Console(highlight=False)
+    measured, chosen, infer = _chosen(recording, model, inference, set_)
+    report = Report(console, measured, chosen)
+    empty = replace(measured, measurements=[])
+
+    def shown(update: Update) -> None:
+        report.row(update.step)
+
+    settings: dict[str, Any] = {"particles": particles, "seed": seed, "deadline": deadline}
+    with Filter(chosen, empty, infer=infer, on_update=shown, **settings) as following:
+        report.row(following.step)
+        for measurement in play(measured, speed):
+            following.observe(measurement.action, measurement.observation)
+        last = following.settle()
+        report.recording = following.recording
+        report.finish()
+        console.print(lateness(following.updates, deadline))
+    if out is not None:
+        save_belief(
+            last.belief,
+            out,
+            label=last.info.label,
+            log_evidence=last.info.log_evidence,
+            random_state=last.random_state,
+            of=fingerprint(following.recording, last.taken),
+        )
+        console.print(f"the belief is in {out}", markup=False)
+
+
+def lateness(updates: Sequence[Update], deadline: float) -> str:
+    """How late updates were, in a sentence."""
+    late = sorted(update.seconds for update in updates)
+    if not late:
+        return "there was no update."
+    within = sum(seconds <= deadline for seconds in late)
+    joined = sum(update.joined - 1 for update in updates)
+    fewest = min(update.particles for update in updates)
+    return (
+        f"{within} of {len(late)} updates were done within {deadline:g} s of their measurement "
+        f"(95 %: {late[int(0.95 * (len(late) - 1))]:.2f} s, the latest: {late[-1]:.2f} s); {joined} windows "
+        f"were joined with others, {fewest} particles were the fewest."
+    )
+
+
+def serve(
+    scene: Annotated[
+        str, typer.Argument(help="A recording with part, guess and peg; its measurements come first.")
+    ],
+    host: Annotated[
+        str, typer.Option(help="127.0.0.1 is reached from this machine alone; others see what is sent.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 for one that is free.")] = 0,
+    token: Annotated[
+        str | None,
+        typer.Option(envvar="BCPPL_TOKEN", help="What clients have to know; a new one by default."),
+    ] = None,
+    model: MODEL = None,
+    inference: INFERENCE = None,
+    particles: PARTICLES = 75,
+    seed: SEED = 0,
+    deadline: DEADLINE = 0.5,
+    set_: Settings = None,
+) -> None:
+    """Serve a live belief on a socket, in MessagePack (see docs/live.md), until it is interrupted."""
+    import asyncio
+    from importlib.util import find_spec
+
+    from rich.console import Console
+
+    if find_spec("msgpack") is None:
+        raise InputError("bcppl serve needs msgpack; pip install 'bcppl[serve]'.")
+    from bcppl.inference.live import Filter
+    from bcppl.inference.live.server import Server
+    from bcppl.inference.live.session import Session
+
+    console = Console(highlight=False)
+    measured, chosen, infer = _chosen(scene, model, inference, set_)
+    settings: dict[str, Any] = {"particles": particles, "seed": seed, "deadline": deadline}
+    with Filter(chosen, measured, infer=infer, **settings) as following:
+        server = Server(Session(following), host, port, token)
+        asyncio.run(_serving(server, console))
+
+
+async def _serving(server: Server, console: Console) -> None:
+    listening = await server.listen()
+    console.print(f"listening at {server.address[0]}:{server.address[1]}, token {server.token}", markup=False)
+    async with listening:
+        await listening.serve_forever()
+
+
+def _chosen(
+    name: str, model: str | None, inference: str | None, set_: list[str] | None
+) -> tuple[Recording, Model, Callable[..., Iterator[Step]]]:
+    """The recording, the model with its settings, and the inference program."""
+    from bcppl.cli import loading
+
+    measured = loading.recording(name)
+    named = model or measured.model
+    chosen = loading.with_settings(loading.model(model, measured.model), loading.settings(set_ or []), named)
+    return measured, chosen, loading.inference(inference, chosen)[1]

@@ -1,0 +1,3 @@
+from bcppl.inference.live.filter import Filter as Filter, Update as Update
+from bcppl.inference.live.playing import play as play
+from bcppl.inference.live.sampler import Sampler as Sampler

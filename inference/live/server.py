@@ -1,0 +1,97 @@
+"""A live belief on a local socket: many clients, one belief, and no client that holds up another."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import secrets
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+
+from bcppl.errors import InputError
+from bcppl.inference.live.session import Session
+from bcppl.inference.live.wire import LENGTH, length_of, packed, unpacked
+
+STALLED = 10.0  # s in which a message that has begun has to be complete, and the first one to come
+CLIENTS = 64  # at a time
+
+
+class Server:
+    """Serves a session to clients that know a token.
+
+    A client's first message is `{"token": ...}`; each one after it is a request (`session`), and gets one
+    answer. A message that is no map, a wrong token or a stalled message ends that connection, and no other.
+
+    Args:
+        session: what is served.
+        host: the address that is listened at; "127.0.0.1" is reached from this machine alone.
+        port: 0 for one that is free.
+        token: what clients have to know; by default a new one.
+
+    Attributes:
+        address: host and port, once it listens.
+    """
+
+    def __init__(
+        self, session: Session, host: str = "127.0.0.1", port: int = 0, token: str | None = None
+    ) -> None:
+        self.session, self.host, self.port = session, host, port
+        self.token = secrets.token_urlsafe(16) if token is None else token
+        self.address: tuple[str, int] = (host, port)
+        self._clients, self._threads = 0, ThreadPoolExecutor(CLIENTS, "bcppl serve")
+
+    async def listen(self) -> asyncio.Server:
+        """Begin to listen.
+
+        Raises:
+            InputError: the address cannot be listened at.
+        """
+        try:
+            server = await asyncio.start_server(self._serve, self.host, self.port)
+        except OSError as error:
+            raise InputError(
+                f"{self.host}:{self.port} cannot be listened at ({error.strerror}); give another --port."
+            ) from error
+        self.address = server.sockets[0].getsockname()[:2]
+        return server
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._clients += 1
+        try:
+            await self._converse(reader, writer)
+        except InputError as error:
+            with suppress(OSError):
+                writer.write(packed({"error": str(error)}))
+        except (OSError, asyncio.IncompleteReadError, TimeoutError):
+            pass  # it has gone, or has stalled
+        finally:
+            self._clients -= 1
+            writer.close()
+            with suppress(OSError):
+                await writer.wait_closed()
+
+    async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self._clients > CLIENTS:
+            raise InputError(f"there are {CLIENTS} clients already; close one.")
+        hello = await asyncio.wait_for(_message(reader), STALLED)
+        given = hello.get("token")
+        if not isinstance(given, str) or not hmac.compare_digest(given.encode(), self.token.encode()):
+            raise InputError("the token is wrong; send {'token': ...} first, as the server printed it.")
+        await _send(writer, {"ok": True})
+        while (header := await reader.read(1)) != b"":
+            request = await asyncio.wait_for(_message(reader, header), STALLED)
+            answering = asyncio.get_running_loop().run_in_executor(
+                self._threads, self.session.answer, request
+            )
+            await _send(writer, await answering)
+
+
+async def _message(reader: asyncio.StreamReader, begun: bytes = b"") -> dict[str, object]:
+    header = begun + await reader.readexactly(LENGTH.size - len(begun))
+    return unpacked(await reader.readexactly(length_of(header)))
+
+
+async def _send(writer: asyncio.StreamWriter, message: dict[str, object]) -> None:
+    """Send a message to a client that reads; one that does not is dropped."""
+    writer.write(packed(message))
+    await asyncio.wait_for(writer.drain(), STALLED)

@@ -1,0 +1,186 @@
+"""What may be asked of a live belief from outside: requests and answers as plain maps.
+
+    {"ask": "begin", "plan": {...}}    a probe begins: a plan as `bcppl.recordings.action_file` has it, or
+                                       where there is none "name", "begin" (s), "seconds" and "rate"
+    {"ask": "samples", "wrench": (K, 7), "pose": (L, 8)}    rows of a stamp and what was measured then
+    {"ask": "end"}                     the probe is over
+    {"ask": "view", "camera": {...}, "depth": (H, W)}       a depth image, m
+    {"ask": "belief"}                  {"mean": (7,), "covariance": (6, 6), "effective", "behind", ...}
+    {"ask": "next_probe"}              {"plan": {...}, "gain": nats}
+    {"ask": "insertion"}               {"search": {...}, "push": {...}}
+
+An answer has "error", one sentence, where something is wrong; the belief is then as it was.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from bcppl.arguments import number_within
+from bcppl.arrays import Array
+from bcppl.errors import InferenceError, InputError
+from bcppl.inference.live.filter import Filter
+from bcppl.inference.live.sampler import Sampler
+from bcppl.robot.motion import Probe
+from bcppl.robot.plan import LONGEST, QUICKEST, probe_of
+from bcppl.sensors import DepthImage, Measurement, View
+from bcppl.sensors.candidates import planner_of
+from bcppl.sensors.layout import Layout
+from bcppl.sensors.protocol import Plannable, sensor_named
+
+MOST_STAMPS = 100_000  # of a probe
+WAITS = 60.0  # s for a ranking or a plan
+
+Answer = dict[str, Any]
+
+
+class Session:
+    """Answers requests about one live belief, from any thread."""
+
+    def __init__(self, live: Filter) -> None:
+        self.live = live
+        self._sampler: Sampler | None = None
+        self._lock = threading.Lock()  # of the sampler: who ranks or plans holds up nobody's samples
+        self._asked: Mapping[str, Callable[[Mapping[str, Any]], Answer]] = {
+            "begin": self._begin,
+            "samples": self._samples,
+            "end": self._end,
+            "view": self._view,
+            "belief": self._belief,
+            "next_probe": self._next_probe,
+            "insertion": self._insertion,
+        }
+
+    def answer(self, request: Mapping[str, Any]) -> Answer:
+        """The answer to a request; of one that is wrong, a sentence under "error"."""
+        asked = request.get("ask")
+        try:
+            if not isinstance(asked, str) or asked not in self._asked:
+                raise InputError(f"{str(asked)[:40]!r} is asked for; ask for {', '.join(self._asked)}.")
+            return self._asked[asked](request)
+        except (InputError, InferenceError) as error:
+            return {"error": str(error)}
+        except TimeoutError:
+            return {
+                "error": f"{asked} takes longer than {WAITS:g} s; ask again when fewer measurements wait."
+            }
+
+    def _begin(self, request: Mapping[str, Any]) -> Answer:
+        if "plan" in request:
+            probe = probe_of(_read(_layout("window").candidate, request["plan"], "the plan"))
+        else:
+            probe = _unknown(request)
+        if len(probe.stamps) > MOST_STAMPS:
+            raise InputError(f"the probe has {len(probe.stamps)} stamps; give {MOST_STAMPS} at most.")
+        names = {
+            getattr(getattr(m.action, "probe", None), "name", None) for m in self.live.recording.measurements
+        }
+        if probe.name in names:
+            raise InputError(f"there was a probe called {probe.name[:40]!r}; give each its own name.")
+        with self._lock:
+            self._sampler = Sampler(probe)
+        return {"stamps": len(probe.stamps)}
+
+    def _samples(self, request: Mapping[str, Any]) -> Answer:
+        rows = {name: _rows(request, name, width) for name, width in (("wrench", 7), ("pose", 8))}
+        count = 0
+        with self._lock:
+            sampler = self._begun()
+            for name, add in (("wrench", sampler.wrench), ("pose", sampler.pose)):
+                for row in rows[name]:
+                    count += self._observe(add(float(row[0]), row[1:]))
+        return {"windows": count, "behind": self.live.behind}
+
+    def _end(self, _: Mapping[str, Any]) -> Answer:
+        with self._lock:
+            sampler, self._sampler = self._begun(), None
+            count = self._observe(sampler.finish())
+        return {"windows": count, "irregular": {name: vars(c) for name, c in sampler.counts.items()}}
+
+    def _view(self, request: Mapping[str, Any]) -> Answer:
+        view = _read(_layout("view").candidate, request.get("camera"), "the camera")
+        depth = request.get("depth")
+        if not isinstance(depth, np.ndarray) or depth.ndim != 2:
+            raise InputError("a view has no depth of shape (H, W); send it as an array.")
+        assert isinstance(view, View)
+        self._observe([Measurement(view, DepthImage(depth))])
+        return {"behind": self.live.behind}
+
+    def _belief(self, _: Mapping[str, Any]) -> Answer:
+        belief = self.live.belief
+        return {
+            "mean": belief.mean.numpy(),
+            "covariance": belief.covariance.numpy(),
+            "effective": belief.effective_sample_size,
+            "measurements": self.live.step.taken,
+            "behind": self.live.behind,
+        }
+
+    def _next_probe(self, _: Mapping[str, Any]) -> Answer:
+        best = self.live.next_probe(timeout=WAITS).best
+        planner = planner_of(best.candidate)
+        return {"plan": planner.candidate.tree(best.candidate), "gain": best.information_gain}
+
+    def _insertion(self, _: Mapping[str, Any]) -> Answer:
+        plan = self.live.insertion(timeout=WAITS)
+        layout = _layout("window").candidate
+        return {"search": layout.tree(plan.search), "push": layout.tree(plan.push)}
+
+    def _begun(self) -> Sampler:
+        if self._sampler is None:
+            raise InputError("no probe has begun; ask for 'begin' first.")
+        return self._sampler
+
+    def _observe(self, windows: list[Measurement]) -> int:
+        for each in windows:
+            self.live.observe(each.action, each.observation)
+        return len(windows)
+
+
+def _layout(kind: str) -> Plannable:
+    sensor = sensor_named(kind)
+    assert isinstance(sensor, Plannable)
+    return sensor
+
+
+def _read(layout: Layout[Any], tree: Any, what: str) -> Any:
+    """The object of a request's map.
+
+    Raises:
+        InputError: it is none; one sentence that begins with `what`.
+    """
+    if not isinstance(tree, dict):
+        raise InputError(f"{what} is missing; send it as a map.")
+    try:
+        return layout.parsed(tree)
+    except InputError as error:
+        raise InputError(f"{what}: {error}") from None
+    except KeyError as error:
+        raise InputError(f"{what} lacks {error.args[0]!r}; add it.") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{what} cannot be read ({error}); send numbers in SI units.") from error
+
+
+def _unknown(request: Mapping[str, Any]) -> Probe:
+    """A probe of which only the time is known: its command is taken to stand still."""
+    name, begin = request.get("name"), number_within("a probe begins at {} s", request.get("begin"))
+    rate = number_within("a probe has {} stamps a second", request.get("rate"), least=1.0, most=QUICKEST)
+    seconds = number_within("a probe lasts {} s", request.get("seconds"), least=1.0 / rate, most=LONGEST)
+    if not isinstance(name, str) or not name:
+        raise InputError("a probe begins without a name; give it one.")
+    stamps = begin + np.arange(max(1, round(seconds * rate))) / rate
+    still = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (2, 1))
+    return Probe(name, np.array([begin, begin + seconds]), still, np.zeros(6), np.zeros(6), stamps)
+
+
+def _rows(request: Mapping[str, Any], name: str, width: int) -> Array:
+    given = request.get(name, [])
+    try:
+        rows = np.asarray(given, dtype=np.float64).reshape(-1, width) if len(given) else np.empty((0, width))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is no list of rows of {width} numbers, the first the stamp.") from error
+    return rows

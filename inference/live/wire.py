@@ -1,0 +1,96 @@
+"""Messages on a socket: MessagePack maps after their length, four bytes, big-endian; nothing in them is code.
+
+An array is the map `{"shape": [2, 3], "float64": bytes}` (or float32), little-endian and in row order.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from bcppl.arrays import Array
+from bcppl.errors import InputError
+
+LARGEST = 32 << 20  # bytes of a message: a depth image of 2048 x 2048 as float64
+DEEPEST = 6  # maps or lists within one another
+LENGTH = struct.Struct(">I")
+TYPES = {"float64": "<f8", "float32": "<f4"}
+
+
+def packed(message: dict[str, Any]) -> bytes:
+    """A message with its length before it."""
+    body = msgpack.packb(message, default=_packed_array)
+    return LENGTH.pack(len(body)) + body
+
+
+def length_of(header: bytes) -> int:
+    """The length of a message's body.
+
+    Raises:
+        InputError: it is empty, or larger than is read.
+    """
+    (length,) = LENGTH.unpack(header)
+    if not 0 < length <= LARGEST:
+        raise InputError(f"a message of {length} bytes is announced; send 1 to {LARGEST}.")
+    return int(length)
+
+
+def unpacked(body: bytes) -> dict[str, Any]:
+    """A message of its body.
+
+    Raises:
+        InputError: it is no MessagePack map, or is nested too deeply, or one of its arrays is none.
+    """
+    try:
+        read = msgpack.unpackb(
+            body,
+            raw=False,
+            strict_map_key=True,
+            max_str_len=1 << 16,
+            max_bin_len=LARGEST,
+            max_array_len=1 << 20,
+            max_map_len=1 << 10,
+            max_ext_len=0,
+        )
+    except Exception as error:  # the library raises its own, ValueError, and those of Unicode
+        raise InputError(f"a message is no MessagePack ({type(error).__name__}); send one map.") from error
+    if not isinstance(read, dict) or not all(isinstance(name, str) for name in read):
+        raise InputError("a message is no map of names; send {'ask': 'belief'}, say.")
+    return {name: _arrays(value, 1) for name, value in read.items()}
+
+
+def _arrays(value: Any, depth: int) -> Any:
+    if depth > DEEPEST:
+        raise InputError(f"a message is nested more than {DEEPEST} deep; send arrays as bytes.")
+    if isinstance(value, list):
+        return [_arrays(each, depth + 1) for each in value]
+    if not isinstance(value, dict):
+        return value
+    kind = next((name for name in TYPES if name in value), None)
+    if kind is not None and "shape" in value:
+        return _array(value["shape"], kind, value[kind])
+    return {name: _arrays(each, depth + 1) for name, each in value.items()}
+
+
+def _array(shape: Any, kind: str, data: Any) -> Array:
+    whole = (
+        isinstance(shape, list)
+        and len(shape) <= 3
+        and all(type(n) is int and 0 <= n <= LARGEST for n in shape)
+    )
+    size = np.dtype(TYPES[kind]).itemsize
+    if not whole or not isinstance(data, bytes) or len(data) != size * math.prod(shape):
+        raise InputError(
+            f"an array's shape does not fit its bytes; send shape and {kind} of as many numbers."
+        )
+    return np.frombuffer(data, TYPES[kind]).reshape(shape).astype(np.float64)
+
+
+def _packed_array(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return {"shape": list(value.shape), "float64": np.ascontiguousarray(value, "<f8").tobytes()}
+    raise TypeError(f"a {type(value).__name__} cannot be sent")

@@ -1,0 +1,228 @@
+"""Live beliefs: what arrives in any order, late, or too fast gives the belief of the batch run."""
+
+from __future__ import annotations
+
+import math
+import random
+import threading
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from bcppl import poses
+from bcppl.arrays import Array
+from bcppl.errors import InferenceError, InputError
+from bcppl.inference import guided_smc
+from bcppl.inference.live import Filter, Sampler, play
+from bcppl.models import load_recording
+from bcppl.models.look_and_touch import model
+from bcppl.robot.motion import Probe
+from bcppl.sensors import Measurement, ProbeWindow, Recording, Touch
+
+FEW = 20
+
+
+@pytest.fixture(scope="module")
+def touched() -> Recording:
+    """A shipped recording without its images, cut into windows of half a cell."""
+    recording = load_recording("peg_probe")
+    windows = [m for m in recording.measurements if isinstance(m.action, ProbeWindow)][:4]
+    return replace(recording, measurements=[half for each in windows for half in halves(each)])
+
+
+def halves(measurement: Measurement) -> list[Measurement]:
+    window, touch = measurement.action, measurement.observation
+    middle = (window.first + window.last) // 2
+    cuts = [(window.first, middle), (middle, window.last)]
+    return [
+        Measurement(
+            ProbeWindow(window.probe, first, last),
+            Touch(*(getattr(touch, f)[first - window.first : last - window.first] for f in FIELDS)),
+        )
+        for first, last in cuts
+    ]
+
+
+FIELDS = ("times", "wrench", "world_from_peg")
+
+
+def test_windows_that_arrive_in_any_order_give_the_same_bits(touched: Recording) -> None:
+    *_, batch = guided_smc.infer(model, touched, particles=FEW, seed=3)
+    shuffled = list(touched.measurements)
+    random.Random(1).shuffle(shuffled)
+    with Filter(model, replace(touched, measurements=[]), particles=FEW, seed=3, deadline=1e3) as live:
+        for each in shuffled:
+            live.observe(each.action, each.observation)
+        step = live.settle()
+    assert [m.action.first for m in live.recording.measurements] == [
+        m.action.first for m in touched.measurements
+    ]
+    assert torch.equal(step.belief.world_from_part, batch.belief.world_from_part)
+    assert torch.equal(step.belief.log_weights, batch.belief.log_weights)
+    assert {update.joined for update in live.updates} == {1}
+
+
+def test_a_window_waits_for_those_before_it(touched: Recording) -> None:
+    with Filter(model, replace(touched, measurements=[]), particles=FEW) as live:
+        live.observe(touched.measurements[1].action, touched.measurements[1].observation)
+        with pytest.warns(RuntimeWarning, match=r"1 measurements wait for earlier ones"):
+            assert live.settle().taken == 0
+        live.observe(touched.measurements[0].action, touched.measurements[0].observation)
+        assert live.settle().taken == 2
+
+
+def test_updates_that_are_late_join_windows_then_halve_particles_and_lose_nothing(touched: Recording) -> None:
+    first = touched.measurements[0]
+    with Filter(model, replace(touched, measurements=[]), particles=2 * FEW, deadline=1e-6) as live:
+        held = threading.Event()
+        live._thread.submit(held.wait)  # the filter is busy while all arrive
+        for each in touched.measurements:
+            live.observe(each.action, each.observation)
+        held.set()
+        live.settle()
+    joined = [update.joined for update in live.updates]
+    assert joined == [1, len(touched.measurements) - 1]
+    stamps = np.concatenate([m.observation.times for m in live.recording.measurements])
+    assert np.array_equal(stamps, first.action.probe.stamps[: len(stamps)])
+    assert live.updates[-1].particles >= FEW
+
+
+def faulty(model: Any, recording: Recording, **settings: Any) -> Iterator[Any]:
+    """Inference that no particle survives where a measurement's first stamp is the third window's."""
+    if any(m.action.first == 50 and m.action.probe.name == "bad" for m in recording.measurements):
+        raise InferenceError("window 3: no particle has any weight")
+    yield from guided_smc.infer(model, recording, **settings)
+
+
+@pytest.mark.parametrize("policy", ["skip", "stop"])
+def test_a_measurement_that_nothing_explains_is_left_out_or_ends_it(touched: Recording, policy: Any) -> None:
+    third = touched.measurements[2]
+    probe = replace(third.action.probe, name="bad")
+    bad = Measurement(ProbeWindow(probe, 50, 75), third.observation)
+    empty = replace(touched, measurements=[])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with Filter(model, empty, particles=FEW, infer=faulty, on_fault=policy) as live:
+            for each in touched.measurements[:2]:
+                live.observe(each.action, replace_name(each))
+            live.settle()
+            before = live.belief
+            live.observe(ProbeWindow(probe, 0, 50), joined_touch(touched))
+            live.observe(bad.action, bad.observation)
+            if policy == "stop":
+                with pytest.raises(InferenceError, match="no particle"):
+                    live.settle()
+                return
+            after = live.settle()
+    assert after.taken == 3 and live.updates[-1].fault.startswith("window 3")
+    assert before is not after.belief
+    assert any("left out" in str(each.message) for each in caught)
+
+
+def replace_name(measurement: Measurement) -> Touch:
+    return measurement.observation
+
+
+def joined_touch(recording: Recording) -> Touch:
+    both = [m.observation for m in recording.measurements[:2]]
+    return Touch(*(np.concatenate([getattr(t, f) for t in both]) for f in FIELDS))
+
+
+def test_a_measurement_that_is_wrong_is_refused_where_it_is_given(touched: Recording) -> None:
+    window, touch = touched.measurements[3].action, touched.measurements[3].observation
+    with Filter(model, replace(touched, measurements=[]), particles=FEW) as live:
+        with pytest.raises(InputError, match="wrench times, not"):
+            live.observe(window, Touch(touch.times[1:], touch.wrench[1:], touch.world_from_peg[1:]))
+        with pytest.raises(InputError, match="pairs a ProbeWindow with a Touch"):
+            live.observe(window, window)
+        assert live.behind == 0
+
+
+# ---- from messages to windows
+
+
+def signal(times: Array) -> Array:
+    """Six smooth columns."""
+    return np.stack([np.sin(3.0 * times + k) for k in range(6)], axis=-1)
+
+
+def pose_at(times: Array) -> Array:
+    turn = np.array([0.0, 0.0, 0.3])
+    twist = np.concatenate([0.01 * np.outer(times, [1.0, -1.0, 0.5]), np.outer(times, turn)], axis=1)
+    start = poses.identity().expand(len(times), 7)
+    return np.asarray(poses.retract(start, torch.from_numpy(twist)).numpy())
+
+
+def probe(seconds: float = 1.0, rate: float = 100.0) -> Probe:
+    stamps = 10.0 + np.arange(round(seconds * rate)) / rate
+    return Probe("p", stamps[[0, -1]], pose_at(np.zeros(2)), np.ones(6), np.ones(6), stamps)
+
+
+def messages(rates: tuple[float, float]) -> list[tuple[float, str, Array]]:
+    """Messages of both streams from before the probe until after it, in the order of their stamps."""
+    listed: list[tuple[float, str, Array]] = []
+    for name, rate, values in zip(("wrench", "pose"), rates, (signal, pose_at), strict=True):
+        times = np.arange(9.9, 11.2, 1.0 / rate)
+        listed += [(float(t), name, row) for t, row in zip(times, values(times - 10.0), strict=True)]
+    return sorted(listed, key=lambda each: each[0])
+
+
+def windows_of(sampler: Sampler, given: list[tuple[float, str, Array]]) -> list[Measurement]:
+    return [w for stamp, name, row in given for w in getattr(sampler, name)(stamp, row)]
+
+
+@pytest.mark.parametrize("rates", [(500.0, 500.0), (1000.0, 125.0), (60.0, 2000.0)])
+def test_windows_hold_what_the_streams_were_at_their_stamps(rates: tuple[float, float]) -> None:
+    got = windows_of(Sampler(probe()), messages(rates))
+    assert [(w.action.first, w.action.last) for w in got] == [(0, 25), (25, 50), (50, 75), (75, 100)]
+    times = np.concatenate([w.observation.times for w in got])
+    assert np.array_equal(times, probe().stamps)
+    wrench = np.concatenate([w.observation.wrench for w in got])
+    assert np.abs(wrench - signal(times - 10.0)).max() < 1.2 * 9.0 / 8.0 / min(rates[0], 100.0) ** 2
+    pose = np.concatenate([w.observation.world_from_peg for w in got])
+    away = poses.local(torch.from_numpy(pose_at(times - 10.0)), torch.from_numpy(pose))
+    assert float(away.abs().max()) < 1e-6
+
+
+def test_messages_out_of_order_and_twice_change_nothing_and_are_counted() -> None:
+    given = messages((500.0, 250.0))
+    straight = windows_of(Sampler(probe()), given)
+    twice = [given[0], *given]
+    order = np.argsort([t + random.Random(k).uniform(0.0, 0.04) for k, (t, _, _) in enumerate(twice)])
+    sampler = Sampler(probe())
+    shuffled = windows_of(sampler, [twice[k] for k in order])
+    for one, other in zip(straight, shuffled, strict=True):
+        assert np.array_equal(one.observation.wrench, other.observation.wrench)
+        assert np.array_equal(one.observation.world_from_peg, other.observation.world_from_peg)
+    counts = sampler.counts
+    assert counts["wrench"].repeated + counts["pose"].repeated == 1
+    assert counts["wrench"].unordered > 10 and counts["wrench"].late == 0
+
+
+def test_messages_that_are_lost_are_bridged_and_counted_or_refused() -> None:
+    given = messages((500.0, 500.0))
+    short = [each for each in given if not (each[1] == "wrench" and 10.305 < each[0] < 10.335)]
+    sampler = Sampler(probe())
+    assert len(windows_of(sampler, short)) == 4 and sampler.counts["wrench"].bridged == 3
+    long = [each for each in given if not (each[1] == "pose" and 10.301 < each[0] < 10.399)]
+    with pytest.raises(InputError, match=r"the pose stream has no message from 10\.300 to 10\.400 s"):
+        windows_of(Sampler(probe()), long)
+
+
+def test_a_recording_is_played_at_the_pace_of_its_stamps(touched: Recording) -> None:
+    now, slept = [100.0], list[float]()
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        now[0] += seconds
+
+    at = [now[0] for _ in play(touched, 2.0, lambda: now[0], sleep)]
+    ends = [float(m.observation.times[-1]) for m in touched.measurements]
+    begin = float(touched.measurements[0].observation.times[0])
+    assert at == pytest.approx([100.0 + 0.5 * (end - begin) for end in ends])
+    assert len(list(play(touched, math.inf, sleep=sleep))) == len(touched.measurements)

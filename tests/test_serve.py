@@ -1,0 +1,191 @@
+"""A live belief on a socket: no client holds up another, and nothing that is sent is more than data."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import struct
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings, strategies as st
+
+from bcppl.errors import InputError
+from bcppl.inference.live import Filter, server, wire
+from bcppl.inference.live.client import Client
+from bcppl.inference.live.server import Server
+from bcppl.inference.live.session import Session
+from bcppl.models import load_recording
+from bcppl.models.look_and_touch import model
+from bcppl.sensors import ProbeWindow, Recording
+
+
+class Echo:
+    """A session that answers at once."""
+
+    def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        return {"asked": request["ask"]}
+
+
+@contextmanager
+def serving(session: Any) -> Iterator[Server]:
+    """A server in a thread of its own."""
+    served, ready, loop = Server(session, token="secret"), threading.Event(), asyncio.new_event_loop()
+
+    async def run() -> None:
+        async with await served.listen():
+            ready.set()
+            await stopped.wait()
+
+    async def made() -> asyncio.Event:
+        return asyncio.Event()
+
+    stopped = loop.run_until_complete(made())
+    thread = threading.Thread(target=loop.run_until_complete, args=(run(),))
+    thread.start()
+    assert ready.wait(10.0)
+    try:
+        yield served
+    finally:
+        loop.call_soon_threadsafe(stopped.set)
+        thread.join(20.0)
+        assert not thread.is_alive()
+
+
+def answer_of(raw: socket.socket) -> dict[str, Any]:
+    raw.settimeout(5.0)
+    data = b""
+    while more := raw.recv(4096):
+        data += more
+    return wire.unpacked(data[4:]) if data else {}
+
+
+def test_clients_that_stall_or_send_garbage_or_know_no_token_hold_up_nobody(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(server, "STALLED", 0.5)
+    with serving(Echo()) as served:
+        stalled = socket.create_connection(served.address)
+        stalled.sendall(b"\x00\x00")  # half of a length
+        garbage, stranger = socket.create_connection(served.address), socket.create_connection(served.address)
+        garbage.sendall(struct.pack(">I", 5) + b"\xc1\xc1\xc1\xc1\xc1")
+        stranger.sendall(wire.packed({"token": "guessed"}) + wire.packed({"ask": "belief"}))
+        huge = socket.create_connection(served.address)
+        huge.sendall(struct.pack(">I", 2**31))
+        with Client(*served.address, "secret") as client:
+            for number in range(20):
+                assert client.ask(str(number)) == {"asked": str(number)}
+            assert "no MessagePack" in answer_of(garbage)["error"]
+            assert "token is wrong" in answer_of(stranger)["error"]
+            assert "bytes is announced" in answer_of(huge)["error"]
+            assert answer_of(stalled) == {}  # closed
+            assert client.ask("still") == {"asked": "still"}
+        with pytest.raises(InputError, match="token is wrong"):
+            Client(*served.address, "guessed")
+        for raw in (stalled, garbage, stranger, huge):
+            raw.close()
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=200))
+def test_bytes_are_a_message_or_refused_in_a_sentence(body: bytes) -> None:
+    try:
+        assert isinstance(wire.unpacked(body), dict)
+    except InputError as error:
+        assert str(error).endswith(".")
+
+
+def test_arrays_come_back_and_lists_within_lists_do_not_exhaust_the_stack() -> None:
+    array = np.arange(6.0).reshape(2, 3)
+    body = wire.packed({"depth": array})
+    assert np.array_equal(wire.unpacked(body[4:])["depth"], array)
+    with pytest.raises(InputError, match="no MessagePack"):
+        wire.unpacked(b"\x81\xa1a" + b"\x91" * 100_000 + b"\x00")
+    with pytest.raises(InputError, match="nested"):
+        wire.unpacked(b"\x81\xa1a" + b"\x91" * 10 + b"\x00")
+    with pytest.raises(InputError, match="does not fit its bytes"):
+        wire.unpacked(msgpack.packb({"a": {"shape": [2**20, 2**20], "float64": b""}}))
+
+
+# ---- a session about a real belief
+
+
+@pytest.fixture(scope="module")
+def touched() -> Recording:
+    recording = load_recording("peg_probe")
+    windows = [m for m in recording.measurements if isinstance(m.action, ProbeWindow)][:3]
+    return replace(recording, measurements=windows)
+
+
+@pytest.fixture
+def session(touched: Recording) -> Iterator[Session]:
+    with Filter(model, replace(touched, measurements=[]), particles=20, deadline=1e3) as live:
+        yield Session(live)
+
+
+def test_samples_that_are_sent_give_the_belief_of_their_windows(session: Session, touched: Recording) -> None:
+    with Filter(model, replace(touched, measurements=[]), particles=20, deadline=1e3) as straight:
+        for each in touched.measurements:
+            straight.observe(each.action, each.observation)
+        expected = straight.settle().belief
+    stamps, wrench, pose = (
+        np.concatenate([getattr(m.observation, name) for m in touched.measurements])
+        for name in ("times", "wrench", "world_from_peg")
+    )
+    rate = 1.0 / float(np.median(np.diff(stamps)))
+    begun = {"name": "probe", "begin": float(stamps[0]), "seconds": len(stamps) / rate, "rate": rate}
+    with serving(session) as served, Client(*served.address, "secret") as client:
+        assert client.ask("begin", **begun) == {"stamps": len(stamps)}
+        for part in np.array_split(np.arange(len(stamps)), 7):
+            client.ask(
+                "samples",
+                wrench=np.column_stack([stamps, wrench])[part],
+                pose=np.column_stack([stamps, pose])[part],
+            )
+        assert client.ask("end")["irregular"]["wrench"]["late"] == 0
+        session.live.settle()
+        got = client.ask("belief")
+        with pytest.raises(InputError, match="there was a probe called 'probe'"):
+            client.ask("begin", **begun)
+    # Other windows are other steps: the same rows and evidence, other random numbers.
+    deviation = expected.covariance[:3, :3].diagonal().sqrt().numpy()
+    assert (np.abs(got["mean"][:3] - expected.mean[:3].numpy()) < 3.0 * deviation).all()
+    assert got["behind"] == 0 and got["covariance"].shape == (6, 6)
+
+
+@pytest.mark.parametrize(
+    ("request_", "sentence"),
+    [
+        ({}, "'None' is asked for; ask for begin"),
+        ({"ask": "samples", "wrench": [[0.0] * 7]}, "no probe has begun"),
+        ({"ask": "begin", "plan": {"name": "p"}}, "the plan lacks"),
+        ({"ask": "begin", "name": "p", "begin": 0.0, "rate": 1e9, "seconds": 1.0}, "stamps a second"),
+        ({"ask": "begin", "name": "p", "begin": 0.0, "rate": 1e4, "seconds": 500.0}, "5000000 stamps"),
+        ({"ask": "view", "camera": {}, "depth": [1.0]}, "the camera lacks 'name'"),
+    ],
+)
+def test_what_is_wrong_is_answered_in_a_sentence(
+    session: Session, request_: dict[str, Any], sentence: str
+) -> None:
+    assert sentence in session.answer(request_)["error"]
+
+
+json_like = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.binary(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+    max_leaves=8,
+)
+words = st.sampled_from(["begin", "samples", "end", "view"])
+names = st.sampled_from(["plan", "name", "begin", "seconds", "rate", "wrench", "pose", "camera", "depth"])
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(words, st.dictionaries(names, json_like, max_size=5))
+def test_no_request_is_more_than_an_answer(session: Session, asked: str, fields: dict[str, Any]) -> None:
+    assert isinstance(session.answer({**fields, "ask": asked}), dict)
