@@ -18,9 +18,10 @@ from bcppl.geometry.outlines import check_fit
 from bcppl.models.worlds.bench.parameters import BenchParameters
 from bcppl.models.worlds.bench.parts import PARTS, PEG_LENGTH, bench_part
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
-from bcppl.models.worlds.guarded_motion import Execution, command_of
+from bcppl.models.worlds.guarded_motion import Execution
 from bcppl.recordings import Recording
 from bcppl.rendering.ray_casting import RayCaster
+from bcppl.robot.commands import command_of
 from bcppl.robot.motion import Probe
 from bcppl.robot.plan import Plan
 

@@ -24,7 +24,7 @@ from bcppl.inference.planning.success import success_probability
 from bcppl.inference.resampling import systematic
 from bcppl.models.worlds.bench.parts import PARTS, PEG_LENGTH, bench_part
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
-from bcppl.models.worlds.guarded_motion import command_of
+from bcppl.robot.commands import command_of
 from bcppl.robot.plan import InsertionPlan
 
 

@@ -11,11 +11,12 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from bcppl.contact.mujoco_model import ContactParameters, interpolated_command
+from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, round_peg
 from bcppl.geometry.parts import Part, Piece
+from bcppl.robot.commands import interpolated_command
 from bcppl.robot.motion import Probe
 from tests.contact_probes import DAMPING, HOLE, SEARCH, STIFFNESS, path, same
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bcppl.arguments import number_within
 from bcppl.arrays import Array, Indices
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part, Piece
+from bcppl.robot.commands import interpolated_command
 from bcppl.robot.motion import Probe
 
 SENSOR_COLUMNS = 16  # of a sensor row: position 3, quaternion 4, force 3, torque 3, normal 3
@@ -211,31 +211,6 @@ def check_probe(probe: Probe) -> None:
             f"probe {probe.name!r} has its first stamp at {stamps[0]:g} s, before its first command at "
             f"{times[0]:g} s; begin the command no later than the first stamp."
         )
-
-
-def interpolated_command(probe: Probe, times: Array) -> tuple[Array, Array]:
-    """Commanded poses (S, 7) and twists (S, 6) of a probe at times (S,), in seconds.
-
-    Translations are interpolated linearly and rotations along the geodesic, so that the twist, in the
-    commanded peg's axes (m/s, rad/s), is constant between two command times. The last pose is held.
-    """
-    knots, poses = probe.command_times, np.asarray(probe.command, dtype=np.float64)
-    turns = Rotation.from_quat(poses[:, [4, 5, 6, 3]])
-    if len(knots) == 1:
-        return np.repeat(poses, len(times), axis=0), np.zeros((len(times), 6))
-    spans = np.diff(knots)
-    speed = np.diff(poses[:, :3], axis=0) / spans[:, None]
-    spin = (turns[:-1].inv() * turns[1:]).as_rotvec() / spans[:, None]
-    # A step that starts within a rounding error before a knot belongs to the next segment.
-    segment = np.clip(np.searchsorted(knots, times + 1e-9, side="right") - 1, 0, len(spans) - 1)
-    elapsed = np.clip(times - knots[segment], 0.0, spans[segment])
-    rotation = turns[segment] * Rotation.from_rotvec(spin[segment] * elapsed[:, None])
-    pose = np.empty((len(times), 7))
-    pose[:, :3] = poses[segment, :3] + speed[segment] * elapsed[:, None]
-    pose[:, 3:] = rotation.as_quat()[:, [3, 0, 1, 2]]
-    twist = np.concatenate([rotation.inv().apply(speed[segment]), spin[segment]], axis=1)
-    twist[times > knots[-1] - 1e-9] = 0.0
-    return pose, twist
 
 
 def rollout_controls(probe: Probe, times: Array) -> Array:

@@ -22,9 +22,9 @@ from bcppl.arguments import number_within
 from bcppl.arrays import Array, Indices, Mask
 from bcppl.compiled import compiled
 from bcppl.contact.half_spaces import project_onto_half_spaces
-from bcppl.contact.mujoco_model import interpolated_command
 from bcppl.geometry.gap import Frames, PegGap, frames_of
 from bcppl.geometry.parts import Part
+from bcppl.robot.commands import interpolated_command
 from bcppl.robot.motion import ProbeWindow
 
 _LONGEST = 0.001  # m: of a step

@@ -12,7 +12,9 @@ from bcppl.arrays import Array
 from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.geometry.parts import Part
 from bcppl.models.worlds.bench.reality import BenchReality
-from bcppl.models.worlds.guarded_motion import TARE, execute, stamps_of
+from bcppl.models.worlds.guarded_motion import execute
+from bcppl.robot.commands import stamps_of
+from bcppl.robot.execution import TARE
 from bcppl.robot.plan import InsertionPlan
 
 _BESIDE = 0.002  # m: a tip farther from the hole's axis is not in the hole but beside the part

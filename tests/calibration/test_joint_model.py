@@ -34,7 +34,7 @@ from tests.calibration.shared_errors import (
 from tests.calibration.test_calibration import BROKEN, SEED, SOUND
 from tests.episode_errors import factors
 
-ROUNDS = 120
+ROUNDS, FEWER = 200, 120
 
 
 def test_what_is_simulated_has_the_residuals_of_the_likelihood() -> None:
@@ -96,7 +96,7 @@ def test_part_and_all_that_touches_share_rank_like_draws() -> None:
 @pytest.mark.parametrize("world", [SLIPS, SOLIDS])
 def test_what_is_approximated_costs_little(world: str) -> None:
     """A slip that surprises no touch is not allowed for; where errors are large another corner touches."""
-    _, spread, lines = table(world, ROUNDS)
+    _, spread, lines = table(world, FEWER)
     print(f"\n{lines}")
     assert spread < 1.2, lines
 

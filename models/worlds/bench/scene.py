@@ -28,7 +28,7 @@ from bcppl.models.worlds.bench.errors import DrawnErrors, drawn_errors
 from bcppl.models.worlds.bench.parameters import BenchParameters
 from bcppl.models.worlds.bench.parts import PARTS, PEG_LENGTH, BenchPart, bench_part
 from bcppl.models.worlds.bench.reality import BenchReality
-from bcppl.models.worlds.guarded_motion import Execution, execute, stamps_of
+from bcppl.models.worlds.guarded_motion import Execution, execute
 from bcppl.models.worlds.inserting import InsertionResult, insert, samples_of
 from bcppl.models.worlds.occlusion import occluder
 from bcppl.models.worlds.simulated_sensors import (
@@ -39,6 +39,7 @@ from bcppl.models.worlds.simulated_sensors import (
     windows,
 )
 from bcppl.rendering.scene import SceneRenderer
+from bcppl.robot.commands import stamps_of
 from bcppl.robot.plan import InsertionPlan, Plan
 from bcppl.sensors import DepthImage, Measurement, Recording, View
 
