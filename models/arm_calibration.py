@@ -14,18 +14,22 @@ kinematics_calibration.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyro
 import pyro.distributions as dist
 import torch
 from scipy.linalg import helmert
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.robot.kinematics import Robot
 from bcppl.traces import Trace
@@ -116,6 +120,98 @@ def sockets(arm: Arm, trace: Trace, angles: Tensor) -> Tensor:
     """Draws (N, 3) of a socket's position, metres, from angles (T, J) of a ball seated in it."""
     mean = arm.positions(trace.choices, angles).mean(dim=1)
     return mean + trace["noise"][:, None] / len(angles) ** 0.5 * torch.randn_like(mean)
+
+
+class RemainingError(NamedTuple):
+    """What a calibration leaves uncertain, metres.
+
+    Attributes:
+        before, after: root mean square distance of the seated ball from its mean, by the nominal arm and by
+            the posterior mean.
+        deviation: standard deviation of the ball's position along an axis, the scatter included, apart from
+            where the whole arm stands.
+        length: over which that error changes: a Gaussian process with a squared exponential covariance.
+    """
+
+    before: float
+    after: float
+    deviation: float
+    length: float
+
+
+def remaining_error(arm: Arm, draws: Trace, weights: Tensor, seatings: Sequence[Tensor]) -> RemainingError:
+    """What is left uncertain over the workspace of the seatings.
+
+    Args:
+        arm: its prior.
+        draws: N of the posterior.
+        weights: (N,) of the draws, with a sum of 1.
+        seatings: angles (T, J) of each.
+    """
+    latent = {address: draws[address] for address in arm.spread}
+    mean = {a: torch.einsum("n,n...->...", weights, value)[None] for a, value in latent.items()}
+    zero = {address: torch.zeros_like(value) for address, value in mean.items()}
+
+    def scatter(values: Mapping[str, Tensor]) -> float:
+        each = [arm.positions(values, q)[0] for q in seatings]
+        squares = torch.cat([(x - x.mean(dim=0)).square().sum(dim=1) for x in each])
+        return float(squares.mean().sqrt())
+
+    # One posture of each seating: how it is seated adds as much as the calibration leaves.
+    postures = torch.stack([q[0] for q in seatings])
+    place = arm.positions(mean, postures)[0]
+    error = _bent(place, arm.positions(latent, postures) - place)
+    variance = float(torch.einsum("n,nti->ti", weights, error.square()).mean())
+    after = scatter(mean)
+    first, second = torch.triu_indices(len(place), len(place), 1)
+    apart = (place[first] - place[second]).norm(dim=1)
+    covered = torch.einsum("n,nti,nti->t", weights, error[:, first], error[:, second]) / 3.0
+    correlation = (covered / max(variance, 1e-30)).clamp(1e-3, 1.0 - 1e-9)
+    # exp(-r^2 / 2 l^2) by least squares of its logarithm, through the origin.
+    curvature = float((-2.0 * correlation.log() * apart**2).sum() / (apart**4).sum()) if len(apart) else 0.0
+    length = 1.0 / math.sqrt(max(curvature, 1e-4))
+    return RemainingError(scatter(zero), after, math.sqrt(variance + after**2 / 3.0), min(length, 1.0))
+
+
+def _bent(place: Tensor, error: Tensor) -> Tensor:
+    """Errors (N, T, 3) of positions (T, 3) without the motion of the whole arm that is nearest to them.
+
+    A ball in sockets does not show where the arm stands, nor does that matter to what is seen and touched in
+    the arm's own frame.
+    """
+    turned = torch.linalg.cross(torch.eye(3, dtype=torch.float64)[:, None], place[None], dim=-1)
+    shifted = torch.eye(3, dtype=torch.float64)[:, None].expand(3, len(place), 3)
+    motions = torch.cat([shifted, turned]).flatten(1).T  # (3 T, 6)
+    flat = error.flatten(1)
+    moved = torch.linalg.lstsq(motions, flat.T, driver="gelsd").solution
+    return (flat - (motions @ moved).T).unflatten(1, (-1, 3))
+
+
+def corrected_joints(arm: Arm, draws: Trace, weights: Tensor) -> dict[str, Array]:
+    """The joints' origins `parent_from_child` (4, 4) at the posterior mean, by name.
+
+    An encoder's offset turns the joint's origin about its axis. A fixed joint to the ball's link leads to
+    where the ball is. Draws and their weights are those of `remaining_error`.
+    """
+    mean = {a: torch.einsum("n,n...->...", weights, draws[a]).numpy() for a in arm.spread}
+    origins = {}
+    for k, joint in enumerate(arm.robot.joints):
+        matrix = joint.parent_from_child.copy()
+        if "errors" in mean:
+            matrix[:3, 3] += mean["errors"][k, :3]
+            matrix[:3, :3] = matrix[:3, :3] @ Rotation.from_rotvec(mean["errors"][k, 3:]).as_matrix()
+        offset = mean["offsets"][k] * joint.axis
+        if joint.kind == "prismatic":
+            matrix[:3, 3] += matrix[:3, :3] @ offset
+        else:
+            matrix[:3, :3] = matrix[:3, :3] @ Rotation.from_rotvec(offset).as_matrix()
+        origins[joint.name] = matrix
+    seat = arm.robot.joint_to(arm.link)
+    if seat.kind == "fixed":
+        matrix = seat.parent_from_child.copy()
+        matrix[:3, 3] += matrix[:3, :3] @ mean["ball"]
+        origins[seat.name] = matrix
+    return origins
 
 
 def laplace_proposal(

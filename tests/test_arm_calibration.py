@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 from torch import Tensor
@@ -15,14 +19,18 @@ from bcppl.inference.importance import importance_sampling
 from bcppl.models.arm_calibration import (
     Arm,
     arm_calibration,
+    corrected_joints,
     laplace_proposal,
     observations,
     read_seatings,
     sockets,
 )
 from bcppl.models.robots import load_robot
+from bcppl.robot.correction import corrected
 from bcppl.robot.kinematics import Robot
+from bcppl.sensors.likelihoods.bench_profiles import profile_named
 from bcppl.traces import generate
+from tests.command_line import Ran
 from tests.scene_contents import contents
 
 DATA = Path(__file__).parents[2] / "shared/data/ball_in_socket"
@@ -189,3 +197,54 @@ def test_nothing_is_written_into_the_arm() -> None:
     before, observed = contents(arm), observations(seatings)
     importance_sampling(arm_calibration, (arm, seatings), observed, 5, laplace_proposal(arm, seatings))
     assert len(before) > 40 and contents(arm) == before
+
+
+# ---- bcppl calibrate arm
+
+
+@needed
+def test_a_calibrated_arm_and_its_profile_are_written(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    """The written arm seats the ball as the posterior mean does, at places that were not calibrated on."""
+    places = ("backcenter", "frontleft", "frontright")
+    for place in places:
+        (tmp_path / "seated" / place).mkdir(parents=True)
+        for file in (DATA / "data/panda_3" / place).glob("hole_*.csv"):
+            (tmp_path / "seated" / place / file.name).write_bytes(file.read_bytes())
+    urdf = DATA / "urdf/panda.urdf"
+    ran = bcppl("calibrate", "arm", "seated", "--urdf", urdf, "--particles", 100, "-o", "mine")
+    assert ran.code == 0, ran.err
+    arm, nominal = Robot("mine.urdf", tip="ball_link"), Robot(urdf, tip="ball_link")
+    others = [p for p in sorted((DATA / "data/panda_3").iterdir()) if p.name not in places]
+    pairs = [read_seatings(place) for place in others]
+    assert max(scatter(arm, q) for pair in pairs for q in pair) < 0.8
+    assert min(scatter(nominal, q) for pair in pairs for q in pair) > 3.0
+    assert all(abs(apart(arm, pair) - 50.0) < 0.5 for pair in pairs)
+    profile = profile_named("mine.json")
+    assert profile is not None and 0.0001 < profile.kinematics[0] < 0.0006
+    assert 0.02 < profile.kinematics[1] <= 1.0 and profile.delay == 0.045
+    (tmp_path / "wrong.json").write_text('{"format": "bcppl bench profile", "grasp": [1, 2]}')
+    with pytest.raises(InputError, match=r"wrong.json has grasp \[1, 2\]; give 3 numbers"):
+        profile_named("wrong.json")
+    (tmp_path / "wrong.json").write_text('{"format": "bcppl bench profile", "grip": 1}')
+    with pytest.raises(InputError, match="has 'grip'; fields of a profile are grasp"):
+        profile_named("wrong.json")
+
+
+def test_corrected_joints_lead_to_the_same_places_as_offsets_and_errors(tmp_path: Path) -> None:
+    """At any values the corrected file's arm, without offsets, is the nominal one's with them."""
+    file = Path(str(files("bcppl.models.robots") / "panda.urdf"))
+    robot = Robot(file, tip="panda_hand")
+    arm = Arm(robot, "panda_hand")
+    torch.manual_seed(4)
+    trace, _ = generate(lambda arm: _prior(arm), (arm,), {}, 1)
+    (tmp_path / "new.urdf").write_text(corrected(file, corrected_joints(arm, trace, torch.ones(1).double())))
+    angles = torch.stack([j.lower + (j.upper - j.lower) * torch.rand(6).double() for j in robot.joints], 1)
+    expected = arm.positions({a: trace[a] for a in arm.spread}, angles)[0]
+    found = Robot(tmp_path / "new.urdf", tip="panda_hand").position("panda_hand", angles)
+    assert float((found - expected).abs().max()) < 1e-9
+    assert float((robot.position("panda_hand", angles) - expected).abs().max()) > 1e-3
+
+
+def _prior(arm: Arm) -> None:
+    for address, spread in arm.spread.items():
+        pyro.sample(address, dist.Normal(torch.zeros_like(spread), spread).to_event(spread.ndim))

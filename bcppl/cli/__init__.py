@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from bcppl.cli import insert, live, new, probe, recordings, run, sweep
+from bcppl.cli import calibrate, insert, live, new, probe, recordings, run, sweep
 from bcppl.errors import InferenceError, InputError
 from bcppl.visible_text import visible
 
@@ -49,6 +49,7 @@ app.command("check")(recordings.check)
 app.command("simulate")(recordings.simulate)
 app.add_typer(recordings.import_app, name="import")
 app.add_typer(new.new_app, name="new")
+app.add_typer(calibrate.calibrate_app, name="calibrate")
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 

@@ -229,6 +229,17 @@ class Robot:
         faces = [part.faces + start for part, start in zip(self.parts, starts, strict=False)]
         return Part(self.name, np.concatenate(vertices), np.concatenate(faces), source=self.parts[0].source)
 
+    def joint_to(self, link: str) -> Joint:
+        """The joint by which a link hangs on its parent, which may be a fixed one.
+
+        Raises:
+            InputError: the link is unknown, or is the base.
+        """
+        chain = self._chain_to(link)
+        if not chain:
+            raise InputError(f"{link!r} is the base of {self.name}, on which no joint leads; give another.")
+        return chain[-1]
+
     # ---- checks and layout
 
     def _known(self, link: str) -> str:

@@ -15,8 +15,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
+from bcppl import strict_json
+from bcppl.arguments import number_within
 from bcppl.distributions.episodes import (
     ArmCompliance,
     Delay,
@@ -102,12 +106,53 @@ PROFILES: Mapping[str, BenchProfile | None] = {
 }
 
 
+FORMAT = "bcppl bench profile"
+
+
 def profile_named(name: str) -> BenchProfile | None:
-    """The profile of that name; None for a perfect bench.
+    """The profile of that name, or in a file that ends in .json; None for a perfect bench.
+
+    A file has the format "bcppl bench profile" and fields of `BenchProfile`; those that it lacks are of ur5e.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, or the file has a field that no profile has, or one that is no number.
     """
+    if name.endswith(".json"):
+        return _read(Path(name))
     if name not in PROFILES:
-        raise InputError(f"there is no profile {name!r} of a bench; choose {', '.join(PROFILES)}.")
+        raise InputError(
+            f"there is no profile {name!r} of a bench; choose {', '.join(PROFILES)}, or give a file (.json)."
+        )
     return PROFILES[name]
+
+
+def profile_tree(name: str) -> dict[str, Any]:
+    """A profile as its file has it.
+
+    Raises:
+        InputError: as of `profile_named`, or the bench is perfect.
+    """
+    profile = profile_named(name)
+    if profile is None:
+        raise InputError(f"profile {name!r} has no errors to write down; give another.")
+    return {"format": FORMAT, **asdict(profile)}
+
+
+def _read(path: Path) -> BenchProfile:
+    remedy = "write it by `bcppl calibrate arm`, or give the name of a profile"
+    tree = strict_json.read(path, remedy)
+    if not isinstance(tree, dict) or tree.pop("format", None) != FORMAT:
+        raise InputError(f"{path} is no profile of a bench (its format is not {FORMAT!r}); {remedy}.")
+    usual = asdict(BenchProfile())
+    for name, value in tree.items():
+        if name not in usual:
+            raise InputError(f"{path} has {name!r}; fields of a profile are {', '.join(usual)}.")
+        count = len(usual[name]) if isinstance(usual[name], tuple) else 0
+        numbers = value if count else [value]
+        if not isinstance(numbers, list) or len(numbers) != max(count, 1):
+            raise InputError(
+                f"{path} has {name} {str(value)[:40]}; give {count or 'one'} number{'s' * bool(count)}."
+            )
+        checked = [number_within(f"{path} has {name} {{}}", number, least=0.0) for number in numbers]
+        usual[name] = tuple(checked) if count else checked[0]
+    return BenchProfile(**usual)
