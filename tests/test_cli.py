@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import subprocess
 import sys
@@ -115,6 +116,8 @@ def test_check_lists_all_problems(bcppl: Callable[..., Ran], tmp_path: Path) -> 
     assert ran.code == 2 and ran.out.count("wrong:") == 3
     for message in ("open mesh", "the truth", "measurement 0's wrench"):
         assert message in ran.out
+    listed = json.loads(bcppl("check", "bad.h5", "--json").out)
+    assert len(listed["problems"]) == 3 and "point finger" not in listed["description"]
     assert bcppl("check", SHIPPED).code == 0
 
 

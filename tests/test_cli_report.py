@@ -10,7 +10,9 @@ import torch
 
 from bcppl import poses
 from bcppl.beliefs import Belief
-from bcppl.cli.report import relative_to_peg, result
+from bcppl.cli.report import WIDTHS, conclusion, relative_to_peg, result
+from bcppl.geometry.holes import hole_of
+from bcppl.models import load_recording
 from tests.command_line import short
 from tests.made_recordings import assert_one_sentence
 from tests.test_contact_episodes import probed
@@ -67,3 +69,26 @@ def test_the_pose_relative_to_the_held_peg_is_that_with_its_tip_at_the_part() ->
     assert relative is not None and float(relative.spread.max()) < 1e-9
     assert relative_to_peg(belief, recording) is None
     assert relative_to_peg(replace(belief, apparent=sure), short(1)) is None, "no peg is held"
+
+
+def test_the_last_line_says_in_words_where_and_how_sure_and_what_to_do() -> None:
+    recording = load_recording("peg_probe")
+    truth = torch.as_tensor(recording.truth, dtype=torch.float64)
+    sure, unsure = around(truth, 0.0001), around(truth, 0.01)
+    hole = poses.compose(truth, torch.from_numpy(hole_of(recording.part).part_from_hole))
+    line = conclusion(sure, recording, False)
+    assert_one_sentence(line)
+    at = [float(each) for each in re.findall(r"at (-?[\d.]+) (-?[\d.]+) (-?[\d.]+) mm", line)[0]]
+    assert at == pytest.approx([1e3 * float(x) for x in hole[:3]], abs=0.05)
+    assert line.startswith("the hole is at") and line.endswith("try the insertion (bcppl insert).")
+    # Of a normal in three dimensions 90 % lie within 2.50 standard deviations.
+    assert float(re.findall(r"sure to ([\d.]+) mm", line)[0]) == pytest.approx(0.25, abs=0.025)
+    assert conclusion(unsure, recording, False).endswith("touch or look once more (bcppl probe).")
+    assert "see to the warnings" in conclusion(sure, recording, True)
+    pushes = replace(short(1), truth=None)
+    assert conclusion(around(TRUTH, 0.001), pushes, False).startswith("the part is at")
+    assert "too few to say how sure" in conclusion(around(TRUTH, 0.001, 4), pushes, False)
+
+
+def test_the_table_fits_a_hundred_columns() -> None:
+    assert sum(WIDTHS.values()) + len(WIDTHS) - 1 <= 100

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import ast
 import inspect
+import os
 import re
+import subprocess
+import sys
 import textwrap
 from importlib import import_module
 from importlib.resources import files
@@ -66,3 +69,10 @@ def test_the_example_is_the_first_block() -> None:
 def test_help_of_kernels_lists_none_of_the_language_behind_them() -> None:
     # `scattered` is for who writes a kernel: notebooks/own_kernel.ipynb.
     assert not {"takes", "refuse_other"}.intersection(import_module("bcppl.inference.kernels").__all__)
+
+
+def test_the_shell_completes_commands() -> None:
+    words = {"_BCPPL_COMPLETE": "complete_bash", "COMP_WORDS": "bcppl in", "COMP_CWORD": "1"}
+    command = Path(sys.executable).with_name("bcppl")
+    ran = subprocess.run([command], env={**os.environ, **words}, capture_output=True, text=True)
+    assert ran.stdout.split() == ["insert"], ran.stderr

@@ -19,7 +19,6 @@ from bcppl.visible_text import visible
 app = typer.Typer(
     name="bcppl",
     help="Estimate where a part is, from depth images and touches, as weighted particles.",
-    add_completion=False,
 )
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from bcppl.arguments import LARGEST_SEED
-from bcppl.cli.setting_option import Settings
+from bcppl.cli.options import AsJson, Settings
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ def insert(
     ] = None,
     particles: Annotated[int, typer.Option(min=2, help="How many particles; a belief has its own.")] = 75,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same plan.")] = 0,
+    as_json: AsJson = False,
 ) -> None:
     """Plan an insertion where the hole is believed to be, and say how probable it is to succeed."""
     from rich.console import Console
@@ -66,7 +68,8 @@ def insert(
             f"--output is {output}; give a file in a folder that exists, ending in {' or '.join(SUFFIXES)}."
         )
     box = None if workspace is None else _box(workspace)
-    console = Console(highlight=False)
+    console = Console(highlight=False, stderr=as_json)
+    found: dict[str, Any] = {"output": str(output)}
     now = posterior(
         recording, of, model, loading.settings(set_ or []), inference, particles, seed, console, _refuse
     )
@@ -87,6 +90,7 @@ def insert(
     save_actions([plan.search, plan.push], output)
     deviation = _deviation(belief, plan)
     place = 1e3 * plan.world_from_hole[:3]
+    found |= {"world_from_hole": plan.world_from_hole.tolist(), "deviation_mm": deviation}
     console.print(
         f"the hole is at {place[0]:.2f} {place[1]:.2f} {place[2]:.2f} mm, sure to {deviation[0]:.2f} mm "
         f"across and {deviation[1]:.2f} mm along its axis (standard deviations, relative to the peg)."
@@ -98,12 +102,15 @@ def insert(
             chance = success_probability(
                 belief, plan, PegPhysics(part, peg), particles=simulations, seed=seed
             )
+        found |= chance._asdict()
         console.print(
             f"of {simulations} simulated insertions {100.0 * chance.success:.0f} % end in the hole (standard "
             f"error {100.0 * chance.standard_error:.0f} %); the search finds it in "
             f"{100.0 * chance.hole_found:.0f} %."
         )
     console.print(f"the plans are in {output}: search, then push from where the search ends.", markup=False)
+    if as_json:
+        print(json.dumps(found))
 
 
 def _refuse(recording: Recording) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bcppl.arguments import LARGEST_SEED
-from bcppl.cli.setting_option import Settings
+from bcppl.cli.options import Settings
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from bcppl.arguments import LARGEST_SEED
-from bcppl.cli.setting_option import Settings
+from bcppl.cli.options import AsJson, Settings
 from bcppl.errors import InputError
 from bcppl.visible_text import visible
 
@@ -95,6 +96,7 @@ def probe(
     world_from_base: Annotated[
         str | None, typer.Option(help=f"Where the arm stands: {NUMBERS}; at the world's origin by default.")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Rank candidates for the next touch or view by their expected information gain, in nats."""
     from rich.console import Console
@@ -115,7 +117,7 @@ def probe(
     asked = options.asked_for(candidates)
     constraints = options.constraints(force, seconds, above)
     constraints += options.reach(robot, link, link_from_peg, world_from_base, seed)
-    console = Console(highlight=False)
+    console = Console(highlight=False, stderr=as_json)
     refuse = partial(options.refuse_without_peg, asked)
     given = loading.settings(set_ or [])
     now = posterior(recording, of, model, given, inference, particles, seed, console, refuse)
@@ -147,6 +149,8 @@ def probe(
     with replacing(picture) as beside:
         figure.savefig(beside, dpi=150, format="png")
     console.print(f"the best is in {output}, its picture in {picture}", soft_wrap=True, markup=False)
+    if as_json:
+        print(json.dumps({"entropy": ranking.entropy, "best": str(output), "ranking": _tree(ranking)}))
 
 
 def _picture(output: Path, given: Sequence[str]) -> Path:
@@ -163,6 +167,22 @@ def _picture(output: Path, given: Sequence[str]) -> Path:
             if file.exists() and Path(name).exists() and file.samefile(name):
                 raise InputError(f"--output would overwrite {name}, which is read; give another name.")
     return picture
+
+
+def _tree(ranking: Ranking) -> list[dict[str, Any]]:
+    from bcppl.sensors.candidates import duration_of, name_of
+
+    return [
+        {
+            "what": name_of(each.candidate),
+            "information_gain": each.information_gain,
+            "standard_error": each.standard_error,
+            "cost": each.cost,
+            "value": each.value,
+            "seconds": duration_of(each.candidate),
+        }
+        for each in ranking
+    ]
 
 
 def _table(ranking: Ranking, top: int) -> Table:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from bcppl.arguments import LARGEST_SEED
+from bcppl.cli.options import AsJson
 from bcppl.errors import InputError
 from bcppl.visible_text import visible
 
@@ -24,6 +26,7 @@ OUT = Annotated[Path, typer.Option("--out", "-o", dir_okay=False, help="The reco
 
 def check(
     recording: Annotated[str, typer.Argument(help="A recording (.h5), or the name of a shipped one.")],
+    as_json: AsJson = False,
 ) -> None:
     """Describe a recording and list its problems (exit code 2 if there are any), notes and doubts.
 
@@ -42,7 +45,7 @@ def check(
     remarks = notes(loaded)
     if Path(recording).is_file() and not is_checked(recording):
         remarks.append("the file has no checksum, so a changed number goes unnoticed: save it again for one.")
-    console = Console()
+    console = Console(stderr=as_json)
     table = Table(show_header=False, box=None, pad_edge=False)
     for what, value in describe(loaded):
         table.add_row(f"[bold]{what}[/bold]", escape(visible(value)))
@@ -55,6 +58,9 @@ def check(
     wrong = problems(loaded)
     for problem in wrong:
         console.print(f"[red]wrong:[/red] {escape(visible(problem))}", highlight=False)
+    if as_json:
+        described = {"description": dict(describe(loaded)), "notes": remarks, "doubts": doubted}
+        print(json.dumps({**described, "problems": wrong}))
     if wrong:
         raise typer.Exit(2)
     if doubted:

@@ -12,26 +12,31 @@ from rich.table import Table
 
 from bcppl import poses
 from bcppl.beliefs import Belief, average_distance, average_nearest_distance, average_point_distance
+from bcppl.beliefs.regions import rotation_angle, translation_distance
 from bcppl.cli import latent_sites
 from bcppl.cli.predictive_checks import PredictiveChecks, piece_errors
+from bcppl.errors import InputError
+from bcppl.geometry.holes import hole_of
 from bcppl.geometry.parts import with_tip_at
 from bcppl.inference.criticism import Explanation, explanations
+from bcppl.inference.planning.insertion import InsertionParameters
 from bcppl.recordings import Recording
 from bcppl.traces import Model
 from bcppl.visible_text import visible
 
 WIDTHS = {
     "measurement": 12,
-    "time s": 7,
-    "ESS": 6,
-    "distinct": 8,
-    "log Z": 9,
-    "accepted": 8,
-    "steps": 5,
-    "ADD mm": 7,
-    "truth gap": 9,
+    "time s": 6,
+    "ESS": 5,
+    "± mm": 6,
+    "± °": 5,
+    "rel. mm": 7,
+    "rel. °": 6,
+    "log Z": 8,
+    "acc.": 4,
+    "ADD mm": 6,
+    "gap": 6,
     "p value": 8,
-    "sim. s": 7,
     "wall s": 6,
 }
 LARGEST_GAP = 5.0  # nats: the truth may score better than the best particle by chance, not by more
@@ -67,26 +72,30 @@ class Report:
         if self.recording.truth is not None:
             add = 1e3 * step.belief.weighted_add(self.recording.part.surface_points(), self.recording.truth)
         simulated = info.effort["physics"].amount if "physics" in info.effort else math.nan
-        cells = [
-            info.label,
-            _number(info.time, 2),
-            _number(info.effective_sample_size, 1),
-            str(info.distinct),
-            _number(info.log_evidence, 2),
-            _number(info.acceptance, 2),
-            str(len(info.exponents) or ""),
-            _number(add, 2),
-            _number(info.truth_gap, 2),
-            self.checks.cell(step),
-            _number(simulated, 0),
-            _number(info.seconds, 2),
-        ]
-        row = dict(zip(WIDTHS, cells, strict=True))
+        relative = relative_to_peg(step.belief, self.recording, self.rows - 1)
+        cells = {
+            "measurement": info.label,
+            "time s": _number(info.time, 2),
+            "ESS": _number(info.effective_sample_size, 1),
+            **_sizes(step.belief, "±"),
+            **({} if relative is None else _sizes(relative, "rel.")),
+            "log Z": _number(info.log_evidence, 2),
+            "acc.": _number(info.acceptance, 2),
+            "ADD mm": _number(add, 2),
+            "gap": _number(info.truth_gap, 1),
+            "p value": self.checks.cell(step),
+            "wall s": _number(info.seconds, 2),
+            # These are in run.json alone.
+            "distinct": str(info.distinct),
+            "exponents": str(len(info.exponents) or ""),
+            "simulated s": _number(simulated, 0),
+        }
+        row = {name: cells.pop(name, "") for name in WIDTHS} | cells
         self._print_row(row)
         return row
 
     def _print_row(self, row: Mapping[str, str], style: str | None = None) -> None:
-        first, *others = (row[name].rjust(width) for name, width in WIDTHS.items())
+        first, *others = (row.get(name, "").rjust(width) for name, width in WIDTHS.items())
         line = " ".join([first.strip().ljust(WIDTHS["measurement"]), *others])
         self.console.print(line, style=style, soft_wrap=True, markup=False)
 
@@ -118,6 +127,7 @@ class Report:
             self._warn(warning)
         self._note(self._effort())
         self.console.print(result(last.belief, self.recording), markup=False)
+        self.console.print(conclusion(last.belief, self.recording, bool(warnings)), markup=False)
         return warnings
 
     def explain(self) -> list[Explanation]:
@@ -181,17 +191,59 @@ class Report:
         return ", ".join(spent)
 
 
-def relative_to_peg(belief: Belief, recording: Recording) -> Belief | None:
+def relative_to_peg(belief: Belief, recording: Recording, taken: int | None = None) -> Belief | None:
     """The belief as seen from the held peg, turned as it was last, with its tip at the part's frame.
 
-    None where the peg is where it is measured, or has touched nothing.
+    None where the peg is where it is measured, or has touched nothing. `taken` is how many measurements the
+    belief has assimilated; all by default.
     """
-    each = (getattr(m.observation, "world_from_peg", None) for m in recording.measurements)
+    if belief.apparent is None or recording.peg is None:
+        return None
+    each = (getattr(m.observation, "world_from_peg", None) for m in recording.measurements[:taken])
     stood = [window[-1] for window in each if window is not None and len(window)]
-    if belief.apparent is None or recording.peg is None or not stood:
+    if not stood:
         return None
     last = torch.as_tensor(stood[-1], dtype=torch.float64)
     return belief.relative(with_tip_at(recording.peg, last, belief.mean[:3]))
+
+
+def conclusion(belief: Belief, recording: Recording, doubtful: bool) -> str:
+    """Where the part is, how sure that is as seen from the held peg, and what to do next, in words."""
+    relative = relative_to_peg(belief, recording)
+    seen = belief if relative is None else relative
+    what, at = _place(belief, recording)
+    where = f"the {what} is at {' '.join(f'{1e3 * number:.2f}' for number in at.tolist())} mm"
+    radii = [
+        seen.credible_region(MASS, distance).radius for distance in (translation_distance, rotation_angle)
+    ]
+    if any(math.isinf(radius) for radius in radii):
+        return f"{where}; the particles are too few to say how sure."
+    whose = "" if relative is None else ", as seen from the held peg"
+    sure = f"sure to {1e3 * radii[0]:.2f} mm and {math.degrees(radii[1]):.2f}° at {100 * MASS:.0f} %{whose}"
+    if recording.peg is None:
+        return f"{where}, {sure}."
+    if doubtful:
+        return f"{where}, {sure}; see to the warnings before you trust it."
+    # As wide as a search may be (`InsertionParameters.maximum_radius`).
+    ready = what == "hole" and radii[0] < InsertionParameters().maximum_radius
+    advice = "try the insertion (bcppl insert)" if ready else "touch or look once more (bcppl probe)"
+    return f"{where}, {sure}; {advice}."
+
+
+def _place(belief: Belief, recording: Recording) -> tuple[str, torch.Tensor]:
+    """The hole and its position (3,), m; where there is none, or several, the part and its own."""
+    try:
+        hole = hole_of(recording.part)
+    except InputError:
+        return "part", belief.mean[:3]
+    return "hole", poses.compose(belief.mean, torch.from_numpy(hole.part_from_hole))[:3]
+
+
+def _sizes(belief: Belief, name: str) -> dict[str, str]:
+    """How far off a pose is from the mean, root mean square, as cells in mm and degrees."""
+    variance = belief.covariance.diagonal()
+    far, turned = variance[:3].sum().sqrt(), variance[3:].sum().sqrt()
+    return {f"{name} mm": _number(1e3 * float(far), 2), f"{name} °": _number(math.degrees(float(turned)), 2)}
 
 
 def result(belief: Belief, recording: Recording) -> str:

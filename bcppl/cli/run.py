@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bcppl.arguments import LARGEST_SEED
-from bcppl.cli.setting_option import Settings
+from bcppl.cli.options import AsJson, Settings
 from bcppl.errors import InputError
 from bcppl.visible_text import visible
 
@@ -53,6 +53,7 @@ def run(
             file_okay=False, help="The folder of a run that was stopped: go on with it, to the same bits."
         ),
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Estimate the part's pose: a row per measurement, the posterior, and a folder of beliefs and figures."""
     from rich.console import Console
@@ -84,7 +85,7 @@ def run(
     inference, infer = loading.inference(inference, chosen, record.get("inference", ""), by)
     scene = chosen.prepare(measured)
     chosen.observe(scene, measured.measurements)  # refuses what cannot be read before anything is written
-    console = Console(highlight=False)
+    console = Console(highlight=False, stderr=as_json)
     if particles < FEWEST:
         console.print(
             f"--particles is {particles}: so few tend to collapse on a wrong pose and be sure of it; "
@@ -142,6 +143,8 @@ def run(
             console.print(f"beliefs and figures are in {folder.path}")
     if explain:
         folder.note(explanations=[each._asdict() for each in report.explain()])
+    if as_json:
+        print(folder.text)
 
 
 def next_label(recording: Recording, count: int) -> str:

@@ -104,7 +104,12 @@ class RunFolder:
         """Add entries to run.json, or replace them."""
         self.record.update(entries)
         with replacing(self.path / RECORD) as beside:
-            beside.write_text(json.dumps(self.record, indent=1), encoding="utf-8")
+            beside.write_text(self.text, encoding="utf-8")
+
+    @property
+    def text(self) -> str:
+        """The content of run.json as text."""
+        return json.dumps(self.record, indent=1)
 
     def draw(self) -> None:
         """Draw ADD over the measurements, from the final mean where the truth is unknown, and beliefs."""

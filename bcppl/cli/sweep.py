@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from bcppl.arguments import LARGEST_SEED
-from bcppl.cli.setting_option import Settings
+from bcppl.cli.options import Settings
 from bcppl.errors import InferenceError, InputError
 from bcppl.sweeps import key_of, product, swept
 

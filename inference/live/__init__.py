@@ -1,10 +1,16 @@
 """Beliefs that follow measurements while they are made.
 
-    from bcppl.inference.live import Filter, play
+    from dataclasses import replace
 
-    with Filter(model, recording_without_measurements) as live:
-        for measurement in play(recording):  # or from a robot's callback
-            live.observe(*measurement)
+    from bcppl.inference.live import Filter, play
+    from bcppl.models import load_recording
+    from bcppl.models.point_probe import model
+
+    recording = load_recording("point_probe_10_pushes")
+    known = replace(recording, measurements=[])  # the part, and a guess of where it is
+    with Filter(model, known, particles=10) as live:
+        for measurement in play(replace(recording, measurements=recording.measurements[:1]), speed=10.0):
+            live.observe(measurement.action, measurement.observation)  # in a robot's callback
         print(live.settle().belief.mean)
 
 `Filter` assimilates measurements in a thread of its own; `Sampler` makes windows of a probe from messages of

@@ -1,4 +1,4 @@
-"""The option by which commands take settings of a model."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
@@ -13,4 +13,8 @@ Settings = Annotated[
         metavar="NAME=VALUE",
         help="A setting of the model, such as profile=panda; may be repeated. A belief has those of its run.",
     ),
+]
+
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print the result as JSON; all else goes to standard error.")
 ]

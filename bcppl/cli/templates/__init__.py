@@ -1,0 +1,1 @@
+"""Files that `bcppl new` writes, `NAME` in them replaced."""
