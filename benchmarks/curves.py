@@ -13,7 +13,9 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from scenes import Curve, Probed, followed, quantile
 
-from bcppl.figures import PARTICLE, SMALLEST_ADD, STRONG, TRUTH, add_over_time
+from bcppl.figures import add_over_time
+from bcppl.figures.over_time import SMALLEST_ADD
+from bcppl.figures.palette import PARTICLE, STRONG, TRUTH
 
 REPORTED = 0.8  # mm, the ADD that the paper reports with 75 particles after a 6 s probe
 BEFORE = 0.5  # s on the axis that the prior and each view are given before the probe begins

@@ -3,19 +3,34 @@
 from __future__ import annotations
 
 import io
+import re
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-from bcppl.drawn_in_3d import MANY_FACES
+from bcppl.beliefs import Belief
+from bcppl.cli.page import page
 from bcppl.errors import InferenceError, InputError
-from bcppl.figures import action_in_3d, add_over_time, belief_in_3d
+from bcppl.figures import (
+    action_in_3d,
+    add_over_time,
+    belief_in_3d,
+    depth_residual,
+    marginals,
+    outlines_on_depth,
+    spread_over_time,
+    touches_on_part,
+    wrench_over_time,
+)
+from bcppl.figures.space_elements import MANY_FACES
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
-from bcppl.sensors import Plan, Push, View
+from bcppl.rendering.rasterisation import renderer_for
+from bcppl.sensors import DepthImage, Measurement, Plan, Probe, ProbeWindow, Push, Touch, View
 
 HALF = np.sqrt(0.5)
 
@@ -145,3 +160,79 @@ def test_a_view_is_drawn_as_a_line_from_the_camera_to_the_mean() -> None:
     path = np.arange(2.0), np.tile(placed_camera().world_from_camera, (2, 1))
     with pytest.raises(InputError, match="a push cannot be drawn"):
         action_in_3d(box(), belief, Push(*path))
+
+
+# ---- images and touches
+
+
+def over_the_box() -> tuple[Camera, np.ndarray, np.ndarray]:
+    """A camera that looks straight down at the box, its pose, and the depth that it would measure."""
+    pose = poses(1, 0.0)[0]
+    above = np.array([0.5, 0.1, 0.52, 0.0, 1.0, 0.0, 0.0])
+    camera = Camera("c", 64, 48, 100.0, 100.0, 31.5, 23.5, above, 0.1, 2.0)
+    depth = np.full((48, 64), 0.5)
+    rendered_depth = renderer_for(box()).images(camera, pose[None])[0]
+    depth[np.isfinite(rendered_depth)] = 0.485  # the top of the box is 15 mm above its middle
+    return camera, pose, depth
+
+
+def test_the_outline_is_where_the_part_is_seen_and_the_residual_is_measured_minus_rendered() -> None:
+    camera, pose, depth = over_the_box()
+    axes = Figure().add_subplot()
+    outlines_on_depth(axes, View(camera), DepthImage(depth), box(), pose, [pose], pose)
+    drawn = [path for c in axes.collections for path in c.get_paths() if len(path.vertices)]
+    assert len(drawn) == 3
+    span = np.ptp(drawn[1].vertices, axis=0)
+    np.testing.assert_allclose(span, [100.0 * 0.10 / 0.485, 100.0 * 0.08 / 0.485], atol=1.1)
+    farther = Figure().add_subplot()
+    depth_residual(farther, View(camera), DepthImage(depth + 0.004), box(), pose)
+    off = np.ma.filled(farther.images[0].get_array(), np.nan)
+    assert np.nanmedian(off) == pytest.approx(4.0, abs=1e-3) and "median 4.0 mm" in farther.get_title()
+    behind = Camera(**{**vars(camera), "world_from_camera": np.array([0.5, 0.1, 0.52, 1.0, 0.0, 0.0, 0.0])})
+    empty = Figure().add_subplot()
+    outlines_on_depth(empty, View(behind), DepthImage(depth), box(), pose)
+    assert "nothing of the part in view" in empty.get_title()
+    rendered(farther.figure)
+
+
+def test_forces_are_tared_and_contact_is_marked_where_it_is_felt() -> None:
+    times = np.arange(100) / 100.0
+    wrench = np.tile([1.0, -2.0, 0.5, 0.0, 0.0, 0.0], (100, 1))
+    wrench[40:60, 2] += 5.0
+    pose = np.tile([0.5, 0.1, 0.05, 1.0, 0.0, 0.0, 0.0], (100, 1))
+    probe = Probe("p", times[[0, -1]], pose[:2], np.ones(6), np.ones(6), times)
+    windows = [
+        Measurement(ProbeWindow(probe, a, b), Touch(times[a:b], wrench[a:b], pose[a:b]))
+        for a, b in ((0, 50), (50, 100))
+    ]
+    axes = wrench_over_time(Figure().add_subplot(), windows)
+    along = {line.get_label(): line.get_ydata() for line in axes.get_lines()}
+    assert np.abs(along["along the peg's x"]).max() < 1e-12
+    assert along["along the peg's z"].max() == pytest.approx(5.0)
+    marked = np.concatenate([path.vertices[:, 0] for path in axes.collections[0].get_paths()])
+    assert marked.min() > 0.39 and marked.max() < 0.61
+    seen = touches_on_part(Figure(), (1, 1, 1), windows, box(), box(), poses(1, 0.0)[0])
+    (tip,) = {tuple(np.round(each, 6)) for each in np.transpose(seen.collections[-1]._offsets3d)}
+    assert tip == (0.0, 0.0, 15.0)  # 30 mm above the part's middle, less half of the peg
+    rendered(seen.figure)
+
+
+def test_marginals_are_in_millimetres_and_degrees_about_the_mean() -> None:
+    values = poses(50, 0.002)
+    figure = marginals(Belief(torch.from_numpy(values), torch.zeros(50).double()), truth=values[0])
+    rows = np.array(figure.axes).reshape(6, 6)
+    assert rows[5, 0].get_xlabel() == "x (mm)" and rows[5, 5].get_xlabel() == "about z (°)"
+    scatter = rows[1, 0].collections[0].get_offsets()
+    expected = 1e3 * (values[:, :2] - values[:, :2].mean(axis=0))
+    np.testing.assert_allclose(np.asarray(scatter), expected, atol=1e-9)
+    rendered(figure)
+
+
+def test_a_page_is_one_file_that_names_no_other_and_runs_nothing() -> None:
+    axes = spread_over_time(Figure().add_subplot(), ["prior", "push 1"], np.array([9.0, 0.5]))
+    record = {"recording": "<script>x</script>", "complete": False, "warnings": ["a & b"], "version": "1"}
+    row = {"measurement": "prior", "ESS": "75.0"}
+    text = page(record, "the hole is at 1 2 3 mm", [row], [("spread", axes.figure)])
+    assert "<script" not in text and "a &amp; b" in text and "stopped before its end" in text
+    assert "75.0" in text and not re.findall(r"(?:src|href)='(?!data:image/png)", text)
+    assert "http" not in text

@@ -54,6 +54,7 @@ class Report:
         self.steps: list[Any] = []
         self.rows = 0
         self.checks = PredictiveChecks()
+        self.conclusion = ""  # of `finish`
 
     def resume(self, step: Any, rows: Sequence[Mapping[str, str]], checks: PredictiveChecks) -> None:
         """Print the rows of a run that was stopped after a step, which it goes on from."""
@@ -127,7 +128,8 @@ class Report:
             self._warn(warning)
         self._note(self._effort())
         self.console.print(result(last.belief, self.recording), markup=False)
-        self.console.print(conclusion(last.belief, self.recording, bool(warnings)), markup=False)
+        self.conclusion = conclusion(last.belief, self.recording, bool(warnings))
+        self.console.print(self.conclusion, markup=False)
         return warnings
 
     def explain(self) -> list[Explanation]:

@@ -61,7 +61,7 @@ def run(
     from bcppl.cli import loading
     from bcppl.cli.predictive_checks import PredictiveChecks
     from bcppl.cli.report import Report
-    from bcppl.cli.run_folder import STEP, RunFolder, beside, read_record
+    from bcppl.cli.run_folder import PAGE, STEP, RunFolder, beside, read_record
     from bcppl.inference.progress import sole_bar
     from bcppl.inference.saved import load_step
     from bcppl.sensors.plausibility import doubts
@@ -140,7 +140,8 @@ def run(
                 complete=report.is_complete,
             )
             folder.draw()
-            console.print(f"beliefs and figures are in {folder.path}")
+            folder.write_page(report.conclusion, report.steps[-1])
+            console.print(f"beliefs and figures are in {folder.path}, all on one page in {PAGE}")
     if explain:
         folder.note(explanations=[each._asdict() for each in report.explain()])
     if as_json:

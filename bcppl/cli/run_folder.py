@@ -26,7 +26,7 @@ from bcppl.sensors import sensor_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-RECORD, STEP = "run.json", "step.h5"
+RECORD, STEP, PAGE = "run.json", "step.h5", "report.html"
 
 
 class RunFolder:
@@ -64,7 +64,7 @@ class RunFolder:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{path} cannot be made ({error.strerror}); give another --out.") from error
-        for old in (*path.glob("belief_*.h5"), *path.glob("*.png"), path / STEP):
+        for old in (*path.glob("belief_*.h5"), *path.glob("*.png"), path / STEP, path / PAGE):
             old.unlink(missing_ok=True)
         self.note(complete=False, rows=[], checked={})
 
@@ -137,6 +137,14 @@ class RunFolder:
             for k in dict.fromkeys([0, looked[-1] if looked else len(labels) // 2, len(labels) - 1])
         ]
         self._keep(belief_in_3d(recording.part, shown, recording.truth), "belief_in_3d.png")
+
+    def write_page(self, conclusion: str, last: Any) -> None:
+        """Write report.html, given the result in words and the last step."""
+        from bcppl.cli.page import figures, page
+
+        with replacing(self.path / PAGE) as beside:
+            drawn = list(figures(self.recording, self.history, last))
+            beside.write_text(page(self.record, conclusion, self.rows, drawn), encoding="utf-8")
 
     def _keep(self, figure: Figure, name: str) -> None:
         with replacing(self.path / name) as beside:

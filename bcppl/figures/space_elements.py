@@ -15,12 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from bcppl.arrays import Array
 from bcppl.beliefs import Belief
+from bcppl.figures.palette import BODY
 from bcppl.geometry.parts import Part
-
-# Of Okabe and Ito's palette, whose colours differ for every kind of colour vision.
-STRONG = "#D55E00"
-PARTICLE = "#7F7F7F"
-BODY = "#9DB4C8"
 
 MANY_FACES = 4000  # more than this are drawn from vertices merged on a grid
 FEATURE_ANGLE = np.radians(25.0)

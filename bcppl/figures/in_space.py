@@ -1,26 +1,18 @@
-"""Pictures of a belief: its error over time, its particles around the part, and the next measurement.
-
-Every function returns a matplotlib `Figure` of its own, made without pyplot: nothing is shown or kept in a
-global state, and `figure.savefig("name.png")` works without a display.
-"""
+"""A belief in space: its particles around the part, and the next measurement."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.collections import LineCollection
-from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from bcppl.arrays import Array
-from bcppl.drawn_in_3d import (
-    BODY,
-    PARTICLE,
-    STRONG,
+from bcppl.errors import InputError
+from bcppl.figures.palette import BODY, PARTICLE, STRONG, TRUTH
+from bcppl.figures.space_elements import (
     arrows,
     frame,
     in_words,
@@ -29,94 +21,11 @@ from bcppl.drawn_in_3d import (
     panel,
     weighted,
 )
-from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 from bcppl.sensors.candidates import Candidate
 from bcppl.sensors.protocol import FAINT, Drawable, sensor_of
 
-# Of Okabe and Ito's palette, whose colours differ for every kind of colour vision.
-TRUTH = "#00A6D6"
-
 HEAVIEST = 10
-SMALLEST_ADD = 0.01  # mm: below it a logarithmic axis shows nothing of interest
-
-
-def add_over_time(
-    times: Array, adds: Array, weights: Array, labels: Sequence[str], contact_start: int | None = None
-) -> Figure:
-    """ADD of every particle, and their weighted mean, after each measurement.
-
-    A line joins the particles that stand at the same place in the population; its opacity follows the weight.
-
-    Args:
-        times: (K,) where each measurement stands on the horizontal axis: seconds, or its number.
-        adds: (K, N) ADD of each particle in metres.
-        weights: (K, N) weights, in any scale, that are not negative.
-        labels: K names of the measurements, written at the ticks.
-        contact_start: index of the first measurement by touch; None where there is none.
-
-    Raises:
-        InputError: a measurement's weights are negative, not finite, or all zero.
-    """
-    times, adds, weights = (np.asarray(values, dtype=np.float64) for values in (times, adds, weights))
-    total = weights.sum(axis=1)
-    if not np.isfinite(total).all() or (weights < 0).any() or (total <= 0).any():
-        raise InputError(
-            "ADD over time got weights that are negative, not finite or all zero; "
-            "give each measurement's weights, not their logarithms."
-        )
-    weights = weights / total[:, None]
-    millimetres = np.maximum(1000.0 * adds, SMALLEST_ADD)
-    mean = np.maximum(1000.0 * (weights * adds).sum(axis=1), SMALLEST_ADD)
-
-    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
-    axes = figure.add_subplot()
-    grey = np.zeros((*weights.shape, 4))
-    grey[..., :3] = to_rgba(PARTICLE)[:3]
-    grey[..., 3] = np.clip(weights / weights.max(axis=1, keepdims=True), 0.06, 0.75)
-    lines = np.stack(np.broadcast_arrays(times[:, None], millimetres), axis=-1)
-    segments = np.stack([lines[:-1], lines[1:]], axis=2).reshape(-1, 2, 2)
-    axes.add_collection(LineCollection(list(segments), colors=grey[1:].reshape(-1, 4), linewidths=0.8))
-    axes.scatter(lines[..., 0].ravel(), lines[..., 1].ravel(), s=9, c=grey.reshape(-1, 4), linewidths=0)
-    axes.plot(times, mean, color=STRONG, linewidth=2.5, marker="o", markersize=5, zorder=3)
-    axes.annotate(
-        f"{mean[-1]:.2g} mm",
-        (times[-1], mean[-1]),
-        xytext=(8, 0),
-        textcoords="offset points",
-        va="center",
-        color=STRONG,
-        fontweight="bold",
-    )
-
-    axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.grid(axis="y", color="0.9")
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_ylabel("ADD (mm)")
-    axes.set_xlabel("after measurement")
-    crowded = sum(len(label) for label in labels) > 70
-    axes.set_xticks(times, labels, rotation=45 if crowded else 0, ha="right" if crowded else "center")
-    margin = 0.06 * max(float(np.ptp(times)), 1e-9) if len(times) > 1 else 1.0
-    axes.set_xlim(times.min() - 0.5 * margin, times.max() + 1.7 * margin)
-    if contact_start is not None:
-        first = times[contact_start]
-        edge = 0.5 * (first + times[contact_start - 1]) if contact_start > 0 else first - 0.25 * margin
-        axes.axvspan(edge, times.max() + 1.7 * margin, color="#0072B2", alpha=0.06, linewidth=0)
-        axes.text(edge, 1.01, " probing", transform=axes.get_xaxis_transform(), color="#0072B2")
-    particle = Line2D([], [], color=PARTICLE, linewidth=1.0, marker="o", markersize=3)
-    average = Line2D([], [], color=STRONG, linewidth=2.5, marker="o", markersize=5)
-    figure.legend(
-        [particle, average],
-        [f"{adds.shape[1]} particles, darker is heavier", "weighted mean"],
-        loc="outside upper right",
-        ncols=2,
-        frameon=False,
-    )
-    return figure
 
 
 def belief_in_3d(

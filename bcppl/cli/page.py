@@ -1,0 +1,157 @@
+"""The page of a run: one file of HTML with the table, the result in words, the warnings and figures."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bcppl.beliefs import Belief
+from bcppl.cli.report import WIDTHS, relative_to_peg
+from bcppl.inference.criticism.nuisances import shared_errors
+from bcppl.inference.population import Population
+from bcppl.recordings import Recording
+from bcppl.sensors import ProbeWindow, View
+from bcppl.sensors.scene import Numbered, by_probe
+from bcppl.visible_text import visible
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RESOLUTION = 90  # dots per inch
+FEW = 8  # particles whose outlines are drawn
+MOST_VIEWS, MOST_PROBES = 4, 3
+STYLE = """
+body { font: 15px/1.45 sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
+table { border-collapse: collapse; font: 13px/1.5 monospace } td, th { padding: 0 .55rem; text-align: right }
+td:first-child, th:first-child { text-align: left } tr:nth-child(odd) td { background: #f4f4f4 }
+img { max-width: 100% } figcaption { color: #555; font-size: 14px } figure { margin: 1.5rem 0 }
+.warning { color: #a04000 } .result { font-size: 17px; font-weight: bold }
+"""
+
+Captioned = tuple[str, "Figure"]
+
+
+def page(
+    record: Mapping[str, Any],
+    conclusion: str,
+    rows: Sequence[Mapping[str, str]],
+    pictures: Sequence[Captioned],
+) -> str:
+    """The page's text; nothing in it refers to another file or host.
+
+    Args:
+        record: the content of run.json.
+        conclusion: the result in words.
+        rows: of the table.
+        pictures: each with its caption.
+    """
+
+    def safe(value: object) -> str:
+        return html.escape(visible(str(value)))
+
+    shown = {name: record.get(name) for name in ("recording", "model", "inference", "particles", "seed")}
+    settings = ", ".join(f"{name} {safe(value)}" for name, value in shown.items())
+    state = "" if record.get("complete") else "<p class='warning'>The run was stopped before its end.</p>"
+    worries = [*record.get("doubts", []), *record.get("warnings", [])]
+    warned = "".join(f"<p class='warning'>{safe(each)}</p>" for each in worries)
+    header = "".join(f"<th>{safe(name)}</th>" for name in WIDTHS)
+    lines = "".join(
+        f"<tr>{''.join(f'<td>{safe(row.get(name, str()))}</td>' for name in WIDTHS)}</tr>" for row in rows
+    )
+    drawn = "".join(
+        f"<figure><img alt='{safe(caption)}' src='data:image/png;base64,{_encoded(figure)}'>"
+        f"<figcaption>{safe(caption)}</figcaption></figure>"
+        for caption, figure in pictures
+    )
+    return (
+        f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>bcppl: {safe(shown['recording'])}"
+        f"</title><style>{STYLE}</style></head><body><h1>{safe(shown['recording'])}</h1><p>{settings}, "
+        f"bcppl {safe(record.get('version'))}</p>{state}<p class='result'>{safe(conclusion)}</p>{warned}"
+        f"<table><thead><tr>{header}</tr></thead><tbody>{lines}</tbody></table>{drawn}</body></html>\n"
+    )
+
+
+def figures(recording: Recording, history: Sequence[tuple[str, Belief]], last: Any) -> Iterator[Captioned]:
+    """What there is to be seen of a run.
+
+    Args:
+        recording: that was run.
+        history: by step its label and belief.
+        last: the last step.
+    """
+    from matplotlib.figure import Figure
+
+    from bcppl.figures import marginals, shared_error_bars, spread_over_time
+
+    labels, belief = [label for label, _ in history], history[-1][1]
+    taken = recording.measurements[: len(history) - 1]
+    relative = [relative_to_peg(each, recording, k) for k, (_, each) in enumerate(history)]
+    spreads = [_spread(each) for _, each in history]
+    as_seen = np.array([np.nan if each is None else _spread(each) for each in relative])
+    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
+    spread_over_time(figure.add_subplot(), labels, np.array(spreads), as_seen)
+    yield "How far the particles are from their mean after each measurement.", figure
+    yield from _images(recording, taken, belief)
+    yield from _touches(recording, taken, belief)
+    yield "The pose axis by axis, from its mean.", marginals(belief, recording.truth, relative[-1])
+    population = getattr(last, "population", None)
+    errors = shared_errors(population) if isinstance(population, Population) else []
+    if errors:
+        count = sum(len(error.mean) for error in errors)
+        figure = Figure(figsize=(7.0, 0.8 + 0.2 * count), layout="constrained")
+        shared_error_bars(figure.add_subplot(), errors)
+        yield "What the touches tell of the errors that they share.", figure
+
+
+def _images(recording: Recording, taken: Sequence[Any], belief: Belief) -> Iterator[Captioned]:
+    from matplotlib.figure import Figure
+
+    from bcppl.figures import depth_residual, outlines_on_depth
+    from bcppl.rendering.rasterisation import renderer_for
+
+    views = [each for each in taken if isinstance(each.action, View)][:MOST_VIEWS]
+    renderer = renderer_for(recording.part)
+    heaviest = belief.world_from_part[belief.log_weights.argsort(descending=True)[:FEW]].numpy()
+    for each in views:
+        figure = Figure(figsize=(10.0, 3.6), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        mean = belief.mean.numpy()
+        outlines_on_depth(left, each.action, each.observation, renderer, mean, heaviest, recording.truth)
+        depth_residual(right, each.action, each.observation, renderer, mean)
+        yield (
+            "Measured depth with the part's outline at the mean (orange), at particles (grey) and at the "
+            "truth (light blue, where known); measured minus rendered depth.",
+            figure,
+        )
+
+
+def _touches(recording: Recording, taken: Sequence[Any], belief: Belief) -> Iterator[Captioned]:
+    from matplotlib.figure import Figure
+
+    from bcppl.figures import touches_on_part, wrench_over_time
+
+    windows = [Numbered(k, each) for k, each in enumerate(taken) if isinstance(each.action, ProbeWindow)]
+    for probe in by_probe(windows)[:MOST_PROBES]:
+        figure = Figure(figsize=(10.0, 3.8), layout="constrained")
+        measured = [each.measurement for each in probe]
+        wrench_over_time(figure.add_subplot(1, 2, 1), measured)
+        if recording.peg is not None:
+            mean = belief.mean.numpy()
+            touches_on_part(figure, (1, 2, 2), measured, recording.part, recording.peg, mean)
+        name = measured[0].action.probe.name
+        yield f"Probe {name}: the force, and where the peg was, as seen from the part.", figure
+
+
+def _spread(belief: Belief) -> float:
+    return 1e3 * float(belief.spread[:3].square().sum().sqrt())
+
+
+def _encoded(figure: Figure) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=RESOLUTION, format="png")
+    return base64.b64encode(buffer.getvalue()).decode("ascii")
