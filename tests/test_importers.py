@@ -242,7 +242,7 @@ def test_an_unknown_object_lists_those_present() -> None:
     with pytest.raises(InputError, match=r"no object 7; give --object one of 1, 5, 8, 10\.$"):
         bop.command(SCENE, 7)
     with pytest.raises(InputError, match=r"no frame 4; give --frame one of 3\.$"):
-        bop.command(SCENE, 5, frame=4)
+        bop.command(SCENE, 5, frame=[4])
 
 
 def test_a_folder_that_is_no_scene_is_refused(tmp_path: Path) -> None:
