@@ -33,7 +33,7 @@ def logs() -> list[Path]:
 
 
 def test_importers_are_found_by_name() -> None:
-    assert list(importers()) == ["bag", "bench", "bop", "point-probe"]
+    assert list(importers()) == ["bag", "bench", "bop", "fmb", "point-probe", "reassemble"]
     assert all(module.HELP and callable(module.command) for module in importers().values())
 
 
