@@ -33,7 +33,7 @@ def logs() -> list[Path]:
 
 
 def test_importers_are_found_by_name() -> None:
-    assert list(importers()) == ["bag", "bench", "bop", "point-probe"]
+    assert list(importers()) == ["bag", "bench", "bop", "fmb", "point-probe", "reassemble"]
     assert all(module.HELP and callable(module.command) for module in importers().values())
 
 
@@ -242,7 +242,7 @@ def test_an_unknown_object_lists_those_present() -> None:
     with pytest.raises(InputError, match=r"no object 7; give --object one of 1, 5, 8, 10\.$"):
         bop.command(SCENE, 7)
     with pytest.raises(InputError, match=r"no frame 4; give --frame one of 3\.$"):
-        bop.command(SCENE, 5, frame=4)
+        bop.command(SCENE, 5, frame=[4])
 
 
 def test_a_folder_that_is_no_scene_is_refused(tmp_path: Path) -> None:

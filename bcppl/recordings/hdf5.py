@@ -12,7 +12,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -28,7 +28,7 @@ LENGTH = len(MARK) + 65
 WAIT = 10.0  # s on the clock for each second of a core: a machine may be busy
 AGAIN = "copy or make it again"
 
-_read_before: set[str] = set()  # checksums of files that were read from end to end
+_read_before: set[tuple[str, ...]] = set()  # checksums of files that were read, and what of them
 
 
 @contextmanager
@@ -90,12 +90,16 @@ def _bounded(file: h5py.File) -> None:
 
 
 @contextmanager
-def opened(path: str | os.PathLike[str], remedy: str = AGAIN) -> Iterator[h5py.File]:
+def opened(
+    path: str | os.PathLike[str], remedy: str = AGAIN, within: Sequence[str] = ()
+) -> Iterator[h5py.File]:
     """An HDF5 file for reading. What goes wrong with it is one sentence that names the file.
 
     Args:
         path: of a file.
         remedy: what to do where it is damaged.
+        within: paths of the groups and datasets that the body reads, in a file of another program; what is
+            beside them, such as videos, is not looked at. All if there are none.
 
     Raises:
         InputError: it is no HDF5 file, is damaged, cut off, or was changed after it was saved, holds links
@@ -104,11 +108,11 @@ def opened(path: str | os.PathLike[str], remedy: str = AGAIN) -> Iterator[h5py.F
     path = Path(path)
     try:
         checksum, sealed = _checksum(path)
-        if not sealed and checksum not in _read_before:
-            _read_elsewhere(path)
-            _read_before.add(checksum)
+        if not sealed and (checksum, *within) not in _read_before:
+            _read_elsewhere(path, within)
+            _read_before.add((checksum, *within))
         with h5py.File(path, "r") as file:
-            structure.check(file, path.stat().st_size)
+            structure.check(file, path.stat().st_size, within=within)
             yield file
         if sealed is False:
             raise OSError("its bytes are not those that were saved")
@@ -147,13 +151,13 @@ def _checksum(path: Path) -> tuple[str, bool | None]:
     return checksum, False if MARK in end else None
 
 
-def _read_elsewhere(path: Path) -> None:
+def _read_elsewhere(path: Path, within: Sequence[str]) -> None:
     """Read a file in a process of its own.
 
     Raises:
         OSError: that was refused, took too much memory or time, or the process crashed.
     """
-    command = [sys.executable, "-P", structure.__file__, os.fspath(path.absolute())]
+    command = [sys.executable, "-P", structure.__file__, os.fspath(path.absolute()), *within]
     known = os.pathsep.join(each for each in sys.path if each)
     environment = {**os.environ, "PYTHONPATH": known, "HDF5_PLUGIN_PRELOAD": "::"}
     patience = WAIT * structure.seconds(path.stat().st_size)

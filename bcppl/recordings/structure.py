@@ -1,6 +1,6 @@
 """What an HDF5 file may hold: numbers and text that lie in it, no more of them than its size explains.
 
-    python structure.py FILE  # reads a file from end to end; exits with 3, and why, where it is refused
+    python structure.py FILE [NAME ...]  # reads a file, or what is named; exits with 3, and why, if refused
 
 Damage can crash the HDF5 library, hang it, or make it ask for terabytes. So a file without a checksum is
 first read by a process of its own, with limits; see `bcppl.recordings.hdf5`, which runs this file as a
@@ -13,6 +13,7 @@ import contextlib
 import math
 import os
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import h5py
@@ -35,13 +36,15 @@ def limit(size: int) -> int:
     return ALLOWANCE + RATIO * size
 
 
-def check(file: h5py.File, size: int, read: bool = False) -> None:
+def check(file: h5py.File, size: int, read: bool = False, within: Sequence[str] = ()) -> None:
     """Refuse links that leave the tree of groups, storage elsewhere, filters of plugins, and bombs.
 
     Args:
         file: open for reading.
         size: of the file in bytes.
         read: whether the numbers are read too, piece by piece.
+        within: paths of the groups and datasets that are looked at in a file of another program, which may
+            hold anything beside them; all if there are none.
 
     Raises:
         StructureError: says which group or dataset.
@@ -52,6 +55,8 @@ def check(file: h5py.File, size: int, read: bool = False) -> None:
         left -= _attributes(group, above or "/", read)
         for key in group:
             where = f"{above}/{key.decode(errors='replace')}"
+            if within and not any(_leads(where, each) for each in within):
+                continue
             if group.links.get_info(key).type != h5py.h5l.TYPE_HARD:
                 raise StructureError(f"{where} is a link to another place; a recording holds none")
             node = h5py.h5o.open(group, key)
@@ -69,6 +74,12 @@ def check(file: h5py.File, size: int, read: bool = False) -> None:
                     h5py.Dataset(node)[()]
             else:
                 raise StructureError(f"{where} is no group and no dataset")
+
+
+def _leads(where: str, path: str) -> bool:
+    """Whether a place is on the way to a path, or in it."""
+    here, there = f"{where}/", f"/{path}/"
+    return here.startswith(there) or there.startswith(here)
 
 
 def _address(node: Any) -> tuple[int, int]:
@@ -126,13 +137,13 @@ def seconds(size: int) -> float:
     return SECONDS + size / BYTES_A_SECOND
 
 
-def main(path: str) -> int:
-    """Read a file; 0, or 3 with one line on standard output where it is refused."""
+def main(path: str, *within: str) -> int:
+    """Read a file, or what is named in it; 0, or 3 with one line on standard output where it is refused."""
     size = os.path.getsize(path)
     _limited(size)
     try:
         with h5py.File(path, "r") as file:
-            check(file, size, read=True)
+            check(file, size, read=True, within=within)
     except Exception as error:  # h5py has errors of all types
         print(" ".join(str(error).split()) or type(error).__name__)
         return REFUSED
@@ -140,4 +151,4 @@ def main(path: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+    sys.exit(main(*sys.argv[1:]))

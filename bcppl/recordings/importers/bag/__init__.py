@@ -40,11 +40,12 @@ def command(
     """
     from bcppl.recordings.importers.bag import draft
     from bcppl.recordings.importers.bag.bag_log import BagLog
+    from bcppl.recordings.importers.bench.configuration.drafts import refuse_both
     from bcppl.recordings.importers.bench.log import imported
 
     if configuration is None:
         draft.show(Path(bag), write)
         raise typer.Exit
-    draft.refuse_both(write)
+    refuse_both(write, "bag")
     path = Path(configuration)
     return imported(path, lambda fields: BagLog(Path(bag), fields, path.parent))

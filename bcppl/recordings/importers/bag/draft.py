@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 
 import yaml
@@ -14,9 +13,9 @@ from bcppl.errors import InputError
 from bcppl.recordings.importers.bag import reading
 from bcppl.recordings.importers.bag.images import encoded
 from bcppl.recordings.importers.bag.reading import Bag, Topic
+from bcppl.recordings.importers.bench.configuration.drafts import GUESS, drafted, offer, refuse_place
 from bcppl.visible_text import visible
 
-GUESS = "# a guess"
 _LOOKED_AT = 200  # messages of a topic that a guess is made from
 
 
@@ -26,10 +25,7 @@ def show(path: Path, write: Path | None) -> None:
     Raises:
         InputError: the bag is damaged, or the file exists.
     """
-    if write is not None and write.exists():
-        raise InputError(f"{write} exists already; give another name, or remove it first.")
-    if write is not None and not write.parent.is_dir():
-        raise InputError(f"there is no folder {write.parent} to write {write.name} into; make it first.")
+    refuse_place(write)
     console = Console()
     with Bag(path) as bag:
         table = Table("topic", "type", "messages", "mean rate", box=None, pad_edge=False)
@@ -44,32 +40,13 @@ def show(path: Path, write: Path | None) -> None:
             raise InputError(f"{path} has no topic; give a bag in which something was recorded.")
     console.print(visible(span), markup=False, highlight=False, soft_wrap=True)
     console.print(table)
-    if write is None:
-        console.print(f"\nA configuration; lines with {GUESS!r} are to be checked:\n", markup=False)
-        console.print(text, highlight=False, markup=False, soft_wrap=True)
-        return
-    write.write_text(text, encoding="utf-8")
-    print(f"wrote {write}: edit it, then bcppl import bag {path} {write} -o recording.h5")
-
-
-def refuse_both(write: Path | None) -> None:
-    """Refuse a configuration to write beside one to read."""
-    if write is not None:
-        raise InputError("--write is for a bag without a configuration; leave out one of the two.")
+    offer(console, text, write, f"bcppl import bag {path} {write}")
 
 
 def configuration(bag: Bag) -> str:
     """The configuration of a bag in YAML: of `bcppl new bench`, with topics for files."""
-    template = files("bcppl.recordings.importers.bench").joinpath("template.yaml").read_text(encoding="utf-8")
-    before, rest = template.split("wrench:\n", 1)
-    frames = rest[rest.index("frame_from_peg:") : rest.index("cameras:\n")]
-    after = rest[rest.index("# What follows") :]
-    first = "# A robot bench's log, for: bcppl import bench bench.yaml -o recording.h5\n"
-    head = before.replace(first, f"# For: bcppl import bag {_plain(bag.path.name)} CONFIG -o recording.h5\n")
-    head = head.replace(
-        "\npart:", f"\n# Lines with {GUESS[2:]!r} come from the bag; all others are examples.\npart:"
-    )
-    return "".join([head, _wrench(bag), _motion(bag), frames, _cameras(bag), after])
+    command = f"bcppl import bag {_plain(bag.path.name)} CONFIG"
+    return drafted(command, "the bag", _wrench(bag) + _motion(bag), _cameras(bag))
 
 
 def _wrench(bag: Bag) -> str:

@@ -3,9 +3,9 @@
     bcppl new bench bench.yaml      # a configuration with comments, to be edited
     bcppl import bench bench.yaml -o recording.h5
 
-One file for each step: `config` (the fields) and `configuration` (their file), `table` (columns of files),
-`streams` and `pose_columns` (rows in SI units), `clocks`, `resampling`, `wrenches`, `gravity`, `cutting`,
-`views`, `bodies`, and `log`, which takes them in turn.
+One file for each step: `configuration` (the fields and their file), `sources` (files, or what stands for
+them: `arrays` of data sets, or a bag), `table` (columns of files), `in_order` and `pose_columns` (rows in
+SI units), `clocks`, `wrenches`, `gravity`, `cutting`, `views`, `bodies`, and `log`, which takes them in turn.
 """
 
 from pathlib import Path

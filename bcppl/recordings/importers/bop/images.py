@@ -1,0 +1,62 @@
+"""Images of a BOP scene: depth as PNG or TIFF of 16 bits, colour as PNG or JPEG."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from bcppl.arrays import Array
+from bcppl.errors import InputError
+
+DEPTHS: dict[str, tuple[str, ...]] = {".png": ("I;16", "I"), ".tif": ("I;16",), ".tiff": ("I;16",)}  # modes
+COLOURS: dict[str, tuple[str, ...]] = {".png": ("RGB",), ".jpg": ("RGB",)}
+MOST_PIXELS = 8 << 20  # beyond one for each byte of the file: an image of depth takes 64 MB
+_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF"}
+
+
+def depth_in_metres(path: Path, scale: float) -> Array:
+    """The depth (H, W), metres, NaN where it is missing; rounded to float32, as recordings keep it.
+
+    Args:
+        path: of the image.
+        scale: millimetres per count.
+
+    Raises:
+        InputError: as `pixels`.
+    """
+    counts = pixels(path, DEPTHS[path.suffix]).astype(np.float64)
+    metres = 1e-3 * scale * counts
+    metres[counts == 0] = np.nan
+    return metres.astype(np.float32).astype(np.float64)
+
+
+def pixels(path: Path, modes: Sequence[str]) -> npt.NDArray[Any]:
+    """The pixels of an image; the checksums of a PNG are compared.
+
+    Raises:
+        InputError: it is missing, has none of the modes, is damaged, or too large for the bytes it has.
+    """
+    try:
+        with _opened(path) as image:
+            image.verify()  # reads all chunks, and none of the pixels
+        with _opened(path) as image:
+            if image.mode not in modes:
+                raise ValueError(f"its mode is {image.mode}, not {' or '.join(modes)}")
+            return np.asarray(image)
+    except Exception as error:  # Pillow raises SyntaxError, struct.error, zlib.error and others
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        what = f"{path} is missing or is no image that can be read ({reason})"
+        raise InputError(f"{what}; give the folder of a BOP scene.") from error
+
+
+def _opened(path: Path) -> Image.Image:
+    """An image file whose header alone is read: formats that Pillow gives to other programs are none."""
+    image = Image.open(path, formats=[_FORMATS[path.suffix]])
+    if image.width * image.height > MOST_PIXELS + path.stat().st_size:
+        raise ValueError(f"it claims {image.width} x {image.height} pixels in {path.stat().st_size} bytes")
+    return image
