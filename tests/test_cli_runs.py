@@ -41,6 +41,7 @@ def test_a_users_own_files_are_taken_as_readily_as_names(bcppl: Callable[..., Ra
         "add_over_time.png",
         *(f"belief_{k:03d}.h5" for k in range(4)),
         "belief_in_3d.png",
+        "report.html",
         "run.json",
         "step.h5",
     ]
@@ -87,6 +88,7 @@ def test_what_was_computed_before_a_stop_is_kept(
         "add_over_time.png",
         *(f"belief_{k:03d}.h5" for k in range(3)),
         "belief_in_3d.png",
+        "report.html",
         "run.json",
         "step.h5",
     ]
