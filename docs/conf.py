@@ -108,6 +108,18 @@ def _skipped(app: Any, what: str, name: str, documented: Any, skip: bool, option
     return True if (getattr(documented, "__doc__", None) or "").startswith("Alias for field") else None
 
 
+ALIAS = re.compile(r"TypeAliasForwardRef\('([\w.]+)'\)")
+
+
+def _named(
+    app: Any, what: str, name: str, documented: Any, options: Any, signature: str | None, returns: str
+) -> tuple[str, str] | None:
+    """Signatures with the names of types that have one, which autodoc does not write in a union."""
+    if signature is None or not ALIAS.search(signature + (returns or "")):
+        return None
+    return ALIAS.sub(r"\1", signature), ALIAS.sub(r"\1", returns or "")
+
+
 def _math(self: Any, node: nodes.Element) -> None:
     """An equation as MathML, which browsers show without a script."""
     block = isinstance(node, nodes.math_block)
@@ -127,5 +139,6 @@ def setup(app: Any) -> dict[str, bool]:
     app.connect("source-read", _with_links)
     app.connect("autodoc-process-docstring", _reread, priority=100)
     app.connect("autodoc-process-docstring", _with_colons, priority=900)
+    app.connect("autodoc-process-signature", _named)
     app.connect("autodoc-skip-member", _skipped)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
