@@ -2,6 +2,7 @@
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+DOCS := $(VENV)/.installed-docs
 RECORDINGS := peg_probe point_probe_10_pushes
 # Packages that the benchmarks measure beside bcppl; each gets an environment of its own.
 PEERS := particles blackjax open3d chsel
@@ -9,13 +10,14 @@ PEERS := particles blackjax open3d chsel
 JOBS ?= 2
 PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: run test tests lint long peers check-links clean help
+.PHONY: run test tests lint long docs peers check-links clean help
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make run          estimate the part's pose in the shipped recordings; beliefs and figures go to runs/"
 	@echo "make test         style, types and tests"
 	@echo "make long         the tests that take minutes"
+	@echo "make docs         the documentation as a site, in build/docs: open build/docs/index.html"
 	@echo "make peers        environments of the packages that the benchmarks compare with, in benchmarks/.peers"
 	@echo "make check-links  are bcppl/models and bcppl/inference symbolic links?"
 	@echo "make clean        remove what was built, the virtual environment too"
@@ -38,6 +40,15 @@ lint: $(STAMP)
 
 long: $(STAMP)
 	$(PYTEST) -m long
+
+# Warnings are errors. Pages that have not changed are not made again.
+docs: $(DOCS)
+	$(BIN)/python -m sphinx -W --keep-going -q -b html -d build/doctrees docs build/docs
+	$(BIN)/python docs/check_site.py build/docs
+
+$(DOCS): $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable ".[docs]"
+	@touch $@
 
 peers: $(PEERS:%=benchmarks/.peers/%/.installed)
 
@@ -76,5 +87,5 @@ check-links:
 	done
 
 clean:
-	rm -rf $(VENV) benchmarks/.peers build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) benchmarks/.peers build docs/generated dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find bcppl models inference tests notebooks benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
