@@ -232,7 +232,7 @@ def test_a_calibrated_arm_and_its_profile_are_written(bcppl: Callable[..., Ran],
 
 def test_corrected_joints_lead_to_the_same_places_as_offsets_and_errors(tmp_path: Path) -> None:
     """At any values the corrected file's arm, without offsets, is the nominal one's with them."""
-    file = Path(str(files("bcppl.models.robots") / "panda.urdf"))
+    file = Path(str(files("bcppl.models.robots") / "panda/panda.urdf"))
     robot = Robot(file, tip="panda_hand")
     arm = Arm(robot, "panda_hand")
     torch.manual_seed(4)

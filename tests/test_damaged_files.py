@@ -99,7 +99,9 @@ def test_a_file_without_a_checksum_is_read_elsewhere_first(
     """As are those of earlier versions, once for each content in a process."""
     read: list[Path] = []
     elsewhere = hdf5._read_elsewhere
-    monkeypatch.setattr(hdf5, "_read_elsewhere", lambda path: (read.append(path), elsewhere(path)))
+    monkeypatch.setattr(
+        hdf5, "_read_elsewhere", lambda path, *more: (read.append(path), elsewhere(path, *more))
+    )
     monkeypatch.setattr(hdf5, "_read_before", set())
     save(full(), tmp_path / "sealed.h5")
     load(tmp_path / "sealed.h5")

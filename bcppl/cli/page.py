@@ -15,16 +15,13 @@ from bcppl.cli.report import WIDTHS, relative_to_peg
 from bcppl.inference.criticism.nuisances import shared_errors
 from bcppl.inference.population import Population
 from bcppl.recordings import Recording
-from bcppl.sensors import ProbeWindow, View
-from bcppl.sensors.scene import Numbered, by_probe
+from bcppl.sensors.protocol import by_sensor
 from bcppl.visible_text import visible
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RESOLUTION = 90  # dots per inch
-FEW = 8  # particles whose outlines are drawn
-MOST_VIEWS, MOST_PROBES = 4, 3
 STYLE = """
 body { font: 15px/1.45 sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
 table { border-collapse: collapse; font: 13px/1.5 monospace } td, th { padding: 0 .55rem; text-align: right }
@@ -86,7 +83,7 @@ def figures(recording: Recording, history: Sequence[tuple[str, Belief]], last: A
     """
     from matplotlib.figure import Figure
 
-    from bcppl.figures import marginals, shared_error_bars, spread_over_time
+    from bcppl.figures import marginals, pictures, shared_error_bars, spread_over_time
 
     labels, belief = [label for label, _ in history], history[-1][1]
     taken = recording.measurements[: len(history) - 1]
@@ -96,8 +93,8 @@ def figures(recording: Recording, history: Sequence[tuple[str, Belief]], last: A
     figure = Figure(figsize=(8.0, 3.2), layout="constrained")
     spread_over_time(figure.add_subplot(), labels, np.array(spreads), as_seen)
     yield "How far the particles are from their mean after each measurement.", figure
-    yield from _images(recording, taken, belief)
-    yield from _touches(recording, taken, belief)
+    for _, measurements in by_sensor(taken):
+        yield from pictures(measurements[0][1].action, [each for _, each in measurements], recording, belief)
     yield "The pose axis by axis, from its mean.", marginals(belief, recording.truth, relative[-1])
     population = getattr(last, "population", None)
     errors = shared_errors(population) if isinstance(population, Population) else []
@@ -106,45 +103,6 @@ def figures(recording: Recording, history: Sequence[tuple[str, Belief]], last: A
         figure = Figure(figsize=(7.0, 0.8 + 0.2 * count), layout="constrained")
         shared_error_bars(figure.add_subplot(), errors)
         yield "What the touches tell of the errors that they share.", figure
-
-
-def _images(recording: Recording, taken: Sequence[Any], belief: Belief) -> Iterator[Captioned]:
-    from matplotlib.figure import Figure
-
-    from bcppl.figures import depth_residual, outlines_on_depth
-    from bcppl.rendering.rasterisation import renderer_for
-
-    views = [each for each in taken if isinstance(each.action, View)][:MOST_VIEWS]
-    renderer = renderer_for(recording.part)
-    heaviest = belief.world_from_part[belief.log_weights.argsort(descending=True)[:FEW]].numpy()
-    for each in views:
-        figure = Figure(figsize=(10.0, 3.6), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        mean = belief.mean.numpy()
-        outlines_on_depth(left, each.action, each.observation, renderer, mean, heaviest, recording.truth)
-        depth_residual(right, each.action, each.observation, renderer, mean)
-        yield (
-            "Measured depth with the part's outline at the mean (orange), at particles (grey) and at the "
-            "truth (light blue, where known); measured minus rendered depth.",
-            figure,
-        )
-
-
-def _touches(recording: Recording, taken: Sequence[Any], belief: Belief) -> Iterator[Captioned]:
-    from matplotlib.figure import Figure
-
-    from bcppl.figures import touches_on_part, wrench_over_time
-
-    windows = [Numbered(k, each) for k, each in enumerate(taken) if isinstance(each.action, ProbeWindow)]
-    for probe in by_probe(windows)[:MOST_PROBES]:
-        figure = Figure(figsize=(10.0, 3.8), layout="constrained")
-        measured = [each.measurement for each in probe]
-        wrench_over_time(figure.add_subplot(1, 2, 1), measured)
-        if recording.peg is not None:
-            mean = belief.mean.numpy()
-            touches_on_part(figure, (1, 2, 2), measured, recording.part, recording.peg, mean)
-        name = measured[0].action.probe.name
-        yield f"Probe {name}: the force, and where the peg was, as seen from the part.", figure
 
 
 def _spread(belief: Belief) -> float:

@@ -27,7 +27,7 @@ from bcppl.inference.live.filter import Filter
 from bcppl.inference.live.sampler import Sampler
 from bcppl.robot.motion import Probe
 from bcppl.robot.plan import LONGEST, QUICKEST, probe_of
-from bcppl.sensors import DepthImage, Measurement, View
+from bcppl.sensors import DepthImage, Measurement
 from bcppl.sensors.candidates import planner_of
 from bcppl.sensors.layout import Layout
 from bcppl.sensors.protocol import Plannable, sensor_named
@@ -106,7 +106,6 @@ class Session:
         depth = request.get("depth")
         if not isinstance(depth, np.ndarray) or depth.ndim != 2:
             raise InputError("a view has no depth of shape (H, W); send it as an array.")
-        assert isinstance(view, View)
         self._observe([Measurement(view, DepthImage(depth))])
         return {"behind": self.live.behind}
 
