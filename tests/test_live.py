@@ -109,7 +109,7 @@ def test_a_measurement_that_nothing_explains_is_left_out_or_ends_it(touched: Rec
         warnings.simplefilter("always")
         with Filter(model, empty, particles=FEW, infer=faulty, on_fault=policy) as live:
             for each in touched.measurements[:2]:
-                live.observe(each.action, replace_name(each))
+                live.observe(each.action, each.observation)
             live.settle()
             before = live.belief
             live.observe(ProbeWindow(probe, 0, 50), joined_touch(touched))
@@ -122,10 +122,6 @@ def test_a_measurement_that_nothing_explains_is_left_out_or_ends_it(touched: Rec
     assert after.taken == 3 and live.updates[-1].fault.startswith("window 3")
     assert before is not after.belief
     assert any("left out" in str(each.message) for each in caught)
-
-
-def replace_name(measurement: Measurement) -> Touch:
-    return measurement.observation
 
 
 def joined_touch(recording: Recording) -> Touch:

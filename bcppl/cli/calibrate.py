@@ -70,8 +70,8 @@ def arm(
     console = Console(highlight=False)
     if len(seatings) < SEATED:
         console.print(
-            f"{len(seatings)} seatings hardly tell joints apart; seat the ball in {SEATED} sockets or more, "
-            "far apart.",
+            f"{len(seatings)} seatings hardly distinguish the joints; seat the ball in {SEATED} sockets or "
+            "more, far apart.",
             style="yellow",
         )
     model = Arm(Robot(urdf, tip=link), link)

@@ -64,8 +64,8 @@ def live(
     report = Report(console, measured, chosen)
     empty = replace(measured, measurements=[])
 
-    def shown(update: Update) -> None:
-        report.row(update.step)
+    def shown(step: Step, update: Update) -> None:
+        report.row(step)
 
     settings: dict[str, Any] = {"particles": particles, "seed": seed, "deadline": deadline}
     with Filter(chosen, empty, infer=infer, on_update=shown, **settings) as following:

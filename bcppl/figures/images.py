@@ -1,7 +1,9 @@
 """Depth images and a belief: where the part would be seen, and how far measured depth is from that.
 
-figure = Figure()
-outlines_on_depth(figure.add_subplot(), view, image, part, belief.mean, belief.world_from_part[:9])
+    figure = Figure()
+    outlines_on_depth(figure.add_subplot(), view, image, part, belief.mean, belief.world_from_part[:9])
+
+Both draw into axes that they are given.
 """
 
 from __future__ import annotations

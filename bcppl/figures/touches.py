@@ -19,7 +19,7 @@ from bcppl.geometry.parts import Part
 from bcppl.sensors import Measurement
 
 TARE = 10  # rows at the beginning, free of contact
-LATENT = {"x": SEEN, "y": "#009E73", "z": STRONG}
+COLOURS = {"x": SEEN, "y": "#009E73", "z": STRONG}
 
 
 def wrench_over_time(axes: Axes, windows: Sequence[Measurement]) -> Axes:
@@ -30,7 +30,7 @@ def wrench_over_time(axes: Axes, windows: Sequence[Measurement]) -> Axes:
         windows: of one probe, in their order.
     """
     times, force = _force(windows)
-    for name, column, colour in zip(LATENT, force.T, LATENT.values(), strict=True):
+    for name, column, colour in zip(COLOURS, force.T, COLOURS.values(), strict=True):
         axes.plot(times, column, color=colour, linewidth=0.9, label=f"along the peg's {name}")
     for each in windows[1:]:
         axes.axvline(each.observation.times[0], color="0.85", linewidth=0.6, zorder=0)

@@ -230,7 +230,7 @@ class Robot:
         return Part(self.name, np.concatenate(vertices), np.concatenate(faces), source=self.parts[0].source)
 
     def joint_to(self, link: str) -> Joint:
-        """The joint by which a link hangs on its parent, which may be a fixed one.
+        """The joint that leads to a link, which may be a fixed one.
 
         Raises:
             InputError: the link is unknown, or is the base.

@@ -1,9 +1,11 @@
 """A client of a served belief, for a robot's program or a notebook.
 
-with Client("127.0.0.1", port, token) as belief:
-    belief.ask("begin", name="touch 1", begin=stamp, seconds=6.0, rate=100.0)
-    belief.ask("samples", wrench=rows_of_stamp_and_wrench, pose=rows_of_stamp_and_pose)
-    print(belief.ask("belief")["mean"])
+    with Client("127.0.0.1", port, token) as belief:
+        belief.ask("begin", name="touch 1", begin=stamp, seconds=6.0, rate=100.0)
+        belief.ask("samples", wrench=rows_of_stamp_and_wrench, pose=rows_of_stamp_and_pose)
+        print(belief.ask("belief")["mean"])
+
+What may be asked is in `bcppl.inference.live.session`.
 """
 
 from __future__ import annotations

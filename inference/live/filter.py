@@ -1,8 +1,10 @@
 """A belief that follows measurements as they arrive, from any thread.
 
-live = Filter(model, recording)
-robot.on_window(live.observe)  # returns at once
-live.belief.mean, live.next_probe().best.candidate, live.insertion()
+    live = Filter(model, recording)
+    robot.on_window(live.observe)  # returns at once
+    live.belief.mean, live.next_probe().best.candidate, live.insertion()
+
+All that runs the model's program runs in one thread, for Pyro's handlers are shared by all threads.
 """
 
 from __future__ import annotations
@@ -46,14 +48,12 @@ class Update:
     """What one update of a live belief did.
 
     Attributes:
-        step: of inference, after it.
         joined: how many measurements it assimilated as one.
         particles: how many it was made with.
         seconds: from the arrival of the last of them until the belief had it.
         fault: why they are left out; empty where they are not.
     """
 
-    step: Step
     joined: int
     particles: int
     seconds: float
@@ -77,7 +77,7 @@ class Filter:
         deadline: seconds within which a measurement is to be assimilated.
         on_fault: whether a measurement that no particle explains, whose likelihood is no number, or whose
             kind the model does not explain is left out with a warning ("skip") or ends the filter ("stop").
-        on_update: called in the filter's thread after each update.
+        on_update: called in the filter's thread with the step and what the update did, after each.
 
     Raises:
         InputError: the recording has a problem, or a number is out of range.
@@ -93,7 +93,7 @@ class Filter:
         seed: int = 0,
         deadline: float = 0.5,
         on_fault: Literal["skip", "stop"] = "skip",
-        on_update: Callable[[Update], None] | None = None,
+        on_update: Callable[[Step, Update], None] | None = None,
     ) -> None:
         self.particles = whole_number("a live filter is to run {} particles", particles)
         self.deadline = number_within("a live filter has a deadline of {} s", deadline, above=0.0)
@@ -285,11 +285,11 @@ class Filter:
         except Exception as error:
             self._failed = error
             raise
-        update = Update(self._step, joined, count, time.monotonic() - arrived, fault)
+        update = Update(joined, count, time.monotonic() - arrived, fault)
         with self._changed:
             self._updates.append(update)
         if self._on_update is not None:
-            self._on_update(update)
+            self._on_update(self._step, update)
 
     def _affordable(self, joined: int) -> int:
         """How many particles the next update is made with, by how long the last one took."""

@@ -1,8 +1,10 @@
 """Windows of a probe from the messages of a wrist sensor and of an arm, as they come.
 
-sampler = Sampler(probe_of(plan))
-for window in sampler.wrench(stamp, force_and_torque): live.observe(*window)
-for window in sampler.pose(stamp, world_from_peg): live.observe(*window)
+    sampler = Sampler(probe_of(plan))
+    for window in sampler.wrench(stamp, force_and_torque):  # and pose(stamp, world_from_peg) alike
+        live.observe(window.action, window.observation)
+
+A probe's stamps are stated before it begins: those of the plan that is about to be executed.
 """
 
 from __future__ import annotations
