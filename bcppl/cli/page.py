@@ -73,29 +73,40 @@ def page(
     )
 
 
-def figures(recording: Recording, history: Sequence[tuple[str, Belief]], last: Any) -> Iterator[Captioned]:
+def figures(
+    recording: Recording, history: Sequence[tuple[str, Belief]], rows: Sequence[Mapping[str, str]], last: Any
+) -> Iterator[Captioned]:
     """What there is to be seen of a run.
 
     Args:
         recording: that was run.
         history: by step its label and belief.
+        rows: of the table, one for each step.
         last: the last step.
     """
     from matplotlib.figure import Figure
 
-    from bcppl.figures import marginals, pictures, shared_error_bars, spread_over_time
+    from bcppl.figures import column_over_time, marginals, pictures, shared_error_bars, spread_over_time
 
     labels, belief = [label for label, _ in history], history[-1][1]
     taken = recording.measurements[: len(history) - 1]
-    relative = [relative_to_peg(each, recording, k) for k, (_, each) in enumerate(history)]
-    spreads = [_spread(each) for _, each in history]
-    as_seen = np.array([np.nan if each is None else _spread(each) for each in relative])
-    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
-    spread_over_time(figure.add_subplot(), labels, np.array(spreads), as_seen)
-    yield "How far the particles are from their mean after each measurement.", figure
+    spread, relative = (
+        np.array([float(row.get(name) or "nan") for row in rows]) for name in ("± mm", "rel. mm")
+    )
+    figure = Figure(figsize=(10.0, 3.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    spread_over_time(left, labels, spread, relative)
+    column_over_time(right, labels, [each.effective_sample_size for _, each in history], "ESS (particles)")
+    yield (
+        "How far the particles are from their mean after each measurement, and how many they are worth.",
+        figure,
+    )
     for _, measurements in by_sensor(taken):
         yield from pictures(measurements[0][1].action, [each for _, each in measurements], recording, belief)
-    yield "The pose axis by axis, from its mean.", marginals(belief, recording.truth, relative[-1])
+    yield (
+        "The pose axis by axis, from its mean.",
+        marginals(belief, recording.truth, relative_to_peg(belief, recording, len(taken))),
+    )
     population = getattr(last, "population", None)
     errors = shared_errors(population) if isinstance(population, Population) else []
     if errors:
@@ -103,10 +114,6 @@ def figures(recording: Recording, history: Sequence[tuple[str, Belief]], last: A
         figure = Figure(figsize=(7.0, 0.8 + 0.2 * count), layout="constrained")
         shared_error_bars(figure.add_subplot(), errors)
         yield "What the touches tell of the errors that they share.", figure
-
-
-def _spread(belief: Belief) -> float:
-    return 1e3 * float(belief.spread[:3].square().sum().sqrt())
 
 
 def _encoded(figure: Figure) -> str:

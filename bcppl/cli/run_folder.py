@@ -143,7 +143,7 @@ class RunFolder:
         from bcppl.cli.page import figures, page
 
         with replacing(self.path / PAGE) as beside:
-            drawn = list(figures(self.recording, self.history, last))
+            drawn = list(figures(self.recording, self.history, self.rows, last))
             beside.write_text(page(self.record, conclusion, self.rows, drawn), encoding="utf-8")
 
     def _keep(self, figure: Figure, name: str) -> None:
