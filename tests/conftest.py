@@ -9,7 +9,16 @@ from pathlib import Path
 import pytest
 
 from bcppl.cli import main
+from bcppl.sensors import protocol
 from tests.command_line import Ran
+
+
+@pytest.fixture
+def own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kinds of sensor that a test registers are forgotten after it."""
+    monkeypatch.setattr(protocol, "_registered", dict(protocol._registered))
+    monkeypatch.setattr(protocol, "_by_type", dict(protocol._by_type))
+    monkeypatch.setattr(protocol, "_searched", False)
 
 
 @pytest.fixture

@@ -36,6 +36,7 @@ def test_a_new_inference_program_runs(bcppl: Callable[..., Ran], tmp_path: Path,
     assert 0.0 < float(json.loads(ran.out)["rows"][1]["acc."]) < 1.0
 
 
+@pytest.mark.usefixtures("own_registry")
 def test_a_new_sensor_is_saved_checked_and_explained(
     bcppl: Callable[..., Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -50,12 +50,7 @@ ABOVE = np.array([0.0, 0.0, 0.3, 0.0, 1.0, 0.0, 0.0])
 LASER = EntryPoint("laser", "bcppl.sensors.laser", protocol.GROUP)
 
 
-@pytest.fixture(autouse=True)
-def own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a test registers, it registers for itself."""
-    monkeypatch.setattr(protocol, "_registered", dict(protocol._registered))
-    monkeypatch.setattr(protocol, "_by_type", dict(protocol._by_type))
-    monkeypatch.setattr(protocol, "_searched", False)
+pytestmark = pytest.mark.usefixtures("own_registry")
 
 
 @pytest.fixture
