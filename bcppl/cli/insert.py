@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bcppl.arguments import LARGEST_SEED
-from bcppl.cli.options import AsJson, Settings
+from bcppl.cli.options import AsJson, Given, InferenceName, ModelName, Of, Particles, Settings
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,12 +23,7 @@ SIX = "x0 y0 z0 x1 y1 z1"
 
 
 def insert(
-    recording: Annotated[
-        str,
-        typer.Argument(
-            help="A recording (.h5), a shipped one's name, or a belief that `bcppl run` wrote (belief_*.h5)."
-        ),
-    ],
+    recording: Given,
     output: Annotated[
         Path, typer.Option("--output", "-o", dir_okay=False, help="File for the plans (.json or .h5).")
     ] = Path("insertion.json"),
@@ -43,13 +38,11 @@ def insert(
     simulations: Annotated[
         int, typer.Option(min=0, help="How many particles the chance is simulated for; 0 for none.")
     ] = 24,
-    of: Annotated[str | None, typer.Option(help="The recording that a belief is of.")] = None,
-    model: Annotated[str | None, typer.Option(help="A model's name or file, as for `bcppl run`.")] = None,
+    of: Of = None,
+    model: ModelName = None,
     set_: Settings = None,
-    inference: Annotated[
-        str | None, typer.Option(help="An inference program's name or file, as for `bcppl run`.")
-    ] = None,
-    particles: Annotated[int, typer.Option(min=2, help="How many particles; a belief has its own.")] = 75,
+    inference: InferenceName = None,
+    particles: Particles = 75,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same plan.")] = 0,
     as_json: AsJson = False,
 ) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bcppl.arguments import LARGEST_SEED
-from bcppl.cli.options import Settings
+from bcppl.cli.options import InferenceName, ModelName, Recorded, Settings
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from bcppl.recordings import Recording
     from bcppl.traces import Model
 
-NAME = Annotated[str, typer.Argument(help="A recording (.h5), or the name of a shipped one.")]
-MODEL = Annotated[str | None, typer.Option(help="A model's name or file, as for `bcppl run`.")]
-INFERENCE = Annotated[str | None, typer.Option(help="An inference program's name or file.")]
 PARTICLES = Annotated[int, typer.Option(min=2, help="How many particles.")]
 SEED = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of inference.")]
 DEADLINE = Annotated[
@@ -37,10 +34,10 @@ DEADLINE = Annotated[
 
 
 def live(
-    recording: NAME,
+    recording: Recorded,
     speed: Annotated[float, typer.Option(min=0.01, help="2 plays twice as fast as it was recorded.")] = 1.0,
-    model: MODEL = None,
-    inference: INFERENCE = None,
+    model: ModelName = None,
+    inference: InferenceName = None,
     particles: PARTICLES = 75,
     seed: SEED = 0,
     deadline: DEADLINE = 0.5,
@@ -115,8 +112,8 @@ def serve(
         str | None,
         typer.Option(envvar="BCPPL_TOKEN", help="What clients have to know; a new one by default."),
     ] = None,
-    model: MODEL = None,
-    inference: INFERENCE = None,
+    model: ModelName = None,
+    inference: InferenceName = None,
     particles: PARTICLES = 75,
     seed: SEED = 0,
     deadline: DEADLINE = 0.5,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from bcppl.arguments import LARGEST_SEED
-from bcppl.cli.options import AsJson, Settings
+from bcppl.cli.options import AsJson, Given, InferenceName, ModelName, Of, Particles, Settings
 from bcppl.errors import InputError
 from bcppl.visible_text import visible
 
@@ -25,12 +25,7 @@ NUMBERS = "x y z qw qx qy qz"
 
 
 def probe(
-    recording: Annotated[
-        str,
-        typer.Argument(
-            help="A recording (.h5), a shipped one's name, or a belief that `bcppl run` wrote (belief_*.h5)."
-        ),
-    ],
+    recording: Given,
     candidates: Annotated[
         str | None,
         typer.Option(
@@ -48,13 +43,11 @@ def probe(
             dir_okay=False, help="File for the best action (.h5 or .json); a picture goes beside it (.png)."
         ),
     ] = None,
-    of: Annotated[str | None, typer.Option(help="The recording that a belief is of.")] = None,
-    model: Annotated[str | None, typer.Option(help="A model's name or file, as for `bcppl run`.")] = None,
+    of: Of = None,
+    model: ModelName = None,
     set_: Settings = None,
-    inference: Annotated[
-        str | None, typer.Option(help="An inference program's name or file, as for `bcppl run`.")
-    ] = None,
-    particles: Annotated[int, typer.Option(min=2, help="How many particles; a belief has its own.")] = 75,
+    inference: InferenceName = None,
+    particles: Particles = 75,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same ranking.")] = 0,
     outer_samples: Annotated[
         int | None,

@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from bcppl.arguments import LARGEST_SEED
-from bcppl.cli.options import AsJson
+from bcppl.cli.options import AsJson, Recorded
 from bcppl.errors import InputError
 from bcppl.visible_text import visible
 
@@ -25,7 +25,7 @@ OUT = Annotated[Path, typer.Option("--out", "-o", dir_okay=False, help="The reco
 
 
 def check(
-    recording: Annotated[str, typer.Argument(help="A recording (.h5), or the name of a shipped one.")],
+    recording: Recorded,
     as_json: AsJson = False,
 ) -> None:
     """Describe a recording and list its problems (exit code 2 if there are any), notes and doubts.

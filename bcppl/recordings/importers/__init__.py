@@ -12,9 +12,23 @@ import importlib
 import pkgutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
+from typing import Annotated
+
+import typer
 
 from bcppl.sensors.measurements import Recording
+
+# Of importers whose logs do not say what is what.
+Configuration = Annotated[
+    Path | None,
+    typer.Argument(metavar="[CONFIG]", help="The configuration; without it, what the log holds is listed."),
+]
+Draft = Annotated[
+    Path | None,
+    typer.Option("--write", metavar="CONFIG", help="Write a configuration with guesses, to be edited."),
+]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from bcppl.recordings.importers import Imported
+from bcppl.recordings.importers import Configuration, Draft, Imported
 
 NAME = "bag"
 HELP = "A ROS 1 or ROS 2 bag or an MCAP file, by the configuration of `import bench` with topics for files."
@@ -23,14 +23,8 @@ def command(
     bag: Annotated[
         Path, typer.Argument(metavar="BAG", help="A .bag or .mcap file, or a ROS 2 bag's folder.")
     ],
-    configuration: Annotated[
-        Path | None,
-        typer.Argument(metavar="[CONFIG]", help="The configuration; without it, the topics are listed."),
-    ] = None,
-    write: Annotated[
-        Path | None,
-        typer.Option("--write", metavar="CONFIG", help="Write a configuration with guesses, to be edited."),
-    ] = None,
+    configuration: Configuration = None,
+    write: Draft = None,
 ) -> Imported:
     """Read the streams of a bag that a configuration describes; its other paths are relative to it.
 

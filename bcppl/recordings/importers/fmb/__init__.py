@@ -22,7 +22,7 @@ from typing import Annotated
 import typer
 
 from bcppl.arguments import number_within
-from bcppl.recordings.importers import Imported
+from bcppl.recordings.importers import Configuration, Draft, Imported
 
 NAME = "fmb"
 HELP = "A trajectory of FMB (wrench, poses, four depth cameras), by the configuration of `import bench`."
@@ -32,14 +32,8 @@ def command(
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="A trajectory's arrays, by their names in an .npz file.")
     ],
-    configuration: Annotated[
-        Path | None,
-        typer.Argument(metavar="[CONFIG]", help="The configuration; without it, the arrays are listed."),
-    ] = None,
-    write: Annotated[
-        Path | None,
-        typer.Option("--write", metavar="CONFIG", help="Write a configuration with guesses, to be edited."),
-    ] = None,
+    configuration: Configuration = None,
+    write: Draft = None,
     rate: Annotated[float, typer.Option(help="Rows per second, which the file does not state.")] = 10.0,
 ) -> Imported:
     """Read the streams and images of a trajectory that a configuration describes.

@@ -21,7 +21,7 @@ from typing import Annotated
 
 import typer
 
-from bcppl.recordings.importers import Imported
+from bcppl.recordings.importers import Configuration, Draft, Imported
 
 NAME = "reassemble"
 HELP = (
@@ -31,14 +31,8 @@ HELP = (
 
 def command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A file DATE-TIME.h5 of the data set.")],
-    configuration: Annotated[
-        Path | None,
-        typer.Argument(metavar="[CONFIG]", help="The configuration; without it, the arrays are listed."),
-    ] = None,
-    write: Annotated[
-        Path | None,
-        typer.Option("--write", metavar="CONFIG", help="Write a configuration with guesses, to be edited."),
-    ] = None,
+    configuration: Configuration = None,
+    write: Draft = None,
 ) -> Imported:
     """Read the streams of a file that a configuration describes; its other paths are relative to it.
 
