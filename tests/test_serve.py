@@ -36,24 +36,22 @@ class Echo:
 @contextmanager
 def serving(session: Any) -> Iterator[Server]:
     """A server in a thread of its own."""
-    served, ready, loop = Server(session, token="secret"), threading.Event(), asyncio.new_event_loop()
+    served, ready, stopped = Server(session, token="secret"), threading.Event(), asyncio.Event()
+    loops: list[asyncio.AbstractEventLoop] = []
 
     async def run() -> None:
         async with await served.listen():
+            loops.append(asyncio.get_running_loop())
             ready.set()
             await stopped.wait()
 
-    async def made() -> asyncio.Event:
-        return asyncio.Event()
-
-    stopped = loop.run_until_complete(made())
-    thread = threading.Thread(target=loop.run_until_complete, args=(run(),))
+    thread = threading.Thread(target=lambda: asyncio.run(run()))
     thread.start()
     assert ready.wait(10.0)
     try:
         yield served
     finally:
-        loop.call_soon_threadsafe(stopped.set)
+        loops[0].call_soon_threadsafe(stopped.set)
         thread.join(20.0)
         assert not thread.is_alive()
 
