@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import NamedTuple
 
 import igl
@@ -11,7 +12,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from bcppl.arrays import Array, Indices
+from bcppl.arrays import Array, Indices, Mask
 from bcppl.compiled import compiled
 from bcppl.effort import Effort
 from bcppl.geometry.parts import Part
@@ -21,6 +22,7 @@ _ON_EDGE = 1e-12  # barycentric coordinate up to which a point lies on an edge o
 ON_SURFACE = 1e-9
 
 SPACING = 0.001  # m, of a grid
+INEXACT = 0.9  # spacings by which interpolation is off where no single plane is closest, at most
 _MOST = 2_000_000  # nodes of a grid
 
 
@@ -164,18 +166,22 @@ def _signed(
 
 
 class DistanceGrid(NamedTuple):
-    """Signed distances (X, Y, Z), m, at the nodes of a grid in the part's frame, of which `low` is first."""
+    """Signed distances (X, Y, Z), m, at the nodes of a grid in the part's frame, of which `low` is first.
+
+    `planar` (X - 1, Y - 1, Z - 1) says of each cell whether a single plane is closest all over it.
+    """
 
     low: Array
     spacing: float
     distance: npt.NDArray[np.float32]
+    planar: Mask
 
 
 def distance_grid(part: Part, signed: SignedDistance, margin: float) -> DistanceGrid:
     """The grid over a part's bounding box and `margin` metres around it.
 
-    Trilinear interpolation is exact where one plane is closest, and within 0.9 spacings elsewhere, since the
-    distance has Lipschitz constant 1. A large part has a wider spacing than 1 mm.
+    Trilinear interpolation is exact where one plane is closest, and within `INEXACT` spacings elsewhere,
+    since the distance has Lipschitz constant 1. A large part has a wider spacing than 1 mm.
     """
     low, high = part.vertices.min(axis=0) - margin, part.vertices.max(axis=0) + margin
     spacing = max(SPACING, float((np.prod(high - low) / _MOST) ** (1.0 / 3.0)))
@@ -183,13 +189,29 @@ def distance_grid(part: Part, signed: SignedDistance, margin: float) -> Distance
     axes = [low[axis] + spacing * np.arange(counts[axis]) for axis in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     distance = signed(torch.from_numpy(nodes.reshape(-1, 3))).distance.numpy()
-    return DistanceGrid(low, spacing, distance.reshape(*counts).astype(np.float32))
+    distance = distance.reshape(*counts).astype(np.float32)
+    return DistanceGrid(low, spacing, distance, _planar(distance, spacing))
+
+
+def _planar(distance: npt.NDArray[np.float32], spacing: float) -> Mask:
+    corner = {
+        (a, b, c): distance[
+            a : a + distance.shape[0] - 1, b : b + distance.shape[1] - 1, c : c + distance.shape[2] - 1
+        ]
+        for a, b, c in product((0, 1), repeat=3)
+    }
+    first = corner[0, 0, 0]
+    along = [corner[tuple(axis)] - first for axis in np.eye(3, dtype=int).tolist()]
+    planar = np.abs(np.sqrt(sum(each**2 for each in along)) / spacing - 1.0) < 1e-3
+    for (a, b, c), here in corner.items():
+        planar &= np.abs(here - (first + a * along[0] + b * along[1] + c * along[2])) < 1e-6
+    return planar
 
 
 @compiled
 def interpolated(x: float, y: float, z: float, grid: DistanceGrid) -> float:
     """The interpolated distance at a point; outside the grid its boundary's plus the L1 distance to it."""
-    low, spacing, distance = grid
+    low, spacing, distance, _ = grid
     count_x, count_y, count_z = distance.shape
     u, v, w = (x - low[0]) / spacing, (y - low[1]) / spacing, (z - low[2]) / spacing
     inside_u = min(max(u, 0.0), count_x - 1.000001)
@@ -209,9 +231,19 @@ def interpolated(x: float, y: float, z: float, grid: DistanceGrid) -> float:
 
 
 @compiled
-def plane_gradient(point: Array, grid: DistanceGrid, gradient: Array) -> bool:
-    """Whether a single plane is closest around a point; `gradient` (3,) is set to the unit gradient there."""
-    low, spacing, distance = grid
+def is_planar(point: Array, grid: DistanceGrid) -> bool:
+    """Whether a single plane is closest around a point (3,)."""
+    low, spacing, distance, planar = grid
+    i, _ = _cell(point[0], low[0], spacing, distance.shape[0])
+    j, _ = _cell(point[1], low[1], spacing, distance.shape[1])
+    k, _ = _cell(point[2], low[2], spacing, distance.shape[2])
+    return bool(planar[i, j, k])
+
+
+@compiled
+def set_gradient(point: Array, grid: DistanceGrid, gradient: Array) -> None:
+    """Set `gradient` (3,) to the unit gradient of the interpolated distance at a point (3,)."""
+    low, spacing, distance, _ = grid
     i, u = _cell(point[0], low[0], spacing, distance.shape[0])
     j, v = _cell(point[1], low[1], spacing, distance.shape[1])
     k, w = _cell(point[2], low[2], spacing, distance.shape[2])
@@ -225,17 +257,9 @@ def plane_gradient(point: Array, grid: DistanceGrid, gradient: Array) -> bool:
         along_x += (2 * a - 1) * wb * wc * here
         along_y += (2 * b - 1) * wa * wc * here
         along_z += (2 * c - 1) * wa * wb * here
-    plane = True
-    first = distance[i, j, k]
-    for corner in range(8):
-        a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
-        expected = first + a * along_x + b * along_y + c * along_z
-        plane = plane and abs(distance[i + a, j + b, k + c] - expected) < 1e-6
     length = np.sqrt(along_x * along_x + along_y * along_y + along_z * along_z)
-    plane = plane and abs(length / spacing - 1.0) < 1e-3
     scale = 1.0 / length if length > 0.0 else 1.0
     gradient[0], gradient[1], gradient[2] = along_x * scale, along_y * scale, along_z * scale
-    return plane
 
 
 @compiled

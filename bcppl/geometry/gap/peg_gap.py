@@ -1,0 +1,113 @@
+"""The gap between a part and a peg: the least of its vertices' and edges' distances."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.arrays import Array
+from bcppl.effort import Effort
+from bcppl.geometry.distance import DistanceGrid, SignedDistance, distance_grid
+from bcppl.geometry.gap.edges import by_edges
+from bcppl.geometry.gap.frames import Frames, frames_of
+from bcppl.geometry.gap.sharp_edges import sharp_edges
+from bcppl.geometry.gap.solids import solids_of
+from bcppl.geometry.gap.vertices import by_vertices, collect, take
+from bcppl.geometry.parts import Part
+from bcppl.threads import parallel_sum, thread_count
+
+_MARGIN = 0.012  # m around the part that the grid covers
+_CHUNK = 8  # particles of a chunk of work, at least
+_PAIRS = 2000  # pairs of poses of a chunk, at least: they take milliseconds, and a thread's beginning a tenth
+
+
+class Gap(NamedTuple):
+    """Minimum distances between a part at N poses and a peg at T, with witness points and normals.
+
+    Attributes:
+        distance: (N, T) metres; in penetration minus the depth of the peg's deepest vertex in the part, or of
+            the part's deepest edge in the peg.
+        witness: (N, T, 3) the witness point, in the part's frame.
+        normal: (N, T, 3) the part's outward unit normal there, in its frame.
+    """
+
+    distance: Tensor
+    witness: Tensor
+    normal: Tensor
+
+    def gradient(self, world_from_part: Tensor) -> Tensor:
+        """Gradients (N, T, 6) of the distance in the tangent space at poses (N, 7) of the part.
+
+        Metres per metre along the world's axes and per radian about the part's.
+        """
+        rotation = poses.rotation_matrix(world_from_part)
+        along = -(self.normal @ rotation.transpose(-1, -2))
+        return torch.cat([along, -torch.linalg.cross(self.witness, self.normal)], dim=-1)
+
+
+class PegGap:
+    """The gap between a part and a peg. Their meshes are closed; a peg that is not convex has convex pieces.
+
+    Polyhedra first touch at a vertex of one of them or where two edges cross. So the gap is the minimum over
+    the distances of the peg's vertices to the part and of the part's sharp edges to the peg. Distances of
+    vertices are interpolated; near an edge of the part, where that is inexact, those of all vertices that
+    may be the closest are computed exactly. The distance of an edge to the peg is that to its closest plane:
+    exact in contact, an underestimate beside the peg's own edges and vertices.
+
+    Attributes:
+        part, peg: the solids.
+        effort: calls, and pairs of poses as `items`.
+
+    Raises:
+        InputError: a mesh is empty, open or not finite.
+    """
+
+    __caches__ = ("_grid",)  # of the part
+
+    def __init__(self, part: Part, peg: Part) -> None:
+        self.part, self.peg = part, peg
+        self.effort = Effort()
+        self._signed = SignedDistance(part)
+        self._grid: DistanceGrid | None = None
+        self._edges = sharp_edges(part)
+        self._solids = solids_of(peg)
+
+    def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gap:
+        """Gaps (N, T) at poses (N, 7) of the part and (T, 7) of the peg, or (N, T, 7), one per particle."""
+        arrays = self.evaluate(frames_of(world_from_part), frames_of(world_from_peg))
+        return Gap(*map(torch.from_numpy, arrays))
+
+    def evaluate(self, part: Frames, peg: Frames) -> tuple[Array, Array, Array]:
+        """The fields of `Gap` as arrays, at frames (N,) of the part and (T,) or (N, T) of the peg."""
+        peg = peg if peg.translation.ndim == 3 else Frames(peg.rotation[None], peg.translation[None])
+        particles, stamps = len(part.translation), peg.translation.shape[1]
+        with self.effort.measure(items=particles * stamps):
+            if self._grid is None:
+                self._grid = distance_grid(self.part, self._signed, _MARGIN)
+            distance, several = np.empty((particles, stamps)), np.zeros((particles, stamps), dtype=np.int64)
+            witness, normal = np.empty((particles, stamps, 3)), np.empty((particles, stamps, 3))
+            pairs, result = (part, peg, self._grid, self._solids), (distance, witness, normal)
+            chunk = max(_CHUNK, _PAIRS // max(1, stamps))
+
+            def of_vertices(first: int, last: int) -> int:
+                by_vertices(first, last, *pairs, *result, several)
+                return 0
+
+            def of_edges(first: int, last: int) -> int:
+                by_edges(first, last, part, peg, self._edges, self._solids, *result)
+                return 0
+
+            parallel_sum(of_vertices, 0, particles, chunk, thread_count())
+            if several.any():
+                which = np.argwhere(several)
+                ends = np.cumsum(several[several > 0])
+                points = np.empty((ends[-1], 3))
+                collect(which, ends, *pairs, points)
+                exact = self._signed(torch.from_numpy(points))
+                take(which, ends, points, exact.distance.numpy(), exact.normal.numpy(), *result)
+            parallel_sum(of_edges, 0, particles, chunk, thread_count())
+        return distance, witness, normal
