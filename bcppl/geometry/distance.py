@@ -22,7 +22,7 @@ _ON_EDGE = 1e-12  # barycentric coordinate up to which a point lies on an edge o
 ON_SURFACE = 1e-9
 
 SPACING = 0.001  # m, of a grid
-INEXACT = 0.9  # spacings by which interpolation is off where no single plane is closest, at most
+_INEXACT = 0.9  # spacings by which interpolation is off where no single plane is closest, at most
 _MOST = 2_000_000  # nodes of a grid
 
 
@@ -168,19 +168,20 @@ def _signed(
 class DistanceGrid(NamedTuple):
     """Signed distances (X, Y, Z), m, at the nodes of a grid in the part's frame, of which `low` is first.
 
-    `planar` (X - 1, Y - 1, Z - 1) says of each cell whether a single plane is closest all over it.
+    `inexact` (X - 1, Y - 1, Z - 1) is how far interpolation may be off in each cell, m: 0 where a single
+    plane is closest all over it.
     """
 
     low: Array
     spacing: float
     distance: npt.NDArray[np.float32]
-    planar: Mask
+    inexact: npt.NDArray[np.float32]
 
 
 def distance_grid(part: Part, signed: SignedDistance, margin: float) -> DistanceGrid:
     """The grid over a part's bounding box and `margin` metres around it.
 
-    Trilinear interpolation is exact where one plane is closest, and within `INEXACT` spacings elsewhere,
+    Trilinear interpolation is exact where one plane is closest, and within 0.9 spacings elsewhere,
     since the distance has Lipschitz constant 1. A large part has a wider spacing than 1 mm.
     """
     low, high = part.vertices.min(axis=0) - margin, part.vertices.max(axis=0) + margin
@@ -190,7 +191,8 @@ def distance_grid(part: Part, signed: SignedDistance, margin: float) -> Distance
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     distance = signed(torch.from_numpy(nodes.reshape(-1, 3))).distance.numpy()
     distance = distance.reshape(*counts).astype(np.float32)
-    return DistanceGrid(low, spacing, distance, _planar(distance, spacing))
+    inexact = np.where(_planar(distance, spacing), 0.0, _INEXACT * spacing).astype(np.float32)
+    return DistanceGrid(low, spacing, distance, inexact)
 
 
 def _planar(distance: npt.NDArray[np.float32], spacing: float) -> Mask:
@@ -231,13 +233,13 @@ def interpolated(x: float, y: float, z: float, grid: DistanceGrid) -> float:
 
 
 @compiled
-def is_planar(point: Array, grid: DistanceGrid) -> bool:
-    """Whether a single plane is closest around a point (3,)."""
-    low, spacing, distance, planar = grid
-    i, _ = _cell(point[0], low[0], spacing, distance.shape[0])
-    j, _ = _cell(point[1], low[1], spacing, distance.shape[1])
-    k, _ = _cell(point[2], low[2], spacing, distance.shape[2])
-    return bool(planar[i, j, k])
+def inexact(x: float, y: float, z: float, grid: DistanceGrid) -> float:
+    """How far off the interpolated distance at a point may be, m."""
+    count_x, count_y, count_z = grid.inexact.shape
+    i = int(min(max((x - grid.low[0]) / grid.spacing, 0.0), count_x - 1.0))
+    j = int(min(max((y - grid.low[1]) / grid.spacing, 0.0), count_y - 1.0))
+    k = int(min(max((z - grid.low[2]) / grid.spacing, 0.0), count_z - 1.0))
+    return float(grid.inexact[i, j, k])
 
 
 @compiled

@@ -6,7 +6,7 @@ import numpy as np
 
 from bcppl.arrays import Array, Indices
 from bcppl.compiled import compiled
-from bcppl.geometry.distance import INEXACT, DistanceGrid, interpolated, is_planar, set_gradient
+from bcppl.geometry.distance import DistanceGrid, inexact, interpolated, set_gradient
 from bcppl.geometry.gap.frames import Frames, placed, relative
 from bcppl.geometry.gap.solids import Solids
 
@@ -16,86 +16,29 @@ _STEEPEST = 3.0**0.5  # slope of a distance that is interpolated axis by axis, a
 
 @compiled
 def _interpolate(
-    points: Array, first: int, last: int, turn: Array, shift: Array, grid: DistanceGrid, distance: Array
+    points: Array,
+    first: int,
+    last: int,
+    turn: Array,
+    shift: Array,
+    grid: DistanceGrid,
+    distance: Array,
+    slack: Array,
 ) -> None:
-    """Set `distance` from `first` to `last` to interpolated ones, at points (P, 3) of the peg's frame."""
+    """Set `distance` to interpolated ones at points (P, 3) of the peg's frame, from `first` to `last`.
+
+    `slack` is set to how far off each may be.
+    """
     # The rotation is looked up once: arrays given to a function for each point take longer than all of it.
     ax, ay, az = turn[0, 0], turn[0, 1], turn[0, 2]
     bx, by, bz = turn[1, 0], turn[1, 1], turn[1, 2]
     cx, cy, cz = turn[2, 0], turn[2, 1], turn[2, 2]
     for p in range(first, last):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
-        distance[p] = interpolated(
-            ax * x + ay * y + az * z + shift[0],
-            bx * x + by * y + bz * z + shift[1],
-            cx * x + cy * y + cz * z + shift[2],
-            grid,
-        )
-
-
-@compiled
-def _look_up(
-    turn: Array, shift: Array, grid: DistanceGrid, solids: Solids, bound: Array, here: Array, point: Array
-) -> tuple[float, int, float]:
-    """Set `here` (V,) to the vertices' interpolated distances, of those that can be closest.
-
-    `bound` (G,) and `point` (3,) are room.
-
-    Returns:
-        the least distance; the index of the closest vertex around which one plane is closest, -1 if it has
-        none; a bound of the exact least distance, below which others may be: infinite where all are far.
-    """
-    corners, stops, spheres = solids.corners, solids.stops, solids.spheres
-    inexact, first_group = INEXACT * grid.spacing, 0
-    _interpolate(spheres, 0, len(spheres), turn, shift, grid, bound)
-    for g in range(len(spheres)):
-        bound[g] -= _STEEPEST * spheres[g, 3]
-        if bound[g] < bound[first_group]:
-            first_group = g
-    least, closest = np.inf, 0
-    for k in range(-1, len(spheres)):
-        g = first_group if k < 0 else k
-        # The closest group comes first, so that hardly any other has to be looked into.
-        if k == first_group:
-            continue
-        begin = stops[g - 1] if g else 0
-        if bound[g] > least + (2.0 * inexact if least < NEAR else 0.0):
-            here[begin : stops[g]] = np.inf
-            continue
-        _interpolate(corners, begin, stops[g], turn, shift, grid, here)
-        for c in range(begin, stops[g]):
-            if here[c] < least:
-                least, closest = here[c], c
-    if abs(least) >= NEAR:
-        return least, closest, np.inf
-    planar, most = -1, np.inf
-    for c in range(len(corners)):
-        if here[c] > least + 2.0 * inexact:
-            continue
-        placed(corners[c], turn, shift, point)
-        if not is_planar(point, grid):
-            most = min(most, here[c] + inexact)
-        elif planar < 0 or here[c] < here[planar]:
-            planar, most = c, min(most, here[c])
-    return least, planar, most
-
-
-@compiled
-def _is_uncertain(
-    c: int,
-    most: float,
-    turn: Array,
-    shift: Array,
-    grid: DistanceGrid,
-    solids: Solids,
-    here: Array,
-    point: Array,
-) -> bool:
-    """Whether a vertex may be the closest one, and its distance is inexact; sets `point` (3,) to it."""
-    if here[c] - INEXACT * grid.spacing >= most:
-        return False
-    placed(solids.corners[c], turn, shift, point)
-    return not is_planar(point, grid)
+        u = ax * x + ay * y + az * z + shift[0]
+        v = bx * x + by * y + bz * z + shift[1]
+        w = cx * x + cy * y + cz * z + shift[2]
+        distance[p], slack[p] = interpolated(u, v, w, grid), inexact(u, v, w, grid)
 
 
 @compiled
@@ -111,22 +54,50 @@ def by_vertices(
     normal: Array,
     several: Indices,
 ) -> None:
-    """The distances of the peg's vertices to the part, and how many vertices are to be looked at exactly."""
-    bound, here, point = np.empty(len(solids.spheres)), np.empty(len(solids.corners)), np.empty(3)
+    """The distances of the peg's vertices to the part, where these are exact.
+
+    Sets `several` to the number of vertices that may be closer, their distances being inexact.
+    """
+    corners, stops, spheres = solids.corners, solids.stops, solids.spheres
+    bound, here, slack = np.empty((2, len(spheres))), np.empty(len(corners)), np.empty(len(corners))
     turn, shift = np.empty((3, 3)), np.empty(3)
     for n in range(first, last):
         own = n if len(peg.rotation) > 1 else 0
         for t in range(peg.rotation.shape[1]):
             relative(part, n, peg, own, t, turn, shift)
-            _, closest, most = _look_up(turn, shift, grid, solids, bound, here, point)
-            if most < np.inf:
-                for c in range(len(solids.corners)):
-                    several[n, t] += _is_uncertain(c, most, turn, shift, grid, solids, here, point)
+            first_group = 0
+            _interpolate(spheres, 0, len(spheres), turn, shift, grid, bound[0], bound[1])
+            for g in range(len(spheres)):
+                bound[0, g] -= _STEEPEST * spheres[g, 3]
+                if bound[0, g] < bound[0, first_group]:
+                    first_group = g
+            # `most` is the least of what the vertices' distances are at most.
+            least, closest, most, exact = np.inf, 0, np.inf, -1
+            for k in range(-1, len(spheres)):
+                g = first_group if k < 0 else k
+                # The closest group comes first, so that hardly any other has to be looked into.
+                if k == first_group:
+                    continue
+                begin = stops[g - 1] if g else 0
+                if bound[0, g] > least and (least >= NEAR or bound[0, g] - grid.spacing >= most):
+                    here[begin : stops[g]] = np.inf
+                    continue
+                _interpolate(corners, begin, stops[g], turn, shift, grid, here, slack)
+                for c in range(begin, stops[g]):
+                    if here[c] < least:
+                        least, closest = here[c], c
+                    most = min(most, here[c] + slack[c])
+                    if slack[c] == 0.0 and (exact < 0 or here[c] < here[exact]):
+                        exact = c
+            if abs(least) < NEAR:
+                closest = exact
+                for c in range(len(corners)):
+                    several[n, t] += here[c] - slack[c] < most and slack[c] > 0.0
             if closest < 0:
                 distance[n, t] = np.inf
                 continue
             distance[n, t] = here[closest]
-            placed(solids.corners[closest], turn, shift, witness[n, t])
+            placed(corners[closest], turn, shift, witness[n, t])
             set_gradient(witness[n, t], grid, normal[n, t])
 
 
@@ -140,17 +111,17 @@ def collect(
     solids: Solids,
     points: Array,
 ) -> None:
-    """Set `points` to the uncertain vertices of pairs (K, 2), in the part's frame; `ends` (K,) are theirs."""
-    bound, here, point = np.empty(len(solids.spheres)), np.empty(len(solids.corners)), np.empty(3)
-    turn, shift = np.empty((3, 3)), np.empty(3)
+    """Set `points` to those vertices of pairs (K, 2), in the part's frame; `ends` (K,) are theirs."""
+    corners, turn, shift = solids.corners, np.empty((3, 3)), np.empty(3)
+    here, slack = np.empty(len(corners)), np.empty(len(corners))
     for k in range(len(which)):
         n, t = which[k]
         relative(part, n, peg, n if len(peg.rotation) > 1 else 0, t, turn, shift)
-        most = _look_up(turn, shift, grid, solids, bound, here, point)[2]
-        place = ends[k - 1] if k else 0
-        for c in range(len(solids.corners)):
-            if _is_uncertain(c, most, turn, shift, grid, solids, here, point):
-                points[place] = point
+        _interpolate(corners, 0, len(corners), turn, shift, grid, here, slack)
+        most, place = (here + slack).min(), ends[k - 1] if k else 0
+        for c in range(len(corners)):
+            if here[c] - slack[c] < most and slack[c] > 0.0:
+                placed(corners[c], turn, shift, points[place])
                 place += 1
 
 
