@@ -13,7 +13,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing.contact_detection import ContactDetector
-from bcppl.contact.sensing.episodes import EpisodeExtractor, Rows, cell_ends
+from bcppl.contact.sensing.episodes import EpisodeExtractor, cell_ends
 from bcppl.contact.sensing.location import ContactSensing
 from bcppl.distributions.episodes.branches import Linearised
 from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FELT, GIVEN, SECONDS, padded
@@ -22,7 +22,6 @@ from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors.measurements import Measurement
 
 _ROWS = 60  # of a cell at most: those of contact last 10 ms at least
-_LEVER = 0.015  # m between the two places at which a peg in a hole's mouth touches
 _REMEMBERED = 600  # rows that are given to a window at most, the newest
 
 
@@ -184,16 +183,6 @@ class ProbeRows:
         tip = torch.from_numpy(corners[np.linalg.norm(corners, axis=1).argmax()])
         return np.asarray(poses.transform(torch.from_numpy(pose), tip[None])[:, 0].numpy())
 
-    def _load(self, rows: Rows) -> Array:
-        """How hard the peg is pressed where it touches (R,), N: more than the force where it is levered.
-
-        A peg in a hole touches both walls, and the forces there nearly cancel. Their torque does not. It is
-        then larger than that of one contact near the tip, which is the force by a lever of its own.
-        """
-        tip = np.array([0.0, 0.0, float(self.sensing.peg.vertices[:, 2].min())])
-        about_tip = rows.wrench[:, 3:] - np.cross(tip, rows.wrench[:, :3])
-        return np.maximum(rows.force, np.linalg.norm(about_tip, axis=1) / _LEVER)
-
     def _rows(self, end: int) -> Tensor:
         """The rows (R, COLUMNS) that are complete at the end of a cell."""
         settings, so_far = self.settings, self._number < end
@@ -208,7 +197,7 @@ class ProbeRows:
             np.clip(_noise_of(self._tip(self._pose[so_far])), 0.3 * settings.gap_noise, settings.gap_noise)
         )
         noise = np.hypot(stamp / np.sqrt(rows.stamps), settings.delay * rows.speed)
-        columns = [rows.felt, noise, self._load(rows), rows.time, rows.episode, np.zeros(len(noise))]
+        columns = [rows.felt, noise, rows.force, rows.time, rows.episode, np.zeros(len(noise))]
         peg_from_world = poses.inverse(torch.from_numpy(rows.world_from_peg))[:, None]
         earlier = poses.compose(peg_from_world, torch.from_numpy(rows.earlier))
         twists = poses.local(poses.identity(), earlier).flatten(1).numpy()
