@@ -90,23 +90,17 @@ def of_run(folder: Path, of: str | None = None) -> Page:
         file = folder / belief_name(number)
         if not file.is_file():
             raise InputError(
-                f"{folder} has no {file.name}, the particles after {rows[number].get('measurement', number)}; "
-                "run the recording again, or view the recording alone."
+                f"{folder} has no {file.name}, which holds the particles after step {number}; run the "
+                "recording again, or view the recording alone."
             )
         if number <= len(recording.measurements) and not is_of(load_fingerprint(file), recording, number):
             raise InputError(
-                f"{file} is of another recording than {name}: part, guess or measurements differ; give the one "
-                "that was run with --of."
+                f"{file} is of another recording than {name}: part, guess or measurements differ; give the "
+                "one that was run with --of."
             )
         history.append((load_label(file), load_belief(file)))
-    return view(
-        recording,
-        history,
-        rows,
-        title=name,
-        facts=_facts(record),
-        notes=_notes(folder, record, len(rows) - 1),
-    )
+    notes = _notes(folder, record, len(rows) - 1)
+    return view(recording, history, rows, title=name, facts=_facts(record), notes=notes)
 
 
 def _facts(record: dict[str, Any]) -> dict[str, object]:

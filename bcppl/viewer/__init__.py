@@ -1,4 +1,4 @@
-"""A page of a run, or of a recording: part, peg, cameras and particles in space, in step with what was measured.
+"""A page of a run, or of a recording: bodies and particles in space, in step with what was measured.
 
     page = bcppl.view(recording, [(step.info.label, step.belief) for step in steps])
     page.save("run.html")  # and `page` alone at the end of a notebook's cell shows it there

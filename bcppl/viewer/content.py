@@ -67,8 +67,8 @@ def content(
     last = len(recording.measurements)
     if len(history) > last + 1:
         raise InputError(
-            f"a page is given {len(history)} beliefs for a recording of {last} measurements; give one for the "
-            "prior and one for each measurement, of the recording that was run."
+            f"a page is given {len(history)} beliefs for a recording of {last} measurements; give one for "
+            "the prior and one for each measurement, of the recording that was run."
         )
     if rows and len(rows) != len(history):
         raise InputError(

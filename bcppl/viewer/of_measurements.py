@@ -26,7 +26,7 @@ from bcppl.sensors import ProbeWindow, Push, Recording, View, sensor_of
 
 ROWS, GAP_ROWS = 200, 32  # of a touch: that are drawn, and at which the gap of every particle is given
 PIXELS = 20_000  # of an image; a larger one is drawn by every second, third ... row and column
-GAP_UNIT = 2e-6  # m of a gap that is kept in 16 bits: up to 65 mm
+GAP_UNIT = 4e-6  # m of a gap that is kept in 16 bits: up to 131 mm
 MISSING = 0  # level of a pixel without a depth
 LEVELS = 65_535
 
@@ -123,7 +123,8 @@ def rectified(camera: Camera, depth: Array) -> Array:
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
     at = camera.project(rays)
-    inside = ((at >= -0.5) & (at < np.array([camera.width, camera.height]) - 0.5)).all(axis=-1)
+    size = np.array([camera.width, camera.height])
+    inside: Mask = np.asarray(((at >= -0.5) & (at < size - 0.5)).all(axis=-1))
     column, row = np.rint(np.where(inside[..., None], at, 0.0)).astype(int).transpose(2, 0, 1)
     return np.where(inside, depth[row, column], np.nan)
 

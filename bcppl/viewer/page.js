@@ -1,6 +1,5 @@
 // The page: its state is a step, a particle (none: the mean) and a moment of the step's touch.
 
-const began = performance.now();
 const element = (name) => document.getElementById(name);
 const held = unpacked(JSON.parse(element("data").textContent));
 element("data").remove();
@@ -21,8 +20,13 @@ function listed(array) {
 const DOT = [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]].flat();
 const DOT_FACES = [0, 1, 4, 1, 2, 4, 2, 3, 4, 3, 0, 4, 1, 0, 5, 2, 1, 5, 3, 2, 5, 0, 3, 5];
 const scaled = (points, by) => points.map((each) => each * by);
+const middle = [0, 1, 2].map((k) => {
+  const [low, high] = bounds(part.vertices.filter((_, n) => n % 3 === k));
+  return 0.5 * (low + high);
+});
 const reach = Number((0.9 * extent).toPrecision(1)); // of the world's axes, a round number
-const hardest = Math.max(1, ...held.measurements.flatMap((each) => (each.force ? Array.from({ length: each.times.length }, (_, k) => Math.hypot(...row(each.force, k))) : [])));
+const forces = held.measurements.flatMap((each) => (each.force ? listed(each.force) : []));
+const hardest = bounds([1, ...forces.map((each) => Math.hypot(...each))])[1];
 const arrow = 0.45 * extent; // as in the figures: the part's z axis, and a tick along its x
 
 const shapes = {
@@ -102,7 +106,7 @@ function drawSpace(touch) {
   drawTouch(touch);
   if (held.truth) scene.put(shapes.edges, [[Array.from(held.truth), palette.truth, 1]]);
   scene.put(shapes.edges, [[mean, "#333333", 1]]);
-  const heaviest = Math.max(...step.weights), crowd = Math.min(1, 8 / Math.sqrt(step.ess || 1));
+  const heaviest = bounds(step.weights)[1], crowd = Math.min(1, 8 / Math.sqrt(step.ess || 1));
   const cloud = listed(step.poses).map((pose, k) => [pose, palette.cloud, Math.max(0.02, crowd * (step.weights[k] / heaviest))]);
   scene.put(element("outlines").checked ? shapes.outline : shapes.arrow, cloud);
   if (state.particle !== null) {
@@ -110,7 +114,7 @@ function drawSpace(touch) {
     scene.put(shapes.part, [[chosen, palette.strong, 0.45]]);
     scene.put(shapes.arrow, [[chosen, palette.strong, 1]]);
   }
-  scene.put(shapes.part, [[mean, palette.body, 0.4]]);
+  scene.put(shapes.part, [[mean, palette.body, state.particle === null ? 0.4 : 0.2]]);
   if (touch && touch.witness) {
     const witness = placed(chosen, Array.from(row(touch.witness, state.particle === null ? 0 : state.particle + 1)));
     scene.put(shapes.dot, [[[...witness, 1, 0, 0, 0], palette.strong, 1]]);
@@ -129,7 +133,7 @@ function drawDepth(words) {
   const off = seen.map((each, k) => 1e3 * (each - depth[k]));
   const known = depth.filter((each) => !Number.isNaN(each));
   // In the greys of depths about the part, for a wall behind it would take them all.
-  const [nearest, farthest] = known.length ? [Math.min(...known), Math.max(...known)] : [image.low, image.high];
+  const [nearest, farthest] = known.length ? bounds(known) : [image.low, image.high];
   const [low, high] = [nearest - 0.4 * extent, farthest + 0.8 * extent];
   const frame = element("whole").checked ? null : surrounding(depth, camera);
   paint(element("measured"), camera, frame, seen, GREYS, low, high, [240, 228, 66]);
@@ -173,7 +177,8 @@ function drawTouchPlots(touch, words) {
     shown.push({ x, y: gaps(0), colour: "#333333", name: held.inferred ? "mean" : "guess" });
     if (which) shown.push({ x, y: gaps(which), colour: palette.strong, name: "particle", width: 2 });
     const firm = gaps(which)[touch.firmest], felt = touch.felt[touch.gap_rows[touch.firmest]];
-    words.push(`gap ${number(firm)} mm where most was felt${felt ? " (contact: 0 mm)" : ", which is no contact"}`);
+    const beyond = Math.abs(row(touch.gap, which)[touch.firmest]) === 32767 ? "of more than " : "";
+    words.push(`gap ${beyond}${number(firm)} mm where most was felt${felt ? " (contact: 0 mm)" : ", which is no contact"}`);
   }
   const inTouch = touch ? bands.filter(([from]) => from >= touch.times[0]).slice(1).filter(([, to]) => to <= touch.times[touch.times.length - 1]) : [];
   at.push(plot(element("gap"), `gap between ${touch ? touch.body : "peg"} and part (mm)`, shown, { bands: inTouch, cursor }));
@@ -250,7 +255,7 @@ scene.picked = ([x, y]) => {
     const away = Math.min(...ends.map((at) => (at ? Math.hypot(at[0] - x, at[1] - y) : Infinity)));
     return Math.round(away) - weights[k];
   });
-  const best = far.indexOf(Math.min(...far));
+  const best = far.indexOf(bounds(far)[0]);
   state.particle = best >= 0 && far[best] < 15 ? best : null;
   update();
 };
@@ -260,12 +265,13 @@ function fromLink() {
   const given = new URLSearchParams(location.hash.slice(1));
   if (given.has("step")) toStep(Number(given.get("step")) || 0);
   if (given.has("particle")) toNumber(Number(given.get("particle")));
+  if (given.has("step")) toward(scene.distance);
 }
 
 const eyes = held.measurements.filter((each) => each.camera).map((each) => Array.from(each.camera.pose.subarray(0, 3)));
 
 function toward(distance) {
-  [scene.target, scene.distance] = [Array.from(steps[state.step].mean.subarray(0, 3)), distance];
+  [scene.target, scene.distance] = [placed(Array.from(steps[state.step].mean), middle), distance];
   scene.draw();
 }
 
@@ -317,4 +323,4 @@ window.addEventListener("hashchange", fromLink);
 toward(4.5 * extent);
 update();
 fromLink();
-document.documentElement.dataset.milliseconds = Math.round(performance.now() - began);
+document.documentElement.dataset.milliseconds = Math.round(performance.now()); // since the page was asked for

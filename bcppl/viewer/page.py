@@ -21,6 +21,7 @@ import numpy as np
 from bcppl.recordings.hdf5 import replacing
 from bcppl.sensors import Recording
 from bcppl.viewer.content import History, content
+from bcppl.visible_text import visible
 
 SCRIPTS = ("scene.js", "pictures.js", "page.js")
 HEIGHT = 820  # pixels, in a notebook
@@ -85,7 +86,7 @@ def view(
         InputError: there are more beliefs than measurements and the prior, or rows for other steps.
     """
     held = content(recording, history, rows, facts, notes)
-    held["title"] = title or recording.part.name
+    held["title"] = visible(title or recording.part.name)
     # Within a script element only "<" can begin what ends it, and JSON has it in strings alone.
     data = json.dumps(_plain(held), allow_nan=False).replace("<", "\\u003c")
     script = "\n".join(_text(name) for name in SCRIPTS)
@@ -94,7 +95,7 @@ def view(
     policy = f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; base-uri 'none'"
     pieces = {
         "POLICY": policy,
-        "TITLE": html.escape(str(held["title"])),
+        "TITLE": html.escape(held["title"]),
         "STYLE": style,
         "DATA": data,
         "SCRIPT": script,

@@ -53,6 +53,11 @@ function measuredDepth(image) {
   return Float64Array.from(image.depth, (level) => (level ? image.low + (level - 1) * scale : NaN));
 }
 
+// The least and the largest; `Math.min(...values)` takes no more values than a call has room for.
+function bounds(values) {
+  return Array.from(values).reduce(([low, high], each) => [Math.min(low, each), Math.max(high, each)], [Infinity, -Infinity]);
+}
+
 function median(values) {
   const sorted = values.filter((each) => !Number.isNaN(each)).sort();
   return sorted.length ? sorted[sorted.length >> 1] : NaN;
@@ -109,7 +114,7 @@ function ticks(low, high, count) {
 }
 
 // Curves {x, y, colour, name} over time (s), bands [from, to, colour, opacity], a cursor; null for no data.
-function plot(canvas, title, curves, { bands = [], cursor = null, limits = null } = {}) {
+function plot(canvas, title, curves, { bands = [], cursor = null } = {}) {
   const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
   [canvas.width, canvas.height] = [Math.max(1, Math.round(ratio * width)), Math.max(1, Math.round(ratio * height))];
   const flat = canvas.getContext("2d");
@@ -125,9 +130,9 @@ function plot(canvas, title, curves, { bands = [], cursor = null, limits = null 
     flat.fillText("nothing at this step", 44, height / 2);
     return null;
   }
-  const [start, end] = [Math.min(...times), Math.max(...times)];
-  const room = 0.06 * (Math.max(...all) - Math.min(...all)) || 1;
-  const [low, high] = limits || [Math.min(...all) - room, Math.max(...all) + room];
+  const [start, end] = bounds(times), [least, most] = bounds(all);
+  const room = 0.06 * (most - least) || 1;
+  const [low, high] = [least - room, most + room];
   const [left, right, top, bottom] = [44, width - 8, 18, height - 26];
   const x = (value) => left + ((value - start) / (end - start || 1)) * (right - left);
   const y = (value) => bottom - ((value - low) / (high - low)) * (bottom - top);
@@ -139,7 +144,7 @@ function plot(canvas, title, curves, { bands = [], cursor = null, limits = null 
   flat.globalAlpha = 1;
   flat.lineWidth = 1;
   flat.textAlign = "right";
-  for (const value of ticks(low, high, 3)) {
+  for (const value of ticks(low, high, 5)) {
     flat.strokeStyle = value === 0 ? "#888888" : "#e4e4e4";
     flat.beginPath();
     flat.moveTo(left, y(value));
@@ -149,7 +154,7 @@ function plot(canvas, title, curves, { bands = [], cursor = null, limits = null 
     flat.fillText(String(value), left - 4, y(value) + 4);
   }
   flat.textAlign = "center";
-  for (const value of ticks(start, end, 5)) flat.fillText(String(value), x(value), bottom + 12);
+  for (const value of ticks(start, end, 8)) flat.fillText(String(value), x(value), bottom + 12);
   flat.textAlign = "right";
   flat.fillText("time (s)", right, height - 3);
   flat.textAlign = "left";
