@@ -317,7 +317,7 @@ element("particle").onchange = (event) => toNumber(event.target.value === "" ? -
 element("moment").oninput = (event) => { state.moment = Number(event.target.value); update(); };
 element("outlines").onchange = element("whole").onchange = update;
 element("near").onclick = () => toward(4.5 * extent);
-element("far").onclick = () => toward(3 * Math.max(extent, ...eyes.map((eye) => Math.hypot(...minus(eye, scene.target)))));
+element("far").onclick = () => toward(2.2 * Math.max(extent, ...eyes.map((eye) => Math.hypot(...minus(eye, scene.target)))));
 window.addEventListener("resize", update);
 window.addEventListener("hashchange", fromLink);
 toward(4.5 * extent);

@@ -52,11 +52,10 @@ class Page:
             beside.write_text(self.text, encoding="utf-8")
 
     def _repr_html_(self) -> str:
-        """The page in a frame of its own, for a notebook: its script reaches nothing of the notebook's."""
-        return (
-            f'<iframe sandbox="allow-scripts" style="width:100%;height:{HEIGHT}px;border:0" '
-            f'srcdoc="{html.escape(self.text)}"></iframe>'
-        )
+        """The page in a frame of its own, for a notebook; its policy holds there too."""
+        # Without `sandbox`: Chromium 150 leaves a sandboxed srcdoc of this size blank.
+        style = f"width:100%;height:{HEIGHT}px;border:0"
+        return f'<iframe style="{style}" srcdoc="{html.escape(self.text)}"></iframe>'
 
 
 def view(
