@@ -12,6 +12,7 @@ from bcppl import (
     robot as robot,
     sensors as sensors,
     traces as traces,
+    viewer as viewer,
 )
 from bcppl.beliefs import Belief as Belief
 from bcppl.errors import InferenceError as InferenceError, InputError as InputError
@@ -44,3 +45,4 @@ from bcppl.traces import (
     structural as structural,
     update as update,
 )
+from bcppl.viewer import view as view

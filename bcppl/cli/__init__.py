@@ -1,4 +1,4 @@
-"""The command line: `bcppl run`, `probe`, `insert`, `live`, `serve`, `sweep`, `check`, `import` and others.
+"""The command line: `bcppl run`, `view`, `probe`, `insert`, `live`, `sweep`, `check`, `import` and others.
 
 A command imports what it computes with when it is called, so that `bcppl --help` answers at once.
 """
@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from bcppl.cli import calibrate, insert, live, new, probe, recordings, run, sweep
+from bcppl.cli import calibrate, insert, live, new, probe, recordings, run, sweep, view
 from bcppl.errors import InferenceError, InputError
 from bcppl.visible_text import visible
 
@@ -39,6 +39,7 @@ def _options(
 
 
 app.command("run")(run.run)
+app.command("view")(view.view)
 app.command("probe")(probe.probe)
 app.command("insert")(insert.insert)
 app.command("live")(live.live)

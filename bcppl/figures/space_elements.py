@@ -33,12 +33,16 @@ def rotation(pose: Array) -> Rotation:
     return Rotation.from_quat(pose[..., [4, 5, 6, 3]])
 
 
-def outline(part: Part) -> tuple[Array, Array]:
-    """Triangles (F, 3, 3) and sharp or open edges (E, 2, 3) of the part, in its frame, metres."""
+def outline(part: Part, most_faces: int = MANY_FACES, cells: float = 40.0) -> tuple[Array, Array]:
+    """Triangles (F, 3, 3) and sharp or open edges (E, 2, 3) of the part, in its frame, metres.
+
+    A mesh of more than `most_faces` has its vertices merged on a grid of so many cells along its longest
+    side, and no edges.
+    """
     mesh = part.mesh
-    if len(mesh.faces) > MANY_FACES:
+    if len(mesh.faces) > most_faces:
         # merge_vertices rounds to decimals: in units of a cell, to the cell.
-        cell = float(part.extent.max()) / 40.0
+        cell = float(part.extent.max()) / cells
         mesh = trimesh.Trimesh(mesh.vertices / cell, mesh.faces, process=False)
         mesh.merge_vertices(digits_vertex=0, merge_tex=True, merge_norm=True)
         mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())

@@ -29,12 +29,12 @@ def wrench_over_time(axes: Axes, windows: Sequence[Measurement]) -> Axes:
         axes: in which it is drawn.
         windows: of one probe, in their order.
     """
-    times, force = _force(windows)
+    times, force = tared_force(windows)
     for name, column, colour in zip(COLOURS, force.T, COLOURS.values(), strict=True):
         axes.plot(times, column, color=colour, linewidth=0.9, label=f"along the peg's {name}")
     for each in windows[1:]:
         axes.axvline(each.observation.times[0], color="0.85", linewidth=0.6, zorder=0)
-    felt = _felt(force)
+    felt = contact_felt(force)
     low, high = axes.get_ylim()
     axes.fill_between(times, low, high, where=felt, color=FELT, alpha=0.18, linewidth=0, label="contact felt")
     axes.set_ylim(low, high)
@@ -63,8 +63,8 @@ def touches_on_part(
         peg: that is held, its tip at its lowest z.
         world_from_part: (7,) such as a belief's mean.
     """
-    _, force = _force(windows)
-    felt = _felt(force)
+    _, force = tared_force(windows)
+    felt = contact_felt(force)
     pose = np.concatenate([each.observation.world_from_peg for each in windows])
     tip = torch.tensor([[0.0, 0.0, float(peg.vertices[:, 2].min())]], dtype=torch.float64)
     at = poses.transform(torch.from_numpy(pose), tip)[:, 0]
@@ -82,12 +82,13 @@ def touches_on_part(
     return axes
 
 
-def _force(windows: Sequence[Measurement]) -> tuple[Array, Array]:
-    """Times (T,) and tared forces (T, 3) of a probe."""
-    touches = [each.observation for each in windows]
+def tared_force(touched: Sequence[Measurement]) -> tuple[Array, Array]:
+    """Times (T,) s and tared forces (T, 3) N of a probe's windows, or of one push."""
+    touches = [each.observation for each in touched]
     force = np.concatenate([touch.wrench[:, :3] for touch in touches])
     return np.concatenate([touch.times for touch in touches]), force - np.nanmean(force[:TARE], axis=0)
 
 
-def _felt(force: Array) -> Mask:
+def contact_felt(force: Array) -> Mask:
+    """Whether contact is beyond doubt by each of the tared forces (T, 3), N."""
     return np.asarray(ContactDetector()(torch.from_numpy(np.nan_to_num(force))).numpy() == 1.0)
