@@ -17,7 +17,7 @@ import torch
 from report import Row, finish, options, show
 
 import bcppl
-from bcppl.cli.sweep import workers
+from bcppl.cli.commands.sweep import workers
 from bcppl.models.point_probe import model
 from bcppl.models.shipped import load_recording
 from bcppl.sweeps import kept, key_of, product, swept

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from bcppl.beliefs import Belief
-from bcppl.cli import probe
+from bcppl.cli.commands import probe
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.planning.candidate_layout import MIXED
 from bcppl.models.look_and_touch import model

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from bcppl.beliefs import Belief
-from bcppl.cli.run import next_label
+from bcppl.cli.commands.run import next_label
 from bcppl.errors import InputError
 from bcppl.recordings import save
 from bcppl.recordings.beliefs import load_belief, load_latent

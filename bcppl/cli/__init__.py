@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from bcppl.cli import calibrate, insert, live, new, probe, recordings, run, sweep, view
+from bcppl.cli.commands import calibrate, insert, live, new, probe, recordings, run, sweep, view
 from bcppl.errors import InferenceError, InputError
 from bcppl.visible_text import visible
 
