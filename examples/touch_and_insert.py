@@ -39,6 +39,12 @@ def announced(plan: Plan, gain: float) -> None:
     print(f"{plan.name}: {gain:.2f} nats expected", flush=True)
 
 
+def take(executor: Executor, reading: Reading) -> None:
+    """Give a reading to the executor, for each of the plan's stamps that it has come to."""
+    while executor.state == "moving" and reading.stamp >= executor.probe.stamps[executor.taken] - 1e-6:
+        executor.sample(reading.wrench[:3], lambda: reading.world_from_peg)
+
+
 def execute(
     arm: Arm,
     plan: Plan,
@@ -49,18 +55,16 @@ def execute(
     readings = arm.read()[-1:]
     plan = replace(plan, times=plan.times - plan.times[0] + readings[0].stamp + LEAD)
     executor = Executor(plan, stop_at_hole=stop_at_hole, limits=LIMITS)
-    stamps = executor.probe.stamps
     while executor.state == "moving":
         for reading in readings:
             heard(reading)
-            while executor.state == "moving" and reading.stamp >= stamps[executor.taken] - 1e-6:
-                executor.sample(reading.wrench[:3], lambda reading=reading: reading.world_from_peg)
+            take(executor, reading)
         arm.command(executor.commanded(reading.stamp + arm.ahead), plan.stiffness)
         readings = arm.read()
     if executor.state == "aborted":
         raise SystemExit(executor.reason)
     # Up to after the last stamp, by both streams: what is between it and the one before is known.
-    until = stamps[executor.taken - 1]
+    until = executor.probe.stamps[executor.taken - 1]
     while True:
         for reading in readings:
             heard(reading)
@@ -77,7 +81,8 @@ def move_to(arm: Arm, world_from_peg: Array, like: Plan, height: float) -> None:
     times = [0.0]
     for one, other in itertools.pairwise(knots):
         times.append(times[-1] + max(0.3, float(np.linalg.norm((one - other)[:3])) / 0.1))
-    execute(arm, replace(like, name="on the way", times=times, world_from_peg=knots, manners=("free",) * 3))
+    path = {"times": np.array(times), "world_from_peg": np.array(knots), "manners": ("free",) * 3}
+    execute(arm, replace(like, name="on the way", **path))
 
 
 def touch(arm: Arm, live: Filter, plan: Plan) -> Executor:

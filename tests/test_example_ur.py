@@ -47,6 +47,7 @@ def test_a_guarded_descent_through_ur_rtde_stops_on_the_part(
     arm, scene = connected, bench_scene(31000)
     start = arm.read()[-1].world_from_peg
     plan = descent(start)
+    arm.command(start, plan.stiffness)  # from here on the clock waits for commands
     readings: list[Any] = []
     executor, last = programs["touch_and_insert"].execute(arm, plan, readings.append)
     stopped_on_the_part(executor, scene)

@@ -106,8 +106,9 @@ class Smoothed:
         """The pose one millisecond later."""
         aligned = np.concatenate([target[:3], np.copysign(1.0, target[3:] @ self.stages[0, 3:]) * target[3:]])
         move = aligned - self.stages[0]
-        # Half a quaternion's change is the angle's.
-        most = max(np.linalg.norm(move[:3]) / FASTEST, 2.0 * np.linalg.norm(move[3:]) / QUICKEST, 1e-3)
+        # A quaternion changes by half of the angle.
+        shift, turn = float(np.linalg.norm(move[:3])), 2.0 * float(np.linalg.norm(move[3:]))
+        most = max(shift / FASTEST, turn / QUICKEST, 1e-3)  # s
         self.stages[0] += 1e-3 / most * move
         for k in (1, 2, 3):
             self.stages[k] += 1e-3 / LAG * (self.stages[k - 1] - self.stages[k])
