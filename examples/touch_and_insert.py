@@ -81,8 +81,14 @@ def move_to(arm: Arm, world_from_peg: Array, like: Plan, height: float) -> None:
     times = [0.0]
     for one, other in itertools.pairwise(knots):
         times.append(times[-1] + max(0.3, float(np.linalg.norm((one - other)[:3])) / 0.1))
-    path = {"times": np.array(times), "world_from_peg": np.array(knots), "manners": ("free",) * 3}
-    execute(arm, replace(like, name="on the way", **path))
+    plan = replace(
+        like,
+        name="on the way",
+        times=np.array(times),
+        world_from_peg=np.array(knots),
+        manners=("free",) * 3,
+    )
+    execute(arm, plan)
 
 
 def touch(arm: Arm, live: Filter, plan: Plan) -> Executor:

@@ -7,7 +7,6 @@ acceleration and jerk, and stops where one is late: a process of its own command
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
 import time
 from multiprocessing.connection import Connection
@@ -74,14 +73,13 @@ class FrankaArm:
     def command(self, world_from_peg: Array, stiffness: Array) -> None:
         """Follow a pose (7,) by a spring of stiffness (6,): N/m along, N m/rad about the peg's axes.
 
-        Another stiffness is taken up at rest, the one at which the arm may change it.
+        Another stiffness is taken up at rest: the arm refuses one while it moves.
         """
         self._pipe.send((np.asarray(world_from_peg), np.asarray(stiffness)))
 
     def close(self) -> None:
         """End the motion and the connection."""
-        with contextlib.suppress(OSError):  # of one that has stopped before
-            self._pipe.send(None)
+        self._pipe.close()
         self._process.join(5.0)
         self._process.terminate()
 
@@ -128,13 +126,16 @@ def row_of(state: Any) -> Array:
 
 
 def _follow(host: str, realtime: bool, patience: float, pipe: Connection, rows: Any, count: Any) -> None:
-    """In the arm's process: follow commands until there is None."""
+    """In the arm's process: follow commands until the connection is closed."""
     try:
         enforce = pylibfranka.RealtimeConfig.kEnforce if realtime else pylibfranka.RealtimeConfig.kIgnore
         robot = pylibfranka.Robot(host, enforce)
         robot.set_collision_behavior(*TORQUES, *FORCES)
         robot.set_K(IDENTITY)  # the spring, and the wrench, are of the peg's frame
-        _control(robot, patience, pipe, np.frombuffer(rows).reshape(KEPT, 14), count)
+        try:
+            _control(robot, patience, pipe, np.frombuffer(rows).reshape(KEPT, 14), count)
+        except (EOFError, ConnectionError):  # the program has closed the connection, or is no more
+            robot.stop()
     except (pylibfranka.FrankaException, RuntimeError, TypeError) as error:  # the others are RuntimeErrors
         pipe.send(str(error))
 
@@ -152,9 +153,6 @@ def _control(robot: Any, patience: float, pipe: Connection, rows: Array, count: 
             more = pipe.poll(0.0 if command is None else patience)
             while more:
                 command, more = pipe.recv(), pipe.poll()
-                if command is None:
-                    robot.stop()
-                    return
         tick += 1
         if command is None:
             continue
