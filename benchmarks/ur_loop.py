@@ -1,4 +1,4 @@
-"""The whole loop on a simulated arm that speaks RTDE: look, choose, touch, update, insert, by `examples/ur`.
+"""The whole loop on a simulated arm that speaks RTDE: look, choose, touch, update, insert, by `examples/`.
 
 Each scene has a process for the arm and one for the program, which talk through ur_rtde. With `--pace clock`
 the arm moves in real time; with `client` its clock goes on with each command, so that a slow machine loses
@@ -17,15 +17,17 @@ from tempfile import TemporaryDirectory
 from report import Row, finish, options, show
 from scipy.stats import binomtest
 
-EXAMPLES = Path(__file__).parents[1] / "examples/ur"
+EXAMPLES = Path(__file__).parents[1] / "examples"
 LONGEST = 300.0  # s of a scene
 
 
 def attempted(seed: int, probes: int, pace: str, folder: str) -> tuple[bool, float, float, str]:
     """Whether the peg went in, how deep (mm), the seconds of it all, and what the program printed last."""
     look = f"{folder}/look.h5"
-    words = [sys.executable, EXAMPLES / "stand_in.py", "--seed", seed, "--look", look, "--pace", pace]
-    with subprocess.Popen([str(each) for each in words], stdout=subprocess.PIPE, text=True) as arm:
+    words = [sys.executable, "-m", "ur.stand_in", "--seed", seed, "--look", look, "--pace", pace]
+    with subprocess.Popen(
+        [str(each) for each in words], stdout=subprocess.PIPE, text=True, cwd=EXAMPLES
+    ) as arm:
         try:
             assert arm.stdout is not None
             arm.stdout.readline()

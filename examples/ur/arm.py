@@ -7,11 +7,11 @@ world. Commands go through the controller's input registers: a target pose, and 
 from __future__ import annotations
 
 import time
-from typing import NamedTuple
 
 import numpy as np
 import rtde_io
 import rtde_receive
+from readings import Reading
 from scipy.spatial.transform import Rotation
 
 from bcppl.arrays import Array
@@ -24,21 +24,10 @@ NUMBER = 18  # an integer register: the number of the newest command, written la
 SILENT = 1.0  # s without a package, after which the arm is taken to have stopped
 
 
-class Reading(NamedTuple):
-    """What the arm reads at a stamp (s of its clock).
-
-    Attributes:
-        wrench: (6,) of the environment on the peg, in the peg's frame about its origin, N and N m.
-        world_from_peg: (7,).
-    """
-
-    stamp: float
-    wrench: Array
-    world_from_peg: Array
-
-
 class URArm:
-    """A connection to the arm."""
+    """A connection to the arm (`readings.Arm`)."""
+
+    ahead = 0.008  # s
 
     def __init__(self, host: str) -> None:
         self._receive = rtde_receive.RTDEReceiveInterface(host, RATE, READ)
@@ -46,8 +35,8 @@ class URArm:
         self._io = (lower, rtde_io.RTDEIOInterface(host, use_upper_range_registers=True))
         self._number, self._newest = 0, -1.0
 
-    def read(self) -> Reading:
-        """The next reading; waits for it.
+    def read(self) -> list[Reading]:
+        """The newest reading; waits for the next one.
 
         Raises:
             TimeoutError: the controller sends none.
@@ -63,7 +52,8 @@ class URArm:
         # In the base's axes, about the tool's centre.
         force, torque = np.array(self._receive.getActualTCPForce()).reshape(2, 3)
         wrench = np.concatenate([turn.inv().apply(force), turn.inv().apply(torque)])
-        return Reading(stamp, wrench, np.concatenate([place[:3], turn.as_quat()[[3, 0, 1, 2]]]))
+        pose = np.concatenate([place[:3], turn.as_quat()[[3, 0, 1, 2]]])
+        return [Reading(stamp, wrench, stamp, pose)]
 
     def command(self, world_from_peg: Array, stiffness: Array) -> None:
         """Follow a pose (7,) by a spring of stiffness (6,): N/m along, N m/rad about the peg's axes."""

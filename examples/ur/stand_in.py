@@ -8,25 +8,18 @@ command, so that a slow machine loses nothing.
 
 from __future__ import annotations
 
-import argparse
 import socket
 import socketserver
 import struct
 import threading
-import time
 from typing import Any
 
-import mujoco
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
+from simulated_arm import Clock, Pace, SimulatedArm, options
 
-from bcppl import poses, save
-from bcppl.arrays import Array
-from bcppl.contact.mujoco_model import build_model
-from bcppl.geometry.parts import Part
+from bcppl import save
 from bcppl.models.worlds import bench_scene
-from bcppl.models.worlds.bench.scene import BenchScene
 
 PORT = 30004
 VERSION, URCONTROL, OUTPUTS, INPUTS, START, PAUSE, DATA = 86, 118, 79, 73, 83, 80, 85
@@ -37,64 +30,24 @@ KINDS = {"timestamp": "DOUBLE", "actual_TCP_pose": "VECTOR6D", "actual_TCP_force
 POSE = [f"input_double_register_{k}" for k in (18, 19, 20, 21, 22, 42)]
 ACROSS, ALONG, ABOUT = (f"input_double_register_{k}" for k in (43, 44, 45))
 NUMBER = "input_int_register_18"
-DAMPED = 0.06, 0.016  # s: damping over stiffness, along and about
-PATIENCE = 0.5  # s that the clock waits for a command, at the client's pace
-NOISE = np.array([0.15] * 3 + [0.005] * 3)  # N, N m
-
-
-class SimulatedArm:
-    """A peg on a spring to a commanded pose, beside a part, in MuJoCo."""
-
-    def __init__(self, scene: BenchScene, start: Array, seed: int) -> None:
-        self.model = build_model(scene.part, scene.peg, scene.contact)
-        self.model.opt.timestep = 0.0005
-        self.data = mujoco.MjData(self.model)
-        self._noise = np.random.default_rng([seed, 77])
-        self.data.qpos[:7] = start
-        self._place(1, scene.truth)
-        self.command(start, np.full(6, 2500.0))
-
-    def command(self, world_from_peg: Array, stiffness: Array) -> None:
-        """Follow a pose (7,)."""
-        self._place(0, world_from_peg)
-        damping = stiffness * np.repeat(DAMPED, 3)
-        self.model.actuator_biasprm[:, 1] = -stiffness
-        self.model.actuator_biasprm[:, 2] = -damping
-
-    def advance(self) -> tuple[Array, Array]:
-        """The pose (7,) and the wrench (6,) in the peg's frame, one tick later."""
-        for _ in range(round(TICK / self.model.opt.timestep)):
-            mujoco.mj_step(self.model, self.data)
-        mujoco.mj_forward(self.model, self.data)
-        sensed = self.data.sensordata
-        return sensed[:7].copy(), -sensed[7:13] + NOISE * self._noise.normal(size=6)
-
-    def _place(self, number: int, pose: Array) -> None:
-        self.data.mocap_pos[number], self.data.mocap_quat[number] = pose[:3], pose[3:]
 
 
 class Controller:
     """The registers, and the newest reading, that all connections share."""
 
-    def __init__(self, arm: SimulatedArm, pace: str) -> None:
-        self.arm, self.pace = arm, pace
+    def __init__(self, arm: SimulatedArm, pace: Pace) -> None:
+        self.arm, self.clock = arm, Clock(pace)
         self.registers: dict[str, float] = {}
         self.reading: dict[str, Any] = {}
         self.ticked = threading.Condition()
-        self.commanded = threading.Event()
         self.running = True
         self._stamp = 0.0
 
     def run(self) -> None:
         """Move the clock on until `running` is false."""
-        begun = time.monotonic()
         while self.running:
             self._tick()
-            if self.pace == "client" and self.registers.get(NUMBER, 0):
-                self.commanded.wait(PATIENCE)
-                self.commanded.clear()
-            elif (left := begun + self._stamp - time.monotonic()) > 0.0:
-                time.sleep(left)
+            self.clock.wait(self._stamp)
 
     def write(self, values: dict[str, float]) -> None:
         """Registers from a client; a new number makes the command in them count."""
@@ -106,7 +59,7 @@ class Controller:
             across, along, about = (self.registers.get(name, 1000.0) for name in (ACROSS, ALONG, ABOUT))
             stiffness = np.array([across, across, along, about, about, about])
             self.arm.command(np.concatenate([place[:3], turn]), stiffness)
-            self.commanded.set()
+            self.clock.command()
 
     def _tick(self) -> None:
         pose, wrench = self.arm.advance()
@@ -206,26 +159,15 @@ class Server(socketserver.ThreadingTCPServer):
         self.controller = controller
 
 
-def start_of(scene: BenchScene, peg: Part) -> Array:
-    """A pose (7,) of the peg, upright, its tip 60 mm above the middle of the guess."""
-    guess = torch.from_numpy(scene.guess.world_from_part)
-    upright = poses.identity().numpy().copy()
-    upright[:3] = guess[:3].numpy()
-    upright[2] += 0.06 - float(peg.vertices[:, 2].min())
-    return np.asarray(upright)
-
-
 def main() -> None:
     """Serve until interrupted."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seed", type=int, default=31000, help="of the bench")
-    parser.add_argument("--look", default="look.h5", help="file for what the cameras see")
+    parser = options(__doc__)
     parser.add_argument("--pace", choices=["clock", "client"], default="clock")
     parser.add_argument("--port", type=int, default=PORT)
     arguments = parser.parse_args()
     scene = bench_scene(arguments.seed)
     save(scene.look(), arguments.look)
-    controller = Controller(SimulatedArm(scene, start_of(scene, scene.peg), arguments.seed), arguments.pace)
+    controller = Controller(SimulatedArm(scene, TICK), arguments.pace)
     threading.Thread(target=controller.run, daemon=True).start()
     with Server(controller, arguments.port) as server:
         print(

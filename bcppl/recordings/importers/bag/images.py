@@ -122,20 +122,9 @@ class Intrinsics:
         Raises:
             InputError: it states none, binning or a part of the image, or another model of a lens.
         """
-        info, remedy = self._first, "state fx, fy, cx, cy and distortion in place of info"
-        matrix = info.K if hasattr(info, "K") else info.k  # as ROS 1 and ROS 2 write it
-        lens = [float(each) for each in (info.D if hasattr(info, "D") else info.d)]
         where = f"{fields.info}, which cameras.{name}.info names,"
-        if not (np.isfinite(matrix).all() and matrix[0] > 0.0 and matrix[4] > 0.0):
-            raise InputError(f"{where} states no intrinsics (its K is not calibrated); {remedy}.")
-        window = info.roi
-        if max(info.binning_x, info.binning_y) > 1 or window.x_offset or window.y_offset:
-            raise InputError(f"{where} states binning or a part of the image; {remedy} of the image itself.")
-        if any(lens) and (info.distortion_model not in _BROWN or any(lens[5:])):
-            raise InputError(f"{where} has the lens model {info.distortion_model!r}; rectify, and {remedy}.")
-        stated = {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5]}
-        numbers = {key: float(value) for key, value in stated.items()}
-        return fields.model_copy(update={**numbers, "distortion": lens[:5] if any(lens) else []})
+        remedy = "state fx, fy, cx, cy and distortion in place of info"
+        return fields.model_copy(update=intrinsics_of(where, self._first, remedy))
 
     @property
     def size(self) -> tuple[int, int] | None:
@@ -144,18 +133,53 @@ class Intrinsics:
         return size if all(size) else None
 
 
+def intrinsics_of(where: str, info: Any, remedy: str) -> dict[str, Any]:
+    """The focal lengths, principal point (pixels) and distortion that a CameraInfo states.
+
+    Args:
+        where: it is from, for messages.
+        info: the message, of ROS 1 or ROS 2.
+        remedy: what to do where it states none.
+
+    Raises:
+        InputError: it states none, binning or a part of the image, or another model of a lens.
+    """
+    matrix = info.K if hasattr(info, "K") else info.k  # as ROS 1 and ROS 2 write it
+    lens = [float(each) for each in (info.D if hasattr(info, "D") else info.d)]
+    if not (np.isfinite(matrix).all() and matrix[0] > 0.0 and matrix[4] > 0.0):
+        raise InputError(f"{where} states no intrinsics (its K is not calibrated); {remedy}.")
+    window = info.roi
+    if max(info.binning_x, info.binning_y) > 1 or window.x_offset or window.y_offset:
+        raise InputError(f"{where} states binning or a part of the image; {remedy} of the image itself.")
+    if any(lens) and (info.distortion_model not in _BROWN or any(lens[5:])):
+        raise InputError(f"{where} has the lens model {info.distortion_model!r}; rectify, and {remedy}.")
+    stated = {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5]}
+    numbers = {key: float(value) for key, value in stated.items()}
+    return {**numbers, "distortion": lens[:5] if any(lens) else []}
+
+
 def encoded(message: Any) -> Length | None:
     """The unit of an image's depth, by its encoding; None if it is no depth."""
     return _DEPTHS[message.encoding][1] if message.encoding in _DEPTHS else None
 
 
-def _depth(
-    where: str, parse: Any, message: Message, fields: CameraFields, size: tuple[int, int] | None
-) -> Array:
-    image = parse(message)
-    if size is not None and size != (image.height, image.width):
+def pixels_of(
+    where: str, image: Any, size: tuple[int, int], info: str = "its CameraInfo"
+) -> tuple[Array, Length]:
+    """The depths (H, W) of an Image, as they are encoded, and their unit.
+
+    Args:
+        where: it is from, for messages.
+        image: the message.
+        size: height and width that `info` states.
+        info: what states the size, for messages.
+
+    Raises:
+        InputError: it is of another size, no depth, or incomplete.
+    """
+    if size != (image.height, image.width):
         raise InputError(
-            f"{where} has {image.width} x {image.height} pixels, and {fields.info} is of {size[1]} x "
+            f"{where} has {image.width} x {image.height} pixels, and {info} is of {size[1]} x "
             f"{size[0]}; give the info of these images."
         )
     if image.encoding not in _DEPTHS:
@@ -167,6 +191,14 @@ def _depth(
     row = image.width * dtype.itemsize
     if image.step < row or len(image.data) < image.step * image.height or not row * image.height:
         raise InputError(f"{where} has fewer bytes than its {image.width} x {image.height} pixels need.")
-    data = np.ascontiguousarray(image.data[: image.step * image.height].reshape(image.height, image.step))
-    pixels = np.ascontiguousarray(data[:, :row]).view(dtype).astype(np.float64)
+    count = image.step * image.height
+    data = np.frombuffer(image.data, dtype=np.uint8, count=count).reshape(image.height, image.step)
+    return np.ascontiguousarray(data[:, :row]).view(dtype).astype(np.float64), unit
+
+
+def _depth(
+    where: str, parse: Any, message: Message, fields: CameraFields, size: tuple[int, int] | None
+) -> Array:
+    image = parse(message)
+    pixels, unit = pixels_of(where, image, size or (image.height, image.width), fields.info or "")
     return in_metres(where, pixels, fields, unit)
