@@ -1,3 +1,3 @@
-from bcppl.viewer.content import content as content
+from bcppl.viewer.held import content as content
 from bcppl.viewer.of_measurements import shown as shown
 from bcppl.viewer.page import Page as Page, view as view

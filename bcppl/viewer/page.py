@@ -20,7 +20,7 @@ import numpy as np
 
 from bcppl.recordings.hdf5 import replacing
 from bcppl.sensors import Recording
-from bcppl.viewer.content import History, content
+from bcppl.viewer.held import History, content
 from bcppl.visible_text import visible
 
 SCRIPTS = ("scene.js", "pictures.js", "page.js")
