@@ -224,10 +224,7 @@ def test_any_cut_gives_the_same_likelihood_with_shared_errors() -> None:
         totals.append(sum(sensor.site(a, pose).log_prob(v) for a, v in values))
         assert isinstance(totals[-1], Tensor)
     for total in totals[1:]:
-        # Gaps are linearised again where a cell of time ends: by a row of it cuts differ, and for one pose in
-        # thirty so does which corner of the peg is taken to touch.
-        apart = (total - totals[0]).abs()
-        assert float(apart.quantile(0.9)) < 0.1 and float(apart.max()) < 1.0
+        torch.testing.assert_close(total, totals[0], rtol=0.0, atol=1e-6)
     # A row within an episode too: the chain rule.
     whole = site(pose, FIVE).log_prob(FIVE)
     parts = torch.zeros_like(whole)

@@ -108,10 +108,12 @@ class Branches(NamedTuple):
             return only  # the states are held once for all particles, by hypothesis
         return only._replace(mean=self.mean[:, order[0]], covariance=self.covariance[:, order[0]])
 
-    def put(self, which: Indices, others: Branches) -> None:
-        """Write the hypotheses of other particles, as many and after the same rows, over those of some."""
-        for mine, other in zip(self, others, strict=True):
+    def with_others(self, which: Indices, others: Branches) -> Branches:
+        """With the hypotheses of other particles, as many and after the same rows, in place of some."""
+        both = Branches._make(each.copy() for each in self)
+        for mine, other in zip(both, others, strict=True):
             mine[which] = other
+        return both
 
     @property
     def of_each(self) -> Branches:

@@ -40,7 +40,7 @@ class FilteredEpisodes(PredictedEpisodes):
     blur: float = field(default=0.0, metadata=NONNEGATIVE)
     bench: LinearErrors = field(default_factory=LinearErrors)
     hypotheses: tuple[Hypothesis, ...] = ()
-    memory: dict[bytes, Linearised] = field(default_factory=dict)
+    memory: dict[bytes, tuple[Linearised, Linearised]] = field(default_factory=dict)
     solids: MeasuresGap | None = None
     cell: float = field(default=0.5, metadata=POSITIVE)
 
@@ -52,28 +52,38 @@ class FilteredEpisodes(PredictedEpisodes):
         return self._known(rows, after).branches
 
     def _known(self, rows: Tensor, after: Tensor | None = None) -> Linearised:
-        """The hypotheses after rows, and the shared errors about which the gap is linear."""
+        """The hypotheses after rows, and the shared errors about which the gap is linear.
+
+        They depend on the rows alone, not on how a probe is cut: the evidence of a window is a difference,
+        and of what is linear about one thing and then about another it would be any number.
+        """
         key = rows.numpy().tobytes()
-        known = self.memory.get(key)
-        if known is None:
-            before, new = None, rows
-            place = last_end(rows, self.cell)
-            if self.bench.errors and place > (0 if after is None else len(after)):
-                # However a probe is cut, gaps are linearised again where a cell ends.
-                self._known(rows[:place], after)
-                after = rows[:place]
-            if after is not None and len(after) and not is_cut(rows, len(after)):
-                before = self.memory.get(after.numpy().tobytes())
-                new = rows if before is None else rows[len(after) :]
-            if before is None:
-                prior = self._prior(0)
-                about = torch.zeros(len(self.pose), len(prior.mean), dtype=torch.float64)
-                before = Linearised(begun(prior, len(self.pose)), about)
-            branches = self._filtered(before.branches, self._prior(0), new, before.about).of_each
-            known = self.memory[key] = self._relinearised(rows, Linearised(branches, before.about))
+        if key not in self.memory:
+            filtered = self._from_last_end(rows, after)
+            self.memory[key] = filtered, self._relinearised(rows, filtered)
             for old in list(self.memory)[:-_REMEMBERED]:
                 del self.memory[old]
-        return known
+        return self.memory[key][1]
+
+    def _from_last_end(self, rows: Tensor, after: Tensor | None) -> Linearised:
+        """The same with gaps linear about what the errors seem to be at the last end before that of rows."""
+        place = self._last_end(rows)
+        if after is not None and not is_cut(rows, len(after)) and self._last_end(after) == place:
+            both = self.memory.get(after.numpy().tobytes())
+            if both is not None:
+                return self._continued(both[0], rows[len(after) :])
+        if place:
+            return self._continued(self._known(rows[:place], after), rows[place:])
+        prior = self._prior(0)
+        about = torch.zeros(len(self.pose), len(prior.mean), dtype=torch.float64)
+        return self._continued(Linearised(begun(prior, len(self.pose)), about), rows)
+
+    def _last_end(self, rows: Tensor) -> int:
+        return last_end(rows, self.cell) if self.bench.errors else 0
+
+    def _continued(self, before: Linearised, rows: Tensor) -> Linearised:
+        branches = self._filtered(before.branches, self._prior(0), rows, before.about)
+        return Linearised(branches.of_each, before.about)
 
     def _relinearised(self, rows: Tensor, known: Linearised) -> Linearised:
         """The same where particles' shared errors now seem to turn the peg otherwise than was assumed.
@@ -94,9 +104,7 @@ class FilteredEpisodes(PredictedEpisodes):
             return Linearised(again, errors)
         about = known.about.clone()
         about[far] = errors[far]
-        # These are the filter's own, and nothing else holds them yet.
-        known.branches.put(far.numpy(), again)
-        return Linearised(known.branches, about)
+        return Linearised(known.branches.with_others(far.numpy(), again), about)
 
     def _variance(self, columns: Tensor, rows: Tensor) -> Tensor:
         """Variances (N, D, R) of gaps a priori, without what the contact's compliance adds."""

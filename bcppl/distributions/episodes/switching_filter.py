@@ -29,7 +29,7 @@ from bcppl.distributions.episodes.branches import INLIER, KEPT, OUTLIER, Branche
 from bcppl.distributions.episodes.displaced import Lines
 from bcppl.threads import parallel_sum, thread_count
 
-_FAINT = 12.0  # nats below the most probable hypothesis, from which on one is dropped
+_FAINT = 25.0  # nats below the most probable hypothesis, from which on one is dropped
 _UNLIKELY = 10.0  # the same before an episode, of a hypothesis with a change
 _CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
 _SURPRISING = 1.0  # standard deviations of a chi-square

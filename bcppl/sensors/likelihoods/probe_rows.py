@@ -102,7 +102,7 @@ class RememberedGaps:
 
     def __init__(self, gap: MeasuresGap, part: Tensor) -> None:
         self.gap, self.part = gap, part
-        self.memory: dict[bytes, Linearised] = {}
+        self.memory: dict[bytes, tuple[Linearised, Linearised]] = {}
         self._number: dict[bytes, int] = {}
         self._distance, self._gradient = part.new_zeros(len(part), 0), part.new_zeros(len(part), 0, 6)
 
