@@ -16,10 +16,10 @@ from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing.contact_detection import ContactDetector
 
 CELL = 0.5  # s: rows are complete at the end of each cell of a probe, or at its own
-SHORTEST, LONGEST = 0.01, 0.05  # s of contact in one row
+SHORTEST, LONGEST = 0.01, 0.1  # s of contact in one row
 _GROWTH = 0.3  # of the time since the onset: rows are short where the force rises
 _TRAVEL = 0.0025  # m that a peg moves within a row of contact, and
-_MOVED = 0.001  # m between rows without one
+_MOVED, _SINCE = 0.001, 0.05  # m and s between rows without one
 _FORCE, _SHARE = 1.5, 0.3  # N, and of the force, by which it changes within a row
 _RESTING, _SLIDING = 0.01, 0.02  # m/s: below the one a peg rests, above the other it slides
 _FRICTION = 0.5  # a peg that slides moves across its force by so much more than along it
@@ -89,6 +89,7 @@ class EpisodeExtractor:
     _episode: int = -1
     _onset: float = -math.inf
     _last_contact: float = -math.inf
+    _begins: bool = True  # a cell, and so an episode
     _moving: bool = False
     _last_free: tuple[float, Array] | None = None
 
@@ -130,7 +131,7 @@ class EpisodeExtractor:
                 self._last_free = time[k], pose[k, :3]
             k += 1
         self._done = float(time[end - 1]) if end > begin else self._done
-        self._last_contact = -math.inf
+        self._begins = True
         return _rows(groups, time, pose, size, speed, wrench, self.delays)
 
     def _contact_row(self, first: int, end: int, seen: _Stamps) -> int:
@@ -140,6 +141,7 @@ class EpisodeExtractor:
         broken = now - self._last_contact > max(_BREAK, 1.5 * self.step) or (seen.felt[between] == 0.0).any()
         if broken:
             self._onset = now
+        broken |= self._begins
         longest = min(LONGEST, max(SHORTEST, _GROWTH * (now - self._onset)))
         stop = first + 1
         while stop < end and seen.felt[stop] == 1.0 and seen.time[stop] - now < longest - 1e-6:
@@ -152,7 +154,7 @@ class EpisodeExtractor:
         moving = seen.pace[first:stop].mean() > (_RESTING if self._moving else _SLIDING)
         if broken or moving != self._moving:
             self._episode += 1
-        self._moving, self._last_contact = moving, seen.time[stop - 1]
+        self._moving, self._last_contact, self._begins = moving, seen.time[stop - 1], False
         return stop
 
     def _is_new(self, k: int, time: Array, pose: Array, felt: Array) -> bool:
@@ -162,7 +164,7 @@ class EpisodeExtractor:
         if self._last_free is None:
             return True
         then, place = self._last_free
-        return time[k] - then > LONGEST - 1e-6 and bool(np.linalg.norm(pose[k, :3] - place) > _MOVED)
+        return time[k] - then > _SINCE - 1e-6 and bool(np.linalg.norm(pose[k, :3] - place) > _MOVED)
 
     def _decided(self, time: Array, pose: Array, force: Array) -> tuple[Array, Array, Array]:
         """1, 0 or NaN (T,) for contact, none and undecided; the speed of `Rows`, and the whole one."""

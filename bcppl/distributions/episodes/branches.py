@@ -44,6 +44,7 @@ class Prior(NamedTuple):
         change_variance: (C, M) by each.
         outlier: the probability that an episode, or a row without contact, is one.
         farthest: m, the range over which an outlier's gap is spread evenly.
+        faint: nats below the most probable hypothesis, from which on one is dropped.
     """
 
     log_weight: Array
@@ -56,6 +57,7 @@ class Prior(NamedTuple):
     change_variance: Array
     outlier: float
     farthest: float
+    faint: float
 
 
 class Branches(NamedTuple):
@@ -108,12 +110,18 @@ class Branches(NamedTuple):
             return only  # the states are held once for all particles, by hypothesis
         return only._replace(mean=self.mean[:, order[0]], covariance=self.covariance[:, order[0]])
 
-    def with_others(self, which: Indices, others: Branches) -> Branches:
-        """With the hypotheses of other particles, as many and after the same rows, in place of some."""
-        both = Branches._make(each.copy() for each in self)
-        for mine, other in zip(both, others, strict=True):
+    def of(self, which: Indices) -> Branches:
+        """Those of some particles."""
+        return self if len(which) == len(self.number) else Branches._make(each[which] for each in self)
+
+    def copied(self) -> Branches:
+        """The same, that may be written over."""
+        return Branches._make(each.copy() for each in self)
+
+    def put(self, which: Indices, others: Branches) -> None:
+        """Write the hypotheses of other particles, as many and after the same rows, over those of some."""
+        for mine, other in zip(self, others, strict=True):
             mine[which] = other
-        return both
 
     @property
     def of_each(self) -> Branches:

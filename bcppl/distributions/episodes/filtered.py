@@ -15,13 +15,15 @@ from bcppl.distributions.episodes.posterior import mean_of
 from bcppl.distributions.episodes.predicted import PredictedEpisodes
 from bcppl.distributions.episodes.prior import nodes_of, prior_of, with_delays
 from bcppl.distributions.episodes.row_errors import Hypothesis, RowErrors, segments_of
-from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FORCE, NOISE, is_cut, last_end
+from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FORCE, NOISE, is_cut
 from bcppl.distributions.episodes.switching_filter import filtered
 from bcppl.distributions.manifold import FARTHEST, ContactManifold, MeasuresGap
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 
 _FAR = 4.0  # standard deviations
-_TURNED = 0.0025  # rad, by which a corner of a peg 12 mm wide moves 15 um
+_TURNED = 0.005  # rad, by which a corner of a peg 12 mm wide moves 30 um
+_FAINT = 12.0  # nats, as of `Prior`, where no rows come after
+_AGAIN = 3  # times at most that gaps are linearised again
 _REMEMBERED = 3  # windows: the last one's rows are those that the next one is given
 
 
@@ -40,9 +42,8 @@ class FilteredEpisodes(PredictedEpisodes):
     blur: float = field(default=0.0, metadata=NONNEGATIVE)
     bench: LinearErrors = field(default_factory=LinearErrors)
     hypotheses: tuple[Hypothesis, ...] = ()
-    memory: dict[bytes, tuple[Linearised, Linearised]] = field(default_factory=dict)
+    memory: dict[bytes, tuple[Branches, Linearised]] = field(default_factory=dict)
     solids: MeasuresGap | None = None
-    cell: float = field(default=0.5, metadata=POSITIVE)
 
     def __post_init__(self) -> None:
         super(ContactManifold, self).__init__(len(self.pose), (self.stamps, COLUMNS))
@@ -55,56 +56,53 @@ class FilteredEpisodes(PredictedEpisodes):
         """The hypotheses after rows, and the shared errors about which the gap is linear.
 
         They depend on the rows alone, not on how a probe is cut: the evidence of a window is a difference,
-        and of what is linear about one thing and then about another it would be any number.
+        and of what is linear about one thing and then about another it would be any number. So what goes on
+        to later rows is linear about no errors.
         """
         key = rows.numpy().tobytes()
         if key not in self.memory:
-            filtered = self._from_last_end(rows, after)
+            filtered = self._about_none(rows, after)
             self.memory[key] = filtered, self._relinearised(rows, filtered)
             for old in list(self.memory)[:-_REMEMBERED]:
                 del self.memory[old]
         return self.memory[key][1]
 
-    def _from_last_end(self, rows: Tensor, after: Tensor | None) -> Linearised:
-        """The same with gaps linear about what the errors seem to be at the last end before that of rows."""
-        place = self._last_end(rows)
-        if after is not None and not is_cut(rows, len(after)) and self._last_end(after) == place:
-            both = self.memory.get(after.numpy().tobytes())
-            if both is not None:
-                return self._continued(both[0], rows[len(after) :])
-        if place:
-            return self._continued(self._known(rows[:place], after), rows[place:])
+    def _about_none(self, rows: Tensor, after: Tensor | None) -> Branches:
+        """The hypotheses after rows, the gaps linear about no errors."""
         prior = self._prior(0)
-        about = torch.zeros(len(self.pose), len(prior.mean), dtype=torch.float64)
-        return self._continued(Linearised(begun(prior, len(self.pose)), about), rows)
+        known, new = begun(prior, len(self.pose)), rows
+        if after is not None and not is_cut(rows, len(after)):
+            before = self.memory.get(after.numpy().tobytes())
+            if before is not None:
+                known, new = before[0], rows[len(after) :]
+        none = torch.zeros(len(self.pose), len(prior.mean), dtype=torch.float64)
+        return self._filtered(known, prior, new, none).of_each
 
-    def _last_end(self, rows: Tensor) -> int:
-        return last_end(rows, self.cell) if self.bench.errors else 0
-
-    def _continued(self, before: Linearised, rows: Tensor) -> Linearised:
-        branches = self._filtered(before.branches, self._prior(0), rows, before.about)
-        return Linearised(branches.of_each, before.about)
-
-    def _relinearised(self, rows: Tensor, known: Linearised) -> Linearised:
-        """The same where particles' shared errors now seem to turn the peg otherwise than was assumed.
+    def _relinearised(self, rows: Tensor, known: Branches) -> Linearised:
+        """The same where particles' shared errors seem to turn the peg otherwise than is assumed.
 
         Where flat faces meet, another corner touches then, of which the gap is another function.
         """
+        branches, about = known, torch.zeros(len(self.pose), len(self.bench.means), dtype=torch.float64)
         if not self.bench.errors or not len(rows):
-            return known
-        errors = mean_of(known.branches)
-        turned = self.bench.effect_again(rows).twist[:, 3:] @ (errors - known.about).T  # (R, 3, N)
-        far = (turned.abs().amax(dim=(0, 1)) > _TURNED).nonzero()[:, 0]
-        if not len(far):
-            return known
-        there, prior = replace(self, pose=self.pose[far], gap=self.solids or self.gap), self._prior(0)
-        begin = begun(prior, len(far)).with_only(known.branches.surviving(len(prior.scale))[far.numpy()])
-        again = there._filtered(begin, prior, rows, errors[far])
-        if len(far) == len(errors):
-            return Linearised(again, errors)
-        about = known.about.clone()
-        about[far] = errors[far]
-        return Linearised(known.branches.with_others(far.numpy(), again), about)
+            return Linearised(branches, about)
+        # Nothing goes on from here: no hypothesis is kept that later rows might raise.
+        far, prior = torch.arange(len(self.pose)), self._prior(0)._replace(faint=_FAINT)
+        for _ in range(_AGAIN):
+            errors = mean_of(branches.of(far.numpy()))
+            turned = self.bench.effect_again(rows).twist[:, 3:] @ (errors - about[far]).T  # (R, 3, N)
+            moved = turned.abs().amax(dim=(0, 1)) > _TURNED
+            if not moved.any():
+                break
+            far, errors = far[moved], errors[moved]
+            if branches is known:
+                branches = known.copied()
+            there = replace(self, pose=self.pose[far], gap=self.solids or self.gap)
+            surviving = branches.of(far.numpy()).surviving(len(prior.scale))
+            begin = begun(prior, len(far)).with_only(surviving)
+            branches.put(far.numpy(), there._filtered(begin, prior, rows, errors))
+            about[far] = errors
+        return Linearised(branches, about)
 
     def _variance(self, columns: Tensor, rows: Tensor) -> Tensor:
         """Variances (N, D, R) of gaps a priori, without what the contact's compliance adds."""

@@ -54,9 +54,8 @@ class ContactEpisodes(FilteredEpisodes):
 
     What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap and
     is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear in it about what it
-    seems to be: at the end of each span of time (`rows.last_end`) all rows are linearised again if the peg
-    seems to be turned otherwise than was assumed (as in an iterated extended Kalman smoother, Bell, SIAM J.
-    Optim. 4, 1994).
+    seems to be: all rows are linearised again, a few times at most, while the peg seems to be turned
+    otherwise than was assumed (as in an iterated extended Kalman smoother, Bell, SIAM J. Optim. 4, 1994).
 
     A row without contact has the probability that a gap about d is positive, as in `ContactManifold`; an
     episode is an outlier as a whole.
@@ -80,7 +79,6 @@ class ContactEpisodes(FilteredEpisodes):
         memory: of what is known after which rows, at these poses; where windows share one, each row is used
             once.
         solids: what measures the gap of pegs that are displaced by shared errors; `gap` unless given.
-        cell: the shortest span after which gaps are linearised again, s.
     """
 
     def log_prob(self, value: Tensor) -> Tensor:

@@ -71,14 +71,3 @@ def is_cut(rows: Tensor, place: int) -> bool:
     return (
         len(both) == 2 and bool((both[:, FELT] == 1.0).all()) and bool(both[0, EPISODE] == both[1, EPISODE])
     )
-
-
-def last_end(rows: Tensor, cell: float) -> int:
-    """The last place at which a span of time ends and no episode goes on; 0 for none.
-
-    From the first row on spans end after 1, 2, 3, 4, 6, 8, 12, ... cells of so many seconds: all rows can be
-    explained again at each end in a time that grows as their number.
-    """
-    number = np.floor((rows[:, TIME] - rows[:1, TIME]).numpy() / cell + 1e-6)
-    ends = np.flatnonzero(np.diff(np.floor(2.0 * np.log2(number + (number == 0) * 0.5)))) + 1
-    return next((int(place) for place in ends[::-1] if not is_cut(rows, int(place))), 0)

@@ -29,7 +29,6 @@ from bcppl.distributions.episodes.branches import INLIER, KEPT, OUTLIER, Branche
 from bcppl.distributions.episodes.displaced import Lines
 from bcppl.threads import parallel_sum, thread_count
 
-_FAINT = 25.0  # nats below the most probable hypothesis, from which on one is dropped
 _UNLIKELY = 10.0  # the same before an episode, of a hypothesis with a change
 _CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
 _SURPRISING = 1.0  # standard deviations of a chi-square
@@ -346,7 +345,7 @@ def _filter(
             )
             while left < min(size, found):
                 c = int(weight[:found].argmax())
-                if weight[c] < best - _FAINT:
+                if weight[c] < best - prior.faint:
                     break
                 b, change = source[c], kind[c] // 2
                 h = old_which[b]

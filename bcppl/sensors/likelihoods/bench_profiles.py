@@ -83,12 +83,14 @@ class BenchProfile:
     def hypotheses(compliance: float) -> tuple[Hypothesis, ...]:
         """How good the bench is, given the median compliance (m/N) of part and peg where they touch.
 
-        What differs from it is among the compliance of arm and grip.
+        What differs from it is among the compliance of arm and grip. Contacts or shared errors may be wider
+        than stated, not both.
         """
         return tuple(
             Hypothesis(math.log(common * share), compliance, noise, scale)
             for common, noise in NOISES
             for share, scale in SCALES
+            if noise == 1.0 or scale == 1.0
         )
 
 

@@ -15,7 +15,6 @@ from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.contact.quasi_static import QuasiStaticMotion, WindowMotion
 from bcppl.contact.sensing.contact_detection import ContactDetector
-from bcppl.contact.sensing.episodes import CELL
 from bcppl.contact.sensing.location import ContactSensing
 from bcppl.distributions.episodes import ContactEpisodes, Hypothesis, LinearError, LinearErrors
 from bcppl.distributions.episodes.branches import begun
@@ -189,7 +188,6 @@ class ContactProbe:
             hypotheses=self.hypotheses,
             memory=gap.memory if isinstance(gap, RememberedGaps) else {},
             solids=self.gap,
-            cell=CELL,
         )
 
     def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
