@@ -15,16 +15,15 @@ from bcppl.distributions.episodes.posterior import mean_of
 from bcppl.distributions.episodes.predicted import PredictedEpisodes
 from bcppl.distributions.episodes.prior import nodes_of, prior_of, with_delays
 from bcppl.distributions.episodes.row_errors import Hypothesis, RowErrors, segments_of
-from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FORCE, NOISE, is_cut
+from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FORCE, NOISE, is_cut, last_end
 from bcppl.distributions.episodes.switching_filter import filtered
 from bcppl.distributions.manifold import FARTHEST, ContactManifold, MeasuresGap
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 
 _FAR = 4.0  # standard deviations
 _TURNED = 0.005  # rad, by which a corner of a peg 12 mm wide moves 30 um
-_FAINT = 12.0  # nats, as of `Prior`, where no rows come after
-_AGAIN = 3  # times at most that gaps are linearised again
-_REMEMBERED = 3  # windows: the last one's rows are those that the next one is given
+_AGAIN = 2  # times at most that gaps are linearised again at one end
+_REMEMBERED = 5  # a window's rows are those that the next one is given; and the last end's
 
 
 @dataclass(eq=False, repr=False)
@@ -42,7 +41,7 @@ class FilteredEpisodes(PredictedEpisodes):
     blur: float = field(default=0.0, metadata=NONNEGATIVE)
     bench: LinearErrors = field(default_factory=LinearErrors)
     hypotheses: tuple[Hypothesis, ...] = ()
-    memory: dict[bytes, tuple[Branches, Linearised]] = field(default_factory=dict)
+    memory: dict[bytes, Linearised] = field(default_factory=dict)
     solids: MeasuresGap | None = None
 
     def __post_init__(self) -> None:
@@ -56,38 +55,40 @@ class FilteredEpisodes(PredictedEpisodes):
         """The hypotheses after rows, and the shared errors about which the gap is linear.
 
         They depend on the rows alone, not on how a probe is cut: the evidence of a window is a difference,
-        and of what is linear about one thing and then about another it would be any number. So what goes on
-        to later rows is linear about no errors.
+        and of what is linear about one thing and then about another it would be any number.
         """
         key = rows.numpy().tobytes()
         if key not in self.memory:
-            filtered = self._about_none(rows, after)
-            self.memory[key] = filtered, self._relinearised(rows, filtered)
-            for old in list(self.memory)[:-_REMEMBERED]:
-                del self.memory[old]
-        return self.memory[key][1]
+            before, new = self._before(rows, after)
+            branches = self._filtered(before.branches, self._prior(0), new, before.about)
+            self._remember(key, Linearised(branches.of_each, before.about))
+        return self.memory[key]
 
-    def _about_none(self, rows: Tensor, after: Tensor | None) -> Branches:
-        """The hypotheses after rows, the gaps linear about no errors."""
-        prior = self._prior(0)
-        known, new = begun(prior, len(self.pose)), rows
+    def _before(self, rows: Tensor, after: Tensor | None) -> tuple[Linearised, Tensor]:
+        """What is known before some of the rows, and these: those since the last end, or after `after`."""
+        place = last_end(rows) if self.bench.errors else 0
         if after is not None and not is_cut(rows, len(after)):
-            before = self.memory.get(after.numpy().tobytes())
-            if before is not None:
-                known, new = before[0], rows[len(after) :]
-        none = torch.zeros(len(self.pose), len(prior.mean), dtype=torch.float64)
-        return self._filtered(known, prior, new, none).of_each
+            known = self.memory.get(after.numpy().tobytes())
+            if known is not None and (not self.bench.errors or last_end(after) == place):
+                return known, rows[len(after) :]
+        if place:
+            return self._linearised_again(rows[:place], after), rows[place:]
+        prior = self._prior(0)
+        about = torch.zeros(len(self.pose), len(prior.mean), dtype=torch.float64)
+        return Linearised(begun(prior, len(self.pose)), about), rows
 
-    def _relinearised(self, rows: Tensor, known: Branches) -> Linearised:
-        """The same where particles' shared errors seem to turn the peg otherwise than is assumed.
+    def _linearised_again(self, rows: Tensor, after: Tensor | None) -> Linearised:
+        """What is known after rows at whose end gaps are linearised about what the errors seem to be.
 
-        Where flat faces meet, another corner touches then, of which the gap is another function.
+        Where flat faces meet, and the peg is turned otherwise than was assumed, another corner touches, of
+        which the gap is another function.
         """
-        branches, about = known, torch.zeros(len(self.pose), len(self.bench.means), dtype=torch.float64)
-        if not self.bench.errors or not len(rows):
-            return Linearised(branches, about)
-        # Nothing goes on from here: no hypothesis is kept that later rows might raise.
-        far, prior = torch.arange(len(self.pose)), self._prior(0)._replace(faint=_FAINT)
+        key = b"again" + rows.numpy().tobytes()
+        if key in self.memory:
+            return self.memory[key]
+        known, prior = self._known(rows, after), self._prior(0)
+        branches, about = known
+        far = torch.arange(len(self.pose))
         for _ in range(_AGAIN):
             errors = mean_of(branches.of(far.numpy()))
             turned = self.bench.effect_again(rows).twist[:, 3:] @ (errors - about[far]).T  # (R, 3, N)
@@ -95,14 +96,20 @@ class FilteredEpisodes(PredictedEpisodes):
             if not moved.any():
                 break
             far, errors = far[moved], errors[moved]
-            if branches is known:
-                branches = known.copied()
+            if branches is known.branches:
+                branches, about = branches.copied(), about.clone()
             there = replace(self, pose=self.pose[far], gap=self.solids or self.gap)
             surviving = branches.of(far.numpy()).surviving(len(prior.scale))
             begin = begun(prior, len(far)).with_only(surviving)
             branches.put(far.numpy(), there._filtered(begin, prior, rows, errors))
             about[far] = errors
-        return Linearised(branches, about)
+        return self._remember(key, Linearised(branches, about))
+
+    def _remember(self, key: bytes, known: Linearised) -> Linearised:
+        self.memory[key] = known
+        for old in list(self.memory)[:-_REMEMBERED]:
+            del self.memory[old]
+        return known
 
     def _variance(self, columns: Tensor, rows: Tensor) -> Tensor:
         """Variances (N, D, R) of gaps a priori, without what the contact's compliance adds."""

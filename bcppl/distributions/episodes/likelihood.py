@@ -54,8 +54,9 @@ class ContactEpisodes(FilteredEpisodes):
 
     What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap and
     is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear in it about what it
-    seems to be: all rows are linearised again, a few times at most, while the peg seems to be turned
-    otherwise than was assumed (as in an iterated extended Kalman smoother, Bell, SIAM J. Optim. 4, 1994).
+    seems to be: where the number of rows has doubled (`rows.last_end`) all are linearised again if the peg
+    seems to be turned otherwise than was assumed (as in an iterated extended Kalman smoother, Bell, SIAM J.
+    Optim. 4, 1994).
 
     A row without contact has the probability that a gap about d is positive, as in `ContactManifold`; an
     episode is an outlier as a whole.

@@ -243,9 +243,12 @@ def _filter(
     )
     log_in = math.log1p(-prior.outlier)
     log_out = math.log(prior.outlier) if prior.outlier > 0.0 else -np.inf
+    # Without sudden changes branches are the prior's hypotheses, and hardly multiply.
+    kept_branches = size if changes == 1 else KEPT
     # Candidates at one episode: which branch each comes from, and what happens.
     weight, source, kind = np.empty(most), np.empty(most, np.int64), np.empty(most, np.int64)
     square, error, white = np.empty(most), np.empty((size, longest)), np.empty(longest)
+    rank, leading = np.empty(most), np.empty(len(gaps.late), np.int64)
     pulls = np.empty((size, longest, parameters))
     joints, factor = np.empty((size, longest, longest)), np.empty((longest, longest))
     # Of a segment: its gaps with each delay, and for which delays they are known.
@@ -338,15 +341,27 @@ def _filter(
                     square[found + 1] = square[found]
                     found += 2
             best, left, known_branches = weight[:found].max(), 0, number[n]
+            # The best of each delay comes first: no other way leads back to one that is gone.
+            rank[:found], leading[:] = weight[:found], -1
+            for c in range(found):
+                delay = prior.delay[which[n, source[c]]]
+                if leading[delay] < 0 or weight[c] > weight[leading[delay]]:
+                    leading[delay] = c
+            for delay in range(delays):
+                if leading[delay] >= 0:
+                    rank[leading[delay]] = best
             old_which[:], old_event[:], old_squared[:] = which[n], event[n], squared[n]
             old_mean[:known_branches], old_covariance[:known_branches] = (
                 mean[n, :known_branches],
                 covariance[n, :known_branches],
             )
-            while left < min(size, found):
-                c = int(weight[:found].argmax())
-                if weight[c] < best - prior.faint:
+            while left < min(kept_branches, found):
+                c = int(rank[:found].argmax())
+                if rank[c] < best - prior.faint:
                     break
+                rank[c] = -np.inf
+                if weight[c] < best - prior.faint:
+                    continue
                 b, change = source[c], kind[c] // 2
                 h = old_which[b]
                 for a in range(parameters):
@@ -372,6 +387,5 @@ def _filter(
                     covariance[n, left, a, a] += changed[a]
                 event[n, left], squared[n, left] = old_event[b], old_squared[b]
                 event[n, left, episode], squared[n, left, episode] = kind[c], square[c]
-                weight[c] = -np.inf
                 left += 1
             number[n], episode = left, episode + 1

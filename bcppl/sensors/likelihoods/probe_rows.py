@@ -15,7 +15,7 @@ from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, cell_ends
 from bcppl.contact.sensing.location import ContactSensing
-from bcppl.distributions.episodes.branches import Branches, Linearised
+from bcppl.distributions.episodes.branches import Linearised
 from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FELT, GIVEN, SECONDS, padded
 from bcppl.distributions.manifold import Gaps, MeasuresGap
 from bcppl.robot.motion import Probe, ProbeWindow
@@ -102,7 +102,7 @@ class RememberedGaps:
 
     def __init__(self, gap: MeasuresGap, part: Tensor) -> None:
         self.gap, self.part = gap, part
-        self.memory: dict[bytes, tuple[Branches, Linearised]] = {}
+        self.memory: dict[bytes, Linearised] = {}
         self._number: dict[bytes, int] = {}
         self._distance, self._gradient = part.new_zeros(len(part), 0), part.new_zeros(len(part), 0, 6)
 
