@@ -13,9 +13,13 @@ from bcppl import poses
 from bcppl.distributions.poses import BoxedNormal, MixturePose, NormalPose
 from bcppl.distributions.poses.boxed import log_mass
 
-# Proposals are mixtures of scaled copies: their scales, in standard deviations, and their probabilities.
-WIDTHS = torch.tensor([1.1, 3.0], dtype=torch.float64)
-SHARES = torch.tensor([0.85, 0.15], dtype=torch.float64)
+# Proposals are mixtures of a Gaussian's copies: one as it is but for a little, one that is wider in all
+# directions, and one for each principal axis that is wider along it. Where a posterior is a bent ridge its
+# curvature at one place says too little of how long it is, and all wide at once hardly ever hits it.
+WIDTHS = (1.1, 3.0, 3.0)  # standard deviations
+SHARES = (0.6, 0.1, 0.3)  # probabilities, the last of all six axes together
+COPIES = 8
+_LEVER = 0.02  # m: a rotation is as long as the displacement that it gives there
 
 _SWEEPS = 3  # of expectation propagation over the axes
 _NARROWEST = 1e-3  # share of a variance that a truncation leaves, at least: beyond, rounding dominates
@@ -108,18 +112,31 @@ def widened(center: Tensor, covariance: Tensor) -> MixturePose:
 
 def widened_mixture(mixture: GaussianMixture) -> MixturePose:
     """A mixture of M Gaussians for each of N particles, each mixed with a wider one."""
-    centers, wide = mixture.centers, WIDTHS[:, None, None] ** 2 * mixture.covariances[..., None, :, :]
-    log_weights = mixture.log_weights.log_softmax(dim=-1)[..., None] + SHARES.log()
+    centers, covariances = mixture.centers, mixture.covariances
+    same, every, along = (width**2 for width in WIDTHS)
+    units = torch.tensor([1.0] * 3 + [1.0 / _LEVER] * 3, dtype=torch.float64)
+    values, axes = torch.linalg.eigh(covariances / (units[:, None] * units))
+    longest = units[:, None] * axes * values.clamp(min=0.0).sqrt()[..., None, :]  # (..., 6, 6), by column
+    wider = (along - same) * longest.mT[..., :, None] * longest.mT[..., None, :]
+    wide = torch.cat(
+        [
+            torch.stack([same * covariances, every * covariances], dim=-3),
+            same * covariances[..., None, :, :] + wider,
+        ],
+        dim=-3,
+    )
+    shares = torch.tensor([*SHARES[:2], *[SHARES[2] / 6.0] * 6], dtype=torch.float64)
+    log_weights = mixture.log_weights.log_softmax(dim=-1)[..., None] + shares.log()
     return MixturePose(
         log_weights.flatten(-2),
-        centers[..., None, :].expand(*centers.shape[:-1], len(WIDTHS), 7).flatten(-3, -2),
+        centers[..., None, :].expand(*centers.shape[:-1], COPIES, 7).flatten(-3, -2),
         wide.flatten(-4, -3),
     )
 
 
 def matched(mixture: MixturePose) -> NormalPose:
     """The Gaussian with the mean and covariance of a `widened_mixture`, its wider copies aside."""
-    every = len(WIDTHS)
+    every = COPIES
     probabilities = mixture.log_weights[..., ::every].softmax(dim=-1)
     centers = mixture.components.center[..., ::every, :]
     covariances = mixture.components.covariance[..., ::every, :, :]
