@@ -222,8 +222,8 @@ def test_a_bench_that_is_not_perfect_is_seen_explained_and_the_peg_inserted(
     perfect, honest = re.findall(r"squared distance (\d+)$", printed["two"], flags=re.MULTILINE)
     assert float(perfect) > 100.0 > 25.0 > float(honest)
     (gain,) = re.findall(r"perfect: ([+-][\d.]+) nats", printed["evidence"])
-    # Fewer particles see, and touch, otherwise: that recording contradicts a perfect bench by a nat or two, with
-    # 100 particles as well, and the notebook's by eight.
+    # Fewer particles see, and touch, otherwise: that recording contradicts a perfect bench by a nat or two,
+    # with 100 particles as well, and the notebook's by eight.
     assert float(gain) > (0.0 if smaller else 4.0)
     assert "the peg's pose in the hand" in printed["explained"]
     offs = [float(off) for off in re.findall(r"relative: ([\d.]+) mm off", printed["relative"])]
