@@ -283,17 +283,17 @@ def main() -> None:
     count = 1 if arguments.quick else arguments.scenes
     groups = [(f, s, p) for f in arguments.fault for s in arguments.scale for p in arguments.profile]
     seeds = range(arguments.seed, arguments.seed + count)
-    others = [None, *range(1, arguments.inference_seeds)]
-    tasks = [Task(seed, *group, other) for seed in seeds for group in groups for other in others]
+    inferences = [None, *range(1, arguments.inference_seeds)]
+    tasks = [Task(seed, *group, other) for seed in seeds for group in groups for other in inferences]
     outcomes: dict[Task, Outcome] = {}
     for task, (world, relative, *others) in swept(outcome, tasks, file=arguments.file, jobs=arguments.jobs):
         one = outcomes[task] = Outcome(Pose(*world), Pose(*relative), *others)
         print(*task, summary(one), flush=True)
     lines, rows = [], []
-    clearances = [bench_scene(seed).clearance for seed in seeds for _ in others]
+    clearances = [bench_scene(seed).clearance for seed in seeds for _ in inferences]
     for group in groups:
         name = f"{group[0]} x {group[1]:g}, {group[2]}"
-        several = [outcomes[Task(seed, *group, other)] for seed in seeds for other in others]
+        several = [outcomes[Task(seed, *group, other)] for seed in seeds for other in inferences]
         lines.append(line(f"world, {name}", [one.world for one in several]))
         lines.append(line(f"relative, {name}", [one.relative for one in several]))
         rows += rows_of(name, Task(0, *group), several, clearances)
