@@ -105,13 +105,13 @@ def mixture_of(mixture: GaussianMixture) -> NormalPose | MixturePose:
 
 
 def widened(center: Tensor, covariance: Tensor) -> MixturePose:
-    """A Gaussian with centres (N, 7) and covariances (N, 6, 6), mixed with a wider one."""
+    """A Gaussian with centres (N, 7) and covariances (N, 6, 6), mixed with wider ones (`WIDTHS`)."""
     alone = torch.zeros(1, dtype=torch.float64)
     return widened_mixture(GaussianMixture(center[..., None, :], covariance[..., None, :, :], alone))
 
 
 def widened_mixture(mixture: GaussianMixture) -> MixturePose:
-    """A mixture of M Gaussians for each of N particles, each mixed with a wider one."""
+    """A mixture of M Gaussians for each of N particles, each mixed with wider ones (`WIDTHS`)."""
     centers, covariances = mixture.centers, mixture.covariances
     same, every, along = (width**2 for width in WIDTHS)
     units = torch.tensor([1.0] * 3 + [1.0 / _LEVER] * 3, dtype=torch.float64)

@@ -44,7 +44,6 @@ class Prior(NamedTuple):
         change_variance: (C, M) by each.
         outlier: the probability that an episode, or a row without contact, is one.
         farthest: m, the range over which an outlier's gap is spread evenly.
-        faint: nats below the most probable hypothesis, from which on one is dropped.
     """
 
     log_weight: Array
@@ -57,7 +56,6 @@ class Prior(NamedTuple):
     change_variance: Array
     outlier: float
     farthest: float
-    faint: float
 
 
 class Branches(NamedTuple):

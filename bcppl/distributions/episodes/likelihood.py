@@ -54,7 +54,7 @@ class ContactEpisodes(FilteredEpisodes):
 
     What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap and
     is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear in it about what it
-    seems to be: where the number of rows has doubled (`rows.last_end`) all are linearised again if the peg
+    seems to be: where rows are half as many again (`rows.last_end`) all are linearised again if the peg
     seems to be turned otherwise than was assumed (as in an iterated extended Kalman smoother, Bell, SIAM J.
     Optim. 4, 1994).
 

@@ -18,9 +18,6 @@ from bcppl.distributions.manifold import FARTHEST
 NOISES = ((0.85, 1.0), (0.15, 2.5))
 # Nodes of the compliance, in decades from its median: they are closer than `varying` is wide.
 _DECADES = torch.linspace(-1.25, 1.25, 11, dtype=torch.float64)
-# Nats below the most probable hypothesis, from which on one is dropped: at the release of a touch the right
-# delay of the wrench was 12 below another, and in the end 46 above it.
-FAINT = 25.0
 # Standard deviations, m and rad, of the pose about which a likelihood is approximated: far wider than what
 # any touch leaves.
 WIDE = torch.tensor([0.1] * 3 + [1.0] * 3, dtype=torch.float64)
@@ -69,5 +66,4 @@ def prior_of(bench: LinearErrors, hypotheses: tuple[Hypothesis, ...], outlier: f
         change_variance=changed,
         outlier=outlier,
         farthest=FARTHEST,
-        faint=FAINT,
     )
