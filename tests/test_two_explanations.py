@@ -162,6 +162,22 @@ def test_modes_widen_as_one_does_and_match_their_mean_and_covariance() -> None:
     torch.testing.assert_close(spread, 0.25 * torch.outer(away, away).expand(3, 6, 6))
 
 
+def test_a_proposal_is_wider_along_each_principal_axis_in_turn_and_in_all_directions() -> None:
+    """In units of the Gaussian itself one axis alone is wider, another each time; millimetres and degrees."""
+    generator = torch.Generator().manual_seed(2)
+    root = torch.randn(6, 6, generator=generator, dtype=torch.float64) * torch.tensor([1e-4] * 3 + [5e-3] * 3)
+    covariance = root.T @ root
+    proposed = widened(poses.identity(), covariance)
+    torch.testing.assert_close(proposed.log_weights.exp().sum(), torch.tensor(1.0).double())
+    lower = torch.linalg.inv(torch.linalg.cholesky(covariance))
+    ratios = [torch.linalg.eigh(lower @ each @ lower.T) for each in proposed.components.covariance]
+    values = torch.stack([ratio.eigenvalues for ratio in ratios])
+    torch.testing.assert_close(values[:2], torch.tensor([[1.21] * 6, [9.0] * 6], dtype=torch.float64))
+    torch.testing.assert_close(values[2:], torch.tensor([[1.21] * 5 + [9.0]] * 6, dtype=torch.float64))
+    axes = torch.stack([ratio.eigenvectors[:, -1] for ratio in ratios[2:]])
+    torch.testing.assert_close((axes @ axes.T).abs(), torch.eye(6).double(), rtol=0.0, atol=1e-6)
+
+
 def test_particles_mostly_stay_in_their_mode_and_may_go_to_any() -> None:
     centers = poses.identity(2)
     centers[1, 0] = 0.01
