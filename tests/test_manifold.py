@@ -35,7 +35,7 @@ class Ledge(NamedTuple):
 
 
 def ledge(world_from_part: Tensor, world_from_peg: Tensor) -> Ledge:
-    place = poses.transform(poses.inverse(world_from_part), world_from_peg[:, :3])
+    place = poses.compose(poses.inverse(world_from_part)[:, None], world_from_peg)[..., :3]
     normal = torch.zeros_like(place)
     normal[..., 2] = 1.0
     return Ledge(place[..., 2], normal, place)

@@ -180,7 +180,8 @@ def test_predicted_touches_are_moved_by_shared_errors_as_measured_ones_are() -> 
     drawn = 0.01 * torch.randn(len(pose), len(errors.means), dtype=torch.float64)
     measured = replace(one, sink=4.0 * one.compliance).with_shared_errors(value, drawn)
     again = replace(one, sink=4.0 * one.compliance)._moved(measured, drawn)[0]
-    torch.testing.assert_close(again, gap(pose, stood).distance, rtol=0.0, atol=1e-7)
+    # Across an edge the gap is linear but for the turn, of which the errors here are a milliradian.
+    torch.testing.assert_close(again, gap(pose, stood).distance, rtol=0.0, atol=2e-6)
     assert float((gap(pose, measured[..., :7]).distance - again).abs().max()) > 1e-6
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from torch import Tensor
 
 from bcppl.arrays import Array, Indices, Mask
 
@@ -126,13 +125,6 @@ class Branches(NamedTuple):
         """The same where what holds for all particles is written for each."""
         count = len(self.number)
         return Branches._make(each if len(each) == count else np.repeat(each, count, axis=0) for each in self)
-
-
-class Linearised(NamedTuple):
-    """Hypotheses, and the shared errors (N, M) of each particle about which the gap is linear."""
-
-    branches: Branches
-    about: Tensor
 
 
 def begun(prior: Prior, particles: int) -> Branches:

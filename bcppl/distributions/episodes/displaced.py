@@ -13,7 +13,7 @@ from bcppl.arrays import Array
 from bcppl.compiled import compiled
 from bcppl.distributions.episodes.linear_errors import Effect, LinearErrors
 from bcppl.distributions.episodes.rows import COLUMNS, WRENCH
-from bcppl.distributions.manifold import Gaps, MeasuresGap
+from bcppl.distributions.manifold import Gaps
 
 
 class Lines(NamedTuple):
@@ -28,6 +28,7 @@ class Lines(NamedTuple):
         gradient: (N, R, 6) by the part's pose.
         late: (D, R, 6) twists of the peg by each delay.
         twist, offset: (D, R, 6, M) and (D, R, M), as of `Effect`.
+        residual: (N, R, K) m; sums of their products are covariances of what the lines leave over.
     """
 
     distance: Tensor
@@ -36,6 +37,7 @@ class Lines(NamedTuple):
     late: Tensor
     twist: Tensor
     offset: Tensor
+    residual: Tensor
 
     @property
     def moved(self) -> Tensor:
@@ -49,7 +51,7 @@ class Lines(NamedTuple):
 
 
 def lines_at(gaps: Gaps, pose: Tensor, rows: Tensor, bench: LinearErrors) -> Lines:
-    """About no error.
+    """About no error, by the gap's derivative.
 
     Args:
         gaps: (N, R), at the pegs as measured.
@@ -61,25 +63,8 @@ def lines_at(gaps: Gaps, pose: Tensor, rows: Tensor, bench: LinearErrors) -> Lin
     gradient = gaps.gradient(pose)
     # Without errors nothing reads the slope.
     slope = _by_twist_of_peg(gradient, pose, rows[:, :7]) if bench.errors else torch.zeros_like(gradient)
-    return Lines(gaps.distance, slope, gradient, late, *effect)
-
-
-def lines_about(gap: MeasuresGap, pose: Tensor, rows: Tensor, bench: LinearErrors, errors: Tensor) -> Lines:
-    """As of `lines_at`, about some errors (N, M): measured at pegs that are displaced by them.
-
-    Where flat faces meet another corner of the peg may touch once it is turned: there the gap has a kink, and
-    is linear about what the errors seem to be, not about none.
-    """
-    late, effect = bench.late_effects(rows)
-    twist = torch.einsum("ram,nm->nra", bench.effect_again(rows).twist, errors)
-    turn = poses.rotation_matrix(rows[:, :7])
-    moved = torch.einsum("rab,nrb->nra", turn, twist[..., :3])
-    peg = rows[:, :7].expand(len(pose), len(rows), 7)
-    peg = poses.retract(peg, torch.cat([moved, twist[..., 3:]], dim=-1))
-    gaps = gap(pose, peg)
-    gradient = gaps.gradient(pose)
-    slope = _by_twist_of_peg(gradient, pose, peg)
-    return Lines(gaps.distance - (slope * twist).sum(dim=-1), slope, gradient, late, *effect)
+    none = gaps.distance.new_zeros(*gaps.distance.shape, 0)
+    return Lines(gaps.distance, slope, gradient, late, *effect, none)
 
 
 def by_shared_errors(gaps: Gaps, pose: Tensor, peg: Tensor, force: Tensor, bench: LinearErrors) -> Tensor:

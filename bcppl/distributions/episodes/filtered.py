@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from bcppl.distributions.episodes.branches import Branches, Linearised, Prior, begun
-from bcppl.distributions.episodes.displaced import Lines, lines_about, lines_at
+from bcppl.distributions.episodes.branches import Branches, Prior, begun
+from bcppl.distributions.episodes.displaced import Lines, lines_at
 from bcppl.distributions.episodes.linear_errors import LinearErrors
-from bcppl.distributions.episodes.posterior import mean_of
+from bcppl.distributions.episodes.posterior import moments
 from bcppl.distributions.episodes.predicted import PredictedEpisodes
 from bcppl.distributions.episodes.prior import nodes_of, prior_of, with_delays
+from bcppl.distributions.episodes.regressed import Spread, regressed
 from bcppl.distributions.episodes.row_errors import Hypothesis, RowErrors, segments_of
 from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FORCE, NOISE, is_cut, last_end
 from bcppl.distributions.episodes.switching_filter import filtered
@@ -21,9 +23,14 @@ from bcppl.distributions.manifold import FARTHEST, ContactManifold, MeasuresGap
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 
 _FAR = 4.0  # standard deviations
-_TURNED = 0.005  # rad, by which a corner of a peg 12 mm wide moves 30 um
-_AGAIN = 2  # times at most that gaps are linearised again at one end
 _REMEMBERED = 5  # a window's rows are those that the next one is given; and the last end's
+
+
+class Linearised(NamedTuple):
+    """Hypotheses, and what the shared errors of each particle may be, over which the gap is linear."""
+
+    branches: Branches
+    errors: Spread
 
 
 @dataclass(eq=False, repr=False)
@@ -60,50 +67,41 @@ class FilteredEpisodes(PredictedEpisodes):
         key = rows.numpy().tobytes()
         if key not in self.memory:
             before, new = self._before(rows, after)
-            branches = self._filtered(before.branches, self._prior(0), new, before.about)
-            self._remember(key, Linearised(branches.of_each, before.about))
+            branches = self._filtered(before.branches, self._prior(0), new, before.errors)
+            self._remember(key, Linearised(branches.of_each, before.errors))
         return self.memory[key]
 
     def _before(self, rows: Tensor, after: Tensor | None) -> tuple[Linearised, Tensor]:
         """What is known before some of the rows, and these: those since the last end, or after `after`."""
-        place = last_end(rows) if self.bench.errors else 0
+        place = last_end(rows) if self._regresses else 0
         if after is not None and not is_cut(rows, len(after)):
             known = self.memory.get(after.numpy().tobytes())
-            if known is not None and (not self.bench.errors or last_end(after) == place):
+            if known is not None and (not self._regresses or last_end(after) == place):
                 return known, rows[len(after) :]
         if place:
             return self._linearised_again(rows[:place], after), rows[place:]
-        prior = self._prior(0)
-        about = torch.zeros(len(self.pose), len(prior.mean), dtype=torch.float64)
-        return Linearised(begun(prior, len(self.pose)), about), rows
+        return Linearised(begun(self._prior(0), len(self.pose)), self._errors_before), rows
+
+    @property
+    def _regresses(self) -> bool:
+        """Whether gaps are fitted over what the errors may be; coarsely they are linear about none."""
+        return bool(self.bench.errors) and not self.blur
+
+    @property
+    def _errors_before(self) -> Spread:
+        """What the shared errors may be before any row."""
+        count, (means, variances) = len(self.pose), (self.bench.means, self.bench.variances)
+        return Spread(means.expand(count, -1), torch.diag(variances).expand(count, -1, -1))
 
     def _linearised_again(self, rows: Tensor, after: Tensor | None) -> Linearised:
-        """What is known after rows at whose end gaps are linearised about what the errors seem to be.
-
-        Where flat faces meet, and the peg is turned otherwise than was assumed, another corner touches, of
-        which the gap is another function.
-        """
+        """What is known after rows of which the gaps are linear over what the errors now may be."""
         key = b"again" + rows.numpy().tobytes()
         if key in self.memory:
             return self.memory[key]
-        known, prior = self._known(rows, after), self._prior(0)
-        branches, about = known
-        far = torch.arange(len(self.pose))
-        for _ in range(_AGAIN):
-            errors = mean_of(branches.of(far.numpy()))
-            turned = self.bench.effect_again(rows).twist[:, 3:] @ (errors - about[far]).T  # (R, 3, N)
-            moved = turned.abs().amax(dim=(0, 1)) > _TURNED
-            if not moved.any():
-                break
-            far, errors = far[moved], errors[moved]
-            if branches is known.branches:
-                branches, about = branches.copied(), about.clone()
-            there = replace(self, pose=self.pose[far], gap=self.solids or self.gap)
-            surviving = branches.of(far.numpy()).surviving(len(prior.scale))
-            begin = begun(prior, len(far)).with_only(surviving)
-            branches.put(far.numpy(), there._filtered(begin, prior, rows, errors))
-            about[far] = errors
-        return self._remember(key, Linearised(branches, about))
+        branches, prior = self._known(rows, after).branches, self._prior(0)
+        errors = Spread(*moments(branches))
+        begin = begun(prior, len(self.pose)).with_only(branches.surviving(len(prior.scale)))
+        return self._remember(key, Linearised(self._filtered(begin, prior, rows, errors).of_each, errors))
 
     def _remember(self, key: bytes, known: Linearised) -> Linearised:
         self.memory[key] = known
@@ -129,24 +127,22 @@ class FilteredEpisodes(PredictedEpisodes):
         """With so many parameters of the pose before the others."""
         return prior_of(self.bench, self._few if pose else self._every, self.outlier, pose)
 
-    def _lines(self, rows: Tensor) -> Lines:
-        """The gaps at rows (R, COLUMNS), linear about no error."""
+    def _lines(self, rows: Tensor, errors: Spread) -> Lines:
+        """The gaps at rows (R, COLUMNS), linear over what the errors may be."""
+        if self._regresses:
+            return regressed(self.solids or self.gap, self.pose, rows, self.bench, errors)
         return lines_at(self.gap(self.pose, rows[:, :7]), self.pose, rows, self.bench)
 
     def _filtered(
-        self, begin: Branches, prior: Prior, rows: Tensor, about: Tensor, free: bool = False
+        self, begin: Branches, prior: Prior, rows: Tensor, errors: Spread, free: bool = False
     ) -> Branches:
         """The hypotheses after rows, the pose `free` to move about `self.pose` or held there.
 
-        The gap is linear in the shared errors about some (N, M).
+        The gap is linear over what the shared errors may be.
         """
         if not len(rows):
             return begin
-        lines = (
-            lines_about(self.solids or self.gap, self.pose, rows, self.bench, about)
-            if about.any()
-            else self._lines(rows)
-        )
+        lines = self._lines(rows, errors)
         hypotheses = self._few if free else self._every
         segments = segments_of(rows, self._row_errors, hypotheses)
         if not free:

@@ -245,7 +245,5 @@ class ContactEpisodes(FilteredEpisodes):
         prior = self._prior(6)
         if self.blur:
             prior = prior._replace(outlier=0.0)
-        about = self.pose.new_zeros(len(self.pose), len(self.bench.means))
-        if self.bench.errors and not self.blur:
-            about = self._known(rows).about
-        return moments(self._filtered(begun(prior, len(self.pose)), prior, rows, about, free=True))
+        errors = self._known(rows).errors if self._regresses else self._errors_before
+        return moments(self._filtered(begun(prior, len(self.pose)), prior, rows, errors, free=True))

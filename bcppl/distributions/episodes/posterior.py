@@ -26,11 +26,6 @@ def drawn(branches: Branches, draws: int) -> Tensor:
     return mean + (root @ standard)[..., 0]
 
 
-def mean_of(branches: Branches) -> Tensor:
-    """Mean (N, M) of the parameters."""
-    return torch.from_numpy(np.einsum("nb,nbm->nm", branches.weights, branches.mean))
-
-
 def moments(branches: Branches) -> tuple[Tensor, Tensor]:
     """Mean (N, M) and covariance (N, M, M) of the parameters."""
     weights, means = torch.from_numpy(branches.weights), torch.from_numpy(branches.mean)

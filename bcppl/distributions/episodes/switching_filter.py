@@ -50,6 +50,7 @@ class _Gaps(NamedTuple):
     twist: Array
     offset: Array
     trust: Array
+    residual: Array
 
 
 def filtered(
@@ -90,7 +91,17 @@ def filtered(
 
     own = lines.slope.new_zeros(*lines.distance.shape, 0) if gradient is None else gradient
     trust = lines.slope.new_zeros(0, 0, 0) if trust is None else trust
-    arrays = (lines.distance, force, own, lines.slope, lines.late, lines.twist, lines.offset, trust)
+    arrays = (
+        lines.distance,
+        force,
+        own,
+        lines.slope,
+        lines.late,
+        lines.twist,
+        lines.offset,
+        trust,
+        lines.residual,
+    )
     given = _Gaps(*(np.ascontiguousarray(each.numpy()) for each in arrays))
 
     def work(begin: int, end: int) -> int:
@@ -141,11 +152,11 @@ def _times(covariance: Array, column: Array, product: Array) -> float:
 
 
 @summed
-def _joint(columns: Array, pull: Array, errors: Array, joint: Array) -> None:
-    """Set `joint` (n, n), the lower triangle, to the covariance of gaps by parameters and by `errors`."""
+def _joint(columns: Array, pull: Array, errors: Array, residual: Array, joint: Array) -> None:
+    """Set `joint` (n, n), the lower triangle, to the covariance of gaps by parameters and other errors."""
     for i in range(len(columns)):
         for j in range(i + 1):
-            joint[i, j] = errors[i, j] + _dot(pull[i], columns[j])
+            joint[i, j] = errors[i, j] + _dot(residual[i], residual[j]) + _dot(pull[i], columns[j])
 
 
 @summed
@@ -285,6 +296,7 @@ def _filter(
                         continue
                     gap = distance[delay, 0] + _dot(column, mean[n, b])
                     variance = segments.own[which[n, b], first] + _times(covariance[n, b], column, pull)
+                    variance += _dot(gaps.residual[n, first], gaps.residual[n, first])
                     root = math.sqrt(variance)
                     # Hypotheses that differ in the compliance alone are the same without contact.
                     if gap / root != score:
@@ -303,6 +315,7 @@ def _filter(
                                 covariance[n, b, a, c] -= share * pull[c]
                 continue
             rows, found = last - first, 0
+            left_over = gaps.residual[n, first:last]
             loaded = segments.loaded[first:last]
             stray = log_out - rows * math.log(prior.farthest)
             likely = log_weight[n, : number[n]].max() - _UNLIKELY
@@ -320,7 +333,7 @@ def _filter(
                     )
                 filled[delay] = True
                 np.dot(slope, covariance[n, b], own_pull)
-                _joint(slope, own_pull, segments.errors[h, first:last], joint)
+                _joint(slope, own_pull, segments.errors[h, first:last], left_over, joint)
                 for change in range(changes):
                     if change and log_weight[n, b] + prior.change_log_probability[change] < likely:
                         continue

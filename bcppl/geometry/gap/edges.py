@@ -16,7 +16,7 @@ from bcppl.geometry.gap.sharp_edges import (
     to_peg_frame,
 )
 from bcppl.geometry.gap.solids import Solids
-from bcppl.geometry.gap.vertices import NEAR
+from bcppl.geometry.gap.vertices import FADING, NEAR
 
 
 @compiled
@@ -34,13 +34,14 @@ def by_edges(
     """The distances of the part's edges to the peg, where these are less than those of its vertices."""
     planes, box, gradient = solids.planes, solids.box, np.empty(3)
     start, stop, middle = np.empty(3), np.empty(3), np.empty(3)
-    turn, shift = np.empty((3, 3)), np.empty(3)
+    turn, shift, rows = np.empty((3, 3)), np.empty(3), np.empty((len(planes), 2))
     for n in range(first, last):
         own = n if len(peg.rotation) > 1 else 0
         for t in range(peg.rotation.shape[1]):
             relative(part, n, peg, own, t, turn, shift)
             # A farther edge cannot be in contact.
-            nearer, next_edge = min(distance[n, t], NEAR), 0
+            of_vertices = distance[n, t]
+            nearer, next_edge = min(of_vertices, NEAR), 0
             for g in range(len(edges.groups)):
                 first_edge, next_edge = next_edge, edges.stops[g]
                 if not may_be_nearer(edges.groups, g, turn, shift, box, nearer):
@@ -57,9 +58,12 @@ def by_edges(
                         begin = solids.ends[s]
                         if is_separated(middle, solid, edges.spheres[e, 3] + nearer):
                             continue
-                        inside, share = segment_distance(start, stop, solid, nearer, gradient)
+                        inside, share = segment_distance(start, stop, solid, nearer, rows, gradient)
                         if inside < nearer:
                             nearer = distance[n, t] = inside
                             witness[n, t] = edges.ends[e, 0] + share * (edges.ends[e, 1] - edges.ends[e, 0])
                             for axis in range(3):
                                 normal[n, t, axis] = -dot(turn[axis], gradient)
+            if FADING < distance[n, t] < of_vertices < np.inf:
+                share = (distance[n, t] - FADING) / (NEAR - FADING)
+                distance[n, t] += share * (of_vertices - distance[n, t])

@@ -13,8 +13,6 @@ from bcppl.geometry.parts import Part
 
 _LONGEST = 0.008  # m; longer edges are subdivided
 _SHARP = np.radians(5.0)  # smallest dihedral angle
-_ROUNDS = 12  # cutting planes, at most
-_EXACT = 1e-8  # m
 _CANCELLED = 0.1  # length of a sum of unit normals below which they are opposite
 
 
@@ -95,73 +93,57 @@ def is_separated(point: Array, planes: Array, reach: float) -> bool:
 
 @compiled
 def segment_distance(
-    start: Array, stop: Array, planes: Array, least: float, normal: Array
+    start: Array, stop: Array, planes: Array, least: float, rows: Array, normal: Array
 ) -> tuple[float, float]:
-    """The signed distance of a segment to a convex solid and its witness point, by cutting planes.
+    """The signed distance of a segment to a convex solid, and its witness point.
 
-    The largest signed distance of a point to the solid's planes is convex and piecewise linear along the
-    segment. Where its minimum lies between two planes, the segment crosses the edge between them: the
-    distance is along the common normal of both edges, a convex combination of the planes' normals. It is
-    negative inside, and exact only if less than `least`. Planes (P, 4) are outward unit normals and offsets;
-    the witness point is a parameter along the segment, from 0 to 1, and `normal` (3,) is set to the solid's
-    outward unit normal there.
+    That is how far they are apart along the direction that separates them most (the theorem of separating
+    axes): an outward normal of the solid, or a combination of two that is perpendicular to the segment, as
+    where it crosses the edge between two faces. It is negative in penetration, and continuous in the
+    segment's place. Beside the solid's vertices it is too small.
+
+    Args:
+        start: (3,) one end of the segment in the solid's frame.
+        stop: (3,) the other.
+        planes: (P, 4) outward unit normals and offsets.
+        least: what is farther than this is not looked into further.
+        rows: (P, 2) room: the ends' distances to the planes.
+        normal: (3,) set to the solid's outward unit normal at the witness point.
+
+    Returns:
+        The distance, exact only if less than `least`, and the witness point's parameter along the segment,
+        from 0 to 1.
     """
-    low, high = 0.0, 1.0
-    at_low, plane_low = _farthest_plane(start, stop, low, planes)
-    slope_low = _slope(planes, plane_low, start, stop)
-    if slope_low >= 0.0:
-        normal[:] = planes[plane_low, :3]
-        return at_low, low
-    at_high, plane_high = _farthest_plane(start, stop, high, planes)
-    slope_high = _slope(planes, plane_high, start, stop)
-    if slope_high <= 0.0:
-        normal[:] = planes[plane_high, :3]
-        return at_high, high
-    share, bound = low, at_low
-    for _ in range(_ROUNDS):
-        share = (at_low - at_high + slope_high * high - slope_low * low) / (slope_high - slope_low)
-        share = min(max(share, low), high)
-        bound = at_low + slope_low * (share - low)
-        # The bound is a lower one: along a combined normal the distance is longer.
-        if bound >= least and bound >= 0.0:
-            return bound, share
-        here, plane = _farthest_plane(start, stop, share, planes)
-        if here <= bound + _EXACT:
-            break
-        slope = _slope(planes, plane, start, stop)
-        if slope < 0.0:
-            low, at_low, slope_low, plane_low = share, here, slope, plane
-        else:
-            high, at_high, slope_high, plane_high = share, here, slope, plane
-    mixed = slope_high / (slope_high - slope_low)
-    normal[:] = mixed * planes[plane_low, :3] + (1.0 - mixed) * planes[plane_high, :3]
-    length = np.sqrt((normal * normal).sum())
-    if length < _CANCELLED:  # opposite planes: the segment crosses a thin solid
-        normal[:] = planes[plane_low, :3]
-        return bound, share
-    normal /= length
-    return bound / length, share
-
-
-@compiled
-def _farthest_plane(start: Array, stop: Array, share: float, planes: Array) -> tuple[float, int]:
-    """The largest signed distance of a point of a segment to the planes of a convex solid, and that plane."""
-    x = start[0] + share * (stop[0] - start[0])
-    y = start[1] + share * (stop[1] - start[1])
-    z = start[2] + share * (stop[2] - start[2])
-    farthest, plane = -np.inf, 0
+    best, place, share = -np.inf, 0, 0.0
     for f in range(len(planes)):
-        away = planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z - planes[f, 3]
-        if away > farthest:
-            farthest, plane = away, f
-    return farthest, plane
-
-
-@compiled
-def _slope(planes: Array, plane: int, start: Array, stop: Array) -> float:
-    """By how much the distance to a plane is longer at the end of a segment than at its start."""
-    return (
-        planes[plane, 0] * (stop[0] - start[0])
-        + planes[plane, 1] * (stop[1] - start[1])
-        + planes[plane, 2] * (stop[2] - start[2])
-    )
+        ahead = stop[0] * planes[f, 0] + stop[1] * planes[f, 1] + stop[2] * planes[f, 2] - planes[f, 3]
+        here = start[0] * planes[f, 0] + start[1] * planes[f, 1] + start[2] * planes[f, 2] - planes[f, 3]
+        rows[f, 0], rows[f, 1] = here, ahead
+        if min(here, ahead) > best:
+            best, place, share = min(here, ahead), f, 0.0 if here <= ahead else 1.0
+    normal[:] = planes[place, :3]
+    for f in range(len(planes)):
+        # Towards its end the segment comes nearer to the first plane and goes away from the second.
+        first = rows[f, 0] - rows[f, 1]
+        if first <= 0.0 or rows[f, 0] <= min(best, -least):
+            continue
+        for g in range(len(planes)):
+            second = rows[g, 1] - rows[g, 0]
+            if second <= 0.0 or rows[g, 1] <= min(best, -least):
+                continue
+            mixed = second / (first + second)
+            apart = mixed * rows[f, 0] + (1.0 - mixed) * rows[g, 0]
+            if apart < 0.0 and apart <= best:
+                continue
+            x = mixed * planes[f, 0] + (1.0 - mixed) * planes[g, 0]
+            y = mixed * planes[f, 1] + (1.0 - mixed) * planes[g, 1]
+            z = mixed * planes[f, 2] + (1.0 - mixed) * planes[g, 2]
+            length = np.sqrt(x * x + y * y + z * z)
+            # Normals that are nearly opposite: the segment crosses a thin solid.
+            if length > _CANCELLED and apart / length > best:
+                best = apart / length
+                share = min(max((rows[f, 0] - rows[g, 0]) / (first + second), 0.0), 1.0)
+                normal[0], normal[1], normal[2] = x / length, y / length, z / length
+                if best >= least:
+                    return best, share
+    return best, share

@@ -10,7 +10,9 @@ from bcppl.geometry.distance import DistanceGrid, inexact, interpolated, set_gra
 from bcppl.geometry.gap.frames import Frames, placed, relative
 from bcppl.geometry.gap.solids import Solids
 
-NEAR = 0.002  # m: below this gap edges are evaluated, and distances exactly where the grid is inexact
+# m: edges are evaluated, and distances exactly where the grid is inexact, below NEAR. Above FADING
+# edges count for less and less, so that the gap is continuous.
+FADING, NEAR = 0.003, 0.004
 _STEEPEST = 3.0**0.5  # slope of a distance that is interpolated axis by axis, at most
 
 

@@ -15,7 +15,7 @@ from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, cell_ends
 from bcppl.contact.sensing.location import ContactSensing
-from bcppl.distributions.episodes.branches import Linearised
+from bcppl.distributions.episodes.filtered import Linearised
 from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FELT, GIVEN, SECONDS, padded
 from bcppl.distributions.manifold import Gaps, MeasuresGap
 from bcppl.robot.motion import Probe, ProbeWindow

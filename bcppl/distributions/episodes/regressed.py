@@ -1,0 +1,156 @@
+"""Gaps as linear functions of errors, fitted over where the errors may be: statistical linear regression.
+
+Where flat faces meet, which corner of the peg touches depends on how it is turned, and the gap has a kink.
+Its derivative there is that of one corner or of another: a likelihood that is linear about one point jumps by
+several nats with a micrometre of the part's pose. The regression is over all that the errors may be, so it is
+continuous wherever the gap is, and what it leaves over is an error of its own.
+
+Source: Garcia-Fernandez, Svensson, Morelande and Särkkä, Posterior linearization filter, IEEE TSP 63, 2015.
+The points are those of the cubature rule of degree 3 (Arasaratnam and Haykin, Cubature Kalman filters, IEEE
+TAC 54, 2009), turned so that each is about one standard deviation off along five axes of six: a far one
+reaches other places of the part than errors do.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bcppl import poses
+from bcppl.arrays import Array
+from bcppl.compiled import compiled
+from bcppl.distributions.episodes.displaced import Lines
+from bcppl.distributions.episodes.linear_errors import LinearErrors
+from bcppl.distributions.manifold import MeasuresGap
+
+# A conference matrix of order 6: its rows are orthogonal.
+_CONFERENCE = np.array(
+    [
+        [0, 1, 1, 1, 1, 1],
+        [1, 0, 1, -1, -1, 1],
+        [1, 1, 0, 1, -1, -1],
+        [1, -1, 1, 0, 1, -1],
+        [1, -1, -1, 1, 0, 1],
+        [1, 1, -1, -1, 1, 0],
+    ],
+    dtype=np.float64,
+)
+_POINTS = math.sqrt(6.0 / 5.0) * np.concatenate([_CONFERENCE, -_CONFERENCE])
+# Variances (m^2, rad^2) that are added: a peg's place is hardly ever known better.
+_LEAST = np.array([2e-5] * 3 + [1e-3] * 3) ** 2
+
+
+class Spread(NamedTuple):
+    """What the shared errors of each particle may be: mean (N, M) and covariance (N, M, M)."""
+
+    mean: Tensor
+    covariance: Tensor
+
+
+def regressed(gap: MeasuresGap, pose: Tensor, rows: Tensor, bench: LinearErrors, errors: Spread) -> Lines:
+    """The gaps as linear functions of shared errors, fitted over what these may be.
+
+    Args:
+        gap: measures gaps.
+        pose: (N, 7) world_from_part.
+        rows: (R, COLUMNS).
+        bench: the errors that all touches share.
+        errors: what they may be.
+    """
+    late, effect = bench.late_effects(rows)
+    by = bench.effect_again(rows).twist  # (R, 6, M)
+    count, points = len(pose), len(_POINTS)
+    half = by.flatten(0, 1) @ errors.covariance  # (N, 6 R, M)
+    turn = poses.rotation_matrix(rows[:, :7])
+    tensors = (by, half, errors.mean, rows[:, :7], turn)
+    shape = (count, len(rows))
+    twist, root, steps = np.empty((*shape, 6)), np.empty((*shape, 6, 6)), np.empty((*shape, points, 6))
+    by_row, by_half, mean, at, turns = (np.ascontiguousarray(each.numpy()) for each in tensors)
+    _spread(by_row, by_half, mean, at, turns, twist, root, steps)
+    peg = poses.retract(rows[:, None, :7].expand(count, -1, points, 7), torch.from_numpy(steps))
+    distance = gap(pose, peg.flatten(1, 2)).distance.numpy().reshape(*shape, points)
+    middle, slope, residual = np.empty(shape), np.empty((*shape, 6)), np.empty((*shape, 6))
+    _fitted(distance, twist, root, middle, slope, residual)
+    fitted = [torch.from_numpy(each) for each in (middle, slope, residual)]
+    gradient = _by_part(fitted[1], pose, rows[:, :7], turn)
+    return Lines(fitted[0], fitted[1], gradient, late, *effect, fitted[2])
+
+
+@compiled
+def _spread(
+    by: Array, half: Array, mean: Array, peg: Array, turn: Array, twist: Array, root: Array, steps: Array
+) -> None:
+    """Set mean twists of the peg, roots of their covariances, and tangents (N, R, P, 6) of the points."""
+    covariance, at = np.empty((6, 6)), np.empty(6)
+    parameters = mean.shape[1]
+    for n in range(len(twist)):
+        for r in range(len(peg)):
+            for i in range(6):
+                total = 0.0
+                for m in range(parameters):
+                    total += by[r, i, m] * mean[n, m]
+                twist[n, r, i] = total
+                for j in range(i + 1):
+                    total = 0.0
+                    for m in range(parameters):
+                        total += half[n, 6 * r + i, m] * by[r, j, m]
+                    covariance[i, j] = total
+                covariance[i, i] += _LEAST[i]
+            factor = root[n, r]
+            factor[:] = 0.0
+            for i in range(6):
+                for j in range(i + 1):
+                    rest = covariance[i, j]
+                    for k in range(j):
+                        rest -= factor[i, k] * factor[j, k]
+                    factor[i, j] = math.sqrt(rest) if i == j else rest / factor[j, j]
+            for p in range(len(_POINTS)):
+                for i in range(6):
+                    at[i] = twist[n, r, i]
+                    for k in range(i + 1):
+                        at[i] += factor[i, k] * _POINTS[p, k]
+                for i in range(3):
+                    steps[n, r, p, 3 + i] = at[3 + i]
+                    steps[n, r, p, i] = turn[r, i, 0] * at[0] + turn[r, i, 1] * at[1] + turn[r, i, 2] * at[2]
+
+
+@compiled
+def _fitted(distance: Array, twist: Array, root: Array, middle: Array, slope: Array, residual: Array) -> None:
+    """Set the line through gaps (N, R, P) at no error, its slope by a twist, and what it leaves over.
+
+    The sum of products of two gaps' residuals (6,) is the covariance of what their lines leave over.
+    """
+    half = len(_POINTS) // 2
+    along = np.empty(half)
+    for n in range(len(twist)):
+        for r in range(twist.shape[1]):
+            gaps, total = distance[n, r], 0.0
+            for p in range(2 * half):
+                total += gaps[p] / (2 * half)
+            along[:] = 0.0
+            for p in range(half):
+                odd = 0.5 * (gaps[p] - gaps[half + p])
+                # Across the points of each pair it is even: what is odd is linear in six directions.
+                residual[n, r, p] = (0.5 * (gaps[p] + gaps[half + p]) - total) / math.sqrt(half)
+                for k in range(6):
+                    along[k] += odd * _POINTS[p, k] / half
+            for i in range(5, -1, -1):
+                rest = along[i]
+                for k in range(i + 1, 6):
+                    rest -= root[n, r, k, i] * slope[n, r, k]
+                slope[n, r, i] = rest / root[n, r, i, i]
+            for i in range(6):
+                total -= slope[n, r, i] * twist[n, r, i]
+            middle[n, r] = total
+
+
+def _by_part(slope: Tensor, part: Tensor, peg: Tensor, turn: Tensor) -> Tensor:
+    """The gap's derivatives (N, R, 6) by the part's pose: it changes as if the peg were moved back."""
+    normal = -(turn @ slope[..., :3, None])[..., 0]
+    moment = (turn @ slope[..., 3:, None])[..., 0]
+    moment = moment + torch.linalg.cross(normal, peg[:, :3] - part[:, None, :3])
+    return torch.cat([normal, -(moment @ poses.rotation_matrix(part))], dim=-1)
