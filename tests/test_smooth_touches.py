@@ -20,7 +20,8 @@ from tests.test_linear_errors import rows_with_wrenches
 from tests.test_manifold import ledge
 
 STEPS = 4001
-EDGES = torch.tensor([[0.03, 0.0, 0.0], [0.0, -0.03, -0.01], [0.03, 0.03, 0.0], [0.006, 0.0, 0.0]]).double()
+PLACES = torch.tensor([[0, 0, -0.003], [0.006, 0, 0], [0.012, 0.004, 0]]).double()  # m, in the hole's frame
+TIP_FROM_PEG = torch.tensor([0, 0, 0.08, 1, 0, 0, 0], dtype=torch.float64)
 
 
 def path(start: Tensor, seed: int, shift: float, turn: float) -> Tensor:
@@ -32,23 +33,21 @@ def path(start: Tensor, seed: int, shift: float, turn: float) -> Tensor:
     return poses.retract(start.expand(STEPS, 7), way)
 
 
-@pytest.mark.parametrize("shape", ["hexagon 12 mm", "D 10 mm"])
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("shape", ["hexagon 12 mm", "D 10 mm", "round tray"])
+@pytest.mark.parametrize("seed", range(6))
 def test_a_gap_changes_no_faster_than_the_peg_moves(shape: str, seed: int) -> None:
     """Past edges and corners, in contact, beside it and in penetration."""
-    part, peg = bench_part(shape)
-    generator = torch.Generator().manual_seed(seed)
-    start = poses.retract(
-        poses.identity(1), 0.1 * torch.randn(1, 6, generator=generator, dtype=torch.float64)
-    )
-    start[:, :3] = EDGES[seed % len(EDGES)] + 1e-3 * torch.randn(1, 3, generator=generator).double()
-    pegs = path(start, seed + 100, 3e-3, 0.05)
-    distance = PegGap(part, peg)(poses.identity(1), pegs).distance[0]
+    kind, generator = bench_part(shape), torch.Generator().manual_seed(seed)
+    hole = torch.from_numpy(kind.part_from_hole)
+    away = torch.cat([PLACES[seed % len(PLACES)], torch.zeros(3).double()])
+    away = away + torch.tensor([1e-3] * 3 + [0.05] * 3) * torch.randn(6, generator=generator).double()
+    tip = poses.compose(hole, poses.retract(poses.identity(1), away))
+    pegs = poses.compose(path(tip, seed + 100, 2e-3, 0.03), TIP_FROM_PEG)
+    distance = PegGap(kind.part, kind.peg(0.0005))(poses.identity(1), pegs).distance[0]
     moved = poses.local(pegs[:-1], pegs[1:])[0]
     most = float(moved[:3].norm() + 0.09 * moved[3:].norm())  # no point of the peg is farther from its tip
-    steps = (distance[1:] - distance[:-1]).abs()
-    assert float(steps.max()) < 1.5 * most
-    assert float(distance.min()) < 0.0 < float(distance.max()) or float(steps.max()) > 0.0
+    assert float((distance[1:] - distance[:-1]).abs().max()) < 1.5 * most
+    assert float(distance.min()) < 2e-3, "edges count"
 
 
 def test_along_a_plane_the_regression_is_the_derivative() -> None:
@@ -80,8 +79,7 @@ def test_what_a_regression_leaves_over_is_what_a_kink_adds_to_the_spread() -> No
     lines = regressed(kinked, poses.identity(1), rows, bench, spread)  # type: ignore[arg-type]
     assert float(lines.distance) == pytest.approx(0.798e-3, rel=0.2)
     assert float(lines.slope[..., :3].norm()) < 1e-6, "as often of one sign as of the other"
-    left_over = float(lines.residual.square().sum())
-    assert left_over < 1.01e-6 - float(lines.distance) ** 2 + 0.5e-6
+    assert 0.1e-6 < float(lines.residual.square().sum()) < 0.4e-6, "the variance of a normal's modulus is .36"
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -53,10 +53,9 @@ class ContactEpisodes(FilteredEpisodes):
     of all rows minus that of the given ones.
 
     What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap and
-    is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear in it about what it
-    seems to be: where rows are half as many again (`rows.last_end`) all are linearised again if the peg
-    seems to be turned otherwise than was assumed (as in an iterated extended Kalman smoother, Bell, SIAM J.
-    Optim. 4, 1994).
+    is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear over what that may
+    be (`bcppl.distributions.episodes.regressed`), which is asked again where rows are half as many again
+    (`rows.last_end`).
 
     A row without contact has the probability that a gap about d is positive, as in `ContactManifold`; an
     episode is an outlier as a whole.
