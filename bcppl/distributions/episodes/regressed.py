@@ -41,6 +41,7 @@ _CONFERENCE = np.array(
 )
 _POINTS = math.sqrt(6.0 / 5.0) * np.concatenate([_CONFERENCE, -_CONFERENCE])
 # Variances (m^2, rad^2) that are added: a peg's place is hardly ever known better.
+_PEGS = 20_000  # at a time, about
 _LEAST = np.array([2e-5] * 3 + [1e-3] * 3) ** 2
 
 
@@ -62,33 +63,42 @@ def regressed(gap: MeasuresGap, pose: Tensor, rows: Tensor, bench: LinearErrors,
         errors: what they may be.
     """
     late, effect = bench.late_effects(rows)
-    by = bench.effect_again(rows).twist  # (R, 6, M)
-    count, points = len(pose), len(_POINTS)
-    half = by.flatten(0, 1) @ errors.covariance  # (N, 6 R, M)
-    turn = poses.rotation_matrix(rows[:, :7])
-    tensors = (by, half, errors.mean, rows[:, :7], turn)
-    shape = (count, len(rows))
-    twist, root, steps = np.empty((*shape, 6)), np.empty((*shape, 6, 6)), np.empty((*shape, points, 6))
-    by_row, by_half, mean, at, turns = (np.ascontiguousarray(each.numpy()) for each in tensors)
-    _spread(by_row, by_half, mean, at, turns, twist, root, steps)
-    peg = poses.retract(rows[:, None, :7].expand(count, -1, points, 7), torch.from_numpy(steps))
-    distance = gap(pose, peg.flatten(1, 2)).distance.numpy().reshape(*shape, points)
+    by, turn = bench.effect_again(rows).twist, poses.rotation_matrix(rows[:, :7])  # (R, 6, M), (R, 3, 3)
+    shape = (len(pose), len(rows))
     middle, slope, residual = np.empty(shape), np.empty((*shape, 6)), np.empty((*shape, 6))
-    _fitted(distance, twist, root, middle, slope, residual)
+    # Few parts at a time: pegs at all points of all parts take gigabytes, and longer than those in a cache.
+    most = max(1, _PEGS // (len(rows) * len(_POINTS)))
+    for first in range(0, len(pose), most):
+        own = slice(first, first + most)
+        errors_here = Spread(errors.mean[own], errors.covariance[own])
+        twist, root, peg = _pegs(by, turn, rows[:, :7], errors_here)
+        distance = gap(pose[own], peg.flatten(1, 2)).distance.numpy().reshape(*peg.shape[:3])
+        _fitted(distance, twist, root, middle[own], slope[own], residual[own])
     fitted = [torch.from_numpy(each) for each in (middle, slope, residual)]
     gradient = _by_part(fitted[1], pose, rows[:, :7], turn)
     return Lines(fitted[0], fitted[1], gradient, late, *effect, fitted[2])
 
 
+def _pegs(by: Tensor, turn: Tensor, peg: Tensor, errors: Spread) -> tuple[Array, Array, Tensor]:
+    """Mean twists (N, R, 6) of pegs, roots (N, R, 6, 6) of their covariances, and pegs (N, R, P, 7) there."""
+    half = by.flatten(0, 1) @ errors.covariance  # (N, 6 R, M)
+    shape = (len(half), len(peg))
+    twist, root, steps = np.empty((*shape, 6)), np.empty((*shape, 6, 6)), np.empty((*shape, len(_POINTS), 6))
+    tensors = (by, half, errors.mean, turn)
+    by_row, by_half, mean, turns = (np.ascontiguousarray(each.numpy()) for each in tensors)
+    _spread(by_row, by_half, mean, turns, twist, root, steps)
+    return twist, root, poses.retract(peg[:, None].expand(*steps.shape[:3], 7), torch.from_numpy(steps))
+
+
 @compiled
 def _spread(
-    by: Array, half: Array, mean: Array, peg: Array, turn: Array, twist: Array, root: Array, steps: Array
+    by: Array, half: Array, mean: Array, turn: Array, twist: Array, root: Array, steps: Array
 ) -> None:
     """Set mean twists of the peg, roots of their covariances, and tangents (N, R, P, 6) of the points."""
     covariance, at = np.empty((6, 6)), np.empty(6)
     parameters = mean.shape[1]
     for n in range(len(twist)):
-        for r in range(len(peg)):
+        for r in range(len(turn)):
             for i in range(6):
                 total = 0.0
                 for m in range(parameters):
