@@ -121,19 +121,22 @@ def segment_distance(
         rows[f, 0], rows[f, 1] = here, ahead
         if min(here, ahead) > best:
             best, place, share = min(here, ahead), f, 0.0 if here <= ahead else 1.0
+            if best >= least:
+                return best, share
     normal[:] = planes[place, :3]
     for f in range(len(planes)):
-        # Towards its end the segment comes nearer to the first plane and goes away from the second.
+        # Towards its end the segment comes nearer to the first plane and goes away from the second. Where it
+        # starts within the first, or ends within the second, one of them alone separates it as much.
         first = rows[f, 0] - rows[f, 1]
-        if first <= 0.0 or rows[f, 0] <= min(best, -least):
+        if first <= 0.0 or rows[f, 0] <= min(best, 0.0):
             continue
         for g in range(len(planes)):
             second = rows[g, 1] - rows[g, 0]
-            if second <= 0.0 or rows[g, 1] <= min(best, -least):
+            if second <= 0.0 or rows[g, 1] <= min(best, 0.0):
                 continue
             mixed = second / (first + second)
             apart = mixed * rows[f, 0] + (1.0 - mixed) * rows[g, 0]
-            if apart < 0.0 and apart <= best:
+            if apart <= (best if best < 0.0 else _CANCELLED * best):
                 continue
             x = mixed * planes[f, 0] + (1.0 - mixed) * planes[g, 0]
             y = mixed * planes[f, 1] + (1.0 - mixed) * planes[g, 1]
