@@ -208,8 +208,8 @@ def test_a_square_peg_that_is_turned_in_the_hand_touches_with_another_corner() -
     prior = -0.5 * nodes**2 - 0.5 * math.log(2.0 * math.pi) + math.log(float(nodes[1] - nodes[0]))
     exact = float(torch.logsumexp(torch.stack(each) + prior, dim=0))
     one = ContactEpisodes(gap, pose, 8, 6e-5, 1e-5, 2e-5, OUTLIER, bench=LinearErrors((yaw,)), hypotheses=ONE)
-    # What lines leave over of a kink widens the errors, of the last touches most.
-    assert exact - 2.0 < float(one.log_prob(rows)[0]) < exact + 0.2
+    # What lines leave over of a kink widens the errors, of the first four rows most.
+    assert exact - 2.5 < float(one.log_prob(rows)[0]) < exact + 0.2
     (errors,) = one.shared_moments(rows).values()
     assert float(errors[0][0, 5]) == pytest.approx(1.6, abs=3.0 * float(errors[1][0, 5].sqrt()))
     none = Spread(torch.zeros(1, 6).double(), torch.zeros(1, 6, 6).double())

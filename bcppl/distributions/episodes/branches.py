@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bcppl.arrays import Array, Indices, Mask
+from bcppl.arrays import Array, Indices
 
 KEPT = 8  # hypotheses of a particle
 INLIER, OUTLIER = 0, 1  # what an episode is; plus twice the number of the change before or in it
@@ -90,35 +90,6 @@ class Branches(NamedTuple):
         used = np.arange(self.log_weight.shape[1]) < self.number[:, None]
         shifted = np.where(used, self.log_weight, -np.inf) - self.log_evidence[:, None]
         return np.asarray(np.exp(shifted))
-
-    def surviving(self, hypotheses: int) -> Mask:
-        """(N, H) which hypotheses of the prior any of a particle's is still of."""
-        used = np.arange(self.log_weight.shape[1]) < self.number[:, None]
-        mask = np.zeros((len(self.number), hypotheses + 1), dtype=np.bool_)
-        np.put_along_axis(mask, np.where(used, self.which, hypotheses), True, axis=1)
-        return mask[:, :-1]
-
-    def with_only(self, mask: Mask) -> Branches:
-        """As `begun`, with those hypotheses of the prior that a mask (N, H) leaves each particle."""
-        order = np.argsort(~mask, axis=1, kind="stable")
-        log_weight = np.take_along_axis(self.log_weight.repeat(len(mask), axis=0), order, axis=1)
-        only = self._replace(number=mask.sum(axis=1), log_weight=log_weight, which=order)
-        if len(mask) > 1:
-            return only  # the states are held once for all particles, by hypothesis
-        return only._replace(mean=self.mean[:, order[0]], covariance=self.covariance[:, order[0]])
-
-    def of(self, which: Indices) -> Branches:
-        """Those of some particles."""
-        return self if len(which) == len(self.number) else Branches._make(each[which] for each in self)
-
-    def copied(self) -> Branches:
-        """The same, that may be written over."""
-        return Branches._make(each.copy() for each in self)
-
-    def put(self, which: Indices, others: Branches) -> None:
-        """Write the hypotheses of other particles, as many and after the same rows, over those of some."""
-        for mine, other in zip(self, others, strict=True):
-            mine[which] = other
 
     @property
     def of_each(self) -> Branches:

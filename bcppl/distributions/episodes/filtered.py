@@ -23,7 +23,7 @@ from bcppl.distributions.manifold import FARTHEST, ContactManifold, MeasuresGap
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 
 _FAR = 4.0  # standard deviations
-_REMEMBERED = 5  # a window's rows are those that the next one is given; and the last end's
+_REMEMBERED = 5  # a window's rows are those that the next one is given
 
 
 class Linearised(NamedTuple):
@@ -59,7 +59,7 @@ class FilteredEpisodes(PredictedEpisodes):
         return self._known(rows, after).branches
 
     def _known(self, rows: Tensor, after: Tensor | None = None) -> Linearised:
-        """The hypotheses after rows, and the shared errors about which the gap is linear.
+        """The hypotheses after rows, and what the shared errors may be by those until the last end.
 
         They depend on the rows alone, not on how a probe is cut: the evidence of a window is a difference,
         and of what is linear about one thing and then about another it would be any number.
@@ -68,19 +68,26 @@ class FilteredEpisodes(PredictedEpisodes):
         if key not in self.memory:
             before, new = self._before(rows, after)
             branches = self._filtered(before.branches, self._prior(0), new, before.errors)
-            self._remember(key, Linearised(branches.of_each, before.errors))
+            self.memory[key] = Linearised(branches.of_each, before.errors)
+            for old in list(self.memory)[:-_REMEMBERED]:
+                del self.memory[old]
         return self.memory[key]
 
     def _before(self, rows: Tensor, after: Tensor | None) -> tuple[Linearised, Tensor]:
-        """What is known before some of the rows, and these: those since the last end, or after `after`."""
+        """What is known before some of the rows, and these: those after `after`, or since the last end.
+
+        Gaps are linear over what the errors may be there: where flat faces meet, and the peg seems to be
+        turned otherwise than was assumed, another corner touches.
+        """
         place = last_end(rows) if self._regresses else 0
-        if after is not None and not is_cut(rows, len(after)):
+        if after is not None and len(after) > place and not is_cut(rows, len(after)):
             known = self.memory.get(after.numpy().tobytes())
-            if known is not None and (not self._regresses or last_end(after) == place):
+            if known is not None:
                 return known, rows[len(after) :]
-        if place:
-            return self._linearised_again(rows[:place], after), rows[place:]
-        return Linearised(begun(self._prior(0), len(self.pose)), self._errors_before), rows
+        if not place:
+            return Linearised(begun(self._prior(0), len(self.pose)), self._errors_before), rows
+        branches = self._known(rows[:place], after).branches
+        return Linearised(branches, Spread(*moments(branches))), rows[place:]
 
     @property
     def _regresses(self) -> bool:
@@ -92,22 +99,6 @@ class FilteredEpisodes(PredictedEpisodes):
         """What the shared errors may be before any row."""
         count, (means, variances) = len(self.pose), (self.bench.means, self.bench.variances)
         return Spread(means.expand(count, -1), torch.diag(variances).expand(count, -1, -1))
-
-    def _linearised_again(self, rows: Tensor, after: Tensor | None) -> Linearised:
-        """What is known after rows of which the gaps are linear over what the errors now may be."""
-        key = b"again" + rows.numpy().tobytes()
-        if key in self.memory:
-            return self.memory[key]
-        branches, prior = self._known(rows, after).branches, self._prior(0)
-        errors = Spread(*moments(branches))
-        begin = begun(prior, len(self.pose)).with_only(branches.surviving(len(prior.scale)))
-        return self._remember(key, Linearised(self._filtered(begin, prior, rows, errors).of_each, errors))
-
-    def _remember(self, key: bytes, known: Linearised) -> Linearised:
-        self.memory[key] = known
-        for old in list(self.memory)[:-_REMEMBERED]:
-            del self.memory[old]
-        return known
 
     def _variance(self, columns: Tensor, rows: Tensor) -> Tensor:
         """Variances (N, D, R) of gaps a priori, without what the contact's compliance adds."""

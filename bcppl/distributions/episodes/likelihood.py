@@ -54,8 +54,7 @@ class ContactEpisodes(FilteredEpisodes):
 
     What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap and
     is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear over what that may
-    be (`bcppl.distributions.episodes.regressed`), which is asked again where rows are half as many again
-    (`rows.last_end`).
+    be (`bcppl.distributions.episodes.regressed`), given the rows until a few before (`rows.last_end`).
 
     A row without contact has the probability that a gap about d is positive, as in `ContactManifold`; an
     episode is an outlier as a whole.

@@ -5,7 +5,7 @@ Its derivative there is that of one corner or of another: a likelihood that is l
 several nats with a micrometre of the part's pose. The regression is over all that the errors may be, so it is
 continuous wherever the gap is, and what it leaves over is an error of its own.
 
-Source: Garcia-Fernandez, Svensson, Morelande and Särkkä, Posterior linearization filter, IEEE TSP 63, 2015.
+Source: Lefebvre, Bruyninckx and De Schutter, Kalman filters for non-linear systems, Int. J. Control 77, 2004.
 The points are those of the cubature rule of degree 3 (Arasaratnam and Haykin, Cubature Kalman filters, IEEE
 TAC 54, 2009), turned so that each is about one standard deviation off along five axes of six: a far one
 reaches other places of the part than errors do.

@@ -14,7 +14,7 @@ WRENCH, WITHIN = slice(13, 19), slice(19, 25)
 SECONDS = (0.006, 0.024, 0.048, 0.096)  # clocks that agree are common
 EARLIER = slice(25, 25 + 6 * len(SECONDS))
 COLUMNS = EARLIER.stop
-_FIRST = 4  # rows
+_TOGETHER = 4  # rows of which the gaps are linear over the same
 
 
 def padded(rows: Tensor, stamps: int) -> Tensor:
@@ -75,14 +75,14 @@ def is_cut(rows: Tensor, place: int) -> bool:
 
 
 def last_end(rows: Tensor) -> int:
-    """The last place before the end of rows at which all until there are linearised again; 0 for none.
+    """The last place before the end of rows until where gaps are linear over what was known earlier.
 
-    These are after 4, 6, 9, ... rows, where no episode goes on: that takes a time that grows as their number.
+    Such are where no episode goes on, so many rows (`_TOGETHER`) from one another; 0 for none.
     """
     felt, episode = rows[:, FELT].numpy(), rows[:, EPISODE].numpy()
     cut = (felt[1:] == 1.0) & (felt[:-1] == 1.0) & (episode[1:] == episode[:-1])
-    places, most, end = np.flatnonzero(~cut) + 1, _FIRST, 0
-    while len(places) and most <= places[-1]:
-        end = int(places[np.searchsorted(places, most)])
-        most += most // 2
+    end = 0
+    for place in (np.flatnonzero(~cut) + 1).tolist():
+        if place - end >= _TOGETHER:
+            end = place
     return end
