@@ -40,8 +40,8 @@ _CONFERENCE = np.array(
     dtype=np.float64,
 )
 _POINTS = math.sqrt(6.0 / 5.0) * np.concatenate([_CONFERENCE, -_CONFERENCE])
-# Variances (m^2, rad^2) that are added: a peg's place is hardly ever known better.
 _PEGS = 20_000  # at a time, about
+# Variances (m^2, rad^2) that are added: a peg's place is hardly ever known better.
 _LEAST = np.array([2e-5] * 3 + [1e-3] * 3) ** 2
 
 
