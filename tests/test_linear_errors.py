@@ -29,9 +29,7 @@ from bcppl.distributions.episodes import (
     PartSlides,
     Size,
 )
-from bcppl.distributions.episodes.branches import begun
 from bcppl.distributions.episodes.displaced import lines_at
-from bcppl.distributions.episodes.regressed import Spread
 from bcppl.distributions.episodes.row_errors import RowErrors
 from bcppl.distributions.episodes.rows import (
     EARLIER,
@@ -176,45 +174,6 @@ def test_the_gap_s_change_by_a_displaced_peg_is_that_of_the_gap_itself() -> None
         apart = [gap(pose, moved(rows[:, :7], sign * step * twist)).distance for sign in (1.0, -1.0)]
         differences = (shifts[:, place] - (apart[0] - apart[1]) / (2.0 * step)).abs()
         assert float(differences.quantile(0.9)) < 0.02 * float(shifts.abs().quantile(0.9))
-
-
-def test_a_square_peg_that_is_turned_in_the_hand_touches_with_another_corner() -> None:
-    """Pressed at a side, measured as if its other corner touched: evidence by quadrature over the turn."""
-    gap, pose = PegGap(block((0.06, 0.06, 0.025)), box_peg(0.016, 0.05)), poses.identity(1)
-    yaw = Grasp(1e-9, 1e-9, math.radians(1.0), slips=0.0)
-    rows = rows_with_wrenches([1] * 8, [0, 0, 1, 1, 2, 2, 3, 3], seed=4)
-    rows[:, EARLIER], rows[:, 10] = 0.0, torch.tensor([0.1, 0.15, 0.6, 0.65, 1.1, 1.15, 1.6, 1.65])
-    measured = torch.tensor([-0.8, -0.8, -0.4, -0.4, 0.4, 0.4, 1.0, 1.0]).double().deg2rad()
-    at = torch.tensor([0.03, 0.0, 0.03, 1.0, 0, 0, 0], dtype=torch.float64).expand(8, 7)
-
-    def turned(angle: Tensor) -> Tensor:
-        zero = torch.zeros(len(angle), 5, dtype=torch.float64)
-        return poses.compose(at, poses.retract(poses.identity(8), torch.cat([zero, angle[:, None]], dim=1)))
-
-    true = turned(measured + math.radians(1.6))
-    true[:, 0] += 0.02
-    away = gap(pose, true).distance[0] + 5e-6 * rows[:, FORCE]
-    rows[:, :7] = turned(measured)
-    rows[:, 0] += 0.02 - away
-    nodes = torch.linspace(-5.0, 5.0, 801, dtype=torch.float64)
-    factor = factors(rows, RowErrors(0.0, 1e-5, 2e-5, 0.1, 0.6, 0.2), ONE[0])
-    each = []
-    for node in nodes:
-        then = turned(measured + node * yaw.yaw)
-        then[:, 0] = rows[:, 0]
-        error = gap(pose, then).distance[0] + 5e-6 * rows[:, FORCE]
-        blocks, pairs = factor.view(4, 2, 2), error.view(4, 2)
-        each.append(MultivariateNormal(torch.zeros(2).double(), scale_tril=blocks).log_prob(pairs).sum())
-    prior = -0.5 * nodes**2 - 0.5 * math.log(2.0 * math.pi) + math.log(float(nodes[1] - nodes[0]))
-    exact = float(torch.logsumexp(torch.stack(each) + prior, dim=0))
-    one = ContactEpisodes(gap, pose, 8, 6e-5, 1e-5, 2e-5, OUTLIER, bench=LinearErrors((yaw,)), hypotheses=ONE)
-    # What lines leave over of a kink widens the errors, of the first four rows most.
-    assert exact - 2.5 < float(one.log_prob(rows)[0]) < exact + 0.2
-    (errors,) = one.shared_moments(rows).values()
-    assert float(errors[0][0, 5]) == pytest.approx(1.6, abs=3.0 * float(errors[1][0, 5].sqrt()))
-    none = Spread(torch.zeros(1, 6).double(), torch.zeros(1, 6, 6).double())
-    about_none = one._filtered(begun(one._prior(0), 1), one._prior(0), rows, none)
-    assert float(about_none.log_evidence[0]) < exact - 3.0, "linear about no turn"
 
 
 def test_any_cut_gives_the_same_likelihood_with_shared_errors() -> None:

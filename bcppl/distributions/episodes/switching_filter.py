@@ -26,6 +26,7 @@ from torch import Tensor
 from bcppl.arrays import Array
 from bcppl.compiled import compiled, summed
 from bcppl.distributions.episodes.branches import INLIER, KEPT, OUTLIER, Branches, Prior, Segments
+from bcppl.distributions.episodes.conditioning import condition, dot, factored, set_joint, squared_by
 from bcppl.distributions.episodes.displaced import Lines
 from bcppl.threads import parallel_sum, thread_count
 
@@ -91,17 +92,8 @@ def filtered(
 
     own = lines.slope.new_zeros(*lines.distance.shape, 0) if gradient is None else gradient
     trust = lines.slope.new_zeros(0, 0, 0) if trust is None else trust
-    arrays = (
-        lines.distance,
-        force,
-        own,
-        lines.slope,
-        lines.late,
-        lines.twist,
-        lines.offset,
-        trust,
-        lines.residual,
-    )
+    of_lines = (lines.slope, lines.late, lines.twist, lines.offset)
+    arrays = (lines.distance, force, own, *of_lines, trust, lines.residual)
     given = _Gaps(*(np.ascontiguousarray(each.numpy()) for each in arrays))
 
     def work(begin: int, end: int) -> int:
@@ -131,95 +123,6 @@ def _log_ndtr(z: float) -> float:
 def _log_sum(a: float, b: float) -> float:
     high, low = max(a, b), min(a, b)
     return high + math.log1p(math.exp(low - high)) if low > -np.inf else high
-
-
-@summed
-def _dot(first: Array, second: Array) -> float:
-    total = 0.0
-    for a in range(len(first)):
-        total += first[a] * second[a]
-    return total
-
-
-@summed
-def _times(covariance: Array, column: Array, product: Array) -> float:
-    """Set `product` (M,) to a symmetric matrix times a column (M,); returns the column's square by it."""
-    square = 0.0
-    for a in range(len(column)):
-        product[a] = _dot(covariance[a], column)
-        square += column[a] * product[a]
-    return square
-
-
-@summed
-def _joint(columns: Array, pull: Array, errors: Array, residual: Array, joint: Array) -> None:
-    """Set `joint` (n, n), the lower triangle, to the covariance of gaps by parameters and other errors."""
-    for i in range(len(columns)):
-        for j in range(i + 1):
-            joint[i, j] = errors[i, j] + _dot(residual[i], residual[j]) + _dot(pull[i], columns[j])
-
-
-@summed
-def _factored(
-    joint: Array, error: Array, columns: Array, change: Array, loaded: Array, factor: Array, white: Array
-) -> tuple[float, float]:
-    """Set `factor` (n, n) to the Cholesky factor of the gaps' covariance, `white` (n,) to whitened errors.
-
-    `joint` is that without the change, whose variances are `change` (M,); by row i it has come by the share
-    `loaded[i]`.
-
-    Returns:
-        the log-density of the gaps, and their squared whitened errors.
-    """
-    squared, log_determinant = 0.0, 0.0
-    for i in range(len(error)):
-        for j in range(i + 1):
-            factor[i, j] = joint[i, j]
-    for a in range(len(change)):
-        if change[a] > 0.0:
-            for i in range(len(error)):
-                for j in range(i + 1):
-                    factor[i, j] += change[a] * loaded[j] * columns[i, a] * columns[j, a]
-    for i in range(len(error)):
-        for j in range(i):
-            known = factor[i, j]
-            for k in range(j):
-                known -= factor[i, k] * factor[j, k]
-            factor[i, j] = known / factor[j, j]
-        variance, rest = factor[i, i], error[i]
-        for k in range(i):
-            variance -= factor[i, k] * factor[i, k]
-            rest -= factor[i, k] * white[k]
-        factor[i, i] = math.sqrt(variance)
-        white[i] = rest / factor[i, i]
-        squared += white[i] * white[i]
-        log_determinant += math.log(variance)
-    return -0.5 * (squared + log_determinant + len(error) * math.log(2.0 * math.pi)), squared
-
-
-@summed
-def _condition(
-    factor: Array,
-    white: Array,
-    pull: Array,
-    columns: Array,
-    change: Array,
-    loaded: Array,
-    gain: Array,
-    mean: Array,
-    covariance: Array,
-) -> None:
-    """Condition parameters, before the change, on an episode's gaps; `gain` (n, M) is room."""
-    for i in range(len(white)):
-        for a in range(len(mean)):
-            gain[i, a] = pull[i, a] + loaded[i] * change[a] * columns[i, a]
-        for k in range(i):
-            for a in range(len(mean)):
-                gain[i, a] -= factor[i, k] * gain[k, a]
-        for a in range(len(mean)):
-            gain[i, a] /= factor[i, i]
-            mean[a] -= gain[i, a] * white[i]
-    covariance -= np.dot(gain.T, gain)
 
 
 @summed
@@ -294,9 +197,9 @@ def _filter(
                         distance[delay, 0], filled[delay] = _line(gaps, n, delay, first, column), True
                     if distance[delay, 0] > _CLEAR:
                         continue
-                    gap = distance[delay, 0] + _dot(column, mean[n, b])
-                    variance = segments.own[which[n, b], first] + _times(covariance[n, b], column, pull)
-                    variance += _dot(gaps.residual[n, first], gaps.residual[n, first])
+                    gap = distance[delay, 0] + dot(column, mean[n, b])
+                    variance = segments.own[which[n, b], first] + squared_by(covariance[n, b], column, pull)
+                    variance += dot(gaps.residual[n, first], gaps.residual[n, first])
                     root = math.sqrt(variance)
                     # Hypotheses that differ in the compliance alone are the same without contact.
                     if gap / root != score:
@@ -328,18 +231,18 @@ def _filter(
                     if not filled[delay]:
                         distance[delay, i] = _line(gaps, n, delay, first + i, slope[i])
                         slope[i] *= share
-                    error[b, i] = _dot(slope[i], mean[n, b]) + share * (
+                    error[b, i] = dot(slope[i], mean[n, b]) + share * (
                         distance[delay, i] + prior.compliance[h] * gaps.force[first + i]
                     )
                 filled[delay] = True
                 np.dot(slope, covariance[n, b], own_pull)
-                _joint(slope, own_pull, segments.errors[h, first:last], left_over, joint)
+                set_joint(slope, own_pull, segments.errors[h, first:last], left_over, joint)
                 for change in range(changes):
                     if change and log_weight[n, b] + prior.change_log_probability[change] < likely:
                         continue
                     for a in range(parameters):
                         changed[a] = prior.change_variance[change, a] * prior.scale[h] ** 2
-                    log_density, square[found] = _factored(
+                    log_density, square[found] = factored(
                         joint, error[b, :rows], slope, changed, loaded, factor, white
                     )
                     inlier = log_weight[n, b] + log_in + log_density
@@ -386,8 +289,8 @@ def _filter(
                 mean[n, left], covariance[n, left] = old_mean[b], old_covariance[b]
                 if kind[c] % 2 == INLIER:
                     slope = columns[prior.delay[h], :rows]
-                    _factored(joints[b], error[b, :rows], slope, changed, loaded, factor, white)
-                    _condition(
+                    factored(joints[b], error[b, :rows], slope, changed, loaded, factor, white)
+                    condition(
                         factor,
                         white[:rows],
                         pulls[b],

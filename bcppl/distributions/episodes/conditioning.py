@@ -1,0 +1,100 @@
+"""A normal over M parameters, conditioned on the gaps of an episode: the arithmetic of one hypothesis."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bcppl.arrays import Array
+from bcppl.compiled import summed
+
+
+@summed
+def dot(first: Array, second: Array) -> float:
+    """The dot product of two vectors."""
+    total = 0.0
+    for a in range(len(first)):
+        total += first[a] * second[a]
+    return total
+
+
+@summed
+def squared_by(covariance: Array, column: Array, product: Array) -> float:
+    """Set `product` (M,) to a symmetric matrix times a column (M,); returns the column's square by it."""
+    square = 0.0
+    for a in range(len(column)):
+        product[a] = dot(covariance[a], column)
+        square += column[a] * product[a]
+    return square
+
+
+@summed
+def set_joint(columns: Array, pull: Array, errors: Array, residual: Array, joint: Array) -> None:
+    """Set `joint` (n, n), the lower triangle, to the covariance of gaps by parameters and other errors."""
+    for i in range(len(columns)):
+        for j in range(i + 1):
+            joint[i, j] = errors[i, j] + dot(residual[i], residual[j]) + dot(pull[i], columns[j])
+
+
+@summed
+def factored(
+    joint: Array, error: Array, columns: Array, change: Array, loaded: Array, factor: Array, white: Array
+) -> tuple[float, float]:
+    """Set `factor` (n, n) to the Cholesky factor of the gaps' covariance, `white` (n,) to whitened errors.
+
+    `joint` is that without the change, whose variances are `change` (M,); by row i it has come by the share
+    `loaded[i]`.
+
+    Returns:
+        the log-density of the gaps, and their squared whitened errors.
+    """
+    squared, log_determinant = 0.0, 0.0
+    for i in range(len(error)):
+        for j in range(i + 1):
+            factor[i, j] = joint[i, j]
+    for a in range(len(change)):
+        if change[a] > 0.0:
+            for i in range(len(error)):
+                for j in range(i + 1):
+                    factor[i, j] += change[a] * loaded[j] * columns[i, a] * columns[j, a]
+    for i in range(len(error)):
+        for j in range(i):
+            known = factor[i, j]
+            for k in range(j):
+                known -= factor[i, k] * factor[j, k]
+            factor[i, j] = known / factor[j, j]
+        variance, rest = factor[i, i], error[i]
+        for k in range(i):
+            variance -= factor[i, k] * factor[i, k]
+            rest -= factor[i, k] * white[k]
+        factor[i, i] = math.sqrt(variance)
+        white[i] = rest / factor[i, i]
+        squared += white[i] * white[i]
+        log_determinant += math.log(variance)
+    return -0.5 * (squared + log_determinant + len(error) * math.log(2.0 * math.pi)), squared
+
+
+@summed
+def condition(
+    factor: Array,
+    white: Array,
+    pull: Array,
+    columns: Array,
+    change: Array,
+    loaded: Array,
+    gain: Array,
+    mean: Array,
+    covariance: Array,
+) -> None:
+    """Condition parameters, before the change, on an episode's gaps; `gain` (n, M) is room."""
+    for i in range(len(white)):
+        for a in range(len(mean)):
+            gain[i, a] = pull[i, a] + loaded[i] * change[a] * columns[i, a]
+        for k in range(i):
+            for a in range(len(mean)):
+                gain[i, a] -= factor[i, k] * gain[k, a]
+        for a in range(len(mean)):
+            gain[i, a] /= factor[i, i]
+            mean[a] -= gain[i, a] * white[i]
+    covariance -= np.dot(gain.T, gain)
