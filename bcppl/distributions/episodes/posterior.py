@@ -28,11 +28,12 @@ def drawn(branches: Branches, draws: int) -> Tensor:
 
 def moments(branches: Branches) -> tuple[Tensor, Tensor]:
     """Mean (N, M) and covariance (N, M, M) of the parameters."""
-    weights, means = torch.from_numpy(branches.weights), torch.from_numpy(branches.mean)
-    mean = (weights[..., None] * means).sum(dim=1)
-    away = means - mean[:, None]
-    each = torch.from_numpy(branches.covariance) + away[..., None] * away[..., None, :]
-    return mean, (weights[..., None, None] * each).sum(dim=1)
+    weights, means = torch.from_numpy(branches.weights)[:, None], torch.from_numpy(branches.mean)
+    covariances = torch.from_numpy(branches.covariance)
+    mean = weights @ means  # (N, 1, M)
+    away = weights.transpose(1, 2).sqrt() * (means - mean)
+    within = (weights @ covariances.flatten(2)).view_as(covariances[:, 0])
+    return mean[:, 0], within + away.transpose(1, 2) @ away
 
 
 def probable_jumps(
