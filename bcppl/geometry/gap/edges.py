@@ -32,21 +32,25 @@ def by_edges(
     normal: Array,
 ) -> None:
     """The distances of the part's edges to the peg, where these are less than those of its vertices."""
+    if not len(edges.groups):
+        return
     planes, box, gradient = solids.planes, solids.box, np.empty(3)
     start, stop, middle = np.empty(3), np.empty(3), np.empty(3)
     turn, shift, rows = np.empty((3, 3)), np.empty(3), np.empty((len(planes), 2))
+    closest_group = 0
     for n in range(first, last):
         own = n if len(peg.rotation) > 1 else 0
         for t in range(peg.rotation.shape[1]):
             relative(part, n, peg, own, t, turn, shift)
             # A farther edge cannot be in contact.
             of_vertices = distance[n, t]
-            nearer, next_edge = min(of_vertices, NEAR), 0
-            for g in range(len(edges.groups)):
-                first_edge, next_edge = next_edge, edges.stops[g]
-                if not may_be_nearer(edges.groups, g, turn, shift, box, nearer):
+            nearer, first_group = min(of_vertices, NEAR), closest_group
+            for k in range(-1, len(edges.groups)):
+                # The group that was closest at the pose before comes first: hardly any other is looked into.
+                g = first_group if k < 0 else k
+                if k == first_group or not may_be_nearer(edges.groups, g, turn, shift, box, nearer):
                     continue
-                for e in range(first_edge, next_edge):
+                for e in range(edges.stops[g - 1] if g else 0, edges.stops[g]):
                     if not may_be_nearer(edges.spheres, e, turn, shift, box, nearer):
                         continue
                     to_peg_frame(turn, shift, edges.spheres, e, middle)
@@ -60,7 +64,8 @@ def by_edges(
                             continue
                         inside, share = segment_distance(start, stop, solid, nearer, rows, gradient)
                         if inside < nearer:
-                            nearer = distance[n, t] = inside
+                            nearer, closest_group = inside, g
+                            distance[n, t] = inside
                             witness[n, t] = edges.ends[e, 0] + share * (edges.ends[e, 1] - edges.ends[e, 0])
                             for axis in range(3):
                                 normal[n, t, axis] = -dot(turn[axis], gradient)
