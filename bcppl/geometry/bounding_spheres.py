@@ -17,10 +17,14 @@ def compact_groups(points: Array) -> list[Indices]:
 def _bisected(points: Array, members: Indices) -> list[Indices]:
     if len(members) <= GROUP:
         return [members] if len(members) else []
+    return [group for half in halves(points, members) for group in _bisected(points, half)]
+
+
+def halves(points: Array, members: Indices) -> tuple[Indices, Indices]:
+    """Members of points (P, 3) in two halves, across the axis along which they are widest."""
     axis = int(np.ptp(points[members], axis=0).argmax())
     order = members[np.argsort(points[members, axis], kind="stable")]
-    half = len(order) // 2
-    return _bisected(points, order[:half]) + _bisected(points, order[half:])
+    return order[: len(order) // 2], order[len(order) // 2 :]
 
 
 def bounding_sphere(points: Array) -> Array:

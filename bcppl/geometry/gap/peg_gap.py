@@ -11,12 +11,13 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.effort import Effort
-from bcppl.geometry.distance import DistanceGrid, SignedDistance, distance_grid
+from bcppl.geometry.distance import SignedDistance
+from bcppl.geometry.distance_grid import DistanceGrid, distance_grid
 from bcppl.geometry.gap.edges import by_edges
 from bcppl.geometry.gap.frames import Frames, frames_of
 from bcppl.geometry.gap.sharp_edges import sharp_edges
 from bcppl.geometry.gap.solids import solids_of
-from bcppl.geometry.gap.vertices import by_vertices, collect, take
+from bcppl.geometry.gap.vertices import NEAR, by_vertices
 from bcppl.geometry.parts import Part
 from bcppl.threads import parallel_sum, thread_count
 
@@ -87,14 +88,14 @@ class PegGap:
         particles, stamps = len(part.translation), peg.translation.shape[1]
         with self.effort.measure(items=particles * stamps):
             if self._grid is None:
-                self._grid = distance_grid(self.part, self._signed, _MARGIN)
-            distance, several = np.empty((particles, stamps)), np.zeros((particles, stamps), dtype=np.int64)
+                self._grid = distance_grid(self.part, self._signed, _MARGIN, NEAR)
+            distance = np.empty((particles, stamps))
             witness, normal = np.empty((particles, stamps, 3)), np.empty((particles, stamps, 3))
-            pairs, result = (part, peg, self._grid, self._solids), (distance, witness, normal)
+            result, grid, surface = (distance, witness, normal), self._grid, self._signed.surface
             chunk = max(_CHUNK, _PAIRS // max(1, stamps))
 
             def of_vertices(first: int, last: int) -> int:
-                by_vertices(first, last, *pairs, *result, several)
+                by_vertices(first, last, part, peg, grid, surface, self._solids, *result)
                 return 0
 
             def of_edges(first: int, last: int) -> int:
@@ -102,12 +103,5 @@ class PegGap:
                 return 0
 
             parallel_sum(of_vertices, 0, particles, chunk, thread_count())
-            if several.any():
-                which = np.argwhere(several)
-                ends = np.cumsum(several[several > 0])
-                points = np.empty((ends[-1], 3))
-                collect(which, ends, *pairs, points)
-                exact = self._signed(torch.from_numpy(points))
-                take(which, ends, points, exact.distance.numpy(), exact.normal.numpy(), *result)
             parallel_sum(of_edges, 0, particles, chunk, thread_count())
         return distance, witness, normal

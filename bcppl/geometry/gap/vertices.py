@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from bcppl.arrays import Array, Indices
+from bcppl.arrays import Array
 from bcppl.compiled import compiled
-from bcppl.geometry.distance import DistanceGrid, inexact, interpolated, set_gradient
+from bcppl.geometry.distance import Surface, signed_at
+from bcppl.geometry.distance_grid import DistanceGrid, inexact, interpolated, set_gradient
 from bcppl.geometry.gap.frames import Frames, placed, relative
 from bcppl.geometry.gap.solids import Solids
 
@@ -50,19 +51,20 @@ def by_vertices(
     part: Frames,
     peg: Frames,
     grid: DistanceGrid,
+    surface: Surface,
     solids: Solids,
     distance: Array,
     witness: Array,
     normal: Array,
-    several: Indices,
 ) -> None:
-    """The distances of the peg's vertices to the part, where these are exact.
-
-    Sets `several` to the number of vertices that may be closer, their distances being inexact.
-    """
+    """Set the distances of the peg's vertices to the part, their witness points (3,) and normals (3,)."""
     corners, stops, spheres = solids.corners, solids.stops, solids.spheres
     bound, here, slack = np.empty((2, len(spheres))), np.empty(len(corners)), np.empty(len(corners))
     turn, shift = np.empty((3, 3)), np.empty(3)
+    point, on_part, gradient = np.empty(3), np.empty(3), np.empty(3)
+    # The triangle of the part that was closest to a vertex at the pose before.
+    triangle = np.zeros(len(corners), np.int64)
+    inexact_ones = np.empty(len(corners), np.int64)
     for n in range(first, last):
         own = n if len(peg.rotation) > 1 else 0
         for t in range(peg.rotation.shape[1]):
@@ -91,56 +93,31 @@ def by_vertices(
                     most = min(most, here[c] + slack[c])
                     if slack[c] == 0.0 and (exact < 0 or here[c] < here[exact]):
                         exact = c
+            left = 0
             if abs(least) < NEAR:
                 closest = exact
                 for c in range(len(corners)):
-                    several[n, t] += here[c] - slack[c] < most and slack[c] > 0.0
-            if closest < 0:
+                    if here[c] - slack[c] < most and slack[c] > 0.0:
+                        inexact_ones[left] = c
+                        left += 1
+            if closest >= 0:
+                distance[n, t] = here[closest]
+                placed(corners[closest], turn, shift, witness[n, t])
+                set_gradient(witness[n, t], grid, normal[n, t])
+            else:
                 distance[n, t] = np.inf
-                continue
-            distance[n, t] = here[closest]
-            placed(corners[closest], turn, shift, witness[n, t])
-            set_gradient(witness[n, t], grid, normal[n, t])
-
-
-@compiled
-def collect(
-    which: Indices,
-    ends: Indices,
-    part: Frames,
-    peg: Frames,
-    grid: DistanceGrid,
-    solids: Solids,
-    points: Array,
-) -> None:
-    """Set `points` to those vertices of pairs (K, 2), in the part's frame; `ends` (K,) are theirs."""
-    corners, turn, shift = solids.corners, np.empty((3, 3)), np.empty(3)
-    here, slack = np.empty(len(corners)), np.empty(len(corners))
-    for k in range(len(which)):
-        n, t = which[k]
-        relative(part, n, peg, n if len(peg.rotation) > 1 else 0, t, turn, shift)
-        _interpolate(corners, 0, len(corners), turn, shift, grid, here, slack)
-        most, place = (here + slack).min(), ends[k - 1] if k else 0
-        for c in range(len(corners)):
-            if here[c] - slack[c] < most and slack[c] > 0.0:
-                placed(corners[c], turn, shift, points[place])
-                place += 1
-
-
-@compiled
-def take(
-    which: Indices,
-    ends: Indices,
-    points: Array,
-    exact: Array,
-    gradient: Array,
-    distance: Array,
-    witness: Array,
-    normal: Array,
-) -> None:
-    """Take the exact distances of points where these are closer."""
-    for k in range(len(which)):
-        n, t = which[k]
-        for p in range(ends[k - 1] if k else 0, ends[k]):
-            if exact[p] < distance[n, t]:
-                distance[n, t], witness[n, t], normal[n, t] = exact[p], points[p], gradient[p]
+            while left:
+                # That which may be the closest comes first: few others are left after it.
+                nearest = 0
+                for k in range(1, left):
+                    c, other = inexact_ones[k], inexact_ones[nearest]
+                    if here[c] - slack[c] < here[other] - slack[other]:
+                        nearest = k
+                c, left = inexact_ones[nearest], left - 1
+                inexact_ones[nearest] = inexact_ones[left]
+                if here[c] - slack[c] >= distance[n, t]:
+                    break
+                placed(corners[c], turn, shift, point)
+                away, triangle[c] = signed_at(point, surface, triangle[c], on_part, gradient)
+                if away < distance[n, t]:
+                    distance[n, t], witness[n, t], normal[n, t] = away, point, gradient
