@@ -23,7 +23,6 @@ from bcppl.inference.design.rules import surface_variance
 from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.inference.planning.constraints import Candidates, Constraint, feasible, require_candidates
 from bcppl.inference.planning.motion_constraints import (
-    ArmWithPeg,
     above_table,
     approach_within,
     collision_free,
@@ -36,6 +35,7 @@ from bcppl.inference.planning.touching import SurfacePoint, TouchParameters, fac
 from bcppl.models.robots import load_robot
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.recordings.action_file import load_actions, save_actions
+from bcppl.robot.arm_with_peg import ArmWithPeg
 from bcppl.robot.inverse_kinematics import joint_paths
 from bcppl.robot.plan import Plan
 from bcppl.sensors import View

@@ -6,14 +6,12 @@ import dataclasses
 import json
 import re
 import shutil
-import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from bcppl import view
 from bcppl.beliefs import Belief
@@ -26,31 +24,10 @@ from bcppl.rendering.rasterisation import renderer_for
 from bcppl.sensors import Probe, ProbeWindow
 from bcppl.viewer import Page
 from bcppl.viewer.of_measurements import rectified
+from tests.browser import SPACE, coloured, in_browser, opened
 from tests.command_line import Ran, short
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-OFFLINE = ("--host-resolver-rules=MAP * ~NOTFOUND", "--disable-background-networking", "--disable-sync")
-SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--hide-scrollbars")
-in_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium to open the page in")
 LARGEST = 5_000_000
-
-
-def opened(page: Path, state: str = "", seconds: int = 300) -> tuple[dict[str, str], Image.Image]:
-    """What a page says of itself in a browser without a network, and a picture of it."""
-    shot = page.with_suffix(".png")
-    words = [
-        "--headless=new",
-        "--no-sandbox",
-        f"--user-data-dir={page.parent / 'profile'}",
-        *OFFLINE,
-        *SOFTWARE,
-    ]
-    words += ["--window-size=1200,900", "--dump-dom", f"--screenshot={shot}", f"{page.as_uri()}{state}"]
-    assert CHROMIUM is not None
-    ran = subprocess.run([CHROMIUM, *words], capture_output=True, text=True, timeout=seconds)
-    root = re.search("<html[^>]*>", ran.stdout)
-    assert root is not None, ran.stderr
-    return dict(re.findall(r'data-([a-z]+)="([^"]*)"', root[0])), Image.open(shot).convert("RGB")
 
 
 def belief(recording: Recording, count: int, spread: float, seed: int) -> Belief:
@@ -77,14 +54,6 @@ def many(particles: int, touches: int = 18) -> tuple[Recording, list[tuple[str, 
     return recording, history
 
 
-def coloured(image: Image.Image, colour: Sequence[int], box: tuple[float, float, float, float]) -> int:
-    """How many pixels in a box (shares of the picture) are nearly of a colour."""
-    wide, high = image.size
-    part = image.crop((int(box[0] * wide), int(box[1] * high), int(box[2] * wide), int(box[3] * high)))
-    return int((np.abs(np.asarray(part).astype(int) - np.asarray(colour)).max(axis=-1) < 12).sum())
-
-
-SPACE = (0.0, 0.1, 0.55, 0.95)  # of the picture
 PEG = (0xC4, 0xA6, 0x4E)  # in the light
 
 

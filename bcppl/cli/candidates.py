@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.beliefs import Belief
+from bcppl.cli.arm import arm_with_peg
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
 from bcppl.inference.planning.candidate_layout import MIXED, plan_candidates
 from bcppl.inference.planning.constraints import Candidates, Constraint, feasible, require_candidates
 from bcppl.inference.planning.generators import MOTIONS, candidate_kinds
 from bcppl.inference.planning.motion_constraints import (
-    ArmWithPeg,
     above_table,
     approach_within,
     collision_free,
@@ -24,15 +22,12 @@ from bcppl.inference.planning.motion_constraints import (
     force_at_most,
     within_reach,
 )
-from bcppl.models.robots import load_robot
 from bcppl.recordings import Recording
 from bcppl.recordings.action_file import SUFFIXES, load_actions
 from bcppl.sensors.candidates import Candidate, name_of, planner_of
 
 COUNT = 8  # of a kind that is named without a number
 MOST = 10_000  # of a kind: more fit no memory, and are ranked in hours
-NUMBERS = "x y z qw qx qy qz"
-ORIGIN = "0 0 0 1 0 0 0"
 
 # A user's own candidates, or how many of each kind are to be planned.
 Asked = Sequence[Candidate] | Mapping[str, int]
@@ -94,29 +89,8 @@ def reach(
     robot: str | None, link: str | None, link_from_peg: str | None, world_from_base: str | None, seed: int
 ) -> list[Constraint]:
     """The constraint on candidates by the reach of an arm, where one is given."""
-    if robot is None:
-        if (link, link_from_peg, world_from_base) != (None, None, None):
-            raise InputError("--link, --link-from-peg, --world-from-base need an arm; give it with --robot.")
-        return []
-    if link is None:
-        raise InputError("--robot is given without --link; name the link of the arm that holds the peg.")
-    arm = load_robot(robot, tip=link)
-    if link_from_peg is None:
-        raise InputError(
-            "--robot is given without --link-from-peg; state how the link holds the peg (panda_hand, whose "
-            'z leads along the fingers, at about "0 0 0.1 0 1 0 0").'
-        )
-    held = _pose("--link-from-peg", link_from_peg)
-    base = _pose("--world-from-base", world_from_base or ORIGIN)
-    return [within_reach(ArmWithPeg(arm, link, held, base), seed=seed)]
-
-
-def _pose(option: str, words: str) -> Any:
-    try:
-        numbers = [float(word) for word in words.replace(",", " ").split()]
-    except ValueError:
-        raise InputError(f"{option} is {words!r}; give seven numbers, {NUMBERS}, in metres.") from None
-    return poses.as_pose(numbers, option).numpy()
+    arm = arm_with_peg(robot, link, link_from_peg, world_from_base)
+    return [] if arm is None else [within_reach(arm, seed=seed)]
 
 
 def planned(

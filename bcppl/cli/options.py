@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+NUMBERS = "x y z qw qx qy qz"  # of a pose
+
 Settings = Annotated[
     list[str] | None,
     typer.Option(
@@ -36,4 +38,25 @@ Particles = Annotated[int, typer.Option(min=2, help="How many particles; a belie
 
 AsJson = Annotated[
     bool, typer.Option("--json", help="Print the result as JSON; all else goes to standard error.")
+]
+
+Arm = Annotated[
+    str | None,
+    typer.Option(
+        "--robot", help="The arm that held the peg (panda, iiwa or a URDF file); it is drawn at every touch."
+    ),
+]
+
+Link = Annotated[str | None, typer.Option(help="The arm's link that holds the peg.")]
+
+LinkFromPeg = Annotated[
+    str | None,
+    typer.Option(
+        help=f"The peg's frame (its tip at the lowest z) in the link's: {NUMBERS}; panda_hand, whose z "
+        "leads along the fingers, holds it at about 0 0 0.1 0 1 0 0."
+    ),
+]
+
+WorldFromBase = Annotated[
+    str | None, typer.Option(help=f"Where the arm stands: {NUMBERS}; at the world's origin by default.")
 ]

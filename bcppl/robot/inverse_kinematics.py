@@ -28,6 +28,7 @@ def joint_paths(
     base_from_tool: Array,
     link_from_tool: Array | None = None,
     *,
+    near: Array | None = None,
     seed: int = 0,
 ) -> Array:
     """Joint angles along paths of poses, within the joint limits.
@@ -42,6 +43,8 @@ def joint_paths(
         link: to which the tool is mounted.
         base_from_tool: (P, K, 7) P paths of K poses in the robot's base frame.
         link_from_tool: (7,) the tool's pose on the link; None for the link's frame.
+        near: (J,) angles that are the only start, so that the arm keeps its configuration; by default the
+            middle of the limits and others within them.
         seed: of the starts.
 
     Returns:
@@ -62,17 +65,18 @@ def joint_paths(
     generator = torch.Generator().manual_seed(seed)
     share = torch.rand(_STARTS, len(robot.joints), generator=generator, dtype=torch.float64)
     share[0] = 0.5
-    angles = (low + share * (high - low)).repeat(count, 1)
+    starts = low + share * (high - low) if near is None else torch.as_tensor(near).reshape(1, -1)
+    angles = starts.repeat(count, 1)
     mounted = None if link_from_tool is None else torch.as_tensor(link_from_tool)
-    reached = torch.ones(count * _STARTS, dtype=torch.bool)
+    reached = torch.ones(len(angles), dtype=torch.bool)
     path = []
     for k in range(length):
-        target = goal[:, k].repeat_interleave(_STARTS, dim=0)
+        target = goal[:, k].repeat_interleave(len(starts), dim=0)
         for _ in range(_NEXT if k else _FIRST):
             error, jacobian = _error(robot, link, angles, target, mounted)
-            near = _is_near(error)
+            there = _is_near(error)
             # One solution for a path's first pose suffices; afterwards all that have reached theirs go on.
-            if bool(near[reached].all() if k else near.reshape(count, _STARTS).any(dim=1).all()):
+            if bool(there[reached].all() if k else there.reshape(count, -1).any(dim=1).all()):
                 break
             angles = (angles + _step(error, jacobian)).clamp(low, high)
         error, _ = _error(robot, link, angles, target, mounted)
@@ -80,8 +84,8 @@ def joint_paths(
         path.append(angles)
         if not bool(reached.any()):
             return np.full((count, length, len(robot.joints)), np.nan)
-    paths = torch.stack(path, dim=1).reshape(count, _STARTS, length, -1)
-    good = reached.reshape(count, _STARTS)
+    paths = torch.stack(path, dim=1).reshape(count, len(starts), length, -1)
+    good = reached.reshape(count, -1)
     chosen = paths[torch.arange(count), good.to(torch.int8).argmax(dim=1)]
     chosen[~good.any(dim=1)] = torch.nan
     return np.asarray(chosen.numpy())

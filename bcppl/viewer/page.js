@@ -3,8 +3,9 @@
 const element = (name) => document.getElementById(name);
 const held = unpacked(JSON.parse(element("data").textContent));
 element("data").remove();
-const { part, peg, palette, labels, steps } = held;
-const state = { step: labels.length - 1, particle: null, moment: null };
+const { part, peg, palette } = held, labels = [], steps = [];
+held.measurements = []; // one fewer than steps, for the first is the prior
+const state = { step: 0, particle: null, moment: null };
 const scene = new Scene(element("scene"), element("overlay"));
 const extent = part.extent, AXES = [["x", palette.x], ["y", palette.y], ["z", palette.z]];
 
@@ -25,8 +26,7 @@ const middle = [0, 1, 2].map((k) => {
   return 0.5 * (low + high);
 });
 const reach = Number((0.9 * extent).toPrecision(1)); // of the world's axes, a round number
-const forces = held.measurements.flatMap((each) => (each.force ? listed(each.force) : []));
-const hardest = bounds([1, ...forces.map((each) => Math.hypot(...each))])[1];
+let hardest = 1; // N
 const arrow = 0.45 * extent; // as in the figures: the part's z axis, and a tick along its x
 
 const shapes = {
@@ -38,7 +38,17 @@ const shapes = {
   pegEdges: peg && scene.geometry(peg.edges),
   dot: scene.geometry(scaled(DOT, 0.012 * extent), DOT_FACES),
   finger: scene.geometry(scaled(DOT, 0.035 * extent), DOT_FACES),
+  links: held.arm ? held.arm.links.map((each) => scene.geometry(each.vertices, each.faces)) : [],
 };
+
+// A step after those that are there.
+function append({ label, step, measurement, cells }) {
+  const k = labels.push(label) - 1;
+  steps.push(step);
+  if (measurement) held.measurements.push(measurement);
+  if (measurement && measurement.force) hardest = bounds([hardest, ...listed(measurement.force).map((each) => Math.hypot(...each))])[1];
+  if (cells.length) document.querySelector("tbody").appendChild(line("td", cells)).onclick = () => toStep(k);
+}
 
 // The newest measurement up to a step that has something.
 function newest(step, name) {
@@ -74,6 +84,18 @@ function drawTouch(touch) {
   scene.labels.push({ at: end, text: `${number(size)} N`, colour: "#7a2f5a" });
 }
 
+// Links where they were at this moment of the touch, between the rows at which they are known.
+function drawArm({ arm }) {
+  if (!arm || !element("arm").checked) return 0;
+  const { rows, poses } = arm;
+  let k = 0;
+  while (k < rows.length - 2 && rows[k + 1] <= state.moment) k++;
+  const next = Math.min(k + 1, rows.length - 1), share = (state.moment - rows[k]) / (rows[next] - rows[k] || 1);
+  const at = (n, link) => Array.from(row(poses, n).subarray(7 * link, 7 * link + 7));
+  shapes.links.forEach((link, n) => scene.put(link, [[between(at(k, n), at(next, n), share), palette.arm, 1]]));
+  return shapes.links.length;
+}
+
 // The frustum of a camera from its centre to a distance.
 function frustum(camera, far) {
   const corner = (u, v) => [((u - camera.cx) / camera.fx) * far, ((v - camera.cy) / camera.fy) * far, far];
@@ -103,6 +125,7 @@ function drawSpace(touch) {
     scene.labels.push({ at: end, text: `world ${name}${k ? "" : `, ${number(1e3 * reach)} mm`}`, colour: "#777777" });
   });
   drawCameras();
+  document.documentElement.dataset.arm = touch ? drawArm(touch) : 0;
   drawTouch(touch);
   if (held.truth) scene.put(shapes.edges, [[Array.from(held.truth), palette.truth, 1]]);
   scene.put(shapes.edges, [[mean, "#333333", 1]]);
@@ -212,7 +235,7 @@ function update() {
   drawTouchPlots(touch, words);
   drawSpace(touch);
   const crowd = step.weights.length < step.particles ? `, the ${step.weights.length} heaviest are drawn` : "";
-  const inferred = held.inferred
+  const inferred = step.particles
     ? `: ${step.particles} particles${crowd}, ESS ${number(step.ess)}, ± ${number(step.spread_mm)} mm, ± ${number(step.spread_degrees)}°` : "";
   element("step").value = state.step;
   element("label").textContent = `${labels[state.step]} (${state.step} of ${labels.length - 1})${inferred}`;
@@ -220,6 +243,7 @@ function update() {
   const pose = chosenPose(), mean = Array.from(step.mean);
   if (state.particle !== null) words.unshift(`weight ${number(100 * step.weights[state.particle])} %, ${offset(pose, mean)} from the mean`);
   else if (held.truth) words.unshift(`${offset(pose, Array.from(held.truth))} from the truth`);
+  if (held.arm && touch && !touch.arm) words.push(`${held.arm.name} does not reach the peg's poses`);
   element("chosen").textContent = `${chosenName()}: ${words.join("; ")}`;
   element("moments").hidden = !touch;
   if (touch) {
@@ -265,13 +289,21 @@ function fromLink() {
   const given = new URLSearchParams(location.hash.slice(1));
   if (given.has("step")) toStep(Number(given.get("step")) || 0);
   if (given.has("particle")) toNumber(Number(given.get("particle")));
-  if (given.has("step")) toward(scene.distance);
+  if (given.has("step") && !held.arm) toward(scene.distance);
 }
-
-const eyes = held.measurements.filter((each) => each.camera).map((each) => Array.from(each.camera.pose.subarray(0, 3)));
 
 function toward(distance) {
   [scene.target, scene.distance] = [placed(Array.from(steps[state.step].mean), middle), distance];
+  scene.draw();
+}
+
+// The part, the cameras and the arm's links about the middle of the picture.
+function overview() {
+  const links = (arm) => shapes.links.map((_, k) => arm.poses.subarray(7 * k, 7 * k + 7));
+  const at = held.measurements.flatMap(({ camera, arm }) => [...(camera ? [camera.pose] : []), ...(arm ? links(arm) : [])]);
+  const ends = [0, 1, 2].map((k) => bounds([steps[state.step].mean, ...at].map((each) => each[k])));
+  scene.target = ends.map(([low, high]) => 0.5 * (low + high));
+  scene.distance = Math.max(4.5 * extent, 1.8 * Math.hypot(...ends.map(([low, high]) => high - low)));
   scene.draw();
 }
 
@@ -289,6 +321,8 @@ function keys() {
     shown.push([palette.peg, peg ? peg.name : "finger"], [palette.seen, "path of its tip"], [palette.felt, "contact felt, force"]);
     if (held.measurements.some((each) => each.command)) shown.push([palette.particle, "path as commanded"]);
   }
+  if (held.arm) shown.push([palette.arm, `${held.arm.name}, by inverse kinematics`]);
+  element("keys").replaceChildren();
   for (const [colour, name] of shown) {
     const key = element("keys").appendChild(document.createElement("span"));
     key.className = "key";
@@ -301,11 +335,11 @@ function keys() {
 element("facts").textContent = held.facts.map((pair) => pair.join(" ")).join(", ");
 element("notes").textContent = [...held.notes, ...(scene.gl ? [] : ["This browser has no WebGL 2: nothing is drawn in space."])].join(" ");
 element("source").textContent = held.source;
-document.querySelector("thead").append(...(held.rows.length ? [line("th", held.columns)] : []));
-held.rows.forEach((cells, k) => {
-  document.querySelector("tbody").appendChild(line("td", cells)).onclick = () => toStep(k);
-});
-element("table").hidden = !held.rows.length;
+document.querySelector("thead").append(line("th", held.columns));
+held.entries.forEach(append);
+state.step = labels.length - 1;
+element("table").hidden = !held.columns.length;
+element("arms").hidden = !held.arm;
 for (const name of ["particle", "mean", "outlines"]) element(name).disabled = !held.inferred;
 keys();
 element("step").max = labels.length - 1;
@@ -315,12 +349,13 @@ element("forth").onclick = () => toStep(state.step + 1);
 element("mean").onclick = () => toNumber(-1);
 element("particle").onchange = (event) => toNumber(event.target.value === "" ? -1 : Number(event.target.value));
 element("moment").oninput = (event) => { state.moment = Number(event.target.value); update(); };
-element("outlines").onchange = element("whole").onchange = update;
+element("outlines").onchange = element("whole").onchange = element("arm").onchange = update;
 element("near").onclick = () => toward(4.5 * extent);
-element("far").onclick = () => toward(2.2 * Math.max(extent, ...eyes.map((eye) => Math.hypot(...minus(eye, scene.target)))));
+element("far").onclick = overview;
 window.addEventListener("resize", update);
 window.addEventListener("hashchange", fromLink);
 toward(4.5 * extent);
+if (held.arm) overview();
 update();
 fromLink();
 document.documentElement.dataset.milliseconds = Math.round(performance.now()); // since the page was asked for

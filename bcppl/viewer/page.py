@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from bcppl.recordings.hdf5 import replacing
+from bcppl.robot.arm_with_peg import ArmWithPeg
 from bcppl.sensors import Recording
 from bcppl.viewer.held import History, content
 from bcppl.visible_text import visible
@@ -66,6 +67,7 @@ def view(
     title: str = "",
     facts: Mapping[str, object] | None = None,
     notes: Sequence[str] = (),
+    arm: ArmWithPeg | None = None,
 ) -> Page:
     """The page of a run, or of a recording alone, to be saved or shown in a notebook.
 
@@ -80,28 +82,44 @@ def view(
         title: of the page.
         facts: about the run, for the page's head.
         notes: sentences about the run, such as its warnings.
+        arm: that holds the peg; it is drawn where the peg was measured, by inverse kinematics.
 
     Raises:
-        InputError: there are more beliefs than measurements and the prior, or rows for other steps.
+        InputError: there are more beliefs than measurements and the prior, or rows for other steps; or the
+            arm reaches no touch.
+
+    Warns:
+        RuntimeWarning: the arm's meshes cannot be read, and segments are drawn in their place.
     """
-    held = content(recording, history, rows, facts, notes)
-    held["title"] = visible(title or recording.part.name)
+    return page_of(content(recording, history, rows, facts, notes, arm), title or recording.part.name)
+
+
+def page_of(held: Mapping[str, Any], title: str, sources: str = "") -> Page:
+    """The page of a `content`.
+
+    Args:
+        held: the content.
+        title: of the page.
+        sources: what its script may connect to, as its policy states it; by default nothing.
+    """
+    title = visible(title)
     # Within a script element only "<" can begin what ends it, and JSON has it in strings alone.
-    data = json.dumps(_plain(held), allow_nan=False).replace("<", "\\u003c")
+    data = as_json(held).replace("<", "\\u003c")
     script = "\n".join(_text(name) for name in SCRIPTS)
     style = _text("page.css")
     page = _text("page.html")
     policy = f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; base-uri 'none'"
+    policy += f"; connect-src {sources}" if sources else ""
     pieces = {
         "POLICY": policy,
-        "TITLE": html.escape(held["title"]),
+        "TITLE": html.escape(title),
         "STYLE": style,
         "DATA": data,
         "SCRIPT": script,
     }
     # Piece by piece from the template, so that nothing in a piece is taken for the place of another.
     text = "".join(pieces.get(word, word) for word in page.split("%%"))
-    return Page(text, len(held["labels"]))
+    return Page(text, len(held["entries"]))
 
 
 def _text(name: str) -> str:
@@ -110,6 +128,11 @@ def _text(name: str) -> str:
 
 def _hash(text: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+
+
+def as_json(held: Mapping[str, Any]) -> str:
+    """A content, or an entry of one, in one line."""
+    return json.dumps(_plain(held), allow_nan=False)
 
 
 def _plain(value: Any) -> Any:

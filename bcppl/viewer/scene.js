@@ -29,6 +29,14 @@ function seenFrom(pose, v) {
   return turned(pose, minus(v, pose), true);
 }
 
+// The pose at a share of the way from one to another that is near.
+function between(a, b, share) {
+  const side = a[3] * b[3] + a[4] * b[4] + a[5] * b[5] + a[6] * b[6] < 0 ? -1 : 1;
+  const mixed = a.map((each, k) => each + share * ((k < 3 ? 1 : side) * b[k] - each));
+  const length = Math.hypot(...mixed.slice(3));
+  return mixed.map((each, k) => (k < 3 ? each : each / length));
+}
+
 const IDENTITY = [0, 0, 0, 1, 0, 0, 0];
 
 const VERTEX = `#version 300 es

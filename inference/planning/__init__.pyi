@@ -14,7 +14,6 @@ from bcppl.inference.planning.metrology import (
     three_two_one as three_two_one,
 )
 from bcppl.inference.planning.motion_constraints import (
-    ArmWithPeg as ArmWithPeg,
     above_table as above_table,
     approach_within as approach_within,
     collision_free as collision_free,
@@ -35,3 +34,4 @@ from bcppl.inference.planning.touching import (
     slide as slide,
     touch as touch,
 )
+from bcppl.robot.arm_with_peg import ArmWithPeg as ArmWithPeg

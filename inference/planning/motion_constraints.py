@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,29 +16,12 @@ from bcppl.geometry.gap import PegGap
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.constraints import Constraint, per_candidate
 from bcppl.inference.planning.motions import expected_contacts, free_path, pressing_force
+from bcppl.robot.arm_with_peg import ArmWithPeg
 from bcppl.robot.inverse_kinematics import joint_paths
-from bcppl.robot.kinematics import Robot
 from bcppl.robot.plan import Plan
 from bcppl.sensors.candidates import Candidate, duration_of, motion_of, placement_of
 
 _CONTACT = 0.0005  # m: a peg so near to the part is in contact with it
-
-
-class ArmWithPeg(NamedTuple):
-    """An arm that holds the peg.
-
-    Attributes:
-        robot: with a tip, so that its joints are those that move the link.
-        link: that holds the peg.
-        link_from_peg: (7,) the peg's frame, whose tip is at its lowest z, in the link's: where the link's z
-            axis is along the fingers, turned by pi.
-        world_from_base: (7,) the robot's base.
-    """
-
-    robot: Robot
-    link: str
-    link_from_peg: Array
-    world_from_base: Array
 
 
 def approach_within(direction: Sequence[float], angle: float, violation: str = "") -> Constraint:

@@ -11,7 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from bcppl.arguments import LARGEST_SEED
-from bcppl.cli.options import AsJson, Given, InferenceName, ModelName, Of, Particles, Settings
+from bcppl.cli.options import (
+    AsJson,
+    Given,
+    InferenceName,
+    Link,
+    LinkFromPeg,
+    ModelName,
+    Of,
+    Particles,
+    Settings,
+    WorldFromBase,
+)
 from bcppl.errors import InputError
 from bcppl.visible_text import visible
 
@@ -21,7 +32,6 @@ if TYPE_CHECKING:
     from bcppl.inference.design.ranking import Ranking
 
 WIDEST = 1000  # characters of a row of the table
-NUMBERS = "x y z qw qx qy qz"
 
 
 def probe(
@@ -78,17 +88,9 @@ def probe(
         str | None,
         typer.Option(help="An arm (panda, iiwa or a URDF file): what it does not reach is left out."),
     ] = None,
-    link: Annotated[str | None, typer.Option(help="The arm's link that holds the peg.")] = None,
-    link_from_peg: Annotated[
-        str | None,
-        typer.Option(
-            help=f"The peg's frame (its tip at the lowest z) in the link's: {NUMBERS}; panda_hand, whose z "
-            "leads along the fingers, holds it at about 0 0 0.1 0 1 0 0."
-        ),
-    ] = None,
-    world_from_base: Annotated[
-        str | None, typer.Option(help=f"Where the arm stands: {NUMBERS}; at the world's origin by default.")
-    ] = None,
+    link: Link = None,
+    link_from_peg: LinkFromPeg = None,
+    world_from_base: WorldFromBase = None,
     as_json: AsJson = False,
 ) -> None:
     """Rank candidates for the next touch or view by their expected information gain, in nats."""

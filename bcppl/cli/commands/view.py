@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from bcppl.cli.options import Arm, Link, LinkFromPeg, WorldFromBase
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
+    from bcppl.robot.arm_with_peg import ArmWithPeg
     from bcppl.viewer import Page
 
 PAGE = "view.html"
@@ -26,17 +28,23 @@ def view(
     of: Annotated[
         str | None, typer.Option(help="The run's recording, where it is no longer where it was run.")
     ] = None,
+    robot: Arm = None,
+    link: Link = None,
+    link_from_peg: LinkFromPeg = None,
+    world_from_base: WorldFromBase = None,
 ) -> None:
     """Show part, peg, cameras, particles and measurements, step by step, on a page that needs no network."""
     import webbrowser
 
-    folder = Path(run)
+    from bcppl.cli.arm import arm_with_peg
+
+    folder, arm = Path(run), arm_with_peg(robot, link, link_from_peg, world_from_base)
     if folder.is_dir():
-        page, place = of_run(folder, of), folder / PAGE
+        page, place = of_run(folder, of, arm), folder / PAGE
     else:
         if of is not None:
             raise InputError(f"--of names a run's recording, but {run} is no folder of a run; leave it out.")
-        page, place = of_recording(run), Path(f"{folder.stem}.{PAGE}")
+        page, place = of_recording(run, arm), Path(f"{folder.stem}.{PAGE}")
     place = save or place
     page.save(place)
     print(f"wrote {place}: {page.steps} steps, {len(page.text) / 1e6:.1f} MB; it needs no other file.")
@@ -44,7 +52,7 @@ def view(
         print("no browser can be opened here: open the file in one.")
 
 
-def of_recording(name: str) -> Page:
+def of_recording(name: str, arm: ArmWithPeg | None = None) -> Page:
     """The page of a recording without a belief.
 
     Raises:
@@ -53,15 +61,16 @@ def of_recording(name: str) -> Page:
     from bcppl.cli import loading
     from bcppl.viewer import view
 
-    return view(loading.recording(name), title=name)
+    return view(loading.recording(name), title=name, arm=arm)
 
 
-def of_run(folder: Path, of: str | None = None) -> Page:
+def of_run(folder: Path, of: str | None = None, arm: ArmWithPeg | None = None) -> Page:
     """The page of the run in a folder, up to its newest belief.
 
     Args:
         folder: that `bcppl run` wrote.
         of: the recording; by default the one that run.json names.
+        arm: that holds the peg.
 
     Raises:
         InputError: the folder holds no run, or one of an earlier version; beliefs are missing, or are of
@@ -100,7 +109,7 @@ def of_run(folder: Path, of: str | None = None) -> Page:
             )
         history.append((load_label(file), load_belief(file)))
     notes = _notes(folder, record, len(rows) - 1)
-    return view(recording, history, rows, title=name, facts=_facts(record), notes=notes)
+    return view(recording, history, rows, title=name, facts=_facts(record), notes=notes, arm=arm)
 
 
 def _facts(record: dict[str, Any]) -> dict[str, object]:
