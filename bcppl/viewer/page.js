@@ -9,18 +9,6 @@ const state = { step: 0, particle: null, moment: null };
 const scene = new Scene(element("scene"), element("overlay"));
 const extent = part.extent, AXES = [["x", palette.x], ["y", palette.y], ["z", palette.z]];
 
-function segments(points) {
-  return points.slice(1).flatMap((each, k) => [...points[k], ...each]);
-}
-
-function listed(array) {
-  return Array.from({ length: array.shape[0] }, (_, k) => Array.from(row(array, k)));
-}
-
-// Corners of an octahedron of a radius: a point that is seen from all sides.
-const DOT = [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]].flat();
-const DOT_FACES = [0, 1, 4, 1, 2, 4, 2, 3, 4, 3, 0, 4, 1, 0, 5, 2, 1, 5, 3, 2, 5, 0, 3, 5];
-const scaled = (points, by) => points.map((each) => each * by);
 const middle = [0, 1, 2].map((k) => {
   const [low, high] = bounds(part.vertices.filter((_, n) => n % 3 === k));
   return 0.5 * (low + high);
@@ -171,7 +159,7 @@ function drawDepth(words) {
 }
 
 function chosenName() {
-  return state.particle === null ? (held.inferred ? "the mean" : "the guess") : `particle ${steps[state.step].numbers[state.particle]}`;
+  return state.particle === null ? (steps[state.step].particles ? "the mean" : "the guess") : `particle ${steps[state.step].numbers[state.particle]}`;
 }
 
 function drawTouchPlots(touch, words) {
@@ -197,7 +185,7 @@ function drawTouchPlots(touch, words) {
   if (touch && touch.gap) {
     const x = Array.from(touch.gap_rows, (each) => touch.times[each]);
     const which = state.particle === null ? 0 : state.particle + 1;
-    shown.push({ x, y: gaps(0), colour: "#333333", name: held.inferred ? "mean" : "guess" });
+    shown.push({ x, y: gaps(0), colour: "#333333", name: steps[state.step].particles ? "mean" : "guess" });
     if (which) shown.push({ x, y: gaps(which), colour: palette.strong, name: "particle", width: 2 });
     const firm = gaps(which)[touch.firmest], felt = touch.felt[touch.gap_rows[touch.firmest]];
     const beyond = Math.abs(row(touch.gap, which)[touch.firmest]) === 32767 ? "of more than " : "";

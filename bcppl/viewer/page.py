@@ -24,7 +24,7 @@ from bcppl.sensors import Recording
 from bcppl.viewer.held import History, content
 from bcppl.visible_text import visible
 
-SCRIPTS = ("scene.js", "pictures.js", "page.js")
+SCRIPTS = ("scene.js", "pictures.js", "page.js", "live.js")
 HEIGHT = 820  # pixels, in a notebook
 
 

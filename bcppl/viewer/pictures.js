@@ -20,6 +20,10 @@ function row(array, k) {
   return array.subarray(k * size, (k + 1) * size);
 }
 
+function listed(array) {
+  return Array.from({ length: array.shape[0] }, (_, k) => Array.from(row(array, k)));
+}
+
 // Depth (H W) in metres of a body at a pose, NaN where a pixel does not see it: triangles into a depth buffer.
 function rendered(body, camera, pose) {
   const { width, height, fx, fy, cx, cy } = camera, inverse = new Float64Array(width * height);

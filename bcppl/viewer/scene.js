@@ -37,6 +37,16 @@ function between(a, b, share) {
   return mixed.map((each, k) => (k < 3 ? each : each / length));
 }
 
+// A line through points, in pairs.
+function segments(points) {
+  return points.slice(1).flatMap((each, k) => [...points[k], ...each]);
+}
+
+// Corners of an octahedron of a radius: a point that is seen from all sides.
+const DOT = [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]].flat();
+const DOT_FACES = [0, 1, 4, 1, 2, 4, 2, 3, 4, 3, 0, 4, 1, 0, 5, 2, 1, 5, 3, 2, 5, 0, 3, 5];
+const scaled = (points, by) => points.map((each) => each * by);
+
 const IDENTITY = [0, 0, 0, 1, 0, 0, 0];
 
 const VERTEX = `#version 300 es

@@ -30,12 +30,15 @@ from bcppl.inference.planning.candidate_layout import plan_candidates, require_u
 from bcppl.inference.planning.constraints import Candidates, require_candidates
 from bcppl.inference.planning.insertion import InsertionParameters, insertion_plan
 from bcppl.inference.sizing import resize
+from bcppl.robot.arm_with_peg import ArmWithPeg
 from bcppl.robot.plan import InsertionPlan
 from bcppl.sensors import Measurement, Recording
 from bcppl.sensors.candidates import Candidate, with_candidates
 from bcppl.sensors.protocol import InParts, sensor_for
 from bcppl.traces import Model
+from bcppl.viewer.live import LivePage
 
+COLUMNS = ("measurement", "particles", "joined", "late s", "log Z")  # of a page's table
 FEWEST = 20  # particles, that no deadline takes
 KEPT = 1000  # updates
 AHEAD = 0.5  # of the deadline: a faster update may have more particles
@@ -106,6 +109,7 @@ class Filter:
         self._waiting = Waiting()
         self._changed = threading.Condition()
         self._updates: deque[Update] = deque(maxlen=KEPT)
+        self._pages: list[LivePage] = []
         self._failed: BaseException | None = None
         self._thread = ThreadPoolExecutor(1, "bcppl live")
         try:
@@ -236,9 +240,25 @@ class Filter:
         plan = lambda: insertion_plan(self.belief, self._recording.part, peg, parameters=parameters)  # noqa: E731
         return self._run(plan, timeout)
 
+    def view(self, title: str = "", arm: ArmWithPeg | None = None) -> LivePage:
+        """A page that follows in a browser: open its `url` on this machine.
+
+        What a page shows is computed in a thread of the page, and one that stalls is left. Steps that were
+        made before this call are shown without their particles.
+
+        Args:
+            title: of the page.
+            arm: that holds the peg; it is drawn where the peg was measured.
+        """
+        page = LivePage(self._recording, title, COLUMNS, arm)
+        self._run(lambda: self._begin_page(page), None)
+        return page
+
     def close(self) -> None:
-        """End the filter's thread; what waits is not assimilated."""
+        """End the filter's thread, and its pages; what waits is not assimilated."""
         self._thread.shutdown(wait=True, cancel_futures=True)
+        for page in self._pages:
+            page.close()
 
     def __enter__(self) -> Filter:
         return self
@@ -254,6 +274,13 @@ class Filter:
             self.model, self._recording, particles=self.particles, seed=self.seed, scene=scene
         )
         return next(iter(first))
+
+    def _begin_page(self, page: LivePage) -> None:
+        for k in range(len(self._recording.measurements)):
+            label = f"{self._recording.measurements[k - 1].kind} {k}" if k else "prior"
+            page.add(label, None, self._recording, [label, *[""] * (len(COLUMNS) - 1)])
+        page.add(self._step.info.label, self.belief, self._recording, _row(self._step))
+        self._pages.append(page)
 
     def _assimilate(self) -> None:
         """Assimilate everything that can be: a measurement may have been waited for by others."""
@@ -288,6 +315,8 @@ class Filter:
         update = Update(joined, count, time.monotonic() - arrived, fault)
         with self._changed:
             self._updates.append(update)
+        for page in self._pages if not fault else []:
+            page.add(self._step.info.label, self.belief, self._recording, _row(self._step, update))
         if self._on_update is not None:
             self._on_update(self._step, update)
 
@@ -317,6 +346,12 @@ class Filter:
         number = len(self._recording.measurements)
         for _, problem in sensor.problems([(number, alone)], self._recording):
             raise InputError(problem)
+
+
+def _row(step: Step, update: Update | None = None) -> list[str]:
+    """Cells of `COLUMNS`."""
+    late = ["", ""] if update is None else [str(update.joined), f"{update.seconds:.2f}"]
+    return [step.info.label, str(len(step.population)), *late, f"{step.info.log_evidence:.2f}"]
 
 
 def resized(step: Step, count: int) -> Step:

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bcppl.arguments import LARGEST_SEED
-from bcppl.cli.options import InferenceName, ModelName, Recorded, Settings
+from bcppl.cli.options import (
+    Arm,
+    InferenceName,
+    Link,
+    LinkFromPeg,
+    ModelName,
+    Recorded,
+    Settings,
+    WorldFromBase,
+)
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,6 +31,7 @@ if TYPE_CHECKING:
     from bcppl.inference.live.server import Server
     from bcppl.recordings import Recording
     from bcppl.traces import Model
+    from bcppl.viewer import LivePage
 
 PARTICLES = Annotated[int, typer.Option(min=2, help="How many particles.")]
 SEED = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of inference.")]
@@ -31,6 +41,10 @@ DEADLINE = Annotated[
         min=0.001, help="s; where updates take longer, windows are joined, then particles are fewer."
     ),
 ]
+VIEW = Annotated[
+    bool, typer.Option("--view", help="Show part, particles and measurements on a page that follows.")
+]
+SOON = 15.0  # s within which a browser asks for a page
 
 
 def live(
@@ -44,18 +58,32 @@ def live(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", dir_okay=False, help="File for the last belief (.h5).")
     ] = None,
+    view: VIEW = False,
+    save: Annotated[
+        Path | None,
+        typer.Option("--save", dir_okay=False, help="Write the page to this file at the end (.html)."),
+    ] = None,
+    robot: Arm = None,
+    link: Link = None,
+    link_from_peg: LinkFromPeg = None,
+    world_from_base: WorldFromBase = None,
     set_: Settings = None,
 ) -> None:
     """Play a recording as if it were being made, and follow it: how late each update was, and the belief."""
     from rich.console import Console
 
+    from bcppl.cli.arm import arm_with_peg
     from bcppl.cli.report import Report
     from bcppl.inference.live import Filter, play
     from bcppl.recordings.beliefs import save_belief
     from bcppl.recordings.fingerprint import fingerprint
 
-    if out is not None and not out.parent.is_dir():
-        raise InputError(f"there is no folder {out.parent} to write {out.name} into; make it first.")
+    for file in filter(None, (out, save)):
+        if not file.parent.is_dir():
+            raise InputError(f"there is no folder {file.parent} to write {file.name} into; make it first.")
+    if robot is not None and not (view or save):
+        raise InputError("--robot is drawn on a page; add --view or --save.")
+    arm = arm_with_peg(robot, link, link_from_peg, world_from_base)
     console = Console(highlight=False)
     measured, chosen, infer = _chosen(recording, model, inference, set_)
     report = Report(console, measured, chosen)
@@ -66,6 +94,8 @@ def live(
 
     settings: dict[str, Any] = {"particles": particles, "seed": seed, "deadline": deadline}
     with Filter(chosen, empty, infer=infer, on_update=shown, **settings) as following:
+        page = following.view(recording, arm) if view or save else None
+        asked = view and page is not None and _asked(page, console)
         report.row(following.step)
         for measurement in play(measured, speed):
             following.observe(measurement.action, measurement.observation)
@@ -73,6 +103,11 @@ def live(
         report.recording = following.recording
         report.finish()
         console.print(lateness(following.updates, deadline))
+        if page is not None and asked:
+            page.opened(SOON)
+    if page is not None and save is not None:
+        page.page().save(save)
+        console.print(f"the page is in {save}", markup=False)
     if out is not None:
         save_belief(
             last.belief,
@@ -83,6 +118,14 @@ def live(
             of=fingerprint(following.recording, last.taken),
         )
         console.print(f"the belief is in {out}", markup=False)
+
+
+def _asked(page: LivePage, console: Console) -> bool:
+    """Whether a browser has been asked for a page."""
+    import webbrowser
+
+    console.print(f"follow at {page.url}", markup=False, soft_wrap=True)
+    return webbrowser.open(page.url)
 
 
 def lateness(updates: Sequence[Update], deadline: float) -> str:
@@ -117,6 +160,7 @@ def serve(
     particles: PARTICLES = 75,
     seed: SEED = 0,
     deadline: DEADLINE = 0.5,
+    view: VIEW = False,
     set_: Settings = None,
 ) -> None:
     """Serve a live belief on a socket, in MessagePack (see docs/live.md), until it is interrupted."""
@@ -135,6 +179,8 @@ def serve(
     measured, chosen, infer = _chosen(scene, model, inference, set_)
     settings: dict[str, Any] = {"particles": particles, "seed": seed, "deadline": deadline}
     with Filter(chosen, measured, infer=infer, **settings) as following:
+        if view:
+            _asked(following.view(scene), console)
         server = Server(Session(following), host, port, token)
         asyncio.run(_serving(server, console))
 
