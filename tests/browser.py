@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -43,6 +44,16 @@ def opened(page: Path, state: str = "", seconds: int = 300) -> tuple[dict[str, s
     return dict(re.findall(r'data-([a-z]+)="([^"]*)"', root[0])), Image.open(shot).convert("RGB")
 
 
+# Chromium reads from descriptor 3 and writes to 4.
+WITH_PIPES = """
+import fcntl, os, sys
+asked, answers = (fcntl.fcntl(int(each), fcntl.F_DUPFD, 10) for each in sys.argv[1:3])
+os.dup2(asked, 3)
+os.dup2(answers, 4)
+os.execv(sys.argv[3], sys.argv[3:])
+"""
+
+
 class Browser:
     """A browser that stays open, asked through pipes (DevTools protocol); it reaches this machine alone."""
 
@@ -57,15 +68,11 @@ class Browser:
             url,
         ]
         (read, answers), (asked, self._write) = os.pipe(), os.pipe()
-        # Chromium reads from descriptor 3 and writes to 4.
-        shell = [
-            "sh",
-            "-c",
-            f'exec 8<&{asked} 9>&{answers}; exec 3<&8 4>&9 8<&- 9>&-; exec "$0" "$@"',
-            CHROMIUM,
-        ]
         self._process = subprocess.Popen(
-            [*shell, *words], pass_fds=(asked, answers), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            [sys.executable, "-c", WITH_PIPES, str(asked), str(answers), CHROMIUM, *words],
+            pass_fds=(asked, answers),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
         )
         os.close(asked)
         os.close(answers)

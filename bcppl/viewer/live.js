@@ -3,7 +3,7 @@
 let due = false;
 
 function follow(entry) {
-  const along = state.step === labels.length - 1;
+  const along = state.step === labels.length - 1, armed = held.measurements.some((each) => each.arm);
   append(entry);
   element("step").max = labels.length - 1;
   if (along) [state.step, state.moment] = [labels.length - 1, null];
@@ -13,6 +13,7 @@ function follow(entry) {
     update();
   });
   due = true;
+  if (!armed && entry.measurement.arm) overview(); // which showed the part alone
 }
 
 function status(text) {

@@ -44,7 +44,7 @@ DEADLINE = Annotated[
 VIEW = Annotated[
     bool, typer.Option("--view", help="Show part, particles and measurements on a page that follows.")
 ]
-SOON = 15.0  # s within which a browser asks for a page
+SOON = 10.0  # s within which a browser asks for a page
 
 
 def live(
