@@ -25,6 +25,7 @@ from bcppl.inference.design.ranking import Ranking
 from bcppl.inference.design.rules import AcquisitionRule, by_linearised_gain
 from bcppl.inference.filters.default import default_inference
 from bcppl.inference.filters.smc import Step, own_state
+from bcppl.inference.live.showing import COLUMNS, show, show_earlier
 from bcppl.inference.live.waiting import Waiting
 from bcppl.inference.planning.candidate_layout import plan_candidates, require_uncertain
 from bcppl.inference.planning.constraints import Candidates, require_candidates
@@ -38,7 +39,6 @@ from bcppl.sensors.protocol import InParts, sensor_for
 from bcppl.traces import Model
 from bcppl.viewer.live import LivePage
 
-COLUMNS = ("measurement", "particles", "joined", "late s", "log Z")  # of a page's table
 FEWEST = 20  # particles, that no deadline takes
 KEPT = 1000  # updates
 AHEAD = 0.5  # of the deadline: a faster update may have more particles
@@ -243,15 +243,21 @@ class Filter:
     def view(self, title: str = "", arm: ArmWithPeg | None = None) -> LivePage:
         """A page that follows in a browser: open its `url` on this machine.
 
-        What a page shows is computed in a thread of the page, and one that stalls is left. Steps that were
-        made before this call are shown without their particles.
+        It begins after what waits, and steps from before are shown without their particles. What it shows is
+        computed in a thread of its own; one that stalls is left.
 
         Args:
             title: of the page.
             arm: that holds the peg; it is drawn where the peg was measured.
         """
         page = LivePage(self._recording, title, COLUMNS, arm)
-        self._run(lambda: self._begin_page(page), None)
+
+        def begin() -> None:
+            show_earlier(page, self._recording)
+            show(page, self._step, self._recording)
+            self._pages.append(page)
+
+        self._run(begin, None)
         return page
 
     def close(self) -> None:
@@ -274,13 +280,6 @@ class Filter:
             self.model, self._recording, particles=self.particles, seed=self.seed, scene=scene
         )
         return next(iter(first))
-
-    def _begin_page(self, page: LivePage) -> None:
-        for k in range(len(self._recording.measurements)):
-            label = f"{self._recording.measurements[k - 1].kind} {k}" if k else "prior"
-            page.add(label, None, self._recording, [label, *[""] * (len(COLUMNS) - 1)])
-        page.add(self._step.info.label, self.belief, self._recording, _row(self._step))
-        self._pages.append(page)
 
     def _assimilate(self) -> None:
         """Assimilate everything that can be: a measurement may have been waited for by others."""
@@ -316,7 +315,7 @@ class Filter:
         with self._changed:
             self._updates.append(update)
         for page in self._pages if not fault else []:
-            page.add(self._step.info.label, self.belief, self._recording, _row(self._step, update))
+            show(page, self._step, self._recording, update)
         if self._on_update is not None:
             self._on_update(self._step, update)
 
@@ -346,12 +345,6 @@ class Filter:
         number = len(self._recording.measurements)
         for _, problem in sensor.problems([(number, alone)], self._recording):
             raise InputError(problem)
-
-
-def _row(step: Step, update: Update | None = None) -> list[str]:
-    """Cells of `COLUMNS`."""
-    late = ["", ""] if update is None else [str(update.joined), f"{update.seconds:.2f}"]
-    return [step.info.label, str(len(step.population)), *late, f"{step.info.log_evidence:.2f}"]
 
 
 def resized(step: Step, count: int) -> Step:
