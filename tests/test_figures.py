@@ -20,6 +20,8 @@ from bcppl.figures import (
     add_over_time,
     belief_in_3d,
     depth_residual,
+    gains_on_part,
+    gap_over_time,
     marginals,
     outlines_on_depth,
     spread_over_time,
@@ -38,6 +40,11 @@ HALF = np.sqrt(0.5)
 def box() -> Part:
     mesh = trimesh.creation.box((0.10, 0.08, 0.03))
     return Part("block", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def small_peg() -> Part:
+    mesh = trimesh.creation.box((0.01, 0.01, 0.01))
+    return Part("peg", np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
 def poses(count: int, spread: float, seed: int = 0) -> np.ndarray:
@@ -215,6 +222,55 @@ def test_forces_are_tared_and_contact_is_marked_where_it_is_felt() -> None:
     (tip,) = {tuple(np.round(each, 6)) for each in np.transpose(seen.collections[-1]._offsets3d)}
     assert tip == (0.0, 0.0, 15.0)  # 30 mm above the part's middle, less half of the peg
     rendered(seen.figure)
+
+
+def test_the_gap_by_a_belief_is_drawn_in_millimetres_with_what_was_felt() -> None:
+    times = np.arange(100) / 100.0
+    pose = np.tile([0.5, 0.1, 0.05, 1.0, 0.0, 0.0, 0.0], (100, 1))
+    # The part's top is at 35 mm, the peg's tip 5 mm below its middle: 20 mm between them, 0.4, then contact.
+    pose[:, 2] = 0.04 + 0.02
+    pose[30:40, 2], pose[40:60, 2] = 0.0404, 0.04
+    wrench = np.zeros((100, 6))
+    wrench[40:60, 2] = 5.0
+    probe = Probe("p", times[[0, -1]], pose[:2], np.ones(6), np.ones(6), times)
+    windows = [Measurement(ProbeWindow(probe, 0, 100), Touch(times, wrench, pose))]
+    stood = np.tile(poses(1, 0.0), (3, 1))
+    stood[:, 2] = 0.02 + np.array([-1e-4, 0.0, 1e-4])
+    belief = Belief(torch.from_numpy(stood), torch.zeros(3, dtype=torch.float64))
+    axes = gap_over_time(Figure().add_subplot(), windows, box(), small_peg(), belief)
+    median = next(line for line in axes.get_lines() if line.get_label() == "median")
+    at, gap = median.get_data()
+    np.testing.assert_allclose(gap[(at >= 0.4) & (at < 0.6)], 0.0, atol=1e-3)
+    np.testing.assert_allclose(gap[(at >= 0.3) & (at < 0.4)], 0.4, atol=1e-3)
+    band = next(each for each in axes.collections if each.get_label() == "middle 90 %")
+    reached = np.concatenate([path.vertices for path in band.get_paths()])
+    during = reached[(reached[:, 0] >= 0.42) & (reached[:, 0] < 0.58), 1]
+    assert during.min() == pytest.approx(-0.1, abs=1e-3) and during.max() == pytest.approx(0.1, abs=1e-3)
+    felt = next(each for each in axes.collections if each.get_label() == "contact felt")
+    marked = np.concatenate([path.vertices[:, 0] for path in felt.get_paths()])
+    assert marked.min() > 0.39 and marked.max() < 0.61
+    rendered(axes.figure)
+
+
+def test_gains_are_drawn_where_plans_meet_the_part() -> None:
+    down = np.array([0.5, 0.1, 0.3, 1.0, 0.0, 0.0, 0.0])
+    knots = np.stack([down, down - [0.0, 0.0, 0.29, 0, 0, 0, 0]])
+    aside = np.array([0.03, 0, 0, 0, 0, 0, 0])
+    plans = [
+        Plan("touch", np.arange(2.0), knots + side * aside, ("guarded",), 4.0, np.ones(6), np.ones(6))
+        for side in (-1, 1)
+    ]
+    peg = small_peg()
+    axes = gains_on_part(Figure(), (1, 1, 1), plans, [2.0, 1.0], box(), peg, poses(1, 0.0)[0])
+    drawn = next(each for each in axes.collections if hasattr(each, "_offsets3d"))
+    x, y, z = np.asarray(drawn._offsets3d)
+    np.testing.assert_allclose(drawn.get_array(), [1.0, 2.0])  # the largest last
+    assert (np.sign(x) == [1, -1]).all() and (np.abs(np.abs(x) - 30.0) <= 5.0 + 1e-6).all()
+    assert (np.abs(y) <= 5.0 + 1e-6).all()
+    np.testing.assert_allclose(z, 15.0, atol=1e-6)  # on the part's upper face, in its frame
+    with pytest.raises(InputError, match="one each"):
+        gains_on_part(Figure(), (1, 1, 1), plans, [2.0], box(), peg, poses(1, 0.0)[0])
+    rendered(axes.figure)
 
 
 def test_marginals_are_in_millimetres_and_degrees_about_the_mean() -> None:

@@ -7,4 +7,9 @@ from bcppl.figures.over_time import (
     column_over_time as column_over_time,
     spread_over_time as spread_over_time,
 )
-from bcppl.figures.touches import touches_on_part as touches_on_part, wrench_over_time as wrench_over_time
+from bcppl.figures.touches import (
+    gains_on_part as gains_on_part,
+    gap_over_time as gap_over_time,
+    touches_on_part as touches_on_part,
+    wrench_over_time as wrench_over_time,
+)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from bcppl.beliefs import Belief
 from bcppl.figures.images import depth_residual, outlines_on_depth
-from bcppl.figures.touches import touches_on_part, wrench_over_time
+from bcppl.figures.touches import gap_over_time, touches_on_part, wrench_over_time
 from bcppl.rendering.rasterisation import renderer_for
 from bcppl.sensors import Measurement, ProbeWindow, Recording, View
 
@@ -61,9 +61,17 @@ def _(_: ProbeWindow, measurements: Sequence[Measurement], recording: Recording,
     for each in measurements:
         probes.setdefault(each.action.probe.name, []).append(each)
     for name, windows in list(probes.items())[:PROBES]:
-        figure = Figure(figsize=(10.0, 3.8), layout="constrained")
-        wrench_over_time(figure.add_subplot(1, 2, 1), windows)
-        if recording.peg is not None:
-            pose = belief.mean.numpy()
-            touches_on_part(figure, (1, 2, 2), windows, recording.part, recording.peg, pose)
-        yield f"Probe {name}: the force, and where the peg was, as seen from the part.", figure
+        figure = Figure(figsize=(10.0, 5.0), layout="constrained")
+        if recording.peg is None:
+            wrench_over_time(figure.add_subplot(), windows)
+            yield f"Probe {name}: the force.", figure
+            continue
+        wrench_over_time(figure.add_subplot(2, 2, 1), windows)
+        gap_over_time(figure.add_subplot(2, 2, 3), windows, recording.part, recording.peg, belief)
+        pose = belief.mean.numpy()
+        touches_on_part(figure, (1, 2, 2), windows, recording.part, recording.peg, pose)
+        yield (
+            f"Probe {name}: the force, the gap that the belief takes to have been between peg and part, and "
+            "where the peg was, as seen from the part.",
+            figure,
+        )
