@@ -16,6 +16,8 @@ from torch import Tensor
 from bcppl.arrays import Array
 from bcppl.compiled import compiled
 
+SMALL = 1e-4  # rad: below, a series' first term is exact to rounding
+
 Kernel = Callable[[Array, Array, Array], None]
 
 
@@ -94,6 +96,51 @@ def local(pose: Array, goal: Array, result: Array) -> None:
         half = math.atan2(math.sqrt(i * i + j * j + k * k), abs(real))
         share = (2.0 if real > 0.0 else -2.0) * (half / math.sin(half) if half > 0.0 else 1.0)
         result[n, 3], result[n, 4], result[n, 5] = share * i, share * j, share * k
+
+
+@compiled
+def bent(
+    w: tuple[float, float, float], v: tuple[float, float, float], once: float, twice: float
+) -> tuple[float, float, float]:
+    """V + once w x v + twice w x (w x v)."""
+    a, b, c = w[1] * v[2] - w[2] * v[1], w[2] * v[0] - w[0] * v[2], w[0] * v[1] - w[1] * v[0]
+    x, y, z = w[1] * c - w[2] * b, w[2] * a - w[0] * c, w[0] * b - w[1] * a
+    return v[0] + once * a + twice * x, v[1] + once * b + twice * y, v[2] + once * c + twice * z
+
+
+@compiled
+def exp(pose: Array, twist: Array, result: Array) -> None:
+    """Poses (N, 7) moved by constant twists (N, 6)."""
+    retract(pose, twist, result)
+    one, other = len(pose) == 1, len(twist) == 1
+    for n in range(len(result)):
+        own, step = pose[0 if one else n], twist[0 if other else n]
+        turn = _rotate(own[3:], step[3], step[4], step[5])
+        angle = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
+        once, twice = 0.5, 1.0 / 6.0
+        if angle > SMALL:
+            once = (1.0 - math.cos(angle)) / angle**2
+            twice = (angle - math.sin(angle)) / angle**3
+        moved = bent(turn, (step[0], step[1], step[2]), once, twice)
+        for axis in range(3):
+            result[n, axis] = own[axis] + moved[axis]
+
+
+@compiled
+def log(pose: Array, goal: Array, result: Array) -> None:
+    """The twists (N, 6) from poses (N, 7) to others."""
+    local(pose, goal, result)
+    one = len(pose) == 1
+    for n in range(len(result)):
+        step = result[n]
+        turn = _rotate(pose[0 if one else n, 3:], step[3], step[4], step[5])
+        angle = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
+        twice = 1.0 / 12.0
+        if angle > SMALL:
+            twice = 1.0 / angle**2 - 0.5 / (angle * math.tan(0.5 * angle))
+        moved = bent(turn, (step[0], step[1], step[2]), -0.5, twice)
+        for axis in range(3):
+            step[axis] = moved[axis]
 
 
 @compiled

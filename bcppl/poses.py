@@ -122,6 +122,61 @@ def local(pose: Tensor, other: Tensor) -> Tensor:
     return torch.cat([other[..., :3] - pose[..., :3], quaternions.rotation_vector(turn)], dim=-1)
 
 
+def exp(pose: Tensor, twist: Tensor) -> Tensor:
+    """The pose (..., 7) after a constant twist (..., 6) for a unit of time: the exponential map of SE(3).
+
+    The twist is the velocity of the pose's origin at first, m along the outer frame's axes, and the rate of
+    turn, rad about the inner frame's. To first order it is as `retract`, but the origin follows a screw: a
+    turn about any place, however far away, is a straight line of twists.
+
+    Source: Chirikjian, Stochastic Models, Information Theory, and Lie Groups, vol. 2, 10.1.
+    """
+    if (known := fused(kernels.exp, pose, twist, 7)) is not None:
+        return known
+    turn = (rotation_matrix(pose) @ twist[..., 3:, None])[..., 0]
+    angle = _clear_of_zero(twist[..., 3:].norm(dim=-1, keepdim=True))
+    once, twice = (1.0 - torch.cos(angle)) / angle**2, (angle - torch.sin(angle)) / angle**3
+    return retract(pose, torch.cat([_bent(turn, twist[..., :3], once, twice), twist[..., 3:]], dim=-1))
+
+
+def log(pose: Tensor, other: Tensor) -> Tensor:
+    """The twist (..., 6) from `pose` to `other`: the inverse of `exp`, rotation angle at most pi."""
+    if (known := fused(kernels.log, pose, other, 6)) is not None:
+        return known
+    return twist_of(pose, local(pose, other))
+
+
+def twist_of(pose: Tensor, tangent: Tensor) -> Tensor:
+    """The twist (..., 6) that leads from a pose (..., 7) to where a tangent (..., 6) of `retract` does.
+
+    Both turn by the same angle, which may exceed pi.
+    """
+    turn = (rotation_matrix(pose) @ tangent[..., 3:, None])[..., 0]
+    angle = _clear_of_zero(tangent[..., 3:].norm(dim=-1, keepdim=True))
+    twice = 1.0 / angle**2 - 0.5 / (angle * torch.tan(0.5 * angle))
+    moved = _bent(turn, tangent[..., :3], torch.full_like(angle, -0.5), twice)
+    return torch.cat([moved, tangent[..., 3:]], dim=-1)
+
+
+def _bent(turn: Tensor, shift: Tensor, once: Tensor, twice: Tensor) -> Tensor:
+    turn, shift = torch.broadcast_tensors(turn, shift)
+    across = torch.linalg.cross(turn, shift, dim=-1)
+    return shift + once * across + twice * torch.linalg.cross(turn, across, dim=-1)
+
+
+def _clear_of_zero(angle: Tensor) -> Tensor:
+    """Angles of at least a ten-thousandth: the series that they stand in are the same to rounding there."""
+    return angle.clamp_min(kernels.SMALL)
+
+
+def log_volume_of_twist(angle: Tensor) -> Tensor:
+    """Log of d(Lebesgue measure of translations) / d(that of twists), given the angle of turn.
+
+    The determinant of SO(3)'s left Jacobian, 2 (1 - cos a) / a^2: Chirikjian, vol. 2, 10.6.
+    """
+    return 2.0 * torch.log(torch.sinc(0.5 * angle / math.pi).abs())
+
+
 def _turned(pose: Tensor, shift: Tensor, turn: Tensor) -> Tensor:
     """A pose (..., 7) moved by (..., 3) in its outer frame and turned by (..., 4) in its inner one."""
     product = quaternions.product(quaternion_xyzw(pose), turn)

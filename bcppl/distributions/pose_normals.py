@@ -1,4 +1,9 @@
-"""Gaussians over poses as proposals need them: mixtures, products, truncation, optimal transport."""
+"""Gaussians over poses as proposals need them: mixtures, products, truncation, optimal transport.
+
+A `GaussianMixture` is of normals over twists (`NormalTwist`): contacts leave posteriors that turn about a
+place afar. Of factors of images, and of priors with limits along axes, the product is in `NormalPose`'s
+coordinates; the two are the same to first order.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.distributions.poses import BoxedNormal, MixturePose, NormalPose
+from bcppl.distributions.poses import BoxedNormal, MixturePose, NormalPose, NormalTwist
 from bcppl.distributions.poses.boxed import log_mass
 
 # Proposals are mixtures of a Gaussian's copies: one as it is but for a little, one that is wider in all
@@ -36,22 +41,22 @@ class GaussianMixture(NamedTuple):
         """The most probable component of each of the poses (N, 7), (N,) int64."""
         if self.log_weights.shape[-1] == 1:
             return torch.zeros(len(pose), dtype=torch.int64)
-        log_prob = NormalPose(self.centers, self.covariances).log_prob(pose[:, None])
+        log_prob = NormalTwist(self.centers, self.covariances).log_prob(pose[:, None])
         return (self.log_weights + log_prob).argmax(dim=1)
 
     def times(self, factor: NormalPose) -> GaussianMixture:
         """The mixture that approximates its product with a Gaussian (...,)."""
         center, spread = factor.center[..., None, :], factor.covariance[..., None, :, :]
-        second = NormalPose(center, spread).covariance
-        own = torch.linalg.inv(NormalPose(self.centers, self.covariances).covariance)
+        second = NormalTwist(center, spread).covariance
+        own = torch.linalg.inv(NormalTwist(self.centers, self.covariances).covariance)
         other = torch.linalg.inv(second)
         covariance = torch.linalg.inv(own + other)
-        away = poses.local(self.centers, center)[..., None]
+        away = poses.log(self.centers, center)[..., None]
         both = self.covariances + second
         squared = (away[..., 0] * torch.linalg.solve(both, away)[..., 0]).sum(dim=-1)
         overlap = -0.5 * (squared + torch.linalg.slogdet(both)[1])
-        whole = NormalPose(
-            poses.retract(self.centers, (covariance @ other @ away)[..., 0]),
+        whole = NormalTwist(
+            poses.exp(self.centers, (covariance @ other @ away)[..., 0]),
             0.5 * (covariance + covariance.transpose(-1, -2)),
         )
         return GaussianMixture(whole.center, whole.covariance, self.log_weights + overlap)
@@ -97,11 +102,11 @@ def log_overlap(product: NormalPose, factors: Sequence[PoseFactor]) -> Tensor:
     return log_mass
 
 
-def mixture_of(mixture: GaussianMixture) -> NormalPose | MixturePose:
+def mixture_of(mixture: GaussianMixture) -> NormalTwist | MixturePose:
     """A mixture of M Gaussians for each of N particles; the Gaussian where M is 1."""
     if mixture.log_weights.shape[-1] == 1:
-        return NormalPose(mixture.centers[..., 0, :], mixture.covariances[..., 0, :, :])
-    return MixturePose(mixture.log_weights, mixture.centers, mixture.covariances)
+        return NormalTwist(mixture.centers[..., 0, :], mixture.covariances[..., 0, :, :])
+    return MixturePose(mixture.log_weights, mixture.centers, mixture.covariances, twists=True)
 
 
 def widened(center: Tensor, covariance: Tensor) -> MixturePose:
@@ -131,21 +136,22 @@ def widened_mixture(mixture: GaussianMixture) -> MixturePose:
         log_weights.flatten(-2),
         centers[..., None, :].expand(*centers.shape[:-1], COPIES, 7).flatten(-3, -2),
         wide.flatten(-4, -3),
+        twists=True,
     )
 
 
-def matched(mixture: MixturePose) -> NormalPose:
+def matched(mixture: MixturePose) -> NormalTwist:
     """The Gaussian with the mean and covariance of a `widened_mixture`, its wider copies aside."""
     every = COPIES
     probabilities = mixture.log_weights[..., ::every].softmax(dim=-1)
     centers = mixture.components.center[..., ::every, :]
     covariances = mixture.components.covariance[..., ::every, :, :]
-    away = poses.local(centers[..., :1, :], centers)
+    away = poses.log(centers[..., :1, :], centers)
     mean = (probabilities[..., None] * away).sum(dim=-2)
     off = away - mean[..., None, :]
     covariance = covariances + off[..., :, None] * off[..., None, :]
-    return NormalPose(
-        poses.retract(centers[..., 0, :], mean), (probabilities[..., None, None] * covariance).sum(dim=-3)
+    return NormalTwist(
+        poses.exp(centers[..., 0, :], mean), (probabilities[..., None, None] * covariance).sum(dim=-3)
     )
 
 

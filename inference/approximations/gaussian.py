@@ -246,7 +246,7 @@ class GaussianApproximation:
         if self.quadratic is None:
             return False
         mixture = self.mixture
-        away = poses.local(mixture.centers, trace[self.pose][:, None])
+        away = poses.log(mixture.centers, trace[self.pose][:, None])
         squared = torch.einsum("nmi,mij,nmj->nm", away, torch.linalg.inv(mixture.covariances), away)
         alone = (squared > _APART).all(dim=0) & (mixture.log_weights.softmax(dim=0) > _SHARE)
         if not bool(alone.any()):

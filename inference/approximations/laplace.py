@@ -57,7 +57,7 @@ class QuadraticApproximation(NamedTuple):
 
     def posterior_each(self, center: Tensor, precision: Tensor) -> GaussianMixture:
         """The posterior under a prior for each mode: means (..., M, 7), precisions (..., M, 6, 6)."""
-        away = poses.local(self.around, center)
+        away = poses.log(self.around, center)
         pull = (precision @ away[..., None])[..., 0]
         covariance = torch.linalg.inv(precision + self.information)
         step = (covariance @ (pull - self.gradient)[..., None])[..., 0]
@@ -65,7 +65,7 @@ class QuadraticApproximation(NamedTuple):
         squares = (step * (pull - self.gradient)).sum(dim=-1) - (away * pull).sum(dim=-1)
         sizes = torch.linalg.slogdet(covariance)[1] + torch.linalg.slogdet(precision)[1]
         return GaussianMixture(
-            poses.retract(self.around, step),
+            poses.exp(self.around, step),
             0.5 * (covariance + covariance.transpose(-1, -2)),
             self.log_likelihood + 0.5 * (squares + sizes),
         )
@@ -99,7 +99,7 @@ def quadratic_approximation(
     center, precision = prior
     scale = torch.linalg.cholesky(torch.linalg.inv(precision[0]))
     earlier = [] if before is None else [before.centers[:1]]
-    starts = [center, poses.retract(center, _STARTS @ scale.T), *earlier]
+    starts = [center, poses.exp(center, _STARTS @ scale.T), *earlier]
     reached = [gauss_newton(sites, torch.cat(starts), prior, BLURS)]
     if heading is not None:
         ahead = torch.cat([center, center if before is None else before.centers[:1]]).repeat_interleave(
@@ -110,11 +110,11 @@ def quadratic_approximation(
     best, _ = max(reached, key=lambda fit: float(fit[1][0]))
     others = [] if before is None or len(before.centers) == 1 else [before.centers]
     if everywhere:
-        others.append(poses.retract(center, _PLACES @ scale.T))
+        others.append(poses.exp(center, _PLACES @ scale.T))
         if before is not None:
             of = torch.arange(len(_NEAR)) % len(before.centers)
             away = torch.linalg.cholesky(before.covariances)[of] @ _NEAR[..., None]
-            others.append(poses.retract(before.centers[of], _WIDE * away[..., 0]))
+            others.append(poses.exp(before.centers[of], _WIDE * away[..., 0]))
     if others:
         each, _ = gauss_newton(sites, torch.cat(others), prior, FINE, _LEFT)
         best = torch.cat([best, each])
@@ -159,16 +159,16 @@ def gauss_newton(
     pose, density = starts, torch.zeros(len(starts))
     for blur in blurs:
         quadratic = _quadratic(sites, pose, blur)
-        pull = (precision @ poses.local(pose, center)[..., None])[..., 0] - quadratic.gradient
+        pull = (precision @ poses.log(pose, center)[..., None])[..., 0] - quadratic.gradient
         step = torch.linalg.solve(precision + quadratic.information, pull[..., None])
         # Which corner touches changes along the step: it is made only as long as it gains.
-        ahead = poses.retract(pose[:, None], _STEP_LENGTHS[:, None] * step[:, None, :, 0])
+        ahead = poses.exp(pose[:, None], _STEP_LENGTHS[:, None] * step[:, None, :, 0])
         log_likelihood = pose.new_zeros(ahead.shape[:2])
         for site, value in sites(ahead.reshape(-1, 7), blur):
             log_likelihood = log_likelihood + site.log_prob(value).reshape(ahead.shape[:2])
         tried = torch.cat([pose[:, None], ahead], dim=1)
         total = torch.cat([quadratic.log_likelihood[:, None], log_likelihood], dim=1)
-        away = poses.local(center, tried)
+        away = poses.log(center, tried)
         total = total - 0.5 * ((away @ precision[0]) * away).sum(dim=-1)
         density, farthest = total.max(dim=1)
         kept = density.topk(min(len(pose), max(least, len(pose) // 2))).indices
@@ -191,7 +191,7 @@ def _distinct(modes: QuadraticApproximation, prior: Normal) -> QuadraticApproxim
     """The modes that carry weight, of those that coincide the one with the largest."""
     if len(modes.around) == 1:
         return modes
-    away = poses.local(modes.around, prior.center)
+    away = poses.log(modes.around, prior.center)
     covariance = torch.linalg.inv(prior.precision + modes.information)
     # Laplace's weights at the poses themselves: Gauss-Newton has not converged at some.
     weight = modes.log_likelihood - 0.5 * ((away @ prior.precision[0]) * away).sum(dim=-1)
@@ -200,7 +200,7 @@ def _distinct(modes: QuadraticApproximation, prior: Normal) -> QuadraticApproxim
     for one in weight.argsort(descending=True).tolist():
         if kept and (len(kept) == _MODES or weight[one] < weight[kept[0]] - _FAINT):
             break
-        off = poses.local(modes.around[kept], modes.around[one])
+        off = poses.log(modes.around[kept], modes.around[one])
         squared = (off * torch.linalg.solve(covariance[kept], off[..., None])[..., 0]).sum(dim=-1)
         if not bool((squared < _SAME).any()):
             kept.append(one)

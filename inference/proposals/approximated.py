@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.pose_normals import GaussianMixture, transport, widened_mixture
-from bcppl.distributions.poses import MixturePose, NormalPose
+from bcppl.distributions.poses import MixturePose, NormalPose, NormalTwist
 from bcppl.inference.approximations.gaussian import GaussianApproximation
 from bcppl.inference.proposals.proposal import Program
 from bcppl.sensors.capabilities import FitsPose
@@ -91,7 +91,7 @@ def joint_random_walk(approximation: GaussianApproximation) -> Program:
         pose, mixture = trace[approximation.pose], approximation.mixture
         covariance = mixture.covariances[mixture.component(pose)]
         step = (2.38 * size) ** 2 / 6.0
-        _follow(trace, approximation, NormalPose(pose, step[:, None, None] * covariance), WALKING)
+        _follow(trace, approximation, NormalTwist(pose, step[:, None, None] * covariance), WALKING)
 
     return program
 
@@ -113,14 +113,14 @@ def _transported(trace: Trace, source: GaussianApproximation, target: GaussianAp
     start, goal = source.mixture, target.mixture
     pose = trace[source.pose]
     own, transitions = start.component(pose), component_transitions(start, goal)
-    away = poses.local(start.centers[own], pose)
+    away = poses.log(start.centers[own], pose)
     maps = torch.stack(
         [torch.stack([transport(one, other) for other in goal.covariances]) for one in start.covariances]
     )
     moved = (away[:, None, None] @ maps[own])[:, :, 0]
     return widened_mixture(
         GaussianMixture(
-            poses.retract(goal.centers, MOVED * moved),
+            poses.exp(goal.centers, MOVED * moved),
             ((1.0 - MOVED**2) * goal.covariances).expand(trace.particles, -1, 6, 6),
             transitions[own],
         )
@@ -132,7 +132,7 @@ def component_transitions(start: GaussianMixture, goal: GaussianMixture) -> Tens
 
     Most particles go to components that coincide with their own, given more measurements.
     """
-    away = poses.local(start.centers[:, None], goal.centers)
+    away = poses.log(start.centers[:, None], goal.centers)
     both = start.covariances[:, None] + goal.covariances
     squared = (away * torch.linalg.solve(both, away[..., None])[..., 0]).sum(dim=-1)
     any_component = goal.log_weights.log_softmax(dim=0).expand(len(start.centers), -1)

@@ -5,7 +5,7 @@ The attribute `freedom` of each is its free axes; the others are held at the val
 
 from bcppl.distributions.poses.base import HELD
 from bcppl.distributions.poses.boxed import BoxedNormal
-from bcppl.distributions.poses.normal import MixturePose, NormalPose
+from bcppl.distributions.poses.normal import MixturePose, NormalPose, NormalTwist
 from bcppl.distributions.poses.uniform import SwingTwistPose, UniformPose, prior_from_guess, tilt_and_yaw
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "BoxedNormal",
     "MixturePose",
     "NormalPose",
+    "NormalTwist",
     "SwingTwistPose",
     "UniformPose",
     "prior_from_guess",
