@@ -17,7 +17,7 @@ def load_recording(name: str | Path) -> Recording:
     """A shipped recording by its name, or any other by its file.
 
     Args:
-        name: "peg_probe", "point_probe_10_pushes", or the path of a recording (.h5).
+        name: "peg_probe", "point_probe_10_pushes", "arm_view", or the path of a recording (.h5).
 
     Raises:
         InputError: there is neither a shipped recording nor a file of that name, or it cannot be read.

@@ -16,7 +16,7 @@ import networkx as nx
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-SHIPPED = ("point_probe_10_pushes", "peg_probe")
+SHIPPED = ("point_probe_10_pushes", "peg_probe", "arm_view")
 
 CHECKOUT = (ROOT / "models").is_dir() and (ROOT / "inference").is_dir()
 pytestmark = pytest.mark.skipif(
