@@ -10,7 +10,7 @@ PEERS := particles blackjax open3d chsel
 JOBS ?= 2
 PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: run test tests lint long docs peers check-links clean help
+.PHONY: run test tests lint long docs notebooks peers check-links clean help
 .DEFAULT_GOAL := help
 
 help:
@@ -18,6 +18,7 @@ help:
 	@echo "make test         style, types and tests"
 	@echo "make long         the tests that take minutes"
 	@echo "make docs         the documentation as a site, in build/docs: open build/docs/index.html"
+	@echo "make notebooks    execute the notebooks in place; their outputs are kept (NOTEBOOKS=series for one)"
 	@echo "make peers        environments of the packages that the benchmarks compare with, in benchmarks/.peers"
 	@echo "make check-links  are bcppl/models and bcppl/inference symbolic links?"
 	@echo "make clean        remove what was built, the virtual environment too"
@@ -45,6 +46,10 @@ long: $(STAMP)
 docs: $(DOCS)
 	$(BIN)/python -m sphinx -W --keep-going -q -b html -d build/doctrees docs build/docs
 	$(BIN)/python docs/check_site.py build/docs
+
+# All, or those that are named; some minutes. They are kept with their outputs, which the site shows.
+notebooks: $(STAMP)
+	$(BIN)/python notebooks/execute.py $(NOTEBOOKS)
 
 $(DOCS): $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable ".[docs]"

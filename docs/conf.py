@@ -1,7 +1,8 @@
 """The documentation as a site: `make docs` builds it in `build/docs`.
 
 What other folders hold, and what is made of the sources, goes to `docs/generated`: the notebooks, which are
-not run (they are kept without outputs), the list of benchmarks, the changelog, the API, the list of messages.
+not run (they are kept with their outputs), the list of benchmarks, the changelog, the API, the list of
+messages.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The notebooks run from top to bottom on what is shipped, and are kept without outputs."""
+"""The notebooks run from top to bottom on what is shipped, and are kept with the outputs of such a run."""
 
 from __future__ import annotations
 
@@ -19,14 +19,34 @@ jupyter_client = pytest.importorskip("jupyter_client", reason="nbclient brings i
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 
 
+LARGEST = 300_000  # bytes of a notebook
+# Of the machine on which a notebook was executed, or of something that went wrong there.
+FOREIGN = re.compile(
+    r"/home/|/Users/|/root/|/tmp/|/work/|/var/|/opt/|[A-Z]:\\\\|site-packages|\.venv|\.py:\d+:"
+    r"|Traceback|Warning\b|\bat 0x[0-9a-f]+"
+)
+
+
 @pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
-def test_notebook_is_kept_without_outputs(path: Path) -> None:
+def test_notebook_is_kept_as_it_was_executed(path: Path) -> None:
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    assert code
-    assert [cell.id for cell in code if cell.outputs or cell.execution_count is not None] == []
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), AGAIN
+    outputs = [(cell.id, output) for cell in code for output in cell.outputs]
+    assert {output.output_type for _, output in outputs} <= {"stream", "display_data", "execute_result"}
+    assert [cell for cell, output in outputs if output.get("name") == "stderr"] == []
+    for cell, output in outputs:
+        text = output.get("text", "") + output.get("data", {}).get("text/plain", "")
+        assert not FOREIGN.search(text), f"{path.stem}, cell {cell}: {text}"
     assert set(notebook.metadata) == {"kernelspec", "language_info"}
+    assert set(notebook.metadata.language_info) == {"name"}
+    assert all(not cell.metadata for cell in notebook.cells)
+    assert all(not output.get("metadata") for _, output in outputs)
+    assert path.stat().st_size < LARGEST
+
+
+AGAIN = "execute it again: make notebooks"
 
 
 class Ran(NamedTuple):
@@ -34,6 +54,19 @@ class Ran(NamedTuple):
 
     printed: dict[str, str]
     drawn: set[str]
+
+
+def shown_by(notebook: Any) -> Ran:
+    """The output of all code cells, by name."""
+    outputs = {cell.id: cell.outputs for cell in notebook.cells if cell.cell_type == "code"}
+    printed = {
+        name: "".join(o.text for o in all_of if o.output_type == "stream" and o.name == "stdout")
+        for name, all_of in outputs.items()
+    }
+    drawn = {
+        name for name, all_of in outputs.items() if any("image/png" in o.get("data", {}) for o in all_of)
+    }
+    return Ran(printed, drawn)
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +88,12 @@ Smaller = Mapping[str, Sequence[tuple[str, str]]]
 
 
 def run(name: str, kernel: Any, smaller: Smaller) -> Ran:
-    """Runs a notebook from top to bottom, some of its numbers replaced by smaller ones."""
+    """Runs a notebook from top to bottom, some of its numbers replaced by smaller ones.
+
+    Its cells print and draw where those that are kept did.
+    """
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    kept = shown_by(notebook)
     cells = {cell.id: cell for cell in notebook.cells}
     for cell, replacements in smaller.items():
         for shipped, few in replacements:
@@ -65,16 +102,12 @@ def run(name: str, kernel: Any, smaller: Smaller) -> Ran:
     notebook.cells.insert(0, nbformat.v4.new_code_cell(RESET, id="reset"))
     client = nbclient.NotebookClient(notebook, timeout=480, km=kernel)
     client.execute()
-    outputs = {cell.id: cell.outputs for cell in notebook.cells if cell.cell_type == "code"}
-    printed = {
-        name: "".join(o.text for o in all_of if o.output_type == "stream" and o.name == "stdout")
-        for name, all_of in outputs.items()
-    }
-    drawn = {
-        name for name, all_of in outputs.items() if any("image/png" in o.get("data", {}) for o in all_of)
-    }
-    assert "Traceback" not in "".join(printed.values())
-    return Ran(printed, drawn)
+    ran = shown_by(notebook)
+    assert "Traceback" not in "".join(ran.printed.values())
+    assert ran.drawn == kept.drawn, f"{name}: {AGAIN}"
+    printing = [{cell for cell, text in each.printed.items() if text} for each in (ran, kept)]
+    assert printing[0] == printing[1], f"{name}: {AGAIN}"
+    return ran
 
 
 # The part is known to millimetres before the first image, so that few particles find it.
@@ -319,3 +352,107 @@ def test_learned_proposal_learns_and_is_put_beside_the_prior(kernel: Any, smalle
     exponents = [int(v) for v in re.findall(r"(\d+) exponents", printed["bridge"])]
     assert len(exponents) == 2 and (smaller or exponents[0] < exponents[1])
     assert len(re.findall(r"([\d.]+) effective draws a second$", printed["worth"], re.MULTILINE)) == 4
+
+
+@shipped_or(
+    {
+        "imports": [("PARTICLES = 75", "PARTICLES = 30")],
+        "sees": [("seed=0)", "seed=0, climbs=60, sweeps=(2, 2))")],
+    }
+)
+def test_real_contacts_bear_out_one_noise_and_friction_and_not_another(kernel: Any, smaller: Smaller) -> None:
+    printed, drawn = run("real_contacts", kernel, smaller)
+    assert drawn == {"pushes", "add", "residuals", "depth", "residual"}
+
+    adds = [float(add) for add in re.findall(r"ADD +([\d.]+) mm, spread", printed["belief"])]
+    assert len(adds) == 11 and adds[0] > 20.0 and adds[-1] < 1.0
+    (squared,) = re.findall(r"distance of the truth ([\d.]+)", printed["belief"])
+    assert float(squared) < 16.0  # of three axes, 99.9 %
+    (bias, scatter), (turned, most) = (
+        re.findall(r"onset: ([+-][\d.]+) mm .* deviation ([\d.]+)", printed["residuals"])[0],
+        re.findall(r"force: (\d+) degrees .* at most (\d+)", printed["residuals"])[0],
+    )
+    assert abs(float(bias)) < 0.3 and 0.2 < float(scatter) < 0.7
+    # Within the cone of friction and the direction's spread; an outward normal would be half a turn off.
+    assert 4.0 < float(turned) < 20.0 and float(most) < 40.0
+
+    checked = re.findall(r"^(with \S+|without) +(\d+) of 20 .* the least ([\d.]+)", printed["checks"], re.M)
+    (_, good, least), (_, bad, _) = checked
+    assert int(good) <= 1 and float(least) > 0.02 and int(bad) >= 5
+    (nats,) = re.findall(r"evidence for friction: ([+-]\d+)", printed["checks"])
+    assert float(nats) > 20.0
+
+    p_values = [float(p) for p in re.findall(r"p value of the image (\S+)", printed["sees"])]
+    assert len(p_values) == 2 and p_values[0] < 1e-3 < 0.05 < p_values[1]
+    off = re.findall(r"off the other method +([\d.]+) mm +([\d.]+) degrees", printed["sees"])
+    assert all(float(mm) < 45.0 and float(degrees) < 5.0 for mm, degrees in off)
+    (half,) = re.findall(r"within (\d+) mm, nine", printed["residual"])
+    assert 5 < float(half) < 25
+
+
+@shipped_or(
+    {
+        "imports": [("PARTICLES = 50", "PARTICLES = 16")],
+        "mistakes": [("in MISTAKES.items()", "in list(MISTAKES.items())[:3]")],
+        "belief": [("recording, particles", "recording, sweeps=3, particles")],
+    }
+)
+def test_own_bench_becomes_a_belief_and_its_mistakes_are_named(kernel: Any, smaller: Smaller) -> None:
+    printed, drawn = run("own_bench", kernel, smaller)
+    assert drawn == {"look", "figure"}
+    assert "the wrench is 12 ms late, as stated" in printed["configuration"]
+    assert "cut: 6 stretches with touches" in printed["configuration"]
+    assert "problems [] notes [] doubts []" in printed["check"]
+    named = dict(re.findall(r"^(\S.*):\n    (.+)$", printed["mistakes"], re.MULTILINE))
+    assert len(named) == (3 if smaller else 5)
+    assert "the quaternion in world_from_peg is written x y z w" in named["quaternion of the peg"]
+    assert "the quaternion in world_from_camera is written x y z w" in named["quaternion of the camera"]
+    assert "take -wrench" in named["force of the other sign"]
+    if not smaller:
+        assert "2 times the stated one" in named["focal length of an image of half the size"]
+        assert "no part anywhere within the guess" in named["depth in tenths of a millimetre"]
+    spreads = [float(mm) for mm in re.findall(r"spread +([\d.]+) mm", printed["belief"])]
+    assert len(spreads) == 3 and spreads[0] > 10.0 > spreads[1] > spreads[2]
+    ((off, turned),) = re.findall(
+        r"^off by ([\d.]+) mm and ([\d.]+) degrees", printed["belief"], re.MULTILINE
+    )
+    assert float(off) < 2.5 and float(turned) < 1.0
+    (squared,) = re.findall(r"squared Mahalanobis distance ([\d.]+)", printed["belief"])
+    assert smaller or float(squared) < 10.6
+
+
+@shipped_or(
+    {
+        "imports": [("DRAWS, PARTICLES = 150, 50_000", "DRAWS, PARTICLES = 25, 20_000")],
+        "power": [("WORLDS = 100", "WORLDS = 10")],
+    }
+)
+def test_is_my_belief_honest_accepts_the_right_one_and_no_mutant(kernel: Any, smaller: Smaller) -> None:
+    printed, drawn = run("is_my_belief_honest", kernel, smaller)
+    assert drawn == {"right-figure", "mutant-figure"}
+    (together,) = re.findall(r"all quantities together: p ([\d.e-]+)", printed["calibrate"])
+    assert float(together) > 0.01
+    table, regions = printed["mutants"].split("90 % regions")
+    p_values = {
+        name: [float(value) for value in values.split()]
+        for name, values in re.findall(
+            r"^(right|sure|perfect arm|hasty|lazy) +([\d. ]+)$", table, re.MULTILINE
+        )
+    }
+    assert len(p_values) == 5 and p_values["right"][0] > 0.01
+    assert all(p_values[mutant][0] < 0.01 for mutant in ("sure", "hasty", "lazy"))
+    assert smaller or p_values["perfect arm"][0] < 0.01
+    # Of the lazy one no coordinate shows it, and the log-likelihood does.
+    assert min(p_values["lazy"][1:5]) > 0.001 > 0.0005 > p_values["lazy"][5]
+    held = {
+        name: [float(value) for value in values.split()]
+        for name, values in re.findall(
+            r"^(right|sure|perfect arm|hasty|lazy) +([\d. ]+)$", regions, re.MULTILINE
+        )
+    }
+    assert max(held["sure"][:3]) < min(1.0, min(held["right"][:3]) + 0.05)
+    good, slipping = (float(p) for p in re.findall(r"p value ([\d.]+),", printed["checks"]))
+    assert good > 0.02 and slipping < 0.01
+    rejected = re.findall(r"^(\d) of each: ([\d.]+) .*, ([\d.]+) slipping$", printed["power"], re.MULTILINE)
+    (_, *once), (_, *often) = [[float(value) for value in row] for row in rejected]
+    assert max(once) < 0.4 and often[0] < 0.4 and often[1] > 0.7
