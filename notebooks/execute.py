@@ -19,7 +19,7 @@ from nbclient import NotebookClient
 from PIL import Image
 
 HERE = Path(__file__).resolve().parent
-DPI, COLOURS = 72, 256  # of figures
+DPI, COLOURS = 72, 128  # of figures
 SECONDS = 1800  # for a cell, on a machine that is busy
 METADATA = {
     "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
