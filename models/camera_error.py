@@ -45,14 +45,18 @@ def first_views(trace: Trace) -> dict[str, Any]:
     return first
 
 
-def conditional(trace: Trace, values: Mapping[str, Tensor]) -> NormalPose:
-    """The approximate conditional of the part's pose, given where its cameras measure it and their biases."""
+def conditional(trace: Trace, values: Mapping[str, Tensor]) -> Any:
+    """The approximate conditional of the part's pose, given where its cameras measure it and their biases.
+
+    It is the prior where cameras see the part where it is.
+    """
     scene = trace.args[0]
     instruments: dict[str, list[Any]] = {}
-    for view in first_views(trace).values():
-        instruments.setdefault(scene.sensor(view).instrument(view), []).append(view)
+    for name, view in first_views(trace).items():
+        if f"seen_by_{name}" in values:
+            instruments.setdefault(scene.sensor(view).instrument(view), []).append(view)
     factors = [scene.sensor(views[0]).factor(views, values) for views in instruments.values()]
-    return product_of_factors(scene.prior, factors)
+    return product_of_factors(scene.prior, factors) if factors else scene.prior
 
 
 def conditional_proposal(trace: Trace) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bcppl.models import load_recording
+from bcppl.inference import infer
+from bcppl.models import load_recording, part_in_view
 from bcppl.recordings import problems
 from bcppl.rendering.rasterisation import renderer_for
 from bcppl.sensors.plausibility import doubts
@@ -38,6 +39,14 @@ def test_at_the_reference_the_arm_is_where_the_image_is_nearer_than_its_backgrou
     assert shown[0] > 0.85 > shown[1]
     off = (depth - rendered[0])[np.isfinite(rendered[0]) & np.isfinite(depth)]
     assert float((np.abs(off) < 0.03).mean()) > 0.7
+
+
+def test_an_image_may_be_taken_to_see_the_part_where_it_is() -> None:
+    recording = load_recording("arm_view")
+    model = part_in_view.model.with_settings(shift=0.0)
+    *_, last = infer(model, recording, particles=20, seed=0)
+    assert set(last.population.trace.choices) == {"part"}
+    assert 1e3 * float((last.belief.mean[:3] - recording.truth[:3]).norm()) < 30.0
 
 
 @pytest.mark.skipif(not XARM.is_dir(), reason=f"the xArm's frames are not at {XARM}")
