@@ -118,6 +118,12 @@ def test_what_is_known_of_a_contact_and_hardly_of_a_turn_about_it_is_normal_over
     assert effective(NormalPose(start(), spread)) < 0.05
 
 
+def test_its_coordinates_are_twists() -> None:
+    there = poses.exp(start(), TWISTS[:2])
+    mine = NormalTwist(start(), covariance(0.1))
+    torch.testing.assert_close(mine.coordinates(there), TWISTS[:2], atol=1e-10, rtol=0.0)
+
+
 def test_a_mixture_of_twists_has_their_density() -> None:
     centers = torch.stack([start(), poses.exp(start(), TWISTS[0])])
     weights = torch.tensor([0.3, 0.7], dtype=torch.float64)

@@ -32,7 +32,6 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from bcppl import poses
 from bcppl.arguments import whole_number
 from bcppl.distributions.checks import THRESHOLD, Check, Checked, chi_square
 from bcppl.distributions.poses import NormalPose
@@ -121,7 +120,7 @@ def _whitened(site: Any, value: Tensor, particles: int) -> Tensor | None:
             return None
         site = site.base_dist
     if isinstance(site, NormalPose):
-        error = poses.local(site.center, value)[..., site.freedom.axes]
+        error = site.coordinates(value)
         scale = torch.linalg.cholesky(site.covariance)
     elif isinstance(site, torch.distributions.Normal):
         error = (value - site.mean) / site.stddev

@@ -133,7 +133,7 @@ def log_evidence(approximation: GaussianApproximation) -> float:
         return 0.0
     own = prior.component(modes.around)
     precision = torch.linalg.inv(prior.covariances[own])
-    away = poses.local(modes.around, prior.centers[own])
+    away = poses.log(modes.around, prior.centers[own])
     sizes = torch.linalg.slogdet(precision)[1] - torch.linalg.slogdet(precision + modes.information)[1]
     squared = ((away[:, None] @ precision)[:, 0] * away).sum(dim=1)
     each = modes.log_likelihood + prior.log_weights[own] + 0.5 * (sizes - squared)

@@ -87,6 +87,12 @@ class NormalPose(PoseDistribution):
         tangent = self.freedom.embed((self._scale @ noise)[..., 0])
         return self._moved(self.center.expand(*shape, 7), tangent)
 
+    def coordinates(self, value: Tensor) -> Tensor:
+        """The free coordinates (..., d) of poses (..., 7) from the centre, which are normal."""
+        tangent = poses.local(self.center, value)
+        drawn, _ = self._measured(tangent, tangent[..., 3:].norm(dim=-1))
+        return self.freedom.coordinates(drawn)
+
     def _moved(self, center: Tensor, tangent: Tensor) -> Tensor:
         """Poses (..., 7) a tangent (..., 6) away from centres."""
         return poses.retract(center, tangent)
