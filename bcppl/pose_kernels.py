@@ -99,10 +99,10 @@ def local(pose: Array, goal: Array, result: Array) -> None:
 
 
 @compiled
-def bent(
+def _bent(
     w: tuple[float, float, float], v: tuple[float, float, float], once: float, twice: float
 ) -> tuple[float, float, float]:
-    """V + once w x v + twice w x (w x v)."""
+    """The sum of v, `once` times w x v, and `twice` times w x (w x v)."""
     a, b, c = w[1] * v[2] - w[2] * v[1], w[2] * v[0] - w[0] * v[2], w[0] * v[1] - w[1] * v[0]
     x, y, z = w[1] * c - w[2] * b, w[2] * a - w[0] * c, w[0] * b - w[1] * a
     return v[0] + once * a + twice * x, v[1] + once * b + twice * y, v[2] + once * c + twice * z
@@ -121,7 +121,7 @@ def exp(pose: Array, twist: Array, result: Array) -> None:
         if angle > SMALL:
             once = (1.0 - math.cos(angle)) / angle**2
             twice = (angle - math.sin(angle)) / angle**3
-        moved = bent(turn, (step[0], step[1], step[2]), once, twice)
+        moved = _bent(turn, (step[0], step[1], step[2]), once, twice)
         for axis in range(3):
             result[n, axis] = own[axis] + moved[axis]
 
@@ -138,7 +138,7 @@ def log(pose: Array, goal: Array, result: Array) -> None:
         twice = 1.0 / 12.0
         if angle > SMALL:
             twice = 1.0 / angle**2 - 0.5 / (angle * math.tan(0.5 * angle))
-        moved = bent(turn, (step[0], step[1], step[2]), -0.5, twice)
+        moved = _bent(turn, (step[0], step[1], step[2]), -0.5, twice)
         for axis in range(3):
             step[axis] = moved[axis]
 

@@ -10,7 +10,7 @@ import trimesh
 
 from bcppl.compiled import compiled
 from bcppl.geometry.distance import SignedDistance, closed_mesh
-from bcppl.geometry.distance_grid import DistanceGrid, distance_grid, inexact, interpolated
+from bcppl.geometry.gap.distance_grid import DistanceGrid, distance_grid, inexact, interpolated
 from bcppl.geometry.parts import Part
 from bcppl.models.worlds.bench.parts import bench_part
 

@@ -134,7 +134,7 @@ def test_a_mode_weighs_what_a_normal_observation_is_worth() -> None:
     )
     precision = torch.diag(spread**-2) + information
     expected = torch.linalg.solve(precision, off / spread**2 + rows.T @ seen / noise**2)
-    torch.testing.assert_close(poses.local(poses.identity(1), posterior.centers)[0], expected)
+    torch.testing.assert_close(poses.log(poses.identity(1), posterior.centers)[0], expected)
     torch.testing.assert_close(posterior.covariances[0], torch.linalg.inv(precision))
 
 

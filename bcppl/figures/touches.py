@@ -140,10 +140,7 @@ def gains_on_part(
         *shown[order].T, c=np.array(known)[order], cmap="viridis", s=30, zorder=4, depthshade=False
     )
     figure.colorbar(drawn, ax=axes, label="information gain (nats)", shrink=0.6, pad=0.12)
-    corners = 1e3 * np.stack([part.vertices.min(axis=0), part.vertices.max(axis=0)])
-    shown = np.concatenate([corners, shown])
-    frame(axes, shown.min(axis=0), shown.max(axis=0))
-    return axes
+    return _framed(axes, part, shown)
 
 
 def touches_on_part(
@@ -173,13 +170,18 @@ def touches_on_part(
     axes = panel(figure, place, outline(part), poses.identity().numpy())
     axes.plot(*path.T, color=PARTICLE, linewidth=0.7, zorder=3)
     axes.scatter(*path[felt].T, color=FELT, s=8, zorder=4, depthshade=False)
-    corners = 1e3 * np.stack([part.vertices.min(axis=0), part.vertices.max(axis=0)])
     near = path[felt] if felt.any() else path
     above = near.max(axis=0, keepdims=True)
     above[:, 2] += 10.0
-    shown = np.concatenate([corners, near, above])
-    frame(axes, shown.min(axis=0), shown.max(axis=0))
     axes.set_title("the tip's path, contact in colour", fontsize=9)
+    return _framed(axes, part, np.concatenate([near, above]))
+
+
+def _framed(axes: Axes3D, part: Part, points: Array) -> Axes3D:
+    """Axes that show the part and points (M, 3) in its frame, mm."""
+    corners = 1e3 * np.stack([part.vertices.min(axis=0), part.vertices.max(axis=0)])
+    shown = np.concatenate([corners, points])
+    frame(axes, shown.min(axis=0), shown.max(axis=0))
     return axes
 
 

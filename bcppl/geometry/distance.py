@@ -58,8 +58,8 @@ class SignedDistance:
 
     The sign comes from angle-weighted pseudonormals (Baerentzen and Aanaes, "Signed distance computation
     using the angle weighted pseudonormal", 2005), as libigl computes them; duplicate vertices at seams are
-    merged first. 45 000 points take 20 ms on one core for a prism of 8 triangles, 130 ms for a sphere of
-    5120.
+    merged first. On one core 45 000 points anywhere take 28 ms for a prism of 12 triangles, 280 ms for a
+    sphere of 5120; points that follow one another nearby take less.
 
     Attributes:
         part: the part.

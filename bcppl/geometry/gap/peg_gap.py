@@ -12,7 +12,7 @@ from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.effort import Effort
 from bcppl.geometry.distance import SignedDistance
-from bcppl.geometry.distance_grid import DistanceGrid, distance_grid
+from bcppl.geometry.gap.distance_grid import DistanceGrid, distance_grid
 from bcppl.geometry.gap.edges import by_edges
 from bcppl.geometry.gap.frames import Frames, frames_of
 from bcppl.geometry.gap.sharp_edges import sharp_edges

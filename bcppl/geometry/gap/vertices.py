@@ -7,7 +7,7 @@ import numpy as np
 from bcppl.arrays import Array
 from bcppl.compiled import compiled
 from bcppl.geometry.distance import Surface, signed_at
-from bcppl.geometry.distance_grid import DistanceGrid, inexact, interpolated, set_gradient
+from bcppl.geometry.gap.distance_grid import DistanceGrid, inexact, interpolated, set_gradient
 from bcppl.geometry.gap.frames import Frames, placed, relative
 from bcppl.geometry.gap.solids import Solids
 
