@@ -111,7 +111,7 @@ def test_a_stated_load_is_given_in_the_sensors_frame(written: tuple[Path, bench_
 @pytest.mark.parametrize(("seed", "late"), [(0, 0.008), (2, -0.05), (5, 0.05)])
 def test_the_clock_is_estimated_from_contacts(seed: int, late: float, tmp_path: Path) -> None:
     there = bench_logs.truth(seed)
-    log = bench_logs.Log(late=late, noise=(0.1, 0.005, 0.00002), seed=seed)
+    log = bench_logs.Log(late=late, noise=(0.1, 0.005, 0.00002), bends=2e-5, seed=seed)
     report = "\n".join(command(bench_logs.write(tmp_path, there, log)).report)
     stated = report.partition("clocks: the wrench is ")[2].split()
     assert abs(float(stated[0]) - 1000.0 * late) < min(2.0, 2.5 * float(stated[2])), report

@@ -16,7 +16,8 @@ THRESHOLD, REACHED = 1.5, 3.5  # N; a force that stays below the second is the t
 _LASTING, _APART = 0.03, 0.05  # s: a contact lasts, and is at least so far from the next
 _FREE = 0.07  # s of free motion before a contact
 _AFTER = 0.1  # s of a contact that are compared with the path, at most
-_LEAST = 0.015  # s of it, at least
+_LEAST = 0.006  # s of it, at least
+_LEFT = 0.5  # of the threshold, below which a contact that has begun is over
 _RESTING = 0.004  # s before an onset up to which the force's level is that of free air
 
 
@@ -40,11 +41,12 @@ class Contact:
 def contacts(force: Stream) -> Iterator[Contact]:
     """The contacts of a force (T, 3) in the world's axes, evenly by `STEP`, N, zero in free air."""
     size = np.linalg.norm(force.values, axis=1)
-    for onset in _onsets(force, size):
+    for onset, risen in _onsets(force, size):
         begin = int(np.searchsorted(force.times, onset))
         level = (force.times > onset - 0.06) & (force.times < onset - _RESTING)
-        left = np.flatnonzero(size[begin + round(_LEAST / STEP) :] < THRESHOLD)
-        lasts = round(_LEAST / STEP) + int(left[0]) if len(left) else len(size) - begin
+        # A peg that bounces leaves the part again.
+        left = np.flatnonzero(size[risen:] < _LEFT * THRESHOLD)
+        lasts = risen - begin + int(left[0]) if len(left) else len(size) - begin
         rows = slice(begin, begin + min(lasts, round(_AFTER / STEP)))
         grown = force.values[rows] - force.values[level].mean(axis=0) if level.any() else np.empty((0, 3))
         if len(grown) * STEP < _LEAST:
@@ -54,7 +56,8 @@ def contacts(force: Stream) -> Iterator[Contact]:
         yield Contact(onset, normal, force.times[rows], grown @ normal)
 
 
-def _onsets(force: Stream, size: Array) -> Iterator[float]:
+def _onsets(force: Stream, size: Array) -> Iterator[tuple[float, int]]:
+    """The times of onsets, and the samples at which the force is above the threshold."""
     free, after = round(_FREE / STEP), round(0.004 / STEP)
     begins, ends = _lasting(size)
     for k, begin in enumerate(begins):
@@ -71,7 +74,7 @@ def _onsets(force: Stream, size: Array) -> Iterator[float]:
             resolution=1e-3,
         )
         for onset in detector.onsets(force.times[seen], force.values[seen])[:1]:
-            yield onset.time
+            yield onset.time, begin
 
 
 def _lasting(size: Array) -> tuple[Indices, Indices]:
