@@ -21,7 +21,7 @@ from bcppl.recordings.streams import Stream
 _WITHIN = 0.1  # s: the largest lateness, either way, that is looked for
 _COARSE, _FINE = 0.002, 0.0005  # s between latenesses
 _THIN = 0.004, 0.002  # s between rows of the path, at least: first, and where it counts
-_IMPROBABLE = 20.0  # nats
+_IMPROBABLE = 8.0  # nats
 _WIDEST = 0.08  # s over which probable latenesses may lie to be looked at more closely
 _LEAST_NOISE = 2e-5  # m: paths differ by as much from what is made of them
 # Standard deviation of the logarithm of compliances of contacts, in steps of `resting.COMPLIANCES`.
@@ -105,8 +105,8 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
 
     In twelve simulated logs of three or four touches (wrench at 1 kHz, poses at 500 Hz that scatter by 20 and
     50 um, lateness from -50 to 50 ms) by an arm whose structure yields by 20 um/N the error was 0.2 ms in the
-    median and 0.8 at most, where spreads of 1.3 to 2.4 ms were stated; where the structure does not yield,
-    1.5 and 10, where 1.5 to 12 were stated. In 88 logs of arms that stop by command, rub, bounce, or have
+    median and 0.6 at most, where spreads of 1.3 ms were stated; where the structure does not yield, 1.6 and
+    5.5, where 1.4 to 10 were stated. In 88 logs of arms that stop by command, rub, bounce, or have
     filters and tips of rubber no error exceeded 3.1 times what was stated, and half of them 0.5 times.
 
     Args:
@@ -128,8 +128,9 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
     weight = _summed([way.evidence(noise, lates) for way in coarse])
     probable = lates[weight > weight.max() - _IMPROBABLE]
     low, high = probable[0] - _COARSE, probable[-1] + _COARSE
-    rates = _DRIFTS if drifts else np.zeros(1)
+    rates, drift_variance = np.zeros(1), float(drifts) * _DRIFT**2
     if high - low < _WIDEST:
+        rates = _DRIFTS if drifts else rates
         farthest = max(abs(time - middle) for way in ways for time in way.times) * rates.max()
         margin = int(np.ceil(farthest / _FINE))
         first, last = round(low / _FINE) - margin, round(high / _FINE) + margin
@@ -140,17 +141,19 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
         weights = np.stack([_summed([_shifted(each, rate * behind / _FINE, margin)]) for rate in rates])
         weights -= 0.5 * np.square(rates / _DRIFT)[:, None]
     else:
-        weights, rates = weight[None], np.zeros(1)
+        weights = weight[None]
     share = np.exp(weights - weights.max())
     share /= share.sum()
     late, drift = share.sum(axis=0) @ lates, share.sum(axis=1) @ rates
     variance = share.sum(axis=0) @ np.square(lates - late)
+    if len(rates) > 1:
+        drift_variance = share.sum(axis=1) @ np.square(rates - drift)
     blind = _BLIND * position.step * max(1.0, position.step / _SLOW)
     return Lateness(
         late=float(late),
         spread=float(np.sqrt(variance + _LEAST**2 + np.square(blind))),
         drift=float(drift),
-        drift_spread=float(np.sqrt(share.sum(axis=1) @ np.square(rates - drift))),
+        drift_spread=float(np.sqrt(drift_variance)),
         at=middle,
         contacts=count,
     )
