@@ -182,9 +182,8 @@ class _Way:
 
     def evidence(self, noise: float, lates: Array) -> Array:
         """Its logarithm (K, L, ...) by contact, lateness and what yields."""
-        if not self.released:
-            return log_evidence(self.contacts, self.position, noise, lates, released=False)
-        return log_evidence(self.contacts, self.position, noise, -lates, released=True)
+        lates = -lates if self.released else lates
+        return log_evidence(self.contacts, self.position, noise, lates, released=self.released)
 
 
 def _reversed(stream: Stream) -> Stream:
