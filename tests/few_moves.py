@@ -11,4 +11,4 @@ from bcppl.traces import Model
 
 
 def infer(model: Model, recording: Any, **settings: Any) -> Iterator[Step]:
-    yield from tempered_smc.infer(model, recording, sweeps=(2, 2), share=(0.6, 0.4), **settings)
+    yield from tempered_smc.infer(model, recording, sweeps=2, share=0.5, **settings)

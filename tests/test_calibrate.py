@@ -255,7 +255,7 @@ def located(recording: Recording) -> Iterator[Step]:
     """The shipped filter, with few particles and moves, on the first measurements."""
     short = replace(recording, measurements=recording.measurements[:2])
     seed = int(torch.randint(2**31, ()))
-    return tempered_smc.infer(point_probe.model, short, particles=24, sweeps=(1, 1), seed=seed)
+    return tempered_smc.infer(point_probe.model, short, particles=24, sweeps=1, seed=seed)
 
 
 def test_the_pose_of_a_models_own_world_is_ranked() -> None:

@@ -54,7 +54,7 @@ def test_a_new_sensor_is_saved_checked_and_explained(
     assert sensor_named("gauge").kind == "gauge" and not problems(load(tmp_path / "own.h5"))
     assert "the reading is negative" in problems(replace(recording, measurements=readings))[0]
     scene = model.prepare(load(tmp_path / "own.h5"))
-    *_, last = tempered_smc.infer(model, recording, particles=40, scene=scene, sweeps=(2, 2))
+    *_, last = tempered_smc.infer(model, recording, particles=40, scene=scene, sweeps=2)
     assert last.taken == 2 and np.isfinite(last.info.log_evidence)
 
 

@@ -260,7 +260,7 @@ def test_learned_proposal_learns_and_is_put_beside_the_prior(kernel: Any, smalle
 @shipped_or(
     {
         "imports": [("PARTICLES = 75", "PARTICLES = 30")],
-        "sees": [("seed=0)", "seed=0, climbs=60, sweeps=(2, 2))")],
+        "sees": [("seed=0)", "seed=0, climbs=60, sweeps=2)")],
     }
 )
 def test_real_contacts_bear_out_one_noise_and_friction_and_not_another(kernel: Any, smaller: Smaller) -> None:

@@ -52,7 +52,7 @@ def held(seen: Recording, **settings: float) -> tuple[bool, float, float]:
     own = replace(
         model, prepare=partial(part_in_view.prepare, **settings), proposals=() if exact else model.proposals
     )
-    *_, last = infer(own, seen, particles=40, sweeps=(6, 6))
+    *_, last = infer(own, seen, particles=40, sweeps=6)
     region = last.belief.credible_region(0.9, translation_deviation)
     off = last.belief.mean[:3] - TRUTH[:3]
     squared = off @ torch.linalg.solve(last.belief.covariance[:3, :3], off)

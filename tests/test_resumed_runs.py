@@ -95,14 +95,14 @@ def state_of(step: Step) -> dict[str, torch.Tensor]:
 
 # ---------------------------------------------------------------- resumed from a step
 
-FEW_MOVES = functools.partial(tempered_smc.infer, sweeps=(2, 2))
+FEW_MOVES = functools.partial(tempered_smc.infer, sweeps=2)
 HOLES = ((0.0, 0.0), (0.01, 0.005))  # on the block of the shipped recording
 TWO_HOLES = replace(which_hole.model, prepare=functools.partial(which_hole.prepare, holes=HOLES))
 
 
 def own(model: Model) -> Callable[..., Any]:
     """A model's own inference program, with few moves."""
-    return functools.partial(default_inference(model)[1], sweeps=(1, 1))
+    return functools.partial(default_inference(model)[1], sweeps=1)
 
 
 # The inference program, the model, the recording, and the steps to resume from.
@@ -290,9 +290,7 @@ def test_a_run_in_another_order_on_the_same_scene_has_no_influence() -> None:
 def test_a_run_by_another_inference_program_on_the_same_scene_has_no_influence() -> None:
     """Guided runs fit images, tempered ones do not."""
     scene, recording = fresh(), bench(FIRST, TOP)
-    other = tempered_smc.infer(
-        look_and_touch.model, recording, particles=PARTICLES, sweeps=(1, 1), scene=scene
-    )
+    other = tempered_smc.infer(look_and_touch.model, recording, particles=PARTICLES, sweeps=1, scene=scene)
     assert [step.taken for step in other] == [0, 1, 2]
     assert_same(alone(FIRST, TOP), guided(recording, scene))
 
@@ -300,7 +298,7 @@ def test_a_run_by_another_inference_program_on_the_same_scene_has_no_influence()
 def test_a_guided_run_is_resumed_from_a_tempered_one_with_the_same_approximation() -> None:
     """It depends on the measurements alone, not on the particles."""
     model, scene = look_and_touch.model, fresh()
-    *_, start = tempered_smc.infer(model, bench(FIRST), particles=PARTICLES, sweeps=(1, 1), scene=scene)
+    *_, start = tempered_smc.infer(model, bench(FIRST), particles=PARTICLES, sweeps=1, scene=scene)
     assert start.population.approximation is None
     one, other = (
         run[-1].population.approximation

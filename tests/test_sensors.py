@@ -252,7 +252,7 @@ def block_and_beams(laser: Any) -> tuple[Recording, torch.Tensor]:
 
 @pytest.mark.parametrize(
     "infer",
-    [guided_smc.infer, partial(tempered_smc.infer, sweeps=(4, 4), share=(0.6, 0.6))],
+    [guided_smc.infer, partial(tempered_smc.infer, sweeps=4, share=0.6)],
     ids=["guided", "tempered"],
 )
 def test_a_new_kind_is_inferred_by_guided_and_by_tempered_smc(laser: Any, infer: Any) -> None:

@@ -7,7 +7,7 @@
     from bcppl.models.point_probe import model
 
     recording = load_recording("point_probe_10_pushes")
-    for belief, info in islice(tempered_smc.infer(model, recording, particles=20, sweeps=(2, 2)), 3):
+    for belief, info in islice(tempered_smc.infer(model, recording, particles=20, sweeps=2), 3):
         print(info.label, belief.mean)
 
 Half of the moves are random walks, half are drawn from a normal that is fitted to the other half of the
@@ -97,8 +97,8 @@ def infer(
     *,
     particles: int = 75,
     seed: int = 0,
-    sweeps: tuple[int | Until, int | Until] | None = None,
-    share: tuple[float, float] = (0.8, 0.6),
+    sweeps: int | Until | None = None,
+    share: float | None = None,
     climbs: int = 0,
     conditional: Program | None = None,
     search: int = 120,
@@ -113,12 +113,12 @@ def infer(
         recording: a `bcppl.recordings.Recording`.
         particles: N.
         seed: same seed, same beliefs.
-        sweeps: moves of every particle after each resampling: without, and with physics in the program. By
-            default 12 (6 where the model brings proposals of its own, which go farther), and until the
-            particles' mean squared displacement is half their variance on every axis and four of five differ,
-            at most 60.
+        sweeps: moves of every particle after each resampling. By default 12 (6 where the model brings
+            proposals of its own, which go farther); where the program simulates physics, until the particles'
+            mean squared displacement is half their variance on every axis and four of five differ, at most
+            60.
         share: particles are resampled below this effective sample size, and exponents keep this conditional
-            one, as shares of N: without, and with physics.
+            one, as shares of N; by default 0.8, and 0.6 where the program simulates physics.
         climbs: number of draws of the prior that climb before a measurement is tempered, to find the modes
             between which particles jump (`bcppl.inference.proposals.climbing`; it needs depth images).
         conditional: where depth images depend on other latent poses than the sought one (those at which
@@ -133,18 +133,22 @@ def infer(
         InputError: a number is out of range.
     """
     particles = whole_number("SMC is to run {} particles", particles)
-    for kept in share:
-        number_within("a share of {} of the particles is to be kept", kept, least=0.0, below=1.0)
+    if share is not None:
+        number_within("a share of {} of the particles is to be kept", share, least=0.0, below=1.0)
     # A run that is resumed has the particles that it was begun with.
     most = max(1, round(0.8 * (particles if start is None else len(start.population))))
     enough = until(displacement=0.5, distinct=most, most=60)
     climbing = whole_number("{} climbs are to find modes", climbs, least=0)
     if climbing and isinstance(model.program, Series):
         raise InputError("climbs find modes of one pose, and the model's is a series; give climbs=0.")
-    moves = (6 if model.proposals else 12, enough) if sweeps is None else sweeps
 
-    def by_physics(trace: Trace) -> int:
-        return int(runs_physics(trace))
+    def moves(trace: Trace) -> int | Until:
+        if sweeps is not None:
+            return sweeps
+        return enough if runs_physics(trace) else 6 if model.proposals else 12
+
+    def kept(trace: Trace) -> float:
+        return share if share is not None else 0.6 if runs_physics(trace) else 0.8
 
     def step(population: Population, observed: Observed) -> Stepped:
         centres, along = None, []
@@ -157,8 +161,8 @@ def infer(
             centres = modes(climbers, model.pose, along)
         return tempered(
             kernel(model.pose, model.proposals, centres, along, conditional),
-            sweeps=lambda trace: moves[by_physics(trace)],
-            share=lambda trace: share[by_physics(trace)],
+            sweeps=moves,
+            share=kept,
         )(population, observed)
 
     if whole_number("{} climbs are to search", search, least=0) and not isinstance(model.program, Series):
