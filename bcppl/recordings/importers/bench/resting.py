@@ -1,14 +1,14 @@
 """How late a force is relative to a path: a peg that rests on a rigid part does not move.
 
-From the onset of a contact to its release the tip stays where it met the part, and the encoders run ahead by
+From the onset of a contact on the tip stays where it met the part, and the encoders run ahead by
 what the structure between them and the tip yields,
 
     path along the force = place at the onset - compliance (force, lagging by the structure's damping),
 
 whatever moves the arm: a spring, as under impedance control, or a controller that stops on contact. So
-nothing is assumed about the arm. Before the onset the path is any smooth one that moves into the part. A
-release is an onset in reversed time. The evidence of a lateness is that of this motion relative to a path
-that is smooth, or at rest, for reasons of its own; a contact that shows neither counts for little.
+nothing is assumed about the arm. Before the onset the path is any smooth one that moves into the part. The
+evidence of a lateness is that of this motion relative to a path that is smooth, or at rest, for reasons of
+its own; a contact that shows neither counts for little.
 """
 
 from __future__ import annotations
@@ -37,9 +37,7 @@ COMPLIANCES = np.concatenate([[0.0], np.geomspace(1e-6, 3e-4, 60)])  # m/N
 _STRAY = 0.1  # probability that a contact shows no lateness
 
 
-def log_evidence(
-    contacts: Sequence[Contact], position: Stream, noise: float, lates: Array, *, released: bool
-) -> Array:
+def log_evidence(contacts: Sequence[Contact], position: Stream, noise: float, lates: Array) -> Array:
     """Logarithms of the evidence (K, L, lags, compliances) of contacts for latenesses, relative to none.
 
     Args:
@@ -47,11 +45,10 @@ def log_evidence(
         position: (P, 3) of the peg in the world, m.
         noise: standard deviation of a position, m.
         lates: (L,) s.
-        released: whether the time of both runs backwards.
     """
     ratios = np.zeros((len(contacts), len(lates), len(LAGS), len(COMPLIANCES)))
     for k, contact in enumerate(contacts):
-        yielded = _yielded(contact, released)
+        yielded = _yielded(contact)
         path = position.values @ contact.normal
         for i, late in enumerate(lates):
             ratio = _log_ratio(contact, yielded, position.times, path, noise, late)
@@ -59,12 +56,8 @@ def log_evidence(
     return np.asarray(np.logaddexp(np.log(_STRAY), np.log1p(-_STRAY) + ratios))
 
 
-def _yielded(contact: Contact, released: bool) -> Array:
+def _yielded(contact: Contact) -> Array:
     """By what (F, lags) the path falls behind, in N."""
-    if released:
-        return -np.stack(
-            [np.interp(contact.times + lag, contact.times, contact.force) for lag in LAGS], axis=1
-        )
     decays = [np.exp(-STEP / lag) if lag > 0.0 else 0.0 for lag in LAGS]
     return -np.stack([lfilter([1.0 - d], [1.0, -d], contact.force) for d in decays], axis=1)
 
