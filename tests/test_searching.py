@@ -70,7 +70,7 @@ def recording(*values: float) -> Any:
 
 
 def last(seed: int, **settings: Any) -> Step:
-    few = {"particles": 40, "sweeps": (4, 4), "search": 40, **settings}
+    few = {"particles": 40, "sweeps": 4, "search": 40, **settings}
     *_, step = tempered_smc.infer(model, recording(*READINGS), seed=seed, **few)
     return step
 
