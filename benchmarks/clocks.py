@@ -13,15 +13,16 @@ import tempfile
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 from joblib import Parallel, delayed
 from report import Row, cores, finish, options, show
 
 from bcppl.recordings.importers.bench import clocks
+from bcppl.recordings.importers.bench.clocks import lateness
 from bcppl.recordings.importers.bench.log import imported
-from bcppl.recordings.streams import Stream
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the logs are those that the tests are made of
 from tests.bench_logs import Log, truth, write
@@ -42,12 +43,11 @@ class Found(NamedTuple):
     spread: float
 
 
-def estimated(force: Stream, position: Stream, late: float) -> Found:
-    """The estimate of one log."""
-    found = clocks.lateness(force, position, within=0.1)
-    if found is None:
+def of(late: float, estimate: clocks.Lateness | None) -> Found:
+    """An estimate beside the truth, s."""
+    if estimate is None:
         return Found(1e3 * late, np.nan, np.nan)
-    return Found(1e3 * late, 1e3 * found.late, 1e3 * found.spread)
+    return Found(1e3 * late, 1e3 * estimate.late, 1e3 * estimate.spread)
 
 
 def of_bench(bends: float, seed: int) -> Found:
@@ -55,24 +55,19 @@ def of_bench(bends: float, seed: int) -> Found:
     rng = np.random.default_rng(seed)
     late = float(rng.uniform(-WITHIN, WITHIN))
     log = Log(late=late, bends=bends, noise=(0.1, 0.005, float(rng.choice([2e-5, 5e-5]))), seed=seed)
-    streams: list[tuple[Stream, Stream]] = []
-    estimate = clocks.lateness
+    estimates: list[clocks.Lateness | None] = []
 
-    def kept(force: Stream, position: Stream, within: float, drifts: bool = False) -> clocks.Lateness | None:
-        streams.append((force, position))
-        return estimate(force, position, within, drifts)
+    def kept(*given: Any) -> clocks.Lateness | None:
+        estimates.append(lateness(*given))
+        return estimates[-1]
 
-    clocks.lateness = kept  # what the import makes of the files is what is judged
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            imported(write(Path(folder), truth(seed, 1.0), log))
-    finally:
-        clocks.lateness = estimate
-    return estimated(*streams[0], late)
+    with tempfile.TemporaryDirectory() as folder, patch.object(clocks, "lateness", kept):
+        imported(write(Path(folder), truth(seed, 1.0), log))
+    return of(late, estimates[0])
 
 
 def of_arm(seed: int) -> Found:
-    """A log of an arm that is drawn at random, half of them with one peculiarity."""
+    """A log of an arm that is drawn at random, nearly half of them with one peculiarity."""
     rng = np.random.default_rng(seed)
 
     def between(low: float, high: float) -> float:
@@ -112,7 +107,8 @@ def of_arm(seed: int) -> Found:
     )
     if rng.random() < 0.5:
         arm |= peculiar[rng.integers(len(peculiar))]
-    return estimated(*touching(TouchingArm(**arm)))  # type: ignore[arg-type]
+    force, position, late = touching(TouchingArm(**arm))  # type: ignore[arg-type]
+    return of(late, lateness(force, position, within=0.1))
 
 
 def judged(name: str, found: Sequence[Found]) -> list[Row]:

@@ -113,9 +113,9 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
     noise = float(np.median(np.abs(np.diff(position.values, n=2, axis=0)))) / (0.6745 * 6.0**0.5)
     noise = max(noise, _LEAST_NOISE)
     felt = list(contacts(force))
-    felt = felt[:: -(-len(felt) // MOST_CONTACTS)] if felt else []
     if not felt:
         return None
+    felt = felt[:: -(-len(felt) // MOST_CONTACTS)]
     times = np.array([contact.time for contact in felt])
     middle = float(times.mean())
     coarse, fine = (_thinned(position, step) for step in _THIN)
