@@ -54,7 +54,7 @@ from bcppl.models.worlds.bench.errors import BenchErrors
 from bcppl.models.worlds.bench.parameters import BenchParameters
 from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.robot.motion import ProbeWindow
-from bcppl.sensors.likelihoods.bench_profiles import PROFILES
+from bcppl.sensors.likelihoods.bench_profiles import PROFILES, BenchProfile
 from bcppl.sensors.measurements import Measurement, Recording
 from tests.episode_errors import factors
 from tests.made_recordings import assert_one_sentence
@@ -174,6 +174,14 @@ def test_the_gap_s_change_by_a_displaced_peg_is_that_of_the_gap_itself() -> None
         apart = [gap(pose, moved(rows[:, :7], sign * step * twist)).distance for sign in (1.0, -1.0)]
         differences = (shifts[:, place] - (apart[0] - apart[1]) / (2.0 * step)).abs()
         assert float(differences.quantile(0.9)) < 0.02 * float(shifts.abs().quantile(0.9))
+
+
+def test_a_bench_may_lack_any_error() -> None:
+    """Errors of size 0 change nothing, and without a delay the wrench is taken to be on time."""
+    none = BenchProfile((0.0, 0.0, 0.0), (0.0, 0.0), (0.0, 0.1), delay=0.0, size=0.0, slips=0.0, slides=0.0)
+    errors = none.errors((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    known = site(around(4), FIVE, *errors).log_prob(FIVE)
+    assert torch.allclose(known, site(around(4), FIVE, bench=LinearErrors(())).log_prob(FIVE), atol=1e-9)
 
 
 def test_any_cut_gives_the_same_likelihood_with_shared_errors() -> None:

@@ -55,8 +55,8 @@ class Grasp(_Unchanging):
         slips: the probability of one, at each episode of contact.
     """
 
-    shift: float = field(default=0.001, metadata=POSITIVE)
-    turn: float = field(default=math.radians(1.0), metadata=POSITIVE)
+    shift: float = field(default=0.001, metadata=NONNEGATIVE)
+    turn: float = field(default=math.radians(1.0), metadata=NONNEGATIVE)
     yaw: float = field(default=math.radians(2.0), metadata=NONNEGATIVE)
     slip: float = field(default=0.0005, metadata=NONNEGATIVE)
     slip_turn: float = field(default=math.radians(0.2), metadata=NONNEGATIVE)
@@ -91,8 +91,8 @@ class ArmCompliance(_Unchanging):
         rotation: about them, rad/(N m).
     """
 
-    translation: float = field(default=2e-5, metadata=POSITIVE)
-    rotation: float = field(default=5e-4, metadata=POSITIVE)
+    translation: float = field(default=2e-5, metadata=NONNEGATIVE)
+    rotation: float = field(default=5e-4, metadata=NONNEGATIVE)
     name = "the compliance of arm and grip"
 
     @property
@@ -121,7 +121,7 @@ class KinematicError(_Unchanging):
         center: (3,) x about which the field is linear, in the world, m.
     """
 
-    size: float = field(default=0.0003, metadata=POSITIVE)
+    size: float = field(default=0.0003, metadata=NONNEGATIVE)
     length: float = field(default=0.1, metadata=POSITIVE)
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
     name = "the error of the arm's kinematics"
@@ -239,7 +239,7 @@ class Size(_Unchanging):
         growth: standard deviation of how much the gap is smaller, m.
     """
 
-    growth: float = field(default=0.0001, metadata=POSITIVE)
+    growth: float = field(default=0.0001, metadata=NONNEGATIVE)
     name = "the size of part and peg"
     count = 1
 

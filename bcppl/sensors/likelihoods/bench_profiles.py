@@ -42,7 +42,7 @@ SCALES = ((0.65, 1.0), (0.35, 2.2))
 
 @dataclass(frozen=True)
 class BenchProfile:
-    """Priors of a bench: metres, radians, seconds, N.
+    """Priors of a bench: metres, radians, seconds, N; 0 for what it does not have.
 
     Attributes:
         grasp: along and about the peg's axes, and about its own.
@@ -76,7 +76,7 @@ class BenchProfile:
             ArmCompliance(*self.compliance),
             KinematicError(*self.kinematics, center=peg),
             PartSlides(probability=self.slides, center=part),
-            Delay(self.delay),
+            *([Delay(self.delay)] if self.delay else []),
             Size(self.size),
         )
 
