@@ -54,6 +54,13 @@ def test_a_mistake_is_named_once_and_with_its_cause(name: str) -> None:
     assert_one_sentence(found)
 
 
+@pytest.mark.parametrize("millimetres", [80, 120])
+def test_how_far_along_its_axis_a_peg_is_off_is_named_where_its_sides_touch(millimetres: int) -> None:
+    """A peg of 80 mm whose sides touch is as near anywhere along them."""
+    (found,) = doubts(plausibility.at_flange(right(14, False), 1e-3 * millimetres))
+    assert f"the peg is {millimetres} mm farther along its axis" in found
+
+
 @pytest.mark.parametrize("name", RIGHT)
 def test_a_right_recording_gives_no_doubt(name: str) -> None:
     assert doubts(plausibility.RIGHT[name](right(11, True))) == []  # a tray, whose images fit least

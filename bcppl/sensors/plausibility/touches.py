@@ -36,6 +36,8 @@ TURNED, LEAST_TURN, FITS = (
 ASKEW = 0.4  # a mean cosine of force and normal below which the force's axes are wrong
 ALONG = np.arange(-0.35, 0.3501, 0.005)  # m along the peg's axis
 SHIFTED = 0.02  # m: a shorter shift is as well the part's place
+# A peg whose sides touch is as near anywhere along them: of three minima the right one was not.
+SHIFTS = 6
 CLOCK = (-0.4, -0.3, -0.2, 0.2, 0.3, 0.4)  # s by which the wrench is late
 LATER = 0.03  # of the stamps that a clock has to explain more
 GAPS = (0.001, 0.002, 0.004, 0.006)  # m: limits between contact and none
@@ -199,11 +201,11 @@ def _side(metres: float) -> str:
 
 
 def _shifts(contacts: Contacts, probes: Sequence[Felt], start: Found | None) -> list[float]:
-    """The shifts along the peg's axis, at most three, at which contacts are nearest to the part."""
+    """The shifts along the peg's axis, at most `SHIFTS`, at which contacts are nearest to the part."""
     costs = np.array([contacts.distance(probes, start, float(metres)) for metres in ALONG])
     inner = (costs[1:-1] <= costs[:-2]) & (costs[1:-1] <= costs[2:])
     minima = np.flatnonzero(inner) + 1
-    few = minima[np.argsort(costs[minima])][:3]
+    few = minima[np.argsort(costs[minima])][:SHIFTS]
     return [float(ALONG[k]) for k in few if abs(ALONG[k]) >= SHIFTED]
 
 
