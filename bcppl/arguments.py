@@ -30,7 +30,7 @@ def whole_number(what: str, value: object, *, least: int = 1, most: int | None =
         count = None
     if count is None or count < least or (most is not None and count > most):
         upper = f"{least} or more" if most is None else f"from {least} to {most}"
-        raise InputError(f"{_named(what, value)}; give a whole number, {upper}.")
+        raise InputError(f"{named(what, value)}; give a whole number, {upper}.")
     return count
 
 
@@ -61,7 +61,7 @@ def number_within(
         return number
     bounds = [(above, "above"), (least, "at least"), (below, "below"), (most, "at most")]
     asked = " and ".join(f"{name} {bound:g}" for bound, name in bounds if math.isfinite(bound))
-    raise InputError(f"{_named(what, value)}; give a finite number{' ' * bool(asked)}{asked}.")
+    raise InputError(f"{named(what, value)}; give a finite number{' ' * bool(asked)}{asked}.")
 
 
 def pose_problem(name: str, pose: Array) -> str | None:
@@ -86,10 +86,11 @@ def latent_address(what: str, address: str, latent: Collection[str]) -> None:
     """
     if address not in latent:
         listed = ", ".join(latent) or "none"
-        raise InputError(f"{_named(what, address)}, which is no latent address; latent are {listed}.")
+        raise InputError(f"{named(what, address)}, which is no latent address; latent are {listed}.")
 
 
-def _named(what: str, value: object) -> str:
+def named(what: str, value: object) -> str:
+    """The beginning of a sentence with a value, shortened where it is long, in the place of {}."""
     try:
         text = repr(value)
     except ValueError:  # Python spells no whole number of more than 4300 digits

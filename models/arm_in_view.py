@@ -9,7 +9,7 @@ segmentation are measurements too: they inform the outline, and the depth image 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,15 @@ from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import fitted_normal
+from bcppl.distributions.parameters import (
+    COUNT,
+    IF_GIVEN,
+    NONNEGATIVE,
+    POSITIVE,
+    PROBABILITY,
+    check_parameters,
+    within,
+)
 from bcppl.distributions.pose_normals import normal_like, truncated
 from bcppl.distributions.poses import NormalPose
 from bcppl.distributions.silhouette import Silhouette, binned_mask
@@ -64,18 +73,21 @@ class Settings:
             not cross it there.
     """
 
-    scale: float = 0.02
-    outlier: float = 0.1
-    bias: float = 0.005
-    widening: float = 0.0055
-    effective_pixels: float | None = 200.0
-    effective_inside: float | None = 10.0
-    bins: int = 8
-    mask_width: float = 8.0
-    mask_rim: float = 1.5
-    mask_wrong: float = 0.05
-    mask_temperature: float = 32.0
-    inside: int = 5
+    scale: float = field(default=0.02, metadata=POSITIVE)
+    outlier: float = field(default=0.1, metadata=PROBABILITY)
+    bias: float = field(default=0.005, metadata=POSITIVE)
+    widening: float = field(default=0.0055, metadata=NONNEGATIVE)
+    effective_pixels: float | None = field(default=200.0, metadata=IF_GIVEN)
+    effective_inside: float | None = field(default=10.0, metadata=IF_GIVEN)
+    bins: int = field(default=8, metadata=COUNT)
+    mask_width: float = field(default=8.0, metadata=POSITIVE)
+    mask_rim: float = field(default=1.5, metadata=POSITIVE)
+    mask_wrong: float = field(default=0.05, metadata=PROBABILITY)
+    mask_temperature: float = field(default=32.0, metadata=POSITIVE)
+    inside: int = field(default=5, metadata=within(least=0, whole=True))
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -22,6 +22,7 @@ import torch
 
 from bcppl import poses
 from bcppl.arguments import number_within
+from bcppl.distributions.parameters import POSITIVE, PROBABILITY, check_parameters
 from bcppl.distributions.poses import NormalPose, prior_from_guess
 from bcppl.geometry.parts import Part
 from bcppl.models.shipped import simulated_in
@@ -32,7 +33,7 @@ from bcppl.sensors.likelihoods.cameras import CalibratedCamera
 from bcppl.sensors.likelihoods.screened_probe import simulated_probe
 from bcppl.sensors.likelihoods.simulated_probe import ProbeSettings
 from bcppl.sensors.measurements import Recording
-from bcppl.sensors.scene import Scene, chosen, likelihoods_for, require_positive
+from bcppl.sensors.scene import Scene, chosen, likelihoods_for
 from bcppl.traces import Model
 
 PROBE = ProbeSettings(evidence=("contacts", "pose"), normal_scale=0.0003)
@@ -49,12 +50,12 @@ class DepthSettings:
             pose is common to all.
     """
 
-    depth_scale: float = 0.003
-    outlier: float = 0.1
-    effective_pixels: float = 50.0
+    depth_scale: float = field(default=0.003, metadata=POSITIVE)
+    outlier: float = field(default=0.1, metadata=PROBABILITY)
+    effective_pixels: float = field(default=50.0, metadata=POSITIVE)
 
     def __post_init__(self) -> None:
-        require_positive(self, "depth_scale")
+        check_parameters(self)
 
 
 @dataclass(frozen=True, eq=False)

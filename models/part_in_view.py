@@ -9,12 +9,19 @@ it, which continue from pixel to pixel. No mask is needed.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import pyro
 
-from bcppl.arguments import number_within, whole_number
+from bcppl.distributions.parameters import (
+    COUNT,
+    IF_GIVEN,
+    NONNEGATIVE,
+    POSITIVE,
+    PROBABILITY,
+    check_parameters,
+)
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.geometry.parts import Part
 from bcppl.models.camera_error import conditional_proposal
@@ -22,7 +29,7 @@ from bcppl.rendering.part_renderer import PartRenderer
 from bcppl.rendering.rasterisation import renderer_for
 from bcppl.sensors.likelihoods.cameras import ClutteredCamera
 from bcppl.sensors.measurements import Recording
-from bcppl.sensors.scene import Scene, chosen, likelihoods_for, require_positive
+from bcppl.sensors.scene import Scene, chosen, likelihoods_for
 from bcppl.traces import Model
 
 
@@ -50,21 +57,18 @@ class Settings:
         bias: the same along the ray, metres, in addition: half a percent of 1 m, a Kinect's range.
     """
 
-    scale: float = 0.005
-    outlier: float = 0.05
-    effective_pixels: float | None = 500.0
-    stride: int = 4
+    scale: float = field(default=0.005, metadata=POSITIVE)
+    outlier: float = field(default=0.05, metadata=PROBABILITY)
+    effective_pixels: float | None = field(default=500.0, metadata=IF_GIVEN)
+    stride: int = field(default=4, metadata=COUNT)
     clutter: bool = True
-    temperature: float = 1.0
-    shift: float = 0.003
-    turn: float = 0.035
-    bias: float = 0.005
+    temperature: float = field(default=1.0, metadata=POSITIVE)
+    shift: float = field(default=0.003, metadata=NONNEGATIVE)
+    turn: float = field(default=0.035, metadata=POSITIVE)
+    bias: float = field(default=0.005, metadata=NONNEGATIVE)
 
     def __post_init__(self) -> None:
-        require_positive(self, "scale", "turn")
-        for name in ("shift", "bias"):
-            number_within(f"part_in_view is given {name} {{}}", getattr(self, name), least=0.0)
-        whole_number("part_in_view is given stride {}", self.stride)
+        check_parameters(self)
 
 
 def part_in_view(scene: Scene, actions: Sequence[Any]) -> None:

@@ -99,9 +99,9 @@ def test_moving_the_part_alone_renders_nothing(recording: Recording) -> None:
 
 def test_what_makes_no_scene_is_refused_in_a_sentence(recording: Recording) -> None:
     for settings, message in [
-        ({"bias": 0.0}, "a site's spread must be positive and bias is 0.0"),
-        ({"camera_shift": -0.002}, "camera_shift is -0.002"),
-        ({"bins": 0}, "bins 0"),
+        ({"bias": 0.0}, "bias = 0.0; give a finite number above 0"),
+        ({"camera_shift": -0.002}, "camera_shift = -0.002"),
+        ({"bins": 0}, "bins = 0"),
     ]:
         with pytest.raises(InputError, match=message):
             camera_error.prepare(recording, **settings)

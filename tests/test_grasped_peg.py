@@ -94,10 +94,10 @@ def test_a_peg_held_as_planned_is_that_of_peg_in_hole() -> None:
         ({"grip_shift": 0.0}, "positive unless the model is peg_in_hole; grip_shift is 0.0"),
         ({"grip_turn": float("nan")}, "grip_turn is nan"),
         ({"grip_shift": "1"}, "grip_shift is '1'"),
-        ({"depth_scale": 0.0}, "a site's spread must be positive and depth_scale is 0.0"),
-        ({"normal_scale": 0.0}, "a site's spread must be positive and normal_scale is 0.0"),
-        ({"contact_scale": -0.003}, "contact_scale is -0.003"),
-        ({"pose_every": 0}, "pose_every 0"),
+        ({"depth_scale": 0.0}, "depth_scale = 0.0; give a finite number above 0"),
+        ({"normal_scale": 0.0}, "normal_scale = 0.0; give a finite number above 0"),
+        ({"contact_scale": -0.003}, "contact_scale = -0.003"),
+        ({"pose_every": 0}, "pose_every = 0"),
     ],
 )
 def test_what_cannot_be_a_spread_is_refused_before_anything_is_built(settings: Any, message: str) -> None:

@@ -1,4 +1,4 @@
-"""Ranges of the parameters of a distribution: declared with its fields, checked in one place.
+"""Ranges of the parameters of a distribution or of settings: declared with the fields, checked in one place.
 
 scale: float = field(metadata=POSITIVE)
 outlier: float = field(default=0.1, metadata=PROBABILITY)
@@ -7,15 +7,15 @@ outlier: float = field(default=0.1, metadata=PROBABILITY)
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 from torch import Tensor
 
-from bcppl.arguments import number_within, whole_number
+from bcppl.arguments import named, number_within, whole_number
 from bcppl.errors import InputError
 
 
@@ -26,6 +26,7 @@ class Range:
     Attributes:
         whole: whether the numbers are whole ones; only `least` bounds these.
         optional: whether None may be given.
+        count: how many such numbers are to be given, in a sequence; 0 for one by itself.
         latent: whether a tensor (N,), a value for each particle, may be given. It is not checked: a proposed
             value may leave the range, and then has probability zero.
     """
@@ -36,6 +37,7 @@ class Range:
     most: float = math.inf
     whole: bool = False
     optional: bool = False
+    count: int = 0
     latent: bool = False
 
     def checked(self, what: str, value: Any) -> Any:
@@ -43,6 +45,11 @@ class Range:
         each = self.latent and isinstance(value, Tensor) and value.ndim > 0
         if each or (self.optional and value is None):
             return value
+        if self.count:
+            if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != self.count:
+                raise InputError(f"{named(what, value)}; give {self.count} numbers.")
+            one = replace(self, count=0)
+            return tuple(one.checked(what, each) for each in value)
         if self.whole:
             return whole_number(what, value, least=int(self.least))
         return number_within(
@@ -60,6 +67,7 @@ NONNEGATIVE = within(least=0.0)
 PROBABILITY = within(above=0.0, below=1.0)
 RARE = within(least=0.0, below=1.0)
 COUNT = within(least=1, whole=True)
+IF_GIVEN = within(above=0.0, optional=True)
 
 
 @cache
@@ -69,12 +77,12 @@ def ranges(kind: type) -> dict[str, Range]:
     return {each.name: each.metadata["range"] for each in declared if "range" in each.metadata}
 
 
-def check_parameters(distribution: Any) -> None:
+def check_parameters(owner: Any) -> None:
     """Check the fields that declare a range, and make them floats and ints."""
-    kind: type = type(distribution)
+    kind: type = type(owner)
     for name, allowed in ranges(kind).items():
         what = f"{kind.__name__} has {name} = {{}}"
-        object.__setattr__(distribution, name, allowed.checked(what, getattr(distribution, name)))
+        object.__setattr__(owner, name, allowed.checked(what, getattr(owner, name)))
 
 
 def check_shape(where: str, name: str, value: Any, *shapes: tuple[int, ...]) -> None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import pyro
 from torch import Tensor
 
-from bcppl.arguments import number_within
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.sensors.capabilities import Approximated
@@ -171,7 +170,7 @@ def likelihoods_for(
     return {kind: each for kind, each in prepared.items() if each is not None}
 
 
-_KINDS = (str, Sequence, Mapping)  # what is one of these is no number, and the other way round
+_KINDS = (str, bool, Sequence, Mapping)  # what is one of these is no number, and the other way round
 
 
 def chosen(model: str, given: Mapping[str, Any], *defaults: Any) -> list[Any]:
@@ -193,7 +192,8 @@ def chosen(model: str, given: Mapping[str, Any], *defaults: Any) -> list[Any]:
     for each, own in zip(defaults, names, strict=True):
         for name in own.intersection(given):
             value, default = given[name], getattr(each, name)
-            if default is not None and any(isinstance(value, k) != isinstance(default, k) for k in _KINDS):
+            kinds = (*_KINDS, type(default)) if is_dataclass(default) else _KINDS
+            if default is not None and any(isinstance(value, k) != isinstance(default, k) for k in kinds):
                 raise InputError(
                     f"setting {name!r} of {model} is given {value!r}; give a value such as its default, "
                     f"{default!r}."
@@ -202,14 +202,3 @@ def chosen(model: str, given: Mapping[str, Any], *defaults: Any) -> list[Any]:
         replace(each, **{name: value for name, value in given.items() if name in own})
         for each, own in zip(defaults, names, strict=True)
     ]
-
-
-def require_positive(settings: Any, *spreads: str) -> None:
-    """Refuse settings of which a site's spread is not a positive number.
-
-    Raises:
-        InputError: names the spread.
-    """
-    for name in spreads:
-        what = f"a site's spread must be positive and {name} is {{}}"
-        number_within(what, getattr(settings, name), above=0.0)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from bcppl.arguments import number_within, whole_number
+from bcppl.distributions.parameters import COUNT, IF_GIVEN, POSITIVE, PROBABILITY, check_parameters, within
 from bcppl.sensors.likelihoods.viewpoints import Sighting
-from bcppl.sensors.scene import require_positive
 
 
 @dataclass(frozen=True)
@@ -32,20 +31,18 @@ class CameraSettings:
         temperature: the divisor of an image's log-likelihood, instead of `effective_pixels`.
     """
 
-    camera_shift: float = 0.002
-    camera_turn: float = math.radians(0.5)
-    bias: float = 0.002
-    viewpoint: float = 0.15
-    scale: float = 0.002
-    outlier: float = 0.1
-    bins: int = 3
-    effective_pixels: float | None = 100.0
-    temperature: float | None = None
+    camera_shift: float = field(default=0.002, metadata=POSITIVE)
+    camera_turn: float = field(default=math.radians(0.5), metadata=POSITIVE)
+    bias: float = field(default=0.002, metadata=POSITIVE)
+    viewpoint: float = field(default=0.15, metadata=within(above=0.0, most=1.0))
+    scale: float = field(default=0.002, metadata=POSITIVE)
+    outlier: float = field(default=0.1, metadata=PROBABILITY)
+    bins: int = field(default=3, metadata=COUNT)
+    effective_pixels: float | None = field(default=100.0, metadata=IF_GIVEN)
+    temperature: float | None = field(default=None, metadata=IF_GIVEN)
 
     def __post_init__(self) -> None:
-        require_positive(self, "camera_shift", "camera_turn", "bias", "scale")
-        number_within("each viewpoint's own share of the errors is {}", self.viewpoint, above=0.0, most=1.0)
-        whole_number("a camera's images are read with bins {}", self.bins)
+        check_parameters(self)
 
     def bias_covariance(self, count: int) -> Tensor:
         """The covariance (K, K) of the biases at K viewpoints of one instrument, m^2."""

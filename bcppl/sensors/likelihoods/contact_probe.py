@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.arguments import number_within
 from bcppl.contact.quasi_static import QuasiStaticMotion, WindowMotion
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.location import ContactSensing
@@ -22,6 +21,7 @@ from bcppl.distributions.episodes.posterior import moments
 from bcppl.distributions.episodes.prior import prior_of, with_delays
 from bcppl.distributions.episodes.rows import EPISODE, FELT, TIME, WRENCH, new_rows
 from bcppl.distributions.manifold import MeasuresGap
+from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE, PROBABILITY, check_parameters, within
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
@@ -73,22 +73,27 @@ class TouchSettings:
         bench: these errors themselves, in place of the profile's.
     """
 
-    gap_noise: float = 0.00006
-    gap_drift: float = 0.000015
-    gap_shared: float | None = None
-    lasting: float = 0.1
-    compliance: float = 0.000005
-    compliance_decades: float = 0.5
-    delay: float = 0.002
-    gap_outlier: float = 0.001
+    gap_noise: float = field(default=0.00006, metadata=POSITIVE)
+    gap_drift: float = field(default=0.000015, metadata=NONNEGATIVE)
+    gap_shared: float | None = field(default=None, metadata=within(least=0.0, optional=True))
+    lasting: float = field(default=0.1, metadata=POSITIVE)
+    compliance: float = field(default=0.000005, metadata=POSITIVE)
+    compliance_decades: float = field(default=0.5, metadata=POSITIVE)
+    delay: float = field(default=0.002, metadata=NONNEGATIVE)
+    gap_outlier: float = field(default=0.001, metadata=PROBABILITY)
     contact_detector: ContactDetector = field(default_factory=ContactDetector)
     free_space: bool = True
     profile: str = "ur5e"
     bench: tuple[LinearError, ...] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("gap_noise", "lasting", "compliance", "compliance_decades"):
-            number_within(f"a contact probe is given {name} {{}}", getattr(self, name), above=0.0)
+        check_parameters(self)
+        given = self.bench is None or isinstance(self.bench, tuple | list)
+        if not given or not all(isinstance(each, LinearError) for each in self.bench or ()):
+            raise InputError(
+                f"bench = {self.bench!r} holds what is no error of a bench; give some such as "
+                "`bcppl.distributions.episodes.Grasp()`, or a profile."
+            )
 
 
 @lru_cache(maxsize=4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from bcppl.contact.touch import Touch
+from bcppl.distributions.parameters import COUNT, NONNEGATIVE, POSITIVE, RARE, check_parameters, within
 from bcppl.distributions.touch import ForceDirection, FreePath, Path, Placed, SharedError, SharedOnset
 from bcppl.effort import Effort
 from bcppl.errors import InputError
@@ -23,6 +24,8 @@ from bcppl.sensors.measurements import Recording
 from bcppl.sensors.push import Push
 from bcppl.sensors.scene import Numbered
 from bcppl.traces.carried import once
+
+THREE = within(count=3)
 
 
 @dataclass(frozen=True)
@@ -47,23 +50,26 @@ class FingerSettings:
         use_direction, use_free_path: whether the sites `direction_*` and `free_*` are there.
     """
 
-    finger: tuple[float, float, float] = (-0.000704, -0.000821, 0.0)
-    registration: tuple[float, float, float] = (-0.000106, -0.000056, 0.001991)
-    drift: tuple[float, float] = (0.000147, 0.003448)
-    offset: float = -0.000013
-    spread: float = 0.000403
-    outlier: float = 0.01
-    friction: float = 0.413
-    direction_spread: float = 0.0341
-    direction_outlier: float = 0.01
-    tolerance: float = 0.000794
-    free_spread: float = 0.000403
-    spacing: float = 0.0005
-    threshold: float = 0.6
-    tare: int = 10
-    averaged: int = 5
+    finger: tuple[float, float, float] = field(default=(-0.000704, -0.000821, 0.0), metadata=THREE)
+    registration: tuple[float, float, float] = field(default=(-0.000106, -0.000056, 0.001991), metadata=THREE)
+    drift: tuple[float, float] = field(default=(0.000147, 0.003448), metadata=within(least=0.0, count=2))
+    offset: float = field(default=-0.000013, metadata=within())
+    spread: float = field(default=0.000403, metadata=POSITIVE)
+    outlier: float = field(default=0.01, metadata=RARE)
+    friction: float = field(default=0.413, metadata=NONNEGATIVE)
+    direction_spread: float = field(default=0.0341, metadata=POSITIVE)
+    direction_outlier: float = field(default=0.01, metadata=RARE)
+    tolerance: float = field(default=0.000794, metadata=NONNEGATIVE)
+    free_spread: float = field(default=0.000403, metadata=POSITIVE)
+    spacing: float = field(default=0.0005, metadata=POSITIVE)
+    threshold: float = field(default=0.6, metadata=POSITIVE)
+    tare: int = field(default=10, metadata=COUNT)
+    averaged: int = field(default=5, metadata=COUNT)
     use_direction: bool = True
     use_free_path: bool = False
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
 
 
 class _Touched(NamedTuple):

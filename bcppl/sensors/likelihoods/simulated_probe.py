@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -13,22 +13,23 @@ import pyro
 import pyro.distributions as dist
 from torch import Tensor
 
-from bcppl.arguments import number_within, whole_number
 from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.nuisances import Nuisances
 from bcppl.contact.physics import PegPhysics
 from bcppl.contact.probe_rollout import ProbeRollout
 from bcppl.contact.sensing.location import ContactSensing
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose, Wrench
+from bcppl.distributions.parameters import COUNT, NONNEGATIVE, POSITIVE, check_parameters, within
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.measurements import Recording
-from bcppl.sensors.scene import Numbered, by_probe, require_positive
+from bcppl.sensors.scene import Numbered, by_probe
 from bcppl.traces.carried import carried, once
 
 # The contact that inference assumes. Worlds that simulate recordings have parameters of their own.
 CONTACT = ContactParameters(time_step=0.004, friction=0.3, time_constant=0.008)
+MEDIAN_AND_SPREAD = within(above=0.0, count=2, optional=True)
 EVIDENCE = ("contacts", "contacts in time", "pose", "gaps", "wrench")
 
 
@@ -61,39 +62,31 @@ class ProbeSettings:
     """
 
     evidence: tuple[str, ...] = ("gaps", "contacts")
-    contact_scale: float = 0.003
-    torque_noise: float = 0.005
-    one_empty: float = 2.0 * 0.005**2
-    translation_scale: float = 0.0012
-    rotation_scale: float = 0.005
-    normal_scale: float = 0.00006
-    free_scale: float = 0.0003
-    force_scale: float = 1.0
-    torque_scale: float = 0.05
-    wrench_share: float = 0.3
-    pose_every: int = 25
-    wrench_every: int = 25
-    friction: tuple[float, float] | None = None
-    time_constant: tuple[float, float] | None = None
+    contact_scale: float = field(default=0.003, metadata=POSITIVE)
+    torque_noise: float = field(default=0.005, metadata=NONNEGATIVE)
+    one_empty: float = field(default=2.0 * 0.005**2, metadata=POSITIVE)
+    translation_scale: float = field(default=0.0012, metadata=POSITIVE)
+    rotation_scale: float = field(default=0.005, metadata=POSITIVE)
+    normal_scale: float = field(default=0.00006, metadata=POSITIVE)
+    free_scale: float = field(default=0.0003, metadata=POSITIVE)
+    force_scale: float = field(default=1.0, metadata=POSITIVE)
+    torque_scale: float = field(default=0.05, metadata=POSITIVE)
+    wrench_share: float = field(default=0.3, metadata=NONNEGATIVE)
+    pose_every: int = field(default=25, metadata=COUNT)
+    wrench_every: int = field(default=25, metadata=COUNT)
+    friction: tuple[float, float] | None = field(default=None, metadata=MEDIAN_AND_SPREAD)
+    time_constant: tuple[float, float] | None = field(default=None, metadata=MEDIAN_AND_SPREAD)
     contact: ContactParameters = CONTACT
 
     def __post_init__(self) -> None:
-        require_positive(self, *(name for name in type(self).__annotations__ if name.endswith("_scale")))
-        number_within("a simulated probe is given torque_noise {}", self.torque_noise, least=0.0)
-        number_within("a simulated probe is given one_empty {}", self.one_empty, least=0.0)
-        number_within("a simulated probe is given wrench_share {}", self.wrench_share, least=0.0)
-        whole_number("a simulated probe is given pose_every {}", self.pose_every)
-        whole_number("a simulated probe is given wrench_every {}", self.wrench_every)
+        check_parameters(self)
         unknown = [name for name in self.evidence if name not in EVIDENCE]
-        both = {"contacts", "contacts in time"} <= set(self.evidence)
+        both = "contacts" in self.evidence and "contacts in time" in self.evidence
         if unknown or both or not self.evidence:
             raise InputError(
                 f"a simulated probe is explained by the evidence {self.evidence}; name one or more of "
                 f"{', '.join(EVIDENCE)}, and contact locations once."
             )
-        for name in ("friction", "time_constant"):
-            for number in getattr(self, name) or ():
-                number_within(f"the median and the spread of {name} are {{}}", number, above=0.0)
 
 
 class SimulatedProbe:
