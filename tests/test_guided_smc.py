@@ -325,7 +325,7 @@ def test_windows_and_no_peg_and_pushes_are_refused_in_a_sentence() -> None:
     with pytest.raises(InputError, match="probe windows but no peg") as caught:
         look_and_touch.prepare(replace(some(8), peg=None))
     assert_one_sentence(str(caught.value))
-    with pytest.raises(InputError, match="gap_noise 0"):
+    with pytest.raises(InputError, match="gap_noise = 0"):
         look_and_touch.prepare(some(8), gap_noise=0.0)
     # Without windows no peg is needed.
     assert "window" not in look_and_touch.prepare(replace(some(VIEW), peg=None)).likelihoods
