@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.contact.track import WIDER, TrackDistribution, contaminated, log_gaussian
-from bcppl.distributions.parameters import COUNT, POSITIVE, within
+from bcppl.distributions.parameters import COUNT, IF_GIVEN, POSITIVE
 
 OUTLIER = 0.05
 
@@ -51,8 +51,8 @@ class PegPose(TrackDistribution):
     translation_scale: float = field(metadata=POSITIVE)
     rotation_scale: float = field(metadata=POSITIVE)
     every: int = field(default=10, metadata=COUNT)
-    normal_scale: float | None = field(default=None, metadata=within(above=0.0, optional=True))
-    free_scale: float | None = field(default=None, metadata=within(above=0.0, optional=True))
+    normal_scale: float | None = field(default=None, metadata=IF_GIVEN)
+    free_scale: float | None = field(default=None, metadata=IF_GIVEN)
 
     @property
     def log_prob_bound(self) -> float:

@@ -20,7 +20,7 @@ from bcppl.distributions.checks import Check
 from bcppl.distributions.depth.camera_image import CameraImage
 from bcppl.distributions.depth.observed import CACHE, Observed
 from bcppl.distributions.depth.rendering import Array, CachedHits
-from bcppl.distributions.parameters import POSITIVE, ranges, within
+from bcppl.distributions.parameters import IF_GIVEN, POSITIVE, ranges
 from bcppl.errors import InputError
 
 
@@ -65,9 +65,9 @@ class DepthDistribution(CameraImage):
 
     scale: float = field(metadata=POSITIVE)
     background: Array | Tensor | None = None
-    effective_pixels: float | None = field(default=None, metadata=within(above=0.0, optional=True))
+    effective_pixels: float | None = field(default=None, metadata=IF_GIVEN)
     _: KW_ONLY
-    temperature: float | None = field(default=None, metadata=within(above=0.0, optional=True))
+    temperature: float | None = field(default=None, metadata=IF_GIVEN)
     camera_error: Tensor | None = None
     bias: Tensor | float = 0.0
     background_is_measured: bool = False
