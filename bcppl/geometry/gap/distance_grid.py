@@ -68,9 +68,15 @@ def _measured(cells: Indices, corner: Corners, low: Array, spacing: float, signe
     """How far off interpolation is at most amid the corners, edges and faces of cells (C, 3)."""
     halves = [half for half in product((0, 1, 2), repeat=3) if 1 in half]
     index = 2 * cells[:, None] + np.array(halves)  # (C, 19, 3) on a lattice of half the spacing
-    # Neighbours share most of these points.
-    points, which = np.unique(index.reshape(-1, 3), axis=0, return_inverse=True)
-    exact = signed(torch.from_numpy(low + 0.5 * spacing * points)).distance.numpy()[which.reshape(-1)]
+    size = index.max(axis=(0, 1)) + 1
+    # Neighbours share most of these points. A table of the whole lattice finds them without sorting.
+    place = np.ravel_multi_index(index.reshape(-1, 3).T, size)
+    table = np.zeros(np.prod(size), np.int32)
+    table[place] = 1
+    first = np.flatnonzero(table)
+    table[first] = np.arange(len(first))
+    points = np.stack(np.unravel_index(first, size), axis=-1)
+    exact = signed(torch.from_numpy(low + 0.5 * spacing * points)).distance.numpy()[table[place]]
     off = np.zeros(len(cells))
     for half, here in zip(halves, exact.reshape(len(cells), -1).T, strict=True):
         between = [
