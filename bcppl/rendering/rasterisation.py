@@ -7,7 +7,7 @@ is proportional to the numbers of triangles and of fragments, so it suits all bu
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import igl
@@ -43,16 +43,13 @@ class Rasteriser(PartRenderer):
     def __init__(self, part: Part, threads: int | None = None) -> None:
         super().__init__(part)
         self.threads = thread_count() if threads is None else threads
-        # Vertices that are doubled at seams are merged: fewer to project, and a closed mesh tests as closed.
-        vertices, which = np.unique(np.asarray(part.vertices, np.float64), axis=0, return_inverse=True)
-        faces = which.reshape(-1)[part.faces]
+        vertices, faces, self._solid = _merged(part)
         self._vertices = np.ascontiguousarray(vertices.T)
         self._faces = np.ascontiguousarray(faces.T.astype(np.uint32))
         self._lowest, self._highest = vertices.min(axis=0), vertices.max(axis=0)
         self._diagonal = float(np.linalg.norm(self._highest - self._lowest))
         corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
         self._corners = np.ascontiguousarray(np.where(corners == 0, self._lowest, self._highest).T)
-        self._solid = _solid(vertices, faces, 1e-4 * self._diagonal)
 
     @cached_property
     def _ray_caster(self) -> RayCaster:
@@ -178,6 +175,15 @@ def _counts(rendered: Indices, length: int) -> Numbers:
     is_rendered = np.zeros(length + 1, dtype=np.int32)
     is_rendered[rendered + 1] = 1
     return np.cumsum(is_rendered, dtype=np.int32)
+
+
+@lru_cache(maxsize=8)
+def _merged(part: Part) -> tuple[Array, Indices, bool]:
+    """A part's vertices (V, 3) without doubles, its faces (F, 3), and whether it is `_solid`."""
+    # Vertices that are doubled at seams are merged: fewer to project, and a closed mesh tests as closed.
+    vertices, which = np.unique(np.asarray(part.vertices, np.float64), axis=0, return_inverse=True)
+    faces = which.reshape(-1)[part.faces]
+    return vertices, faces, _solid(vertices, faces, 1e-4 * float(np.linalg.norm(part.extent)))
 
 
 def _solid(vertices: Array, faces: Indices, step: float) -> bool:
