@@ -48,7 +48,7 @@ class Errors(NamedTuple):
 
 def pushes(log: str, count: int, seed: int) -> Recording:
     """Pushes drawn from a log, the part at a pose within 20 mm and 20 degrees of the guess."""
-    return command(sorted(LOGS.glob(f"{log}_10_10*")), pushes=count, seed=seed)
+    return command(sorted(LOGS.glob(f"{log}_*")), pushes=count, seed=seed)
 
 
 @cache

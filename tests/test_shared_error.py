@@ -24,9 +24,16 @@ def towards(y: float) -> Path:
     return Path(torch.stack([t(-0.06 + 0.0005 * k, y, 0.0) for k in range(41)]))
 
 
-def log_probs(pose: Tensor, touches: list[tuple[Path, Tensor]], outlier: float = 0.0) -> list[Tensor]:
+def log_probs(
+    pose: Tensor,
+    touches: list[tuple[Path, Tensor]],
+    outlier: float = 0.0,
+    varying: float = 0.0,
+    wider: float = 1.0,
+) -> list[Tensor]:
     """Of every touch given those before it, as a program asks for them: after it has run."""
-    shared = SharedError(Placed(BOX, pose), t(0.0, 0.0, 0.0), SHIFT, TURN, OFFSET, SPREAD)
+    scatter = wider * SHIFT, wider * TURN, OFFSET, wider * SPREAD, varying
+    shared = SharedError(Placed(BOX, pose), t(0.0, 0.0, 0.0), *scatter)
     sites = []
     for path, place in touches:
         shared.placed.expect(path.points)
@@ -67,11 +74,12 @@ def test_the_order_of_touches_does_not_matter() -> None:
     assert torch.allclose(sum(more), sum(there), atol=1e-9)
 
 
-def test_each_touch_integrates_to_one_given_the_others() -> None:
+@pytest.mark.parametrize("varying", [0.0, 0.4])
+def test_each_touch_integrates_to_one_given_the_others(varying: float) -> None:
     path, steps = towards(0.03), 800
     places = path.at((torch.arange(steps, dtype=torch.float64) + 0.5) / steps * path.length)
     every = torch.cat([places, NEVER[None], path.points[:1]])
-    mass = log_probs(at(*[0.0002] * len(every)), [*TOUCHES[:2], (path, every)], 0.05)[-1].exp()
+    mass = log_probs(at(*[0.0002] * len(every)), [*TOUCHES[:2], (path, every)], 0.05, varying)[-1].exp()
     assert float(mass[:steps].mean() * path.length + mass[steps:].sum()) == pytest.approx(1.0, abs=5e-3)
 
 
@@ -89,3 +97,29 @@ def test_samples_err_together() -> None:
     assert inside.mean(dim=1).tolist() == pytest.approx([OFFSET] * 2, abs=1.5e-5)
     assert covariance[0, 1].item() == pytest.approx(SHIFT**2, rel=0.05)
     assert covariance[1, 1].item() == pytest.approx(SHIFT**2 + SPREAD**2, rel=0.05)
+
+
+def test_a_session_that_scatters_more_is_a_mixture_of_sessions() -> None:
+    """The joint density is the average of three, each with all its errors wider by a factor."""
+    pose, varying, stray = at(0.0, 0.0003, -0.0004), 0.4, 0.02
+    found = sum(log_probs(pose, TOUCHES, stray, varying))
+    each = []
+    for node, share in ((-1.0, 1 / 6), (0.0, 2 / 3), (1.0, 1 / 6)):
+        factor = math.exp(varying * math.sqrt(3.0) * node)
+        each.append(math.log(share) + sum(log_probs(pose, TOUCHES, stray, wider=factor)))
+    assert torch.allclose(found, torch.stack(each).logsumexp(dim=0), atol=1e-9)
+    there, back = (sum(log_probs(pose, touches, 0.0, varying)) for touches in (TOUCHES, TOUCHES[::-1]))
+    assert torch.allclose(there, back, atol=1e-9)
+
+
+def test_two_touches_that_scatter_widen_the_third() -> None:
+    torch.manual_seed(0)
+    pose, spreads = at(0.0).expand(20000, 7), []
+    for x in (-0.0498, -0.0490):
+        shared = SharedError(Placed(BOX, pose), t(0.0, 0.0, 0.0), 0.0, 0.0, OFFSET, SPREAD, 0.4)
+        for y, off in ((-0.08, x), (0.05, -0.0996 - x)):
+            shared.add(towards(y))
+            shared.condition_on(t(off, y, 0.0))
+        shared.add(towards(0.0))
+        spreads.append(float(SharedOnset(shared, 0.0).sample()[:, 0].std()))
+    assert spreads[0] < 0.95 * SPREAD and spreads[1] > 1.5 * SPREAD, spreads

@@ -79,13 +79,12 @@ class OnsetLocation(LazyDistribution):
     def __post_init__(self) -> None:
         super().__init__(len(self.pose), (3,))
 
-    def threshold(self) -> tuple[Scale, Scale]:
-        """Offset and spread of the threshold, metres."""
-        return self.offset, self.spread
-
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density (N,) of one location (3,), or of one for each particle (N, 3)."""
-        offset, width = self.threshold()
+        return self.log_density(value, self.offset, self.spread)
+
+    def log_density(self, value: Tensor, offset: Scale, width: Scale) -> Tensor:
+        """The same with an offset and a spread of the threshold, of which there may be several (S, N)."""
         # A location that all particles share keeps its shape, and is evaluated once.
         travelled = _travelled(self.path, value)
         touched = torch.isfinite(travelled)
@@ -111,7 +110,10 @@ class OnsetLocation(LazyDistribution):
 
         Of a threshold farther from its mean; 0 for an onset that only an outlier explains.
         """
-        offset, width = self.threshold()
+        return self.tail_of(value, self.offset, self.spread)
+
+    def tail_of(self, value: Tensor, offset: Scale, width: Scale) -> Tensor:
+        """The same with an offset and a spread of the threshold, of which there may be several (S, N)."""
         travelled = _travelled(self.path, value)
         touched = torch.isfinite(travelled)
         place = value if bool(touched.all()) else torch.where(touched[..., None], value, self.path.points[0])
@@ -130,8 +132,10 @@ class OnsetLocation(LazyDistribution):
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Locations of first contact (N, 3), interpolated between the path's points; NaN for never."""
+        return self._sample(self.offset, self.spread)
+
+    def _sample(self, offset: Scale, spread: Scale) -> Tensor:
         particles, path = len(self.pose), self.path
-        offset, spread = self.threshold()
         threshold = -offset + spread * torch.randn(particles, dtype=torch.float64)
         distances = distance_along(self.distance, self.pose, path.points)
         below = distances <= threshold[:, None]

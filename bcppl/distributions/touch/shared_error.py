@@ -5,10 +5,15 @@ one session, and by another in the next. Ten touches do not average it away. To 
 the signed distance at touch k, with b a shift in the plane and a turn about the vertical, normal about zero.
 Then the thresholds of all touches are jointly normal, and each is conditioned on those before it (the
 Cholesky factor of their covariance contains the conditionals): no latent value is added.
+
+One session scatters more than another, too. All errors of a session are wider or narrower by a common factor,
+log-normal about one. It is integrated out by a sum over three nodes (Gauss and Hermite): a touch has the
+average of its densities at them, weighted by the session's touches before it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -24,6 +29,8 @@ from bcppl.distributions.touch.placed import Placed, distance_at
 
 # The residual of an earlier touch is clipped at so many standard deviations.
 CLIPPED = 4.0
+_NODES = ((-math.sqrt(3.0), 1.0 / 6.0), (0.0, 2.0 / 3.0), (math.sqrt(3.0), 1.0 / 6.0))
+_LEAST = -1e4  # nats of a touch: one that is impossible at every scale tells nothing of the scale
 
 
 class SharedError:
@@ -36,18 +43,31 @@ class SharedError:
         center: (3,) in the part's frame: the centre of the turn, metres.
         shift, turn: standard deviations of the shared error: metres along each axis of the plane, radians.
         offset, spread: of each touch independently, as for `OnsetLocation`, metres.
+        varying: standard deviation of the natural logarithm of the factor by which a session's errors, the
+            shared one's and each touch's, are wider than stated.
     """
 
-    __caches__ = ("_known",)
+    __caches__ = ("_known", "_weighed")
 
     def __init__(
-        self, placed: Placed, center: Tensor, shift: float, turn: float, offset: float, spread: float
+        self,
+        placed: Placed,
+        center: Tensor,
+        shift: float,
+        turn: float,
+        offset: float,
+        spread: float,
+        varying: float = 0.0,
     ) -> None:
         self.placed, self.center, self.offset, self.spread = placed, center, offset, spread
         self.scale = torch.tensor([shift, shift, turn], dtype=torch.float64)
+        nodes = _NODES if varying > 0.0 else ((0.0, 1.0),)
+        self.factors = torch.tensor([math.exp(varying * x) for x, _ in nodes], dtype=torch.float64)
+        self.shares = torch.tensor([share for _, share in nodes], dtype=torch.float64)
         self.paths: list[Path] = []
         self.places: list[Tensor] = []
         self._known: tuple[int, Tensor, Tensor] | None = None
+        self._weighed: list[Tensor] = []
 
     def add(self, path: Path) -> None:
         """Add a touch along a path."""
@@ -58,11 +78,25 @@ class SharedError:
         self.places.append(place)
 
     def threshold(self, which: int) -> tuple[Tensor, Tensor]:
-        """Offset and spread (N,) of a touch, given the places of those before it."""
+        """Offset (N,) and spreads (S, N), by the session's factor, of a touch given the places before it."""
         if self._known is None or which >= self._known[0]:
             self._known = len(self.paths), *self._conditionals()
         _, mean, spread = self._known
-        return self.offset - mean[:, which], spread[:, which]
+        return self.offset - mean[:, which], self.factors[:, None] * spread[:, which]
+
+    def log_weights(self, which: int, outlier: float) -> Tensor:
+        """Log-probabilities (S, N) of the session's factor given the places of the touches before one."""
+        if not self._weighed:
+            self._weighed.append(self.shares.log()[:, None].expand(-1, len(self.placed.pose)))
+        for k in range(len(self._weighed) - 1, which):
+            each = self.onset(k, outlier).log_density(self.places[k], *self.threshold(k))
+            self._weighed.append((self._weighed[k] + each.clamp(min=_LEAST)).log_softmax(dim=0))
+        return self._weighed[which]
+
+    def onset(self, which: int, outlier: float) -> OnsetLocation:
+        """The onset of a touch by itself."""
+        path = self.paths[which]
+        return OnsetLocation(self.placed, self.placed.pose, path, self.offset, self.spread, outlier)
 
     def _conditionals(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation (N, K) of the error of the signed distance at each touch."""
@@ -129,21 +163,30 @@ class SharedOnset(OnsetLocation):
     def __init__(self, shared: SharedError, outlier: float) -> None:
         self.shared, self.which = shared, len(shared.paths) - 1
         # Later touches of the session do not change it.
-        self.given = shared.center, shared.scale, tuple(shared.paths), tuple(shared.places)
+        self.given = shared.center, shared.scale, shared.factors, tuple(shared.paths), tuple(shared.places)
         placed, path = shared.placed, shared.paths[-1]
         super().__init__(placed, placed.pose, path, shared.offset, shared.spread, outlier)
 
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (N,) of one location (3,), or of one for each particle (N, 3)."""
+        each = self.log_density(value, *self.shared.threshold(self.which))
+        return (self.shared.log_weights(self.which, self.outlier) + each).logsumexp(dim=0)
+
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """Locations of first contact (N, 3), interpolated between the path's points; NaN for never."""
+        offset, spread = self.shared.threshold(self.which)
+        weights = self.shared.log_weights(self.which, self.outlier).exp()
+        own = torch.multinomial(weights.T, 1) if len(weights) > 1 else torch.zeros(len(offset), 1).long()
+        return self._sample(offset, spread.T.gather(1, own)[:, 0])
+
     def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check:
         """The check of an onset beside the session's others: how many are as far off."""
-        others = [
-            OnsetLocation(
-                self.distance, self.pose, self.shared.paths[k], *self.shared.threshold(k), self.outlier
-            ).tail(place)
-            for k, place in enumerate(self.shared.places)
-            if k != self.which
-        ]
-        return touch_check(self.tail(value), self.outlier, torch.stack(others, 1) if others else None)
+        shared, places = self.shared, self.shared.places
+        weights = shared.log_weights(len(places), self.outlier).exp()
 
-    def threshold(self) -> tuple[Tensor, Tensor]:
-        """Offset and spread (N,) of this touch, given the places of those before it, metres."""
-        return self.shared.threshold(self.which)
+        def tail(which: int, place: Tensor) -> Tensor:
+            onset = shared.onset(which, self.outlier)
+            return (weights * onset.tail_of(place, *shared.threshold(which))).sum(dim=0)
+
+        others = [tail(k, place) for k, place in enumerate(places) if k != self.which]
+        return touch_check(tail(self.which, value), self.outlier, torch.stack(others, 1) if others else None)

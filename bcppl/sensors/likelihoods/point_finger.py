@@ -39,6 +39,8 @@ class FingerSettings:
         drift: how far the registration of another session lies from that: standard deviations, metres along
             either axis and radians. All pushes of one recording share it; (0, 0) for none.
         offset, spread: how far inside the part that place lies at onset, mean and standard deviation, metres.
+        varying: standard deviation of the natural logarithm of the factor by which another session scatters
+            more, and its registration lies farther off.
         outlier: probability of an onset that has nothing to do with the part.
         friction: coefficient between finger and part.
         direction_spread, direction_outlier: scale, radians; probability of a direction unrelated to the part.
@@ -55,6 +57,7 @@ class FingerSettings:
     drift: tuple[float, float] = field(default=(0.000147, 0.003448), metadata=within(least=0.0, count=2))
     offset: float = field(default=-0.000013, metadata=within())
     spread: float = field(default=0.000403, metadata=POSITIVE)
+    varying: float = field(default=0.35, metadata=NONNEGATIVE)
     outlier: float = field(default=0.01, metadata=RARE)
     friction: float = field(default=0.413, metadata=NONNEGATIVE)
     direction_spread: float = field(default=0.0341, metadata=POSITIVE)
@@ -133,8 +136,8 @@ class PointFinger:
     def _touched(self, world_from_part: Tensor) -> _Touched:
         settings, pose = self.settings, compose(world_from_part, self.part_from_touched)
         distance = Placed(self.distance, pose)
-        shared = SharedError(distance, self.middle, *settings.drift, settings.offset, settings.spread)
-        return _Touched(pose, distance, shared)
+        scatter = settings.offset, settings.spread, settings.varying
+        return _Touched(pose, distance, SharedError(distance, self.middle, *settings.drift, *scatter))
 
     def observe(self, number: int, action: Push, world_from_part: Tensor) -> None:
         """Sample `onset_*`, and as the settings ask `direction_*` and `free_*`."""
