@@ -275,7 +275,6 @@ def rank(bench: Bench, seed: int, profile: BenchProfile = STILL, solids: bool = 
     standard = torch.randn(*mean.shape, 1, dtype=torch.float64)
     own = mean + ((axes * values.clamp(min=0.0).sqrt()[:, None]) @ standard)[..., 0]
     hypotheses = [site._every[k] for k in branches.which[range(DRAWS), pick]]
-    hypotheses = [h._replace(noise=h.noise / bench.noise) for h in hypotheses]
     whole = LinearErrors(errors_of())
     errors = whole.means + whole.variances.sqrt() * torch.randn(DRAWS, len(whole.means), dtype=torch.float64)
     for name, place in LinearErrors(bench.errors).slices.items():

@@ -103,10 +103,7 @@ def test_what_is_approximated_costs_little(world: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", sorted(set(BENCHES) - {"sound"}))
-def test_mutants_do_not(name: str, request: pytest.FixtureRequest) -> None:
-    if name == "noise doubled":
-        reason = "30 rounds do not show it: one of the noise's own hypotheses is 2.5 times as wide"
-        request.applymarker(pytest.mark.xfail(reason=reason, strict=True))
+def test_mutants_do_not(name: str) -> None:
     corrected, _, lines = table(name, 30)
     print(f"\n{lines}")
     assert corrected < BROKEN, lines
