@@ -18,13 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from report import Row, cores, finish, options, show
-from touches import LOGS, OTHER, errors, explained, groups, learnt
+from touches import LOGS, SESSIONS, errors, explained, groups, learnt
 
 from bcppl.sensors.likelihoods.point_finger import FingerSettings
 from bcppl.sweeps import swept
 
 LEARNT = "as learnt"
-SESSIONS = {**OTHER, "wood_30_63": "10_130"}  # another table; where the finger is learnt for each
 # The settings of the model in place of those that are learnt.
 VARIANTS: Mapping[str, Callable[[FingerSettings], FingerSettings]] = {
     LEARNT: lambda finger: finger,

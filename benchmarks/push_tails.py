@@ -17,15 +17,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from report import Row, cores, finish, options, show
-from touches import LOGS, OTHER, errors, held, learnt
+from touches import LOGS, SESSIONS, errors, held, learnt, pushes
 
 from bcppl.cli.predictive_checks import PredictiveChecks
 from bcppl.inference import infer
 from bcppl.models.point_probe import model
-from bcppl.recordings.importers.point_probe import command
 from bcppl.sweeps import swept
 
-PATTERNS = {"10_90": "10_90_10_10*", "10_130": "10_130_10_10*", "wood": "wood_30_63*"}
 PUSHES = 20  # drawn, of which the first are assimilated
 COUNTS = (3, 5, 10)
 WRONG = 5.0  # mm: farther than this from the truth is another mode, not noise
@@ -59,11 +57,9 @@ class Run(NamedTuple):
 def run(asked: tuple[str, int, int]) -> list[Run]:
     """One run of a draw of a log with an inference seed, after each of the counts."""
     log, draw, seed = asked
-    recording = command(sorted(LOGS.glob(PATTERNS[log])), pushes=PUSHES, seed=draw)
+    recording = pushes(log, PUSHES, draw)
     recording = replace(recording, measurements=recording.measurements[: max(COUNTS)])
-    # The default finger is learnt on log 10_130.
-    settings = asdict(learnt(OTHER[log])) if log in OTHER else {}
-    scene = model.prepare(recording, **settings)
+    scene = model.prepare(recording, **asdict(learnt(SESSIONS[log])))
     checks, results, spent = PredictiveChecks(), [], 0.0
     begun = time.process_time()
     for done, step in enumerate(infer(model, recording, seed=seed, scene=scene)):
@@ -101,7 +97,7 @@ def main() -> None:
     parser = options(__doc__ or "")
     parser.add_argument("--draws", type=int, default=40, help="of every log")
     parser.add_argument("--seeds", type=int, default=4, help="of inference, on every draw")
-    parser.add_argument("--logs", nargs="+", choices=list(PATTERNS), default=list(PATTERNS))
+    parser.add_argument("--logs", nargs="+", choices=list(SESSIONS), default=list(SESSIONS))
     parser.add_argument("--file", type=Path, help="where runs are kept")
     parser.add_argument("--jobs", type=int, default=cores(), help="processes, of one thread each if several")
     arguments = parser.parse_args()

@@ -33,6 +33,7 @@ from bcppl.sensors.likelihoods.point_finger import FingerSettings, contact_of, r
 
 LOGS = DATA / "point_probe_pushes"
 OTHER = {"10_90": "10_130", "10_130": "10_90"}  # where the finger is learnt for the pushes of a log
+SESSIONS = {**OTHER, "wood_30_63": "10_130"}  # and for those on another table
 PARTICLES = 75
 PUSHES = 50  # of each log
 SOFT = 1e-3  # m: where the loss of least squares turns from squares to distances

@@ -32,13 +32,13 @@ def log_probs(
     wider: float = 1.0,
 ) -> list[Tensor]:
     """Of every touch given those before it, as a program asks for them: after it has run."""
-    scatter = wider * SHIFT, wider * TURN, OFFSET, wider * SPREAD, varying
+    scatter = wider * SHIFT, wider * TURN, OFFSET, wider * SPREAD, outlier, varying
     shared = SharedError(Placed(BOX, pose), t(0.0, 0.0, 0.0), *scatter)
     sites = []
     for path, place in touches:
         shared.placed.expect(path.points)
         shared.add(path)
-        sites.append(SharedOnset(shared, outlier))
+        sites.append(SharedOnset(shared))
         shared.condition_on(place)
     return [site.log_prob(place) for site, (_, place) in zip(sites, touches, strict=True)]
 
@@ -90,7 +90,7 @@ def test_samples_err_together() -> None:
     drawn = []
     for y in (-0.08, 0.05):
         shared.add(towards(y))
-        drawn.append(SharedOnset(shared, 0.0).sample())
+        drawn.append(SharedOnset(shared).sample())
         shared.condition_on(drawn[-1])
     inside = torch.stack(drawn)[..., 0] + 0.05
     covariance = torch.cov(inside)
@@ -112,14 +112,20 @@ def test_a_session_that_scatters_more_is_a_mixture_of_sessions() -> None:
     assert torch.allclose(there, back, atol=1e-9)
 
 
+def test_a_touch_that_is_impossible_tells_nothing_of_the_scatter() -> None:
+    astray = (towards(0.03), t(-0.05, 0.05, 0.0))  # 20 mm off its path
+    after, alone = (log_probs(at(0.0), each, 0.0, 0.4)[-1] for each in ([astray, TOUCHES[0]], TOUCHES[:1]))
+    assert torch.isfinite(after).all() and torch.allclose(after, alone, atol=0.5)
+
+
 def test_two_touches_that_scatter_widen_the_third() -> None:
     torch.manual_seed(0)
     pose, spreads = at(0.0).expand(20000, 7), []
     for x in (-0.0498, -0.0490):
-        shared = SharedError(Placed(BOX, pose), t(0.0, 0.0, 0.0), 0.0, 0.0, OFFSET, SPREAD, 0.4)
+        shared = SharedError(Placed(BOX, pose), t(0.0, 0.0, 0.0), 0.0, 0.0, OFFSET, SPREAD, varying=0.4)
         for y, off in ((-0.08, x), (0.05, -0.0996 - x)):
             shared.add(towards(y))
             shared.condition_on(t(off, y, 0.0))
         shared.add(towards(0.0))
-        spreads.append(float(SharedOnset(shared, 0.0).sample()[:, 0].std()))
+        spreads.append(float(SharedOnset(shared).sample()[:, 0].std()))
     assert spreads[0] < 0.95 * SPREAD and spreads[1] > 1.5 * SPREAD, spreads

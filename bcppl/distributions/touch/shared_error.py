@@ -42,7 +42,7 @@ class SharedError:
         placed: the part at its poses; its z axis is taken for the vertical.
         center: (3,) in the part's frame: the centre of the turn, metres.
         shift, turn: standard deviations of the shared error: metres along each axis of the plane, radians.
-        offset, spread: of each touch independently, as for `OnsetLocation`, metres.
+        offset, spread, outlier: of each touch independently, as for `OnsetLocation`; metres.
         varying: standard deviation of the natural logarithm of the factor by which a session's errors, the
             shared one's and each touch's, are wider than stated.
     """
@@ -57,9 +57,11 @@ class SharedError:
         turn: float,
         offset: float,
         spread: float,
+        outlier: float = 0.0,
         varying: float = 0.0,
     ) -> None:
-        self.placed, self.center, self.offset, self.spread = placed, center, offset, spread
+        self.placed, self.center = placed, center
+        self.offset, self.spread, self.outlier = offset, spread, outlier
         self.scale = torch.tensor([shift, shift, turn], dtype=torch.float64)
         nodes = _NODES if varying > 0.0 else ((0.0, 1.0),)
         self.factors = torch.tensor([math.exp(varying * x) for x, _ in nodes], dtype=torch.float64)
@@ -84,19 +86,24 @@ class SharedError:
         _, mean, spread = self._known
         return self.offset - mean[:, which], self.factors[:, None] * spread[:, which]
 
-    def log_weights(self, which: int, outlier: float) -> Tensor:
+    def log_weights(self, which: int) -> Tensor:
         """Log-probabilities (S, N) of the session's factor given the places of the touches before one."""
         if not self._weighed:
             self._weighed.append(self.shares.log()[:, None].expand(-1, len(self.placed.pose)))
         for k in range(len(self._weighed) - 1, which):
-            each = self.onset(k, outlier).log_density(self.places[k], *self.threshold(k))
+            each = self.onset(k).log_density(self.places[k], *self.threshold(k))
             self._weighed.append((self._weighed[k] + each.clamp(min=_LEAST)).log_softmax(dim=0))
         return self._weighed[which]
 
-    def onset(self, which: int, outlier: float) -> OnsetLocation:
+    def tail(self, which: int, place: Tensor) -> Tensor:
+        """`OnsetLocation.tail` (N,) of a touch at a place, the session's factor given all places so far."""
+        weights = self.log_weights(len(self.places)).exp()
+        return (weights * self.onset(which).tail_of(place, *self.threshold(which))).sum(dim=0)
+
+    def onset(self, which: int) -> OnsetLocation:
         """The onset of a touch by itself."""
         path = self.paths[which]
-        return OnsetLocation(self.placed, self.placed.pose, path, self.offset, self.spread, outlier)
+        return OnsetLocation(self.placed, self.placed.pose, path, self.offset, self.spread, self.outlier)
 
     def _conditionals(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation (N, K) of the error of the signed distance at each touch."""
@@ -155,38 +162,34 @@ class SharedOnset(OnsetLocation):
 
     Args:
         shared: the error; this touch is the last that was added to it.
-        outlier: probability of an onset that is independent of the part.
     """
 
     __caches__ = ("shared",)
 
-    def __init__(self, shared: SharedError, outlier: float) -> None:
+    def __init__(self, shared: SharedError) -> None:
         self.shared, self.which = shared, len(shared.paths) - 1
         # Later touches of the session do not change it.
         self.given = shared.center, shared.scale, shared.factors, tuple(shared.paths), tuple(shared.places)
         placed, path = shared.placed, shared.paths[-1]
-        super().__init__(placed, placed.pose, path, shared.offset, shared.spread, outlier)
+        super().__init__(placed, placed.pose, path, shared.offset, shared.spread, shared.outlier)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density (N,) of one location (3,), or of one for each particle (N, 3)."""
         each = self.log_density(value, *self.shared.threshold(self.which))
-        return (self.shared.log_weights(self.which, self.outlier) + each).logsumexp(dim=0)
+        return (self.shared.log_weights(self.which) + each).logsumexp(dim=0)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
         """Locations of first contact (N, 3), interpolated between the path's points; NaN for never."""
         offset, spread = self.shared.threshold(self.which)
-        weights = self.shared.log_weights(self.which, self.outlier).exp()
-        own = torch.multinomial(weights.T, 1) if len(weights) > 1 else torch.zeros(len(offset), 1).long()
+        own = torch.multinomial(self.shared.log_weights(self.which).exp().T, 1)
         return self._sample(offset, spread.T.gather(1, own)[:, 0])
+
+    def tail(self, value: Tensor) -> Tensor:
+        """As of `OnsetLocation`, given the session's other touches."""
+        return self.shared.tail(self.which, value)
 
     def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check:
         """The check of an onset beside the session's others: how many are as far off."""
-        shared, places = self.shared, self.shared.places
-        weights = shared.log_weights(len(places), self.outlier).exp()
-
-        def tail(which: int, place: Tensor) -> Tensor:
-            onset = shared.onset(which, self.outlier)
-            return (weights * onset.tail_of(place, *shared.threshold(which))).sum(dim=0)
-
-        others = [tail(k, place) for k, place in enumerate(places) if k != self.which]
-        return touch_check(tail(self.which, value), self.outlier, torch.stack(others, 1) if others else None)
+        places = self.shared.places
+        others = [self.shared.tail(k, place) for k, place in enumerate(places) if k != self.which]
+        return touch_check(self.tail(value), self.outlier, torch.stack(others, 1) if others else None)

@@ -136,7 +136,7 @@ class PointFinger:
     def _touched(self, world_from_part: Tensor) -> _Touched:
         settings, pose = self.settings, compose(world_from_part, self.part_from_touched)
         distance = Placed(self.distance, pose)
-        scatter = settings.offset, settings.spread, settings.varying
+        scatter = settings.offset, settings.spread, settings.outlier, settings.varying
         return _Touched(pose, distance, SharedError(distance, self.middle, *settings.drift, *scatter))
 
     def observe(self, number: int, action: Push, world_from_part: Tensor) -> None:
@@ -146,7 +146,7 @@ class PointFinger:
         distance, shared = touched.distance, touched.shared
         distance.expect(path.points)
         shared.add(path)
-        onset = pyro.sample(f"onset_{number}", SharedOnset(shared, settings.outlier))
+        onset = pyro.sample(f"onset_{number}", SharedOnset(shared))
         shared.condition_on(onset)
         if onset.ndim == 1 and not bool(onset.isnan().any()):
             distance.expect(onset[None])
