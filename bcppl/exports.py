@@ -38,6 +38,10 @@ class _WhenUsed(ModuleType):
             vars(self)  # executes it, which would otherwise undo what is set here
         object.__setattr__(self, name, value)
 
+    def __reduce__(self) -> tuple[Callable[[str], ModuleType], tuple[str]]:
+        """As cloudpickle sends a module to another process, which knows this class as no module."""
+        return import_module, (self.__name__,)
+
 
 def _when_used(name: str) -> ModuleType:
     spec = find_spec(name)

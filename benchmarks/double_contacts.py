@@ -8,23 +8,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
 
 import numpy as np
 import torch
+from scenes import PARTICLES, default_run
 from torch import Tensor
 
 from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.geometry.holes import fit_in, hole_of
+from bcppl.inference.planning.metrology import three_two_one
 from bcppl.inference.planning.waypoints import DAMPING, STIFFNESS
-from bcppl.models.worlds.bench.scene import BenchScene
+from bcppl.models.worlds.bench.parameters import BenchParameters
+from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.robot.plan import Manner, Plan
+from bcppl.sensors.measurements import Recording
 
 ABOVE = 0.05  # m above the mouth where a probe begins
 LEAN = math.radians(6.0)  # of a peg that wedges
 INSIDE, PRESS = 0.01, 0.003  # m: how deep a peg is half in, and how far its command goes beyond a surface
 FORCE = 6.0  # N that stop a guarded motion
 _STREAM = 31  # of random numbers
+USUAL = "3-2-1"  # the probe planned by the default model's vision
 
 
 def along(scene: BenchScene, positions: Sequence[Sequence[float]], leans: Sequence[Sequence[float]]) -> Array:
@@ -73,3 +79,13 @@ def half_in(scene: BenchScene) -> Plan:
 
 
 PLANS: dict[str, Callable[[BenchScene], Plan]] = {"wedged": wedged, "half in": half_in}
+
+
+@cache
+def recorded_scene(seed: int, noise: float, probe: str) -> tuple[BenchScene, Recording]:
+    """A scene and its recording by one of `PLANS`, or by the usual probe."""
+    scene = bench_scene(seed, BenchParameters(peg_noise=noise))
+    if probe in PLANS:
+        return scene, scene.probe(PLANS[probe](scene))
+    *_, seen = default_run(scene.look(), PARTICLES, seed)
+    return scene, scene.probe(three_two_one(seen.belief, scene.part, scene.peg))

@@ -15,22 +15,18 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import curves
-from double_contacts import PLANS
+from double_contacts import PLANS, USUAL, recorded_scene
 from report import Row, finish, options, show
-from scenes import MASSES, PARTICLES, REGIONS, Curve, Probed, default_run, quantile, regions_of
+from scenes import MASSES, PARTICLES, REGIONS, Curve, Probed, quantile, regions_of
 
 from bcppl.inference import bayes_contact, guided_smc, tempered_smc
-from bcppl.inference.planning.metrology import three_two_one
 from bcppl.models import look_and_touch, peg_in_hole
-from bcppl.models.worlds.bench.parameters import BenchParameters
-from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.sensors.likelihoods.simulated_probe import CONTACT, ProbeSettings
-from bcppl.sensors.measurements import Recording
 from bcppl.sweeps import one_line, swept
 from bcppl.traces import Model
 
@@ -39,7 +35,7 @@ GOALS = (0.8, 0.4)  # mm, of the median at the end
 NINTH, HELD, SECONDS = 2.0, 80.0, 15.0  # mm of 90 % of the scenes; % of 90 % regions; s of a scene
 NOISE = 0.00005  # m, of the peg's measured position
 FRICTION = (0.25, 0.6)
-DEFAULT, GEOMETRY, WITHOUT_POSE, USUAL = "default", "geometry alone", "no pose", "3-2-1"
+DEFAULT, GEOMETRY, WITHOUT_POSE = "default", "geometry alone", "no pose"
 WRENCH = "and the wrench"
 
 Settings = dict[str, Any]
@@ -124,16 +120,6 @@ def model_of(way: str, noise: float) -> Model:
         }
         settings = {"pose_every": every, **wider, **settings}
     return peg_in_hole.model.with_settings(**settings)
-
-
-@cache
-def recorded_scene(seed: int, noise: float, probe: str) -> tuple[BenchScene, Recording]:
-    """A scene and its recording; the usual probe is planned by the default model's vision."""
-    scene = bench_scene(seed, BenchParameters(peg_noise=noise))
-    if probe in PLANS:
-        return scene, scene.probe(PLANS[probe](scene))
-    *_, seen = default_run(scene.look(), PARTICLES, seed)
-    return scene, scene.probe(three_two_one(seen.belief, scene.part, scene.peg))
 
 
 def outcome(task: Task) -> Outcome:

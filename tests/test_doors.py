@@ -50,6 +50,14 @@ def test_checking_a_recording_imports_what_renders_and_measures_gaps_and_no_phys
     assert modules.isdisjoint({"mujoco", "matplotlib", "bcppl.inference"})
 
 
+def test_a_package_can_be_sent_to_another_process_before_it_was_used() -> None:
+    """As a function of a script is, which names what the script imported."""
+    code = "import cloudpickle, pickle\nfrom bcppl.inference.filters import guided_smc\n"
+    code += "from bcppl.models import worlds\nassert type(worlds).__name__ == '_WhenUsed'\n"
+    code += "for each in (guided_smc, worlds): assert pickle.loads(cloudpickle.dumps(each)) is each"
+    assert "bcppl.models.worlds" in imported(code)
+
+
 def test_no_export_imports_the_compiler_of_torch() -> None:
     code = "import bcppl\nfor name in bcppl.__all__: getattr(bcppl, name)\n"
     code += "for name in bcppl.inference.__all__: getattr(bcppl.inference, name)"
