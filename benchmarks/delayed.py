@@ -1,4 +1,6 @@
-"""What delayed acceptance saves: simulated seconds per effective sample at a simulated probe's posterior.
+"""What deciding in stages saves: simulated seconds per effective sample at a simulated probe's posterior.
+
+By delayed acceptance and by surrogate transitions.
 
 A probe is taken in as usual. From its last population, moves of every particle go on at the posterior, each
 half learning from the other before every sweep. Of the chains' tangent coordinates the one that mixes worst
@@ -29,6 +31,7 @@ from bcppl.inference.kernels import (
     moved_by,
     repeat,
     student_t,
+    surrogate_transition,
 )
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import differential_evolution, drift, independent
@@ -80,6 +83,8 @@ WITH: dict[str, Kernel] = {
     "delayed: 2 independent, surrogate": repeat(
         delayed_acceptance(INDEPENDENT, surrogate=student_t(POSE)), 2
     ),
+    "transition: 10 long walks, surrogate": surrogate_transition(repeat(LONG_WALK, 10), student_t(POSE)),
+    "transition: 10 long walks, geometry": surrogate_transition(repeat(LONG_WALK, 10), approximated),
 }
 KERNELS = {**WITHOUT, **WITH}
 
@@ -214,7 +219,7 @@ def main() -> None:
         figure(results).savefig(arguments.figure, dpi=150)
 
     def gain(without: str) -> float:
-        """The median over probes of how many times less the best kernel with delayed acceptance costs."""
+        """The median over probes of how many times less the best kernel with stages costs."""
         best = min(WITH, key=lambda name: median(name, "cost"))
         return float(np.median([result[without].cost / result[best].cost for result in results]))
 

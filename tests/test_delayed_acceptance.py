@@ -22,8 +22,9 @@ from bcppl.inference.kernels import (
     moved_by,
     repeat,
     student_t,
+    surrogate_transition,
 )
-from bcppl.inference.kernels.staged import Screened, Staged
+from bcppl.inference.kernels.staged import Screened, Staged, SurrogateTarget
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.targets import POSTERIOR, Target
@@ -111,6 +112,8 @@ SOUND_KERNELS: dict[str, Kernel] = {
     "more stages than sites": delayed_acceptance(WALK, ["touch_0"], stages=9),
     "surrogate": delayed_acceptance(LEANING, surrogate=student_t("x")),
     "bad surrogate": delayed_acceptance(LEANING, surrogate=lambda _: lambda trace: -2.0 * trace["x"]),
+    "transition": surrogate_transition(cycle(LEANING, WALK), student_t("x")),
+    "bad transition": surrogate_transition(repeat(LEANING, 2), lambda _: lambda trace: -2.0 * trace["x"]),
     "repeat": repeat(delayed_acceptance(WALK, surrogate=student_t("x")), 3),
     "around others": delayed_acceptance(cycle(LEANING, mixture([WALK, LEANING]))),
     "within others": mixture([cycle(delayed_acceptance(LEANING), WALK), delayed_acceptance(WALK, stages=3)]),
@@ -122,7 +125,7 @@ def test_the_target_is_exact(name: str) -> None:
     assert worst_z(SOUND_KERNELS[name]) < SOUND
 
 
-@pytest.mark.parametrize("name", ["two stages", "surrogate", "within others"])
+@pytest.mark.parametrize("name", ["two stages", "surrogate", "transition", "within others"])
 def test_tempered_targets_are_exact(name: str) -> None:
     assert worst_z(SOUND_KERNELS[name], HALF, exponent=0.5) < SOUND
     assert worst_z(SOUND_KERNELS[name], POSTERIOR, exponent=0.5) > BROKEN
@@ -187,6 +190,23 @@ def test_mutant_that_does_not_undo_its_surrogate(monkeypatch: pytest.MonkeyPatch
     assert worst_z(kernel) > BROKEN
 
 
+def test_mutants_of_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel = surrogate_transition(repeat(LEANING, 2), student_t("x"))
+    accept = SurrogateTarget.accept
+
+    def one_way(self: SurrogateTarget, old: Trace, new: Trace, log_ratio: Tensor) -> tuple[Tensor, Trace]:
+        return accept(self, old, new, torch.zeros_like(log_ratio))
+
+    monkeypatch.setattr(SurrogateTarget, "accept", one_way)
+    assert worst_z(kernel) > BROKEN, "the moves do not leave the surrogate invariant"
+    monkeypatch.setattr(SurrogateTarget, "accept", accept)
+    above = Target.above
+    monkeypatch.setattr(
+        Target, "above", lambda self, new, needed, *_: above(self, new, needed + 0.5 * new["x"])
+    )
+    assert worst_z(kernel) > BROKEN, "the decision leaves out a part of the ratio"
+
+
 # ---- what is evaluated
 
 
@@ -215,6 +235,21 @@ def test_a_surrogate_decides_before_any_site() -> None:
     delayed_acceptance(walk, surrogate=student_t("x"))(equal_weights(trace))(trace, POSTERIOR)
     assert [name for name, _ in Seen.asked] == ["depth_1", "touch_0", "touch_2"]
     assert 0 < max(count for _, count in Seen.asked) < 1000
+
+
+def test_a_transition_asks_each_costly_site_once_for_those_that_moved() -> None:
+    torch.manual_seed(0)
+    trace = exact(2000)
+    POSTERIOR(trace)
+    Seen.asked.clear()
+    surrogate = lambda _: lambda each: each.log_prob("x", "depth_1")  # noqa: E731
+    moved, accepted = surrogate_transition(repeat(WALK, 5), surrogate)(equal_weights(trace))(trace, POSTERIOR)
+    asked = [each for each in Seen.asked if each[0] != "depth_1"]
+    assert [name for name, _ in asked] == ["touch_0", "touch_2"]
+    assert int(accepted.sum()) < asked[1][1] < asked[0][1] < 2000
+    assert torch.equal(accepted == 1.0, moved["x"] != trace["x"])
+    fresh, _ = generate(program, (), OBSERVED, 2000)
+    torch.testing.assert_close(moved.log_prob(), fresh.at({"x": moved["x"]}).log_prob())
 
 
 def test_sites_that_count_for_nothing_are_not_asked() -> None:

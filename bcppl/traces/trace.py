@@ -262,6 +262,13 @@ class Trace:
         secret._keep_run(self._ran)
         return secret
 
+    def without_states(self) -> Trace:
+        """The same trace, whose simulators (`carried`) begin again where they are asked for.
+
+        Merged with another trace, it does not run them as far as that one has.
+        """
+        return self._like(carried={}, known=dict(self.known))
+
     def at(self, values: Mapping[str, Value]) -> Trace:
         """The trace at other values of some latent addresses; log-probabilities that stay are kept.
 

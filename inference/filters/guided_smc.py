@@ -36,7 +36,7 @@ from bcppl.inference.filters.smcp3 import Pair, moved as moved_by_pair
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
 from bcppl.inference.filters.tempering import resample_move, tempered
 from bcppl.inference.filters.view_search import is_refuted, searched_by_climbing
-from bcppl.inference.kernels import Kernel, delayed_acceptance, metropolis_hastings, sequence
+from bcppl.inference.kernels import Kernel, cycle, metropolis_hastings, sequence, surrogate_transition
 from bcppl.inference.kernels.kernel import Move
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Program, drift
@@ -92,7 +92,8 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
     """A random walk of one other latent value, the approximation's proposals, and a random walk of the pose.
 
     `proposals` are those that go with the approximation that the population carries. Where the program runs
-    physics and these are to `screen`, what is approximated decides first (`approximated`).
+    physics and these are to `screen`, they move by what is approximated (`approximated`), and physics decides
+    once about where they have led.
     """
 
     def moved(population: Population) -> Move:
@@ -101,7 +102,7 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
         of_pose: list[Any] = [*proposals(population.approximation), drift(pose, WALK)]
         guided = [metropolis_hastings(proposal) for proposal in of_pose]
         if screen and runs_physics(population.trace):
-            guided = [delayed_acceptance(move, surrogate=approximated) for move in guided]
+            guided = [surrogate_transition(cycle(guided), approximated)]
         # One for all: chosen for each particle, every walk would have to run.
         chosen = [walks[int(torch.randint(len(walks), ()))]] if walks else []
         return sequence([*chosen, *guided])(population)

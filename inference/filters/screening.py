@@ -6,7 +6,7 @@ its place in a target of its own: copies of the particles are weighted for that 
 that survive are simulated and weighted by what remains, the ratio of the two targets. Both steps are proper
 weightings (Naesseth, Lindsten and Schoen, Nested sequential Monte Carlo methods, ICML 2015), so the result
 targets the posterior whatever the cheap likelihood is; a poor one costs effective particles. In moves it is
-the surrogate of delayed acceptance (`bcppl.inference.kernels.delayed_acceptance`).
+the surrogate of transitions (`bcppl.inference.kernels.surrogate_transition`).
 """
 
 from __future__ import annotations

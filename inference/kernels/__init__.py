@@ -26,7 +26,15 @@ from bcppl.inference.kernels.hastings import metropolis_hastings
 from bcppl.inference.kernels.involutions import involutive
 from bcppl.inference.kernels.kernel import Kernel, Move, fitted, scattered
 from bcppl.inference.kernels.rejuvenation import Moved, Until, displacement, distinct, moved_by, until
-from bcppl.inference.kernels.staged import Screened, Staged, Surrogate, delayed_acceptance, student_t
+from bcppl.inference.kernels.staged import (
+    Screened,
+    Staged,
+    Surrogate,
+    SurrogateTarget,
+    delayed_acceptance,
+    student_t,
+    surrogate_transition,
+)
 
 __all__ = [
     "Kernel",
@@ -35,6 +43,7 @@ __all__ = [
     "Screened",
     "Staged",
     "Surrogate",
+    "SurrogateTarget",
     "Until",
     "cycle",
     "delayed_acceptance",
@@ -52,5 +61,6 @@ __all__ = [
     "scattered",
     "sequence",
     "student_t",
+    "surrogate_transition",
     "until",
 ]

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_other
+from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_other, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import spread_of
 from bcppl.inference.proposals.coordinates import coordinates_of
@@ -202,3 +202,70 @@ def delayed_acceptance(
         return in_stages
 
     return staged
+
+
+def surrogate_transition(kernel: Kernel, surrogate: Surrogate) -> Kernel:
+    """Moves that leave a surrogate of the target invariant, then one decision about where they have led.
+
+    Liu, Monte Carlo Strategies in Scientific Computing, Springer, 2001, section 9.4.3: the last decision is
+    on the ratio of the target to the surrogate, so that costly sites are evaluated once, however many moves
+    come before. The moves are to be reversible together, as one Metropolis-Hastings move is, and as several
+    in random order are (`cycle`); `sequence` of them is not.
+
+    Args:
+        kernel: of these moves. A particle is moved as often as `repeat` asks for.
+        surrogate: of the target's log-density; like a proposal, it is fitted to other particles than those
+            that are moved.
+
+    Raises:
+        InputError: what is given is no kernel.
+    """
+    refuse_other("surrogate_transition", kernel)
+
+    def fit(population: Population) -> Move:
+        move, log_density = fitted(kernel, population), surrogate(population)
+
+        def transition(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
+            if not isinstance(target, Target):
+                return move(trace, target)  # a function of the whole trace has no costly sites
+            begun = trace.without_states()
+            walked, _ = move(begun, SurrogateTarget(log_density=log_density))
+            index = _displaced(begun, walked)
+            accepted = torch.zeros(trace.particles, dtype=torch.float64)
+            if len(index) == 0:
+                return trace, accepted
+            chance = torch.log(torch.rand(len(index), dtype=torch.float64))
+            gained = (log_density(walked) - log_density(begun))[index]
+            passed, survivors = target.above(walked.chosen(index), chance + target(trace)[index] + gained)
+            accepted[index[passed]] = 1.0
+            return scattered(trace, index[passed], survivors), accepted
+
+        return transition
+
+    return fit
+
+
+def _displaced(old: Trace, new: Trace) -> Tensor:
+    """The particles (K,) whose value at some latent address is another."""
+    other = torch.zeros(old.particles, dtype=torch.bool)
+    for address, value in new.choices.items():
+        other |= (value != old[address]).reshape(old.particles, -1).any(dim=1)
+    return other.nonzero().flatten()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurrogateTarget(Target):
+    """A surrogate of a log-density, zero where the latent sites are impossible, as the target of moves."""
+
+    log_density: Callable[[Trace], Tensor]
+
+    def __call__(self, trace: Trace) -> Tensor:
+        """The log-density (N,)."""
+        possible = self.part(trace, list(trace.choices)) > -torch.inf
+        return torch.where(possible, self.log_density(trace), -torch.inf)
+
+    def accept(self, old: Trace, new: Trace, log_ratio: Tensor) -> tuple[Tensor, Trace]:
+        """Which particles take their proposals: see `Target.accept`."""
+        chance = torch.log(torch.rand(old.particles, dtype=torch.float64))
+        index = (self(new) - self(old) + log_ratio > chance).nonzero().flatten()
+        return index, new[index]
