@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -14,10 +15,17 @@ def thread_count() -> int:
     return min(cores, max(int(limit), 1)) if limit.isdecimal() else cores
 
 
-def parallel_sum(work: Callable[[int, int], int], begin: int, end: int, chunk: int, threads: int) -> int:
-    """The sum of `work(first, last)` over chunks of particles, computed by several threads.
+@functools.cache
+def _others(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads)
 
-    The threads end with the call: a persistent pool would not survive a fork of the process.
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_others.cache_clear)  # the threads stay behind
+
+
+def parallel_sum(work: Callable[[int, int], int], begin: int, end: int, chunk: int, threads: int) -> int:
+    """The sum of `work(first, last)` over chunks of particles, computed by this thread and others.
 
     Args:
         work: of the first particle of a chunk and the one after its last.
@@ -27,7 +35,15 @@ def parallel_sum(work: Callable[[int, int], int], begin: int, end: int, chunk: i
         threads: at most so many.
     """
     starts = range(begin, end, chunk)
-    if min(threads, len(starts)) <= 1:
+    others = min(threads, len(starts)) - 1
+    if others < 1:
         return work(begin, end) if end > begin else 0
-    with ThreadPoolExecutor(min(threads, len(starts))) as pool:
-        return sum(pool.map(lambda first: work(first, min(first + chunk, end)), starts))
+    left = iter(starts)
+
+    def share() -> int:
+        return sum(work(first, min(first + chunk, end)) for first in left)
+
+    pool = _others(threads - 1)
+    shares = [pool.submit(share) for _ in range(others)]
+    # One that has not begun by the end of this one's share has nothing left to do.
+    return share() + sum(each.result() for each in shares if not each.cancel())
