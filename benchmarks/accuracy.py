@@ -279,7 +279,7 @@ def main() -> None:
     by_kind(found)
     misses(found)
     if given.figure:
-        curves.of_all(found, GOALS, given.figure)
+        curves.of_all(found, GOALS, "goals", given.figure)
     finish(rows_of(found, jobs == 1), given.json)
 
 

@@ -29,8 +29,8 @@ def places(curve: Curve) -> list[float]:
     ]
 
 
-def of_all(found: Sequence[Probed], goals: Sequence[float], file: Path) -> None:
-    """ADD over time of every scene, with the median and where four of five scenes lie."""
+def of_all(found: Sequence[Probed], beside: Sequence[float], what: str, file: Path) -> None:
+    """ADD over time of every scene, with the median, where four of five scenes lie, and ADDs beside it."""
     curves = [one.curve for one in found if one.curve.times]
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     axes = figure.add_subplot()
@@ -46,8 +46,8 @@ def of_all(found: Sequence[Probed], goals: Sequence[float], file: Path) -> None:
     low, middle, high = ([max(quantile(adds, q), SMALLEST_ADD) for adds in filled] for q in (0.1, 0.5, 0.9))
     axes.fill_between(times, low, high, color=STRONG, alpha=0.15, linewidth=0)
     axes.plot(times, middle, color=STRONG, linewidth=2.5, marker="o", markersize=4, zorder=3)
-    for goal in goals:
-        axes.axhline(goal, color=TRUTH, linewidth=1.0, linestyle="--")
+    for add in beside:
+        axes.axhline(add, color=TRUTH, linewidth=1.0, linestyle="--")
     axes.axvspan(0.0, max(times), color="#0072B2", alpha=0.06, linewidth=0)
     axes.text(0.0, 1.01, " probing", transform=axes.get_xaxis_transform(), color="#0072B2")
     axes.set_yscale("log")
@@ -70,7 +70,7 @@ def of_all(found: Sequence[Probed], goals: Sequence[float], file: Path) -> None:
             Patch(color=STRONG, alpha=0.15),
             Line2D([], [], color=TRUTH, linewidth=1.0, linestyle="--"),
         ],
-        [f"{len(found)} scenes", "median", "10 to 90 %", "goals"],
+        [f"{len(found)} scenes", "median", "10 to 90 %", what],
         loc="outside upper right",
         ncols=4,
         frameon=False,

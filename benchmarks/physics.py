@@ -196,7 +196,7 @@ def figure(outcomes: dict[Task, Outcome], file: Path) -> None:
         for task, one in outcomes.items()
         if task.way == DEFAULT
     ]
-    curves.of_all(found, (curves.REPORTED,), file)
+    curves.of_all(found, (curves.REPORTED,), f"BayesContact: {curves.REPORTED} mm", file)
 
 
 def main() -> None:
