@@ -20,6 +20,8 @@ class Segments(NamedTuple):
         contact: (S,) 1 for an episode.
         own: (H, R) of each hypothesis, variances of the errors of rows without contact, m^2.
         errors: (H, R, E) covariances of a row's error with those of its episode up to it, m^2.
+        factor: (H, R, E) their Cholesky factors, with inverted diagonals.
+        log_determinant: (H, S) of an episode's covariance.
         loaded: (R,) by a row of an episode, the share of a change's variances that has come.
     """
 
@@ -28,6 +30,8 @@ class Segments(NamedTuple):
     contact: Indices
     own: Array
     errors: Array
+    factor: Array
+    log_determinant: Array
     loaded: Array
 
 

@@ -38,41 +38,48 @@ def set_joint(columns: Array, pull: Array, errors: Array, residual: Array, joint
 
 
 @summed
-def factored(
-    joint: Array, error: Array, columns: Array, change: Array, loaded: Array, factor: Array, white: Array
-) -> tuple[float, float]:
-    """Set `factor` (n, n) to the Cholesky factor of the gaps' covariance, `white` (n,) to whitened errors.
+def factorise(joint: Array, columns: Array, change: Array, loaded: Array, factor: Array) -> float:
+    """Set `factor` (n, n) to the Cholesky factor of the gaps' covariance, its diagonal inverted.
 
     `joint` is that without the change, whose variances are `change` (M,); by row i it has come by the share
     `loaded[i]`.
 
     Returns:
-        the log-density of the gaps, and their squared whitened errors.
+        the logarithm of its determinant.
     """
-    squared, log_determinant = 0.0, 0.0
-    for i in range(len(error)):
+    log_determinant = 0.0
+    for i in range(len(joint)):
         for j in range(i + 1):
             factor[i, j] = joint[i, j]
     for a in range(len(change)):
         if change[a] > 0.0:
-            for i in range(len(error)):
+            for i in range(len(joint)):
                 for j in range(i + 1):
                     factor[i, j] += change[a] * loaded[j] * columns[i, a] * columns[j, a]
-    for i in range(len(error)):
+    for i in range(len(joint)):
+        variance = factor[i, i]
         for j in range(i):
             known = factor[i, j]
             for k in range(j):
                 known -= factor[i, k] * factor[j, k]
-            factor[i, j] = known / factor[j, j]
-        variance, rest = factor[i, i], error[i]
-        for k in range(i):
-            variance -= factor[i, k] * factor[i, k]
-            rest -= factor[i, k] * white[k]
-        factor[i, i] = math.sqrt(variance)
-        white[i] = rest / factor[i, i]
-        squared += white[i] * white[i]
+            factor[i, j] = known * factor[j, j]
+            variance -= factor[i, j] * factor[i, j]
+        factor[i, i] = 1.0 / math.sqrt(variance)
         log_determinant += math.log(variance)
-    return -0.5 * (squared + log_determinant + len(error) * math.log(2.0 * math.pi)), squared
+    return log_determinant
+
+
+@summed
+def whiten(factor: Array, error: Array, white: Array) -> float:
+    """Set `white` (n,) to errors whitened by a factor as of `factorise`; returns the sum of their squares."""
+    squared = 0.0
+    for i in range(len(error)):
+        rest = error[i]
+        for k in range(i):
+            rest -= factor[i, k] * white[k]
+        white[i] = rest * factor[i, i]
+        squared += white[i] * white[i]
+    return squared
 
 
 @summed
@@ -95,6 +102,6 @@ def condition(
             for a in range(len(mean)):
                 gain[i, a] -= factor[i, k] * gain[k, a]
         for a in range(len(mean)):
-            gain[i, a] /= factor[i, i]
+            gain[i, a] *= factor[i, i]
             mean[a] -= gain[i, a] * white[i]
     covariance -= np.dot(gain.T, gain)

@@ -9,7 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bcppl.arrays import Array, Indices
+from bcppl.compiled import compiled
 from bcppl.distributions.episodes.branches import Segments
+from bcppl.distributions.episodes.conditioning import factorise
 from bcppl.distributions.episodes.rows import EPISODE, FELT, FORCE, NOISE, TIME
 
 
@@ -77,4 +80,20 @@ def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, .
             both = both + scale[:, None, None] ** 2 * lasting + torch.diag_embed(own[:, begin:end])
             joint[:, begin:end, : end - begin] = both
     arrays = (first, last, contact[first].to(torch.int64), alone, joint, loaded)
-    return Segments(*(np.ascontiguousarray(each.numpy()) for each in arrays))
+    first, last, touching, own, errors, loaded = (np.ascontiguousarray(each.numpy()) for each in arrays)
+    factor, log_determinant = np.zeros_like(errors), np.zeros((len(errors), len(first)))
+    set_factors(first, last, touching, errors, factor, log_determinant)
+    return Segments(first, last, touching, own, errors, factor, log_determinant, loaded)
+
+
+@compiled
+def set_factors(
+    first: Indices, last: Indices, contact: Indices, errors: Array, factor: Array, log_determinant: Array
+) -> None:
+    """Set the Cholesky factors (H, R, E) of episodes' covariances, as of `factorise`, and (H, S) the rest."""
+    none, never = np.zeros((errors.shape[2], 0)), np.zeros(0)
+    for h in range(len(errors)):
+        for s in range(len(first)):
+            if contact[s]:
+                own, to = errors[h, first[s] : last[s]], factor[h, first[s] : last[s]]
+                log_determinant[h, s] = factorise(own, none, never, never, to)

@@ -26,7 +26,7 @@ from torch import Tensor
 from bcppl.arrays import Array
 from bcppl.compiled import compiled, summed
 from bcppl.distributions.episodes.branches import INLIER, KEPT, OUTLIER, Branches, Prior, Segments
-from bcppl.distributions.episodes.conditioning import condition, dot, factored, set_joint, squared_by
+from bcppl.distributions.episodes.conditioning import condition, dot, factorise, set_joint, squared_by, whiten
 from bcppl.distributions.episodes.displaced import Lines
 from bcppl.threads import parallel_sum, thread_count
 
@@ -35,6 +35,7 @@ from bcppl.threads import parallel_sum, thread_count
 _FAINT = 25.0
 _UNLIKELY = 10.0  # the same before an episode, of a hypothesis with a change
 _CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
+_LOG_TWO_PI = math.log(2.0 * math.pi)
 _SURPRISING = 1.0  # standard deviations of a chi-square
 # Particles of a chunk of work, and rows of all of them, at least: fewer take less than a thread's beginning.
 _CHUNK, _ROWS = 8, 2000
@@ -111,12 +112,7 @@ def _log_ndtr(z: float) -> float:
     if z > -30.0:
         return math.log(0.5 * math.erfc(-z / math.sqrt(2.0)))
     inverse = 1.0 / (z * z)
-    return (
-        -0.5 * z * z
-        - math.log(-z)
-        - 0.5 * math.log(2.0 * math.pi)
-        + math.log(1.0 - inverse + 3.0 * inverse**2)
-    )
+    return -0.5 * z * z - math.log(-z) - 0.5 * _LOG_TWO_PI + math.log(1.0 - inverse + 3.0 * inverse**2)
 
 
 @compiled
@@ -172,6 +168,8 @@ def _filter(
     delays = len(gaps.late)
     distance, columns = np.empty((delays, longest)), np.empty((delays, longest, parameters))
     filled = np.empty(delays, np.bool_)
+    # Without parameters an episode's errors are correlated alike in all particles.
+    alike = parameters == 0 and gaps.residual.shape[2] == 0
     pull, gain, changed = np.empty(parameters), np.empty((longest, parameters)), np.empty(parameters)
     old_which, old_event, old_squared = which[0].copy(), event[0].copy(), squared[0].copy()
     old_mean, old_covariance = mean[0].copy(), covariance[0].copy()
@@ -209,7 +207,7 @@ def _filter(
                     inside = log_in + positive
                     log_weight[n, b] += either
                     if parameters and inside > log_out and score < 5.0:
-                        hazard = math.exp(-0.5 * score**2 - 0.5 * math.log(2.0 * math.pi) - positive)
+                        hazard = math.exp(-0.5 * score**2 - 0.5 * _LOG_TWO_PI - positive)
                         bend = hazard * (hazard + score) / variance
                         for a in range(parameters):
                             mean[n, b, a] += pull[a] / root * hazard
@@ -235,16 +233,21 @@ def _filter(
                         distance[delay, i] + prior.compliance[h] * gaps.force[first + i]
                     )
                 filled[delay] = True
-                np.dot(slope, covariance[n, b], own_pull)
-                set_joint(slope, own_pull, segments.errors[h, first:last], left_over, joint)
+                if not alike:
+                    np.dot(slope, covariance[n, b], own_pull)
+                    set_joint(slope, own_pull, segments.errors[h, first:last], left_over, joint[:rows])
                 for change in range(changes):
                     if change and log_weight[n, b] + prior.change_log_probability[change] < likely:
                         continue
                     for a in range(parameters):
                         changed[a] = prior.change_variance[change, a] * prior.scale[h] ** 2
-                    log_density, square[found] = factored(
-                        joint, error[b, :rows], slope, changed, loaded, factor, white
-                    )
+                    if alike:
+                        log_determinant = segments.log_determinant[h, s]
+                        square[found] = whiten(segments.factor[h, first:last], error[b, :rows], white)
+                    else:
+                        log_determinant = factorise(joint[:rows], slope, changed, loaded, factor)
+                        square[found] = whiten(factor, error[b, :rows], white)
+                    log_density = -0.5 * (square[found] + log_determinant + rows * _LOG_TWO_PI)
                     inlier = log_weight[n, b] + log_in + log_density
                     outlier = log_weight[n, b] + stray
                     source[found], source[found + 1] = b, b
@@ -260,25 +263,27 @@ def _filter(
                     square[found + 1] = square[found]
                     found += 2
             best, left, known_branches = weight[:found].max(), 0, number[n]
-            # The best of each delay comes first: no other way leads back to one that is gone.
-            rank[:found], leading[:] = weight[:found], -1
-            for c in range(found):
-                delay = prior.delay[which[n, source[c]]]
-                if leading[delay] < 0 or weight[c] > weight[leading[delay]]:
-                    leading[delay] = c
-            for delay in range(delays):
-                if leading[delay] >= 0:
-                    rank[leading[delay]] = best
+            crowded, seen = found > kept_branches, 0
+            if crowded:
+                # The best of each delay comes first: no other way leads back to one that is gone.
+                rank[:found], leading[:] = weight[:found], -1
+                for c in range(found):
+                    delay = prior.delay[which[n, source[c]]]
+                    if leading[delay] < 0 or weight[c] > weight[leading[delay]]:
+                        leading[delay] = c
+                for delay in range(delays):
+                    if leading[delay] >= 0:
+                        rank[leading[delay]] = best
             old_which[:], old_event[:], old_squared[:] = which[n], event[n], squared[n]
             old_mean[:known_branches], old_covariance[:known_branches] = (
                 mean[n, :known_branches],
                 covariance[n, :known_branches],
             )
-            while left < min(kept_branches, found):
-                c = int(rank[:found].argmax())
-                if rank[c] < best - _FAINT:
-                    break
-                rank[c] = -np.inf
+            while left < kept_branches and seen < found:
+                c, seen = seen, seen + 1
+                if crowded:
+                    c = int(rank[:found].argmax())
+                    rank[c] = -np.inf
                 if weight[c] < best - _FAINT:
                     continue
                 b, change = source[c], kind[c] // 2
@@ -287,9 +292,10 @@ def _filter(
                     changed[a] = prior.change_variance[change, a] * prior.scale[h] ** 2
                 log_weight[n, left], which[n, left] = weight[c], h
                 mean[n, left], covariance[n, left] = old_mean[b], old_covariance[b]
-                if kind[c] % 2 == INLIER:
+                if parameters and kind[c] % 2 == INLIER:
                     slope = columns[prior.delay[h], :rows]
-                    factored(joints[b], error[b, :rows], slope, changed, loaded, factor, white)
+                    factorise(joints[b, :rows], slope, changed, loaded, factor)
+                    whiten(factor, error[b, :rows], white)
                     condition(
                         factor,
                         white[:rows],
