@@ -80,10 +80,15 @@ def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, .
             both = both + scale[:, None, None] ** 2 * lasting + torch.diag_embed(own[:, begin:end])
             joint[:, begin:end, : end - begin] = both
     arrays = (first, last, contact[first].to(torch.int64), alone, joint, loaded)
-    first, last, touching, own, errors, loaded = (np.ascontiguousarray(each.numpy()) for each in arrays)
+    return _with_factors(*(np.ascontiguousarray(each.numpy()) for each in arrays))
+
+
+def _with_factors(
+    first: Indices, last: Indices, contact: Indices, own: Array, errors: Array, loaded: Array
+) -> Segments:
     factor, log_determinant = np.zeros_like(errors), np.zeros((len(errors), len(first)))
-    set_factors(first, last, touching, errors, factor, log_determinant)
-    return Segments(first, last, touching, own, errors, factor, log_determinant, loaded)
+    set_factors(first, last, contact, errors, factor, log_determinant)
+    return Segments(first, last, contact, own, errors, factor, log_determinant, loaded)
 
 
 @compiled
