@@ -95,7 +95,7 @@ def _with_factors(
 def set_factors(
     first: Indices, last: Indices, contact: Indices, errors: Array, factor: Array, log_determinant: Array
 ) -> None:
-    """Set the Cholesky factors (H, R, E) of episodes' covariances, as of `factorise`, and (H, S) the rest."""
+    """Set the factors (H, R, E) of episodes' covariances, as of `factorise`, and log-determinants (H, S)."""
     none, never = np.zeros((errors.shape[2], 0)), np.zeros(0)
     for h in range(len(errors)):
         for s in range(len(first)):
