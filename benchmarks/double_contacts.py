@@ -1,7 +1,7 @@
 """Probes in which a peg touches in two places at once: wedged in a hole's mouth, and half in the hole.
 
 They are planned from the truth: a belief after vision is off by more than the hole has to spare. What they
-find is compared on the same recordings (`physics.py --double`).
+find is compared on the same recordings (`physics.py --double`), beside those of the usual probe.
 """
 
 from __future__ import annotations

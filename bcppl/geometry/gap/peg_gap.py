@@ -23,7 +23,7 @@ from bcppl.threads import parallel_sum, thread_count
 
 _MARGIN = 0.012  # m around the part that the grid covers
 _CHUNK = 8  # particles of a chunk of work, at least
-_PAIRS = 2000  # pairs of poses of a chunk, at least: they take milliseconds, and a thread's beginning a tenth
+_PAIRS = 2000  # pairs of poses of a chunk, at least: they take milliseconds, and to wake a thread a tenth
 
 
 class Gap(NamedTuple):
