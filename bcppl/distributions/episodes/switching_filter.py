@@ -37,7 +37,7 @@ _UNLIKELY = 10.0  # the same before an episode, of a hypothesis with a change
 _CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
 _LOG_TWO_PI = math.log(2.0 * math.pi)
 _SURPRISING = 1.0  # standard deviations of a chi-square
-# Particles of a chunk of work, and rows of all of them, at least: fewer take less than it takes to wake a thread.
+# Particles of a chunk of work, and rows of all of them, at least: fewer take less than to wake a thread.
 _CHUNK, _ROWS = 8, 2000
 
 
