@@ -83,7 +83,7 @@ def window_of(recording: Recording) -> tuple[Any, Approximated]:
 
 
 def approximated(
-    everywhere: bool, before: GaussianMixture | None = None
+    everywhere: bool, before: GaussianMixture | None = None, nearby: bool = False
 ) -> tuple[Normal, QuadraticApproximation]:
     recording = touched()
     sensor, window = window_of(recording)
@@ -91,7 +91,7 @@ def approximated(
     center = torch.from_numpy(recording.guess.world_from_part)[None]
     prior = Normal(center, torch.diag(spread**-2)[None])
     sites, heading = partial(sensor.sites, [window]), sensor.heading([window])
-    return prior, quadratic_approximation(sites, prior, before, heading, everywhere)
+    return prior, quadratic_approximation(sites, prior, before, heading, everywhere, nearby=nearby)
 
 
 def test_the_world_is_sound_and_both_places_explain_the_touch_alike() -> None:
@@ -115,6 +115,22 @@ def test_a_search_everywhere_reaches_both_modes_with_equal_weights_and_keeps_the
     assert float((modes.log_weights[0] - modes.log_weights[1]).abs()) < 0.5
     _, again = approximated(False, modes)
     assert len(again.around) == 2
+
+
+def test_modes_nearby_are_followed_and_those_that_explain_nothing_are_searched_for_again() -> None:
+    prior, both = approximated(True)
+    modes = both.posterior(prior.center[0], prior.precision[0])
+    off = torch.tensor([2e-4, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    for k in range(2):
+        beside = modes._replace(centers=poses.retract(modes.centers, off))
+        one = GaussianMixture(*(values[k : k + 1] for values in beside))
+        _, followed = approximated(False, one, nearby=True)
+        torch.testing.assert_close(followed.around, both.around[k : k + 1], rtol=0.0, atol=1e-5)
+    far = poses.retract(modes.centers[:1], 100.0 * off)
+    lost = GaussianMixture(far, modes.covariances[:1], modes.log_weights[:1])
+    _, again = approximated(False, lost, nearby=True)
+    _, searched = approximated(False, lost)
+    torch.testing.assert_close(again.around, searched.around)
 
 
 def test_a_mode_weighs_what_a_normal_observation_is_worth() -> None:

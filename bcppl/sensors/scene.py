@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bcppl.effort import Effort
 from bcppl.errors import InputError
+from bcppl.geometry.simplified import simplified
 from bcppl.sensors.capabilities import Approximated
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.protocol import HasLikelihood, sensor_named, sensor_of
@@ -152,7 +153,7 @@ S = TypeVar("S", bound=Scene)
 def likelihoods_for(
     recording: Recording, chosen: Mapping[str, Prepare], only: bool = False
 ) -> dict[str, Likelihood]:
-    """A likelihood for each kind of measurement.
+    """A likelihood for each kind of measurement, of part and peg `simplified`.
 
     Args:
         recording: what was measured.
@@ -161,6 +162,8 @@ def likelihoods_for(
         only: leave out the kinds that are not chosen; otherwise those in the recording get the default of
             their sensor.
     """
+    peg = None if recording.peg is None else simplified(recording.peg)
+    recording = replace(recording, part=simplified(recording.part), peg=peg)
     prepared = {kind: prepare(recording) for kind, prepare in chosen.items()}
     if not only:
         for kind in dict.fromkeys(sensor_of(m.action).kind for m in recording.measurements):

@@ -125,6 +125,8 @@ class GaussianApproximation:
         contacts = [(sensor, own) for sensor, own in by_sensor if isinstance(sensor, Contacts)]
         first = self.quadratic is None
         ambiguous = any(sensor.new_contact(own, newest=not first) for sensor, own in contacts)
+        # No contact has begun, which could have been with several places: the modes hardly move.
+        nearby = not (first or ambiguous) and len(contacts) == len(by_sensor)
         headings = [sensor.heading(own) for sensor, own in contacts]
 
         def sites(pose: Tensor, blur: float) -> Iterator[tuple[Any, Tensor]]:
@@ -144,7 +146,7 @@ class GaussianApproximation:
             near = center[None] if mine is None else torch.cat([center[None], mine.centers])
             inside = [sensor.in_hole(c, near) for sensor, c in by_sensor if isinstance(sensor, EntersHole)]
             inside = [places for places in inside if len(places.part)]
-            each.append(quadratic_approximation(sites, normal, mine, heading, everywhere, inside))
+            each.append(quadratic_approximation(sites, normal, mine, heading, everywhere, inside, nearby))
         quadratic = each[0] if len(each) == 1 else together(each, known)
         return replace(self, quadratic=quadratic, relevant=relevant, stale=False)
 

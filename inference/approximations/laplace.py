@@ -9,14 +9,16 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.distributions.checks import Checked
 from bcppl.distributions.pose_normals import GaussianMixture
 from bcppl.sensors.capabilities import InHole
 
 # Standard deviations (m) that are added to the errors, one for each Gauss-Newton step: of starts about the
-# prior mean, from outside the part, and from many places.
+# prior mean, from outside the part, from many places, and from modes.
 BLURS = (0.003, 0.002, 0.001, 0.0005, 0.0002, 0.0, 0.0, 0.0)
 SHARP = (0.0005, 0.0005, 0.0002, 0.0, 0.0, 0.0, 0.0)
 FINE = (0.0002, 0.0002, 0.0001, 0.00005, 0.0, 0.0, 0.0)
+NEAR = (0.0001, 0.0, 0.0, 0.0)  # of modes that were reached without the newest measurement
 _AHEAD = torch.tensor([0.0, 0.003, 0.006, 0.01], dtype=torch.float64)  # m
 _STEP_LENGTHS = torch.tensor([0.15, 0.5, 1.0], dtype=torch.float64)
 # Starts of Gauss-Newton, in prior standard deviations; they are the same in every run.
@@ -31,6 +33,8 @@ _REFUTED = 10.0  # nats by which a mode that started at another component of the
 # Starts from many places that are followed to the end: of 12 none reached the narrow mode that held the
 # truth of scene 20108 of the accuracy bench.
 _LEFT = 20
+# Squared standard deviations within which two starts have come together, and lead to the same mode.
+_MET = 0.01
 
 # The sites of the likelihood at poses (S, 7), errors `blur` metres wider, each with its observed value.
 Sites = Callable[[Tensor, float], Iterable[tuple[Any, Tensor]]]
@@ -78,13 +82,17 @@ def quadratic_approximation(
     heading: Tensor | None = None,
     everywhere: bool = False,
     inside: Sequence[InHole] = (),
+    nearby: bool = False,
 ) -> QuadraticApproximation:
     """The quadratic approximation around the posterior modes that Gauss-Newton reaches.
 
-    It starts from the prior mean and from places around it, at first with errors of millimetres. Where a part
-    is estimated too near, a peg penetrates it deeply, and would leave a thin wall on the wrong side; so it
-    starts from outside as well, the part displaced along the direction of the last contact. Errors of
-    millimetres lead all starts to one mode, and which corner or edge was touched may be ambiguous:
+    Where the modes are `nearby` those of fewer measurements, it starts from these, and from nowhere else
+    unless the best of what it reaches explains the measurements badly.
+
+    Otherwise it starts from the prior mean and from places around it, at first with errors of millimetres.
+    Where a part is estimated too near, a peg penetrates it deeply, and would leave a thin wall on the wrong
+    side; so it starts from outside as well, the part displaced along the direction of the last contact.
+    Errors of millimetres lead all starts to one mode, and which corner or edge was touched may be ambiguous:
     `everywhere` starts from many places with small errors too, under the prior and around what fewer
     measurements have left, each of which leads to the nearest mode.
 
@@ -95,7 +103,22 @@ def quadratic_approximation(
         heading: (3,) the direction of motion at the last contact; None for none.
         everywhere: whether to search for all modes.
         inside: poses that have the peg in a hole, of which each leads to a mode.
+        nearby: whether the modes of `before` hardly move.
     """
+    modes = None
+    if nearby and before is not None:
+        reached, _ = gauss_newton(sites, before.centers, prior, NEAR, len(before.centers))
+        modes = _quadratic(sites, reached) if _explains(sites, reached[:1]) else None
+    if modes is None:
+        modes = _quadratic(sites, _searched(sites, prior, before, heading, everywhere))
+    each = [modes, *(_in_hole(sites, one, prior) for one in inside)]
+    return _distinct(_joined(each), prior)
+
+
+def _searched(
+    sites: Sites, prior: Normal, before: GaussianMixture | None, heading: Tensor | None, everywhere: bool
+) -> Tensor:
+    """The modes (M, 7) that are reached from all starts."""
     center, precision = prior
     scale = torch.linalg.cholesky(torch.linalg.inv(precision[0]))
     earlier = [] if before is None else [before.centers[:1]]
@@ -118,10 +141,16 @@ def quadratic_approximation(
     if others:
         each, _ = gauss_newton(sites, torch.cat(others), prior, FINE, _LEFT)
         best = torch.cat([best, each])
-    modes = [_quadratic(sites, best), *(_in_hole(sites, each, prior) for each in inside)]
-    return _distinct(
-        QuadraticApproximation(*(torch.cat(values) for values in zip(*modes, strict=True))), prior
-    )
+    return best
+
+
+def _explains(sites: Sites, pose: Tensor) -> bool:
+    """Whether no site would be warned of at a pose (1, 7)."""
+    for site, value in sites(pose, 0.0):
+        check = site.predictive_check(value, lambda: None) if isinstance(site, Checked) else None
+        if check is not None and check.surprising:
+            return False
+    return True
 
 
 def _in_hole(sites: Sites, inside: InHole, prior: Normal) -> QuadraticApproximation:
@@ -153,7 +182,7 @@ def gauss_newton(
     """The poses (M, 7) of highest posterior density that are reached, and their log-densities (M,).
 
     Each step adds one of `blurs` (m) to the errors, 0 in the end, and keeps half of the starts (S, 7), but at
-    least so many.
+    least so many; of those that have come together it keeps the best.
     """
     center, precision = prior
     pose, density = starts, torch.zeros(len(starts))
@@ -173,7 +202,16 @@ def gauss_newton(
         density, farthest = total.max(dim=1)
         kept = density.topk(min(len(pose), max(least, len(pose) // 2))).indices
         pose, density = tried[kept, farthest[kept]], density[kept]
+        apart = _apart(pose, (precision + quadratic.information)[kept])
+        pose, density = pose[apart], density[apart]
     return pose[:least], density[:least]
+
+
+def _apart(pose: Tensor, precision: Tensor) -> Tensor:
+    """Which of some poses (S, 7), the best first, have not come together with a better one (S,)."""
+    away = poses.log(pose[:, None], pose)
+    squared = torch.einsum("sri,sij,srj->sr", away, precision, away)
+    return ~(squared < _MET).triu(diagonal=1).any(dim=0)
 
 
 def _quadratic(sites: Sites, pose: Tensor, blur: float = 0.0) -> QuadraticApproximation:

@@ -29,6 +29,7 @@ from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, bin_depth
 from bcppl.geometry.parts import Part
+from bcppl.geometry.simplified import SEEN, simplified
 from bcppl.geometry.turns import box_turns
 from bcppl.rendering.extrinsics_error import apparent_motion, line_of_sight
 from bcppl.rendering.part_renderer import PartRenderer
@@ -86,7 +87,7 @@ class ErringCamera:
         renderer: Callable[[Part], PartRenderer] = renderer_for,
     ) -> None:
         self.settings, self.prior = settings, prior
-        self.renderer = renderer(recording.part)
+        self.renderer = renderer(simplified(recording.part, SEEN))
         self.looks: dict[str, Look] = {}
         self.viewpoints = viewpoints_of(recording)
         motion = partial(apparent_motion, shift=settings.camera_shift, turn=settings.camera_turn)
