@@ -13,7 +13,7 @@ from bcppl.geometry.simplified import SEEN, TOUCHED, simplified
 
 
 def comb(teeth: int = 12) -> Part:
-    """A plate with round pins, by a boolean union that is left with needless triangles, every face divided."""
+    """A plate with round pins, by a boolean union of needless triangles, every face divided."""
     solids = [trimesh.creation.box((0.06, 0.02, 0.01))]
     for x in np.linspace(-0.025, 0.025, teeth):
         pin = trimesh.creation.cylinder(0.0015, 0.01, sections=24)

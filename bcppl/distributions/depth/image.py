@@ -19,9 +19,13 @@ from bcppl import poses
 from bcppl.distributions.checks import Check
 from bcppl.distributions.depth.camera_image import CameraImage
 from bcppl.distributions.depth.observed import CACHE, Observed
+from bcppl.distributions.depth.pixels import PixelLaw, Pixels, log_densities, sum_gains
 from bcppl.distributions.depth.rendering import Array, CachedHits
 from bcppl.distributions.parameters import IF_GIVEN, POSITIVE, ranges
 from bcppl.errors import InputError
+from bcppl.threads import parallel_sum, thread_count
+
+HITS = 1 << 16  # of a chunk of work
 
 
 @dataclass(eq=False, repr=False)
@@ -91,11 +95,12 @@ class DepthDistribution(CameraImage):
             )
         self._log_uniform = -math.log(self.camera.far - self.camera.near)
 
-    # ---- a subclass defines the density of a pixel
+    # ---- a subclass defines the law of a pixel
 
-    def _log_density(self, depth: Tensor, rendered: Tensor) -> Tensor:
-        """Log-density of pixels that read `depth` where `rendered` is rendered, metres."""
-        raise NotImplementedError
+    @property
+    def _law(self) -> PixelLaw:
+        """The law of a pixel; Laplace noise alone."""
+        return PixelLaw(self.camera.near, self.camera.far, self.scale, 0.0, 0.0)
 
     def _noisy(self, rendered: Tensor) -> Tensor:
         """Draws of pixels at which the depth `rendered` is known, metres."""
@@ -150,31 +155,22 @@ class DepthDistribution(CameraImage):
         self._check_finite()
         seen = self.observed(value)
         hits = self._hits(np.asarray(seen.valid.any(axis=0)))
-        pixel = hits.pixel
-        behind = seen.behind.take(pixel)
-        several = len(seen.depth) > 1
-        if several:
-            pixel = pixel + hits.particle * seen.depth.shape[1]
-        depth = torch.from_numpy(seen.depth.take(pixel))
-        shift = 0.0 if self._biases is None else self._biases.take(hits.particle)
-        if self._biases is None or self.background_is_measured:
-            rendered = np.minimum(hits.depth + shift, behind)
-            gain = self._log_density(depth, torch.from_numpy(rendered)).numpy()
-            gain -= seen.without_part.take(pixel)
-            total = seen.total_without_part
-        else:
-            rendered = np.minimum(hits.depth, behind) + shift
-            gain = self._log_density(depth, torch.from_numpy(rendered)).numpy()
-            known = np.isfinite(behind)
-            without = np.where(known, behind + shift, 0.0)
-            gain -= np.where(
-                known, self._log_density(depth, torch.from_numpy(without)).numpy(), self._log_uniform
-            )
-            total = seen.totals_at(self._log_density, self._log_uniform, self._biases)
-        if several:
-            gain = np.where(seen.valid.take(pixel), gain, 0.0)
-        gains = np.bincount(hits.particle, weights=gain, minlength=len(self.pose))
-        return torch.from_numpy(seen.power * (total + gains))
+        biases = self._biases
+        moves = biases is not None and not self.background_is_measured
+        total = seen.totals_at(self._law, biases) if moves else seen.total_without_part
+        bias = np.empty(0) if biases is None else biases
+        pixels = Pixels(seen.depth, seen.valid, seen.behind, seen.without_part, bias, moves)
+        starts = range(0, len(hits.pixel), HITS)
+        gains = np.zeros((len(starts), len(self.pose)))
+
+        def work(first: int, last: int) -> int:
+            for k in range(first, last):
+                begin, end = starts[k], min(starts[k] + HITS, len(hits.pixel))
+                sum_gains(begin, end, hits.particle, hits.pixel, hits.depth, pixels, self._law, gains[k])
+            return 0
+
+        parallel_sum(work, 0, len(starts), 1, thread_count())
+        return torch.from_numpy(seen.power * (total + gains.sum(axis=0)))
 
     def without_part(self, value: Tensor) -> Tensor:
         """Log-probability (1 or N,) of an image (H, W), or of N, with no part in view, and no bias."""
@@ -254,9 +250,8 @@ class DepthDistribution(CameraImage):
             )
         behind = self._behind
         known = np.isfinite(behind)
-        shown = self._log_density(
-            torch.from_numpy(depth), torch.from_numpy(np.where(known, behind, 0.0))
-        ).numpy()
+        rendered = np.broadcast_to(np.where(known, behind, 0.0), depth.shape)
+        shown = log_densities(depth.ravel(), rendered.ravel(), self._law).reshape(depth.shape)
         without = np.where(valid, np.where(known, shown, self._log_uniform), 0.0)
         power = np.ones(len(depth))
         if self.effective_pixels is not None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from bcppl.distributions.depth.image import DepthDistribution
+from bcppl.distributions.depth.pixels import PixelLaw
 from bcppl.distributions.parameters import PROBABILITY
 from bcppl.errors import InputError
 
@@ -22,9 +22,6 @@ class LaplaceDepth(DepthDistribution):
 
     Arguments are those of `DepthDistribution`.
     """
-
-    def _log_density(self, depth: Tensor, rendered: Tensor) -> Tensor:
-        return -(depth - rendered).abs() / self.scale - math.log(2.0 * self.scale)
 
 
 @dataclass(eq=False, repr=False)
@@ -41,10 +38,9 @@ class RobustDepth(DepthDistribution):
 
     outlier: float = field(default=0.1, kw_only=True, metadata=PROBABILITY)
 
-    def _log_density(self, depth: Tensor, rendered: Tensor) -> Tensor:
-        residual = (depth - rendered).abs_()
-        inlier = residual.mul_(-1.0 / self.scale).exp_().mul_((1.0 - self.outlier) / (2.0 * self.scale))
-        return inlier.add_(self.outlier * math.exp(self._log_uniform)).log_()
+    @property
+    def _law(self) -> PixelLaw:
+        return super()._law._replace(outlier=self.outlier)
 
     def _noisy(self, rendered: Tensor) -> Tensor:
         return torch.where(
@@ -87,15 +83,9 @@ class OccludedDepth(DepthDistribution):
         room = rendered.clamp(max=self.camera.far) - self.camera.near
         return torch.where(room > self.scale, room, 0.0)
 
-    def _log_density(self, depth: Tensor, rendered: Tensor) -> Tensor:
-        inlier = torch.exp((depth - rendered).abs_().mul_(-1.0 / self.scale))
-        inlier.mul_((1.0 - self.occluder - self.outlier) / (2.0 * self.scale))
-        room = self._room(rendered)
-        uniform = math.exp(self._log_uniform)
-        before = (depth > self.camera.near) & (depth < self.camera.near + room)
-        hidden = torch.where(before, self.occluder / room, 0.0)
-        spread = torch.where(room > 0.0, self.outlier * uniform, (self.occluder + self.outlier) * uniform)
-        return torch.log(inlier + hidden + spread)
+    @property
+    def _law(self) -> PixelLaw:
+        return super()._law._replace(occluder=self.occluder, outlier=self.outlier)
 
     def _noisy(self, rendered: Tensor) -> Tensor:
         chance, room = torch.rand_like(rendered), self._room(rendered)

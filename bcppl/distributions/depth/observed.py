@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
+from bcppl.distributions.depth.pixels import PixelLaw, log_totals
 from bcppl.distributions.depth.rendering import Array, Mask
 
 MOST_TOTALS = 100_000  # biases whose totals are cached
-BATCH = 1 << 17  # pixels whose densities are evaluated together: they then stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,42 +55,27 @@ class Observed:
         """The log-density of each image where no ray meets the part and there is no bias, (1 or N,)."""
         return np.asarray(self.without_part.sum(axis=1))
 
-    def totals_at(
-        self, log_density: Callable[[Tensor, Tensor], Tensor], log_uniform: float, bias: Array
-    ) -> Array:
+    def totals_at(self, law: PixelLaw, bias: Array) -> Array:
         """The log-density (N,) of the image without the part, its background farther by biases (N,).
 
         Each bias is evaluated once: particles that were copied, or moved in other coordinates, share it.
         """
-        biases = bias.tolist()
         if len(self.depth) > 1:
-            return np.array([self._total(k, log_density, log_uniform, [b])[0] for k, b in enumerate(biases)])
+            return np.array([self._total(k, law, bias[k : k + 1])[0] for k in range(len(bias))])
+        biases = bias.tolist()
         unknown = sorted({b for b in biases if b not in self.totals})
         if len(self.totals) + len(unknown) > MOST_TOTALS:
             self.totals.clear()
             unknown = sorted(set(biases))
         if unknown:
-            self.totals.update(zip(unknown, self._total(0, log_density, log_uniform, unknown), strict=True))
+            self.totals.update(zip(unknown, self._total(0, law, np.array(unknown)).tolist(), strict=True))
         return np.array([self.totals[b] for b in biases])
 
-    def _total(
-        self,
-        image: int,
-        log_density: Callable[[Tensor, Tensor], Tensor],
-        log_uniform: float,
-        biases: list[float],
-    ) -> list[float]:
+    def _total(self, image: int, law: PixelLaw, biases: Array) -> Array:
         """The log-density of one image without the part, at each of some biases."""
         known = np.flatnonzero(self.valid[image] & np.isfinite(self.behind))
-        nothing = log_uniform * float(self.valid[image].sum() - len(known))
-        depth = torch.from_numpy(self.depth[image].take(known))
-        behind = torch.from_numpy(self.behind.take(known))
-        totals: list[float] = []
-        rows = max(1, BATCH // max(len(known), 1))
-        for first in range(0, len(biases), rows):
-            shift = torch.tensor(biases[first : first + rows], dtype=torch.float64)[:, None]
-            totals += (log_density(depth, behind + shift).sum(dim=1) + nothing).tolist()
-        return totals
+        nothing = -math.log(law.far - law.near) * float(self.valid[image].sum() - len(known))
+        return nothing + log_totals(self.depth[image].take(known), self.behind.take(known), biases, law)
 
 
 def _alike(first: npt.NDArray[Any] | None, second: npt.NDArray[Any] | None) -> bool:
