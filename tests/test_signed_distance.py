@@ -10,7 +10,7 @@ import trimesh
 
 from bcppl.compiled import compiled
 from bcppl.geometry.distance import SignedDistance, closed_mesh
-from bcppl.geometry.gap.distance_grid import DistanceGrid, distance_grid, inexact, interpolated
+from bcppl.geometry.gap.distance_grid import DistanceGrid, RefinedGrid, distance_grid, inexact, interpolated
 from bcppl.geometry.parts import Part
 from bcppl.models.worlds.bench.parts import bench_part
 
@@ -55,11 +55,15 @@ def test_distances_are_those_of_libigl_and_negative_inside(name: str) -> None:
 def test_interpolation_is_nowhere_farther_off_than_the_grid_states(name: str) -> None:
     part = part_of(name)
     signed, rng = SignedDistance(part), np.random.default_rng(1)
-    grid = distance_grid(part, signed, 0.012, NEAR)
+    refined = RefinedGrid(distance_grid(part, signed, 0.012), signed, NEAR)
+    coarse = refined.grid
+    refined.measure()
+    grid = refined.grid
     points = rng.uniform(part.vertices.min(axis=0) - NEAR, part.vertices.max(axis=0) + NEAR, (100_000, 3))
     exact = signed(torch.from_numpy(points)).distance.numpy()
     here, stated = looked_up(points, grid)
     near = np.abs(exact) < NEAR
+    assert (np.abs(looked_up(points, coarse)[0] - exact) <= looked_up(points, coarse)[1] + 2e-6).all()
     off = np.abs(here - exact)
     assert (off <= stated + 2e-6).all()  # a cell whose corners are in a plane to 1e-6 counts as exact
     # Where something may be missed it is stated closely: a coarse bound costs exact distances.

@@ -155,10 +155,9 @@ class DepthDistribution(CameraImage):
         self._check_finite()
         seen = self.observed(value)
         hits = self._hits(np.asarray(seen.valid.any(axis=0)))
-        biases = self._biases
-        moves = biases is not None and not self.background_is_measured
-        total = seen.totals_at(self._law, biases) if moves else seen.total_without_part
-        bias = np.empty(0) if biases is None else biases
+        bias = np.empty(0) if self._biases is None else self._biases
+        moves = bool(len(bias)) and not self.background_is_measured
+        total = seen.totals_at(self._law, bias) if moves else seen.total_without_part
         pixels = Pixels(seen.depth, seen.valid, seen.behind, seen.without_part, bias, moves)
         starts = range(0, len(hits.pixel), HITS)
         gains = np.zeros((len(starts), len(self.pose)))

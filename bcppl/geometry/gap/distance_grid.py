@@ -19,6 +19,7 @@ SPACING = 0.001  # m, of a grid
 _INEXACT = 0.9  # spacings by which interpolation is off where no single plane is closest, at most
 _LEAST = 1e-7  # m by which it is taken to be off where no single plane is closest, at least
 _MOST = 2_000_000  # nodes of a grid
+_WORTH = 8.0  # exact distances that take as long as to measure one cell
 
 # By corner of a cell (0 or 1 along each axis), the distances there.
 Corners = Mapping[tuple[int, int, int], npt.NDArray[np.float32]]
@@ -37,13 +38,11 @@ class DistanceGrid(NamedTuple):
     inexact: npt.NDArray[np.float32]
 
 
-def distance_grid(part: Part, signed: SignedDistance, margin: float, near: float) -> DistanceGrid:
+def distance_grid(part: Part, signed: SignedDistance, margin: float) -> DistanceGrid:
     """The grid over a part's bounding box and `margin` metres around it.
 
     Trilinear interpolation is exact where one plane is closest, and within 0.9 spacings elsewhere, since the
-    distance has Lipschitz constant 1. Within `near` of the surface how far it is off is measured amid each
-    cell's corners, edges and faces: nowhere in it is it off by twice as much, be it round or at an edge
-    (450 000 points in each of four parts: by 1.9 times). A large part has a wider spacing than 1 mm.
+    distance has Lipschitz constant 1. A large part has a wider spacing than 1 mm.
     """
     low, high = part.vertices.min(axis=0) - margin, part.vertices.max(axis=0) + margin
     spacing = max(SPACING, float((np.prod(high - low) / _MOST) ** (1.0 / 3.0)))
@@ -52,16 +51,45 @@ def distance_grid(part: Part, signed: SignedDistance, margin: float, near: float
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     distance = signed(torch.from_numpy(nodes.reshape(-1, 3))).distance.numpy()
     distance = distance.reshape(*counts).astype(np.float32)
-    corner = _corners(distance)
-    inexact = np.where(_planar(corner, spacing), 0.0, _INEXACT * spacing).astype(np.float32)
-    closest = np.min([np.abs(each) for each in corner.values()], axis=0)
-    cells = np.argwhere((inexact > 0.0) & (closest < near + spacing))
-    if len(cells):
-        off = _measured(
-            cells, {at: each[tuple(cells.T)] for at, each in corner.items()}, low, spacing, signed
-        )
-        inexact[tuple(cells.T)] = np.minimum(2.0 * off + _LEAST, _INEXACT * spacing)
+    inexact = np.where(_planar(_corners(distance), spacing), 0.0, _INEXACT * spacing).astype(np.float32)
     return DistanceGrid(low, spacing, distance, inexact)
+
+
+class RefinedGrid:
+    """A grid that measures how far off its interpolation is, once that pays.
+
+    Where a grid is not known to be exact, exact distances are searched for. For few poses these take less
+    time than to measure, for many they take more: it is measured when they have taken about as much. That
+    changes no distance.
+
+    Attributes:
+        grid: as it is now.
+    """
+
+    def __init__(self, grid: DistanceGrid, signed: SignedDistance, near: float) -> None:
+        self.grid = grid
+        self._signed, self._near, self._searched = signed, near, 0
+        closest = np.min([np.abs(each) for each in _corners(grid.distance).values()], axis=0)
+        self._cells = np.argwhere((grid.inexact > 0.0) & (closest < near + grid.spacing))
+
+    def refine(self, searched: int) -> None:
+        """Note that so many more exact distances were searched for."""
+        self._searched += searched
+        if 0 < len(self._cells) * _WORTH <= self._searched:
+            self.measure()
+
+    def measure(self) -> None:
+        """Measure how far off interpolation is, in cells within `near` metres of the surface.
+
+        Amid each cell's corners, edges and faces: nowhere in it is it off by twice as much, be it round or at
+        an edge (450 000 points in each of four parts: by 1.9 times).
+        """
+        cells, grid = self._cells, self.grid
+        corner = {at: each[tuple(cells.T)] for at, each in _corners(grid.distance).items()}
+        off = _measured(cells, corner, grid.low, grid.spacing, self._signed)
+        inexact = grid.inexact.copy()
+        inexact[tuple(cells.T)] = np.minimum(2.0 * off + _LEAST, _INEXACT * grid.spacing)
+        self.grid, self._cells = grid._replace(inexact=inexact), cells[:0]
 
 
 def _measured(cells: Indices, corner: Corners, low: Array, spacing: float, signed: SignedDistance) -> Array:

@@ -12,7 +12,7 @@ from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.effort import Effort
 from bcppl.geometry.distance import SignedDistance
-from bcppl.geometry.gap.distance_grid import DistanceGrid, distance_grid
+from bcppl.geometry.gap.distance_grid import RefinedGrid, distance_grid
 from bcppl.geometry.gap.edges import by_edges
 from bcppl.geometry.gap.frames import Frames, frames_of
 from bcppl.geometry.gap.sharp_edges import sharp_edges
@@ -73,7 +73,7 @@ class PegGap:
         self.part, self.peg = part, peg
         self.effort = Effort()
         self._signed = SignedDistance(part)
-        self._grid: DistanceGrid | None = None
+        self._grid: RefinedGrid | None = None
         self._edges = sharp_edges(part)
         self._solids = solids_of(peg)
 
@@ -88,20 +88,20 @@ class PegGap:
         particles, stamps = len(part.translation), peg.translation.shape[1]
         with self.effort.measure(items=particles * stamps):
             if self._grid is None:
-                self._grid = distance_grid(self.part, self._signed, _MARGIN, NEAR)
+                self._grid = RefinedGrid(distance_grid(self.part, self._signed, _MARGIN), self._signed, NEAR)
             distance = np.empty((particles, stamps))
             witness, normal = np.empty((particles, stamps, 3)), np.empty((particles, stamps, 3))
-            result, grid, surface = (distance, witness, normal), self._grid, self._signed.surface
+            result, grid, surface = (distance, witness, normal), self._grid.grid, self._signed.surface
             chunk = max(_CHUNK, _PAIRS // max(1, stamps))
 
             def of_vertices(first: int, last: int) -> int:
-                by_vertices(first, last, part, peg, grid, surface, self._solids, *result)
-                return 0
+                return by_vertices(first, last, part, peg, grid, surface, self._solids, *result)
 
             def of_edges(first: int, last: int) -> int:
                 by_edges(first, last, part, peg, self._edges, self._solids, *result)
                 return 0
 
-            parallel_sum(of_vertices, 0, particles, chunk, thread_count())
+            searched = parallel_sum(of_vertices, 0, particles, chunk, thread_count())
             parallel_sum(of_edges, 0, particles, chunk, thread_count())
+            self._grid.refine(searched)
         return distance, witness, normal

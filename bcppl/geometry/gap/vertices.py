@@ -56,8 +56,13 @@ def by_vertices(
     distance: Array,
     witness: Array,
     normal: Array,
-) -> None:
-    """Set the distances of the peg's vertices to the part, their witness points (3,) and normals (3,)."""
+) -> int:
+    """Set the distances of the peg's vertices to the part, their witness points (3,) and normals (3,).
+
+    Returns:
+        how many exact distances were searched for, where the grid was not known to be exact enough.
+    """
+    searched = 0
     corners, stops, spheres = solids.corners, solids.stops, solids.spheres
     bound, here, slack = np.empty((2, len(spheres))), np.empty(len(corners)), np.empty(len(corners))
     turn, shift = np.empty((3, 3)), np.empty(3)
@@ -117,7 +122,9 @@ def by_vertices(
                 inexact_ones[nearest] = inexact_ones[left]
                 if here[c] - slack[c] >= distance[n, t]:
                     break
+                searched += 1
                 placed(corners[c], turn, shift, point)
                 away, triangle[c] = signed_at(point, surface, triangle[c], on_part, gradient)
                 if away < distance[n, t]:
                     distance[n, t], witness[n, t], normal[n, t] = away, point, gradient
+    return searched
