@@ -14,10 +14,10 @@ import shapely
 import trimesh
 
 from bcppl.errors import InputError
-from bcppl.geometry import decomposition
-from bcppl.geometry.decomposition import decomposed
+from bcppl.geometry.convex import decomposition
+from bcppl.geometry.convex.decomposition import decomposed
+from bcppl.geometry.convex.hausdorff import hausdorff_error
 from bcppl.geometry.extrusion import block
-from bcppl.geometry.hausdorff import hausdorff_error
 from bcppl.geometry.parts import Part, Piece
 
 

@@ -20,8 +20,8 @@ from bcppl.contact.nuisances import Nuisances
 from bcppl.contact.physics import PegPhysics
 from bcppl.errors import InputError
 from bcppl.geometry import extrusion
+from bcppl.geometry.convex.hausdorff import hausdorff_error, solid_of
 from bcppl.geometry.extrusion import block, block_with_hole, box_peg, cylinder_peg, extruded, peg_for
-from bcppl.geometry.hausdorff import hausdorff_error, solid_of
 from bcppl.geometry.holes import hole_of
 from bcppl.geometry.layers import prismatic
 from bcppl.geometry.outlines import NAMED, check_fit, named_outline, round_outline

@@ -12,7 +12,7 @@ import torch
 from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.distributions.checks import chi_square
-from bcppl.geometry.hausdorff import hausdorff_error
+from bcppl.geometry.convex.hausdorff import hausdorff_error
 from bcppl.inference.criticism.hypotheses import Displaced, Edge, alternatives, displaced, edges, likeliest
 from bcppl.inference.criticism.nuisances import SuddenChange, sudden_changes
 from bcppl.inference.criticism.predictive import THRESHOLD, Check, surprise
@@ -148,7 +148,7 @@ def piece_errors(recording: Recording) -> list[str]:
             wrong.append(
                 f"the convex pieces of part {solid.name!r} extend {1e3 * error.added:.2g} mm beyond its mesh "
                 f"and lack up to {1e3 * error.lost:.2g} mm of it: it is touched as another shape than it is "
-                "seen as; decompose it again (bcppl.geometry.decomposition)."
+                "seen as; decompose it again (bcppl.geometry.convex.decomposition)."
             )
     return wrong
 

@@ -77,7 +77,7 @@ def pieces_of(part: Part) -> Sequence[Piece]:
             f"part {part.name!r} has no convex pieces and its mesh is not convex, so contact cannot be "
             "simulated; give it convex pieces with `bcppl.geometry.extrusion.extruded` (from its "
             "outline), `bcppl.geometry.layers.prismatic` (upright walls) or "
-            "`bcppl.geometry.decomposition.decomposed` (any mesh)."
+            "`bcppl.geometry.convex.decomposition.decomposed` (any mesh)."
         )
     return [Piece("hull", np.asarray(part.mesh.convex_hull.vertices, dtype=np.float64))]
 

@@ -13,7 +13,7 @@ import trimesh
 from shapely.affinity import rotate, translate
 
 from bcppl.errors import InputError
-from bcppl.geometry.cover import Cell, convex_cells, straightened
+from bcppl.geometry.convex.cover import Cell, convex_cells, straightened
 from bcppl.geometry.outlines import check_outline, positive, rectangular_outline, round_outline
 from bcppl.geometry.parts import Part, Piece
 

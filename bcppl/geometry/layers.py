@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 from bcppl.arguments import number_within
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.geometry.cover import Cell, convex_cells, grown_in, polygons_of, straightened
+from bcppl.geometry.convex.cover import Cell, convex_cells, grown_in, polygons_of, straightened
+from bcppl.geometry.convex.hausdorff import hausdorff_error
 from bcppl.geometry.extrusion import BEVEL, OVERLAP
-from bcppl.geometry.hausdorff import hausdorff_error
 from bcppl.geometry.parts import Part, Piece
 
 _LEVEL = 2e-6  # m: vertices closer in height than this lie on one level; files round to 1e-6

@@ -12,7 +12,7 @@ from shapely.affinity import translate
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.geometry.cover import polygons_of
+from bcppl.geometry.convex.cover import polygons_of
 from bcppl.geometry.parts import Part
 
 _BELOW = 0.0002  # m below the top at which its outline is taken

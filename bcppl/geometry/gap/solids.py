@@ -8,7 +8,7 @@ import numpy as np
 
 from bcppl.arrays import Array, Indices
 from bcppl.geometry.bounding_spheres import bounding_sphere, compact_groups
-from bcppl.geometry.hausdorff import planes_of, solid_of
+from bcppl.geometry.convex.hausdorff import planes_of, solid_of
 from bcppl.geometry.parts import Part
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from bcppl.errors import InputError
-from bcppl.geometry.decomposition import decomposed
+from bcppl.geometry.convex.decomposition import decomposed
 from bcppl.geometry.extrusion import box_peg, round_peg
 from bcppl.geometry.layers import prismatic
 from bcppl.geometry.parts import Guess, Part, load_mesh

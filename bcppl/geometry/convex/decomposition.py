@@ -23,7 +23,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from bcppl.arguments import number_within, seed_number
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.geometry.hausdorff import HausdorffError, bodies_of, hausdorff_error
+from bcppl.geometry.convex.hausdorff import HausdorffError, bodies_of, hausdorff_error
 from bcppl.geometry.parts import Part, Piece
 
 FRACTION = 0.2  # of the clearance that the error may use up in either direction
