@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -35,6 +36,7 @@ _REFUTED = 10.0  # nats by which a mode that started at another component of the
 _LEFT = 20
 # Squared standard deviations within which two starts have come together, and lead to the same mode.
 _MET = 0.01
+_REPLICAS = 16  # of the best mode, for a site whose check draws them
 
 # The sites of the likelihood at poses (S, 7), errors `blur` metres wider, each with its observed value.
 Sites = Callable[[Tensor, float], Iterable[tuple[Any, Tensor]]]
@@ -146,8 +148,12 @@ def _searched(
 
 def _explains(sites: Sites, pose: Tensor) -> bool:
     """Whether no site would be warned of at a pose (1, 7)."""
-    for site, value in sites(pose, 0.0):
-        check = site.predictive_check(value, lambda: None) if isinstance(site, Checked) else None
+
+    def replicas(number: int) -> Any:
+        return list(sites(pose.repeat(_REPLICAS, 1), 0.0))[number][0]
+
+    for k, (site, value) in enumerate(sites(pose, 0.0)):
+        check = site.predictive_check(value, partial(replicas, k)) if isinstance(site, Checked) else None
         if check is not None and check.surprising:
             return False
     return True
