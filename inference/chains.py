@@ -34,7 +34,7 @@ from bcppl.inference.progress import watched
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace
-from bcppl.traces.trace import shapes
+from bcppl.traces.values import shapes
 
 
 class Chains(NamedTuple):

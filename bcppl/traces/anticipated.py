@@ -10,8 +10,9 @@ from typing import Any
 from torch import Tensor
 
 from bcppl.distributions.support import Support
+from bcppl.traces.dependence.changes import changed
 from bcppl.traces.series import SeriesTrace
-from bcppl.traces.trace import Trace, changed
+from bcppl.traces.trace import Trace
 from bcppl.traces.update import update
 from bcppl.traces.values import Value, tensors
 from bcppl.traces.verbs import constrained

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,15 +16,14 @@ from bcppl.distributions.support import Support, support_of
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.common import Common
-from bcppl.traces.dependence.equality import comparison, equal
-from bcppl.traces.dependence.surroundings import changed as surroundings_changed
+from bcppl.traces.dependence.changes import changed
 from bcppl.traces.differentiation.graph import kept
 from bcppl.traces.evaluation import Hiding, log_probability
 from bcppl.traces.explained import hidden_site, other_addresses, refuse_masked
 from bcppl.traces.indexing import Index, aligned, beside, particles_at
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.structural import Structure
-from bcppl.traces.values import Value, held, tensors
+from bcppl.traces.values import Value, held, shapes, tensors
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -372,24 +371,3 @@ def _of_each_particle(value: Tensor, site: Any, particles: int) -> Tensor:
             # Kernels would round what they move.
             value = value if support_of(site).is_discrete else value.to(torch.float64)
     return value
-
-
-def changed(first: Trace, second: Trace, addresses: Iterable[str]) -> Iterator[str]:
-    """Those of some addresses of two traces whose values or distributions differ."""
-    same, then, now = comparison(), first._run, second._run
-    if kept():
-        # Equal numbers may depend on different tensors.
-        yield from addresses
-        return
-    for address in addresses:
-        if (
-            not equal(then.values[address], now.values[address])
-            or not same(then.distributions[address], now.distributions[address])
-            or surroundings_changed(then.surroundings.get(address, {}), now.surroundings.get(address, {}))
-        ):
-            yield address
-
-
-def shapes(values: Mapping[str, Tensor]) -> str:
-    """Addresses and the shapes of their values, `x (3,), y (3, 7)`, or `none`."""
-    return ", ".join(f"{address} {tuple(value.shape)}" for address, value in values.items()) or "none"

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
+from bcppl.traces.dependence.changes import changed
 from bcppl.traces.explained import other_addresses
 from bcppl.traces.series import SeriesTrace
-from bcppl.traces.trace import Trace, changed
+from bcppl.traces.trace import Trace
 from bcppl.traces.values import Value, tensors
 from bcppl.traces.verbs import constrained, copied, log_weight, refuse_unfit
 

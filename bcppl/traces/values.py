@@ -54,3 +54,8 @@ def _tensor(address: str, value: Any) -> Tensor:
     raise InputError(
         f"the value given for address {address!r} is a {kind}; give a tensor, a numpy array or a number."
     )
+
+
+def shapes(values: Mapping[str, Tensor]) -> str:
+    """Addresses and the shapes of their values, `x (3,), y (3, 7)`, or `none`."""
+    return ", ".join(f"{address} {tuple(value.shape)}" for address, value in values.items()) or "none"

@@ -21,8 +21,8 @@ from bcppl.traces.faults import Fault, ProgramError
 from bcppl.traces.indexing import indexed
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.series import Series, SeriesTrace, Stage, runnable
-from bcppl.traces.trace import Trace, refuse_masked_latents, shapes
-from bcppl.traces.values import Value, held, tensors
+from bcppl.traces.trace import Trace, refuse_masked_latents
+from bcppl.traces.values import Value, held, shapes, tensors
 
 # A vector that was meant as one event is unlikely to have more entries.
 FEW = 20

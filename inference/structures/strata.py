@@ -17,7 +17,7 @@ from bcppl.inference.population import FIELDS, Population
 from bcppl.inference.summaries import Probabilities
 from bcppl.traces import Structure, Trace
 from bcppl.traces.series import SeriesTrace
-from bcppl.traces.trace import shapes
+from bcppl.traces.values import shapes
 
 
 @dataclass(frozen=True, eq=False, repr=False)

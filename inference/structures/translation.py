@@ -48,7 +48,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals import Program
 from bcppl.traces import Trace, generate, simulate
 from bcppl.traces.differentiation.programs import result_with_grad, with_gradients
-from bcppl.traces.trace import shapes
+from bcppl.traces.values import shapes
 from bcppl.traces.verbs import assessed
 
 
