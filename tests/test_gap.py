@@ -205,6 +205,21 @@ def test_pegs_that_lean_in_a_hole_are_as_far_from_its_walls_as_by_mujoco() -> No
     assert off.max() < 1e-7 and off.min() > -5e-5 and (np.abs(off) < 1e-7).mean() > 0.75
 
 
+def test_a_grid_that_knows_how_inexact_it_is_gives_the_same_gaps_with_fewer_searches() -> None:
+    gap = PegGap(bench_part("round tray").part, peg_for(round_outline(0.008), 0.0005, 0.05))
+    pegs = torch.cat([anyhow(40, 3, 0.02), anyhow(200, 4, 0.03)])
+    coarse = gap(poses.identity(1), pegs)
+    assert gap._grid is not None
+    before, grid = gap._grid._searched, gap._grid.grid
+    gap._grid.measure()
+    assert gap._grid.grid is not grid
+    fine = gap(poses.identity(1), pegs)
+    for name in ("distance", "witness", "normal"):
+        torch.testing.assert_close(getattr(coarse, name), getattr(fine, name), rtol=0.0, atol=2e-6)
+    assert before > 100
+    assert gap._grid._searched - before < 0.8 * before
+
+
 def test_centred_in_a_round_hole_it_is_half_the_clearance() -> None:
     gap, clearance = in_a_hole()
     off = np.array([0.0, 5e-5, -1e-4, 2e-4, 0.00025, 0.0003])
