@@ -16,6 +16,7 @@ from typing import Any
 import pyro
 
 from bcppl.distributions.poses import prior_from_guess
+from bcppl.geometry.gap import PegGap
 from bcppl.geometry.parts import Part
 from bcppl.models.shipped import simulated_in
 from bcppl.rendering.part_renderer import PartRenderer
@@ -38,13 +39,17 @@ def look_and_touch(scene: Scene, actions: Sequence[Any]) -> None:
 
 
 def prepare(
-    recording: Recording, renderer: Callable[[Part], PartRenderer] = renderer_for, **settings: Any
+    recording: Recording,
+    renderer: Callable[[Part], PartRenderer] = renderer_for,
+    gap: Callable[[Part, Part], PegGap] = PegGap,
+    **settings: Any,
 ) -> Scene:
     """The scene of a recording.
 
     Args:
         recording: of depth images and probe windows.
         renderer: makes the renderer of the part; by default the one that is faster for its mesh.
+        gap: makes what measures the gap between part and peg.
         settings: fields of `CameraSettings` and `TouchSettings`.
 
     Raises:
@@ -55,7 +60,7 @@ def prepare(
     prior = prior_from_guess(recording.guess)
     likelihoods: dict[str, Prepare] = {
         "view": partial(ErringCamera, prior=prior, settings=cameras, renderer=renderer),
-        "window": partial(ContactProbe.prepare, settings=touches),
+        "window": partial(ContactProbe.prepare, settings=touches, gap=gap),
     }
     return Scene(prior, likelihoods_for(recording, likelihoods), "look_and_touch")
 

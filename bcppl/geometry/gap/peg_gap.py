@@ -67,7 +67,7 @@ class PegGap:
         InputError: a mesh is empty, open or not finite.
     """
 
-    __caches__ = ("_grid",)  # of the part
+    __caches__: tuple[str, ...] = ("_grid",)  # of the part
 
     def __init__(self, part: Part, peg: Part) -> None:
         self.part, self.peg = part, peg

@@ -13,7 +13,7 @@ from bcppl.geometry.parts import Part
 
 _LONGEST = 0.008  # m; longer edges are subdivided
 _SHARP = np.radians(5.0)  # smallest dihedral angle
-_CANCELLED = 0.1  # length of a sum of unit normals below which they are opposite
+CANCELLED = 0.1  # length of a sum of unit normals below which they are opposite
 
 
 class SharpEdges(NamedTuple):
@@ -136,14 +136,14 @@ def segment_distance(
                 continue
             mixed = second / (first + second)
             apart = mixed * rows[f, 0] + (1.0 - mixed) * rows[g, 0]
-            if apart <= (best if best < 0.0 else _CANCELLED * best):
+            if apart <= (best if best < 0.0 else CANCELLED * best):
                 continue
             x = mixed * planes[f, 0] + (1.0 - mixed) * planes[g, 0]
             y = mixed * planes[f, 1] + (1.0 - mixed) * planes[g, 1]
             z = mixed * planes[f, 2] + (1.0 - mixed) * planes[g, 2]
             length = np.sqrt(x * x + y * y + z * z)
             # Normals that are nearly opposite: the segment crosses a thin solid.
-            if length > _CANCELLED and apart / length > best:
+            if length > CANCELLED and apart / length > best:
                 best = apart / length
                 share = min(max((rows[f, 0] - rows[g, 0]) / (first + second), 0.0), 1.0)
                 normal[0], normal[1], normal[2] = x / length, y / length, z / length

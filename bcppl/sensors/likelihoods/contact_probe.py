@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 
@@ -96,11 +96,14 @@ class TouchSettings:
             )
 
 
+MakesGap = Callable[[Part, Part], PegGap]
+
+
 @lru_cache(maxsize=4)
-def _solids(part: Part, peg: Part) -> tuple[PegGap, QuasiStaticMotion]:
+def _solids(part: Part, peg: Part, gap: MakesGap) -> tuple[PegGap, QuasiStaticMotion]:
     """Distances between two solids, prepared once for all scenes of the same two."""
-    gap = PegGap(part, peg)
-    return gap, QuasiStaticMotion(gap)
+    measure = gap(part, peg)
+    return measure, QuasiStaticMotion(measure)
 
 
 def _shared_errors(
@@ -127,6 +130,7 @@ class ContactProbe:
     Args:
         recording: its part, peg and probes.
         settings: of the touches.
+        gap: makes what measures the gap between part and peg.
 
     Raises:
         InputError: the recording has no peg.
@@ -134,11 +138,11 @@ class ContactProbe:
 
     __caches__ = ("_streams",)
 
-    def __init__(self, recording: Recording, settings: TouchSettings) -> None:
+    def __init__(self, recording: Recording, settings: TouchSettings, gap: MakesGap = PegGap) -> None:
         if recording.peg is None:
             raise InputError("the recording has probe windows but no peg; add the peg that was held.")
         self.settings, self.peg = settings, recording.peg
-        self.gap, self.quasi_static = _solids(recording.part, recording.peg)
+        self.gap, self.quasi_static = _solids(recording.part, recording.peg, gap)
         profile = profile_named(settings.profile)
         self.bench, self.hypotheses = _shared_errors(recording, settings, profile)
         own = GEOMETRY if profile is None else math.hypot(GEOMETRY, profile.repeats)
@@ -146,10 +150,12 @@ class ContactProbe:
         self._streams: dict[str, ProbeRows] = {}
 
     @classmethod
-    def prepare(cls, recording: Recording, settings: TouchSettings) -> ContactProbe | None:
+    def prepare(
+        cls, recording: Recording, settings: TouchSettings, gap: MakesGap = PegGap
+    ) -> ContactProbe | None:
         """The likelihood of a recording's touches; None for one without peg and touches."""
         touched = any(isinstance(m.action, ProbeWindow) for m in recording.measurements)
-        return cls(recording, settings) if touched or recording.peg is not None else None
+        return cls(recording, settings, gap) if touched or recording.peg is not None else None
 
     @property
     def efforts(self) -> Mapping[str, Effort]:
