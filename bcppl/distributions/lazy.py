@@ -49,8 +49,9 @@ class LazyDistribution(TorchDistribution):
         )
 
     def undrawn(self) -> Tensor:
-        """NaN in the shape of a sample."""
-        return torch.full((*self.batch_shape, *self.event_shape), torch.nan, dtype=torch.float64)
+        """NaN in the shape of a sample, all of it one number in memory."""
+        nothing = torch.tensor(torch.nan, dtype=torch.float64)
+        return nothing.expand(*self.batch_shape, *self.event_shape)
 
     @property
     def log_prob_bound(self) -> float:

@@ -168,7 +168,8 @@ class ContactManifold(LazyDistribution):
         """A sample of each of several, their motions all in one batch where they can be run together.
 
         All have the same noise, as far as they have as many stamps, so that they are compared by what differs
-        between them; torch's generator is left as one of them leaves it.
+        between them; torch's generator is left as one of them leaves it. Each is as long as its motion, and
+        has as many columns as that predicts.
         """
         kinds = {type(site.motion) for site in sites}
         together = getattr(next(iter(kinds)), "together", None) if len(kinds) == 1 else None

@@ -211,8 +211,9 @@ class ContactEpisodes(FilteredEpisodes):
         outliers = float(bdtrc(deep.numpy() - 1, len(free), self.outlier).mean())
         return Check(min(1.0, 2.0 * min(whole.probability, outliers)), "contacts", whole.excess)
 
-    def _with_errors(self, rows: Tensor) -> Tensor:
-        return padded(super()._with_errors(rows), self.stamps)
+    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
+        """As of `ContactManifold`, with room (N, T, COLUMNS) for all that a measured window has."""
+        return padded(super().sample(sample_shape), self.stamps)
 
     def _spread_at(self, gaps: Gaps, rows: Tensor) -> Tensor:
         """Standard deviations (N, R) of the gaps of rows without contact, a priori."""
