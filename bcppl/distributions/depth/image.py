@@ -25,7 +25,7 @@ from bcppl.distributions.parameters import IF_GIVEN, POSITIVE, ranges
 from bcppl.errors import InputError
 from bcppl.threads import parallel_sum, thread_count
 
-HITS = 1 << 16  # of a chunk of work
+HITS, CHUNKS = 1 << 16, 64  # of a chunk of work, at least; of these at most, each with sums of its own
 
 
 @dataclass(eq=False, repr=False)
@@ -159,12 +159,13 @@ class DepthDistribution(CameraImage):
         moves = bool(len(bias)) and not self.background_is_measured
         total = seen.totals_at(self._law, bias) if moves else seen.total_without_part
         pixels = Pixels(seen.depth, seen.valid, seen.behind, seen.without_part, bias, moves)
-        starts = range(0, len(hits.pixel), HITS)
+        size = max(HITS, len(hits.pixel) // CHUNKS + 1)
+        starts = range(0, len(hits.pixel), size)
         gains = np.zeros((len(starts), len(self.pose)))
 
         def work(first: int, last: int) -> int:
             for k in range(first, last):
-                begin, end = starts[k], min(starts[k] + HITS, len(hits.pixel))
+                begin, end = starts[k], min(starts[k] + size, len(hits.pixel))
                 sum_gains(begin, end, hits.particle, hits.pixel, hits.depth, pixels, self._law, gains[k])
             return 0
 

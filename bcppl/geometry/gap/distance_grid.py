@@ -68,7 +68,7 @@ class RefinedGrid:
 
     def __init__(self, grid: DistanceGrid, signed: SignedDistance, near: float) -> None:
         self.grid = grid
-        self._signed, self._near, self._searched = signed, near, 0
+        self._signed, self._searched = signed, 0
         closest = np.min([np.abs(each) for each in _corners(grid.distance).values()], axis=0)
         self._cells = np.argwhere((grid.inexact > 0.0) & (closest < near + grid.spacing))
 
