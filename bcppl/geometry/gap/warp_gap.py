@@ -234,7 +234,7 @@ def _measure(
 class WarpGap(PegGap):
     """The gap between a part and a peg by Warp; see `PegGap`.
 
-    Within 4 mm of a contact it is `PegGap`'s to 1 um. Farther away that interpolates, and this does not.
+    Within 3 mm of contact it is `PegGap`'s to 20 nm. Farther away that interpolates, and this does not.
 
     Args:
         part, peg: the solids.
@@ -256,10 +256,8 @@ class WarpGap(PegGap):
         solids, edges, bodies = self._solids, self._edges, Bodies()
         offset = np.append(self._center, 0.0)
         bodies.mesh = self._mesh.id
-        bodies.corners, bodies.planes = (
-            self._array(solids.corners, wp.vec3),
-            self._array(solids.planes, wp.vec4),
-        )
+        bodies.corners = self._array(solids.corners, wp.vec3)
+        bodies.planes = self._array(solids.planes, wp.vec4)
         bodies.spheres = self._array(solids.spheres, wp.vec4)
         bodies.lowest, bodies.highest = (wp.vec3(*map(float, side)) for side in solids.box)
         bodies.edge_ends = self._array(edges.ends - self._center, wp.vec3)
