@@ -15,6 +15,7 @@ from torch import Tensor
 
 from bcppl.arrays import Array
 from bcppl.compiled import compiled
+from bcppl.devices import is_on_host
 
 SMALL = 1e-4  # rad: below, a series' first term is exact to rounding
 
@@ -24,11 +25,13 @@ Kernel = Callable[[Array, Array, Array], None]
 def fused(kernel: Kernel, first: Tensor, second: Tensor, *shape: int) -> Tensor | None:
     """A kernel's result (..., *shape) of operands (..., K) that broadcast; None where torch computes it.
 
-    That is where a gradient is asked for, and with numbers of another type.
+    That is where a gradient is asked for, with numbers of another type, and on a GPU.
     """
     if first.requires_grad or second.requires_grad:
         return None
     if first.dtype is not torch.float64 or second.dtype is not torch.float64:
+        return None
+    if not (is_on_host(first) and is_on_host(second)):
         return None
     batch = first.shape[:-1]
     if batch != second.shape[:-1]:

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from bcppl import pose_kernels as kernels, quaternions
 from bcppl.arguments import pose_problem
+from bcppl.devices import constant, is_on_host, numbers
 from bcppl.errors import InputError
 from bcppl.pose_kernels import fused
 
@@ -47,14 +48,22 @@ def as_pose(values: object, name: str = "pose") -> Tensor:
         InputError: the last dimension is not 7, a number is not finite, or a quaternion is not a unit one.
     """
     pose = torch.as_tensor(values, dtype=torch.float64)
-    if problem := pose_problem(name, pose.detach().cpu().numpy()):
+    # Of many on a GPU only whether all are valid is asked there.
+    if (is_on_host(pose) or not bool(_are_valid(pose))) and (problem := pose_problem(name, numbers(pose))):
         raise InputError(problem)
     return torch.cat([pose[..., :3], pose[..., 3:] / pose[..., 3:].norm(dim=-1)[..., None]], dim=-1)
 
 
+def _are_valid(pose: Tensor) -> Tensor:
+    if pose.ndim == 0 or pose.shape[-1] != 7:
+        return torch.tensor(False)
+    unit = (pose[..., 3:].norm(dim=-1) - 1.0).abs() <= 1e-3
+    return unit.all() & torch.isfinite(pose).all()
+
+
 def quaternion_xyzw(pose: Tensor) -> Tensor:
     """The rotations of poses (..., 7) as unit quaternions in scipy's order, shape (..., 4)."""
-    return pose.index_select(-1, _XYZW)
+    return pose.index_select(-1, constant(_XYZW, pose))
 
 
 def from_translation_quaternion_xyzw(translation: Tensor, quaternion: Tensor) -> Tensor:
@@ -62,7 +71,7 @@ def from_translation_quaternion_xyzw(translation: Tensor, quaternion: Tensor) ->
     if translation.shape[:-1] != quaternion.shape[:-1]:
         batch = torch.broadcast_shapes(translation.shape[:-1], quaternion.shape[:-1])
         translation, quaternion = translation.expand(*batch, 3), quaternion.expand(*batch, 4)
-    return torch.cat([translation, quaternion.index_select(-1, _WXYZ)], dim=-1)
+    return torch.cat([translation, quaternion.index_select(-1, constant(_WXYZ, quaternion))], dim=-1)
 
 
 def from_rotation_matrix(translation: Tensor, rotation: Tensor) -> Tensor:

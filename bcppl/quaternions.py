@@ -12,6 +12,8 @@ import math
 import torch
 from torch import Tensor
 
+from bcppl.devices import constant
+
 # What a product of quaternions, and a rotation matrix row by row, take of the outer product of two
 # quaternions (of one with itself): rows x x, x y, x z, x w, y x, ... w w. A small batch costs by operations.
 _PRODUCT = torch.tensor(
@@ -43,12 +45,12 @@ _RELATIVE = _CONJUGATE.repeat_interleave(4)[:, None] * _PRODUCT  # the same of t
 
 def product(first: Tensor, second: Tensor) -> Tensor:
     """The quaternion (..., 4) of the rotation `second` followed by the rotation `first`."""
-    return _outer(first, second) @ _PRODUCT.to(first.dtype)
+    return _outer(first, second) @ constant(_PRODUCT, first)
 
 
 def relative(first: Tensor, second: Tensor) -> Tensor:
     """The quaternion (..., 4) of the rotation that is followed by `first` to give the rotation `second`."""
-    return _outer(first, second) @ _RELATIVE.to(first.dtype)
+    return _outer(first, second) @ constant(_RELATIVE, first)
 
 
 def _outer(first: Tensor, second: Tensor) -> Tensor:
@@ -58,7 +60,7 @@ def _outer(first: Tensor, second: Tensor) -> Tensor:
 
 def conjugate(quaternion: Tensor) -> Tensor:
     """The quaternion (..., 4) of the inverse rotation."""
-    return quaternion * _CONJUGATE.to(quaternion.dtype)
+    return quaternion * constant(_CONJUGATE, quaternion)
 
 
 def from_rotation_vector(vector: Tensor) -> Tensor:
@@ -77,7 +79,7 @@ def rotation_vector(quaternion: Tensor) -> Tensor:
 
 def rotation_matrix(quaternion: Tensor) -> Tensor:
     """The rotation matrix (..., 3, 3) of a unit quaternion (..., 4)."""
-    rows = _outer(quaternion, quaternion) @ _ROTATION.to(quaternion.dtype)
+    rows = _outer(quaternion, quaternion) @ constant(_ROTATION, quaternion)
     return rows.reshape(*quaternion.shape[:-1], 3, 3)
 
 
@@ -87,7 +89,7 @@ def from_rotation_matrix(rotation: Tensor) -> Tensor:
     Of four expressions for the quaternion, the one that divides by the largest number (Markley, Unit
     quaternion from rotation matrix, JGCD 31, 2008, eqs. 7 to 9).
     """
-    outer = (rotation.flatten(-2) @ _ROTATION.T.to(rotation.dtype)).unflatten(-1, (4, 4))
+    outer = (rotation.flatten(-2) @ constant(_ROTATION, rotation).T).unflatten(-1, (4, 4))
     rows = outer + torch.eye(4, dtype=rotation.dtype)  # 4 q qT
     largest = rows.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)[..., None, None]
     row = rows.gather(-2, largest.expand(*largest.shape[:-1], 4))[..., 0, :]

@@ -13,6 +13,7 @@ from torch import Tensor
 from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised
 from bcppl.beliefs.belief import ApparentPose, SeesPart
+from bcppl.devices import HOST, moved
 from bcppl.distributions.support import refuse_several_poses
 from bcppl.errors import InferenceError, InputError, OtherKindError
 from bcppl.inference.ancestry import inherited
@@ -210,7 +211,9 @@ class Population:
                 f"a belief over {address!r} was asked for, which is no pose: its values have shape "
                 f"{tuple(poses.shape[1:])}; use bcppl.inference.summaries."
             )
-        return Belief(poses, self.log_weights, freedom or FREE, self.apparent_pose(address))
+        # What people read is on the host, wherever the particles are.
+        poses, log_weights = moved((poses, self.log_weights), HOST)
+        return Belief(poses, log_weights, freedom or FREE, self.apparent_pose(address))
 
     def apparent_pose(self, address: str) -> ApparentPose | None:
         """The pose at an address as seen from a held peg; None where its measured pose is its true one."""

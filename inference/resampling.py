@@ -24,6 +24,7 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, seed_number, whole_number
 from bcppl.beliefs import normalised
+from bcppl.devices import same_random_state
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 
@@ -31,7 +32,7 @@ from bcppl.inference.population import Population
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
     """Torch's generator seeded within, and restored afterwards."""
-    with torch.random.fork_rng(devices=[]):
+    with same_random_state():
         torch.manual_seed(seed_number(seed))
         yield
 

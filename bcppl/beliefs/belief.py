@@ -25,6 +25,7 @@ from bcppl.beliefs.weights import (
     normalised,
     weighted_quantiles,
 )
+from bcppl.devices import beside, is_on_host
 from bcppl.errors import InputError
 from bcppl.poses import FREE, Freedom, as_pose
 
@@ -145,11 +146,20 @@ class Belief:
         The rotation minimises the weighted sum of squared chordal distances (Markley et al., Averaging
         quaternions, JGCD 30, 2007, eq. 12).
         """
+        if not is_on_host(self.weights):
+            return self._mean_there
         weights = self.weights.numpy()
         rotation = Rotation.from_quat(poses.quaternion_xyzw(self.world_from_part).numpy()).mean(weights)
         return poses.from_translation_quaternion_xyzw(
             self.weights @ self.world_from_part[:, :3], torch.from_numpy(np.asarray(rotation.as_quat()))
         )
+
+    @property
+    def _mean_there(self) -> Tensor:
+        """The mean on a GPU: the quaternion is the leading eigenvector of their weighted products."""
+        turn = self.world_from_part[:, 3:]
+        _, axes = torch.linalg.eigh((turn.T @ (self.weights[:, None] * turn)).cpu())
+        return torch.cat([self.weights @ self.world_from_part[:, :3], beside(axes[:, -1], turn)])
 
     @cached_property
     def tangent(self) -> Tensor:

@@ -40,7 +40,7 @@ class GaussianMixture(NamedTuple):
     def component(self, pose: Tensor) -> Tensor:
         """The most probable component of each of the poses (N, 7), (N,) int64."""
         if self.log_weights.shape[-1] == 1:
-            return torch.zeros(len(pose), dtype=torch.int64)
+            return torch.zeros(len(pose), dtype=torch.int64, device=pose.device)
         log_prob = NormalTwist(self.centers, self.covariances).log_prob(pose[:, None])
         return (self.log_weights + log_prob).argmax(dim=1)
 

@@ -12,9 +12,9 @@ from bcppl.geometry.camera import Camera
 
 
 @lru_cache(maxsize=256)
-def _nominal(camera: Camera) -> tuple[Tensor, Tensor]:
+def _nominal(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
     """A camera's nominal position (3,), and its axes (3, 3) in columns, in the world."""
-    pose = torch.as_tensor(camera.world_from_camera, dtype=torch.float64)
+    pose = torch.as_tensor(camera.world_from_camera, dtype=torch.float64, device=device)
     return pose[:3], poses.rotation_matrix(pose)
 
 
@@ -24,7 +24,7 @@ def line_of_sight(camera: Camera, part: Tensor) -> Tensor:
     They are along the lines of sight to parts at `world_from_part` (..., 7), and one metre along the optical
     axis.
     """
-    origin, axes = _nominal(camera)
+    origin, axes = _nominal(camera, part.device)
     away = part[..., :3] - origin
     return away / (away @ axes[:, 2])[..., None]
 
@@ -41,7 +41,7 @@ def apparent_motion(camera: Camera, part: Tensor, shift: float, turn: float) -> 
         shift: the error along each of the camera's axes, metres, of the first three columns.
         turn: the error about each of them, radians, of the last three.
     """
-    origin, axes = _nominal(camera)
+    origin, axes = _nominal(camera, part.device)
     axes = axes.expand(*part.shape[:-1], 3, 3)
     away = part[..., :3] - origin
     across = torch.linalg.cross(away[..., None].expand_as(axes), axes, dim=-2)

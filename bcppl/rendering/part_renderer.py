@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from torch import Tensor
 
 from bcppl import poses
 from bcppl.arrays import Array, ArrayRecord, Indices, Mask
+from bcppl.devices import beside, is_on_host, on_host
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
+
+if TYPE_CHECKING:
+    from bcppl.rendering.warp_casting import WarpCaster
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,14 +53,37 @@ class PartRenderer(ABC):
         part: the part; its mesh may be open.
         effort: images rendered, rays cast (or fragments tested) and seconds spent so far.
 
+    Poses on a GPU are rendered there (`on`).
+
     Raises:
         InputError: the mesh is empty or not finite.
     """
+
+    __caches__: tuple[str, ...] = ("_elsewhere",)
 
     def __init__(self, part: Part) -> None:
         part.check(closed=False)
         self.part = part
         self.effort = Effort()
+        self._elsewhere: dict[torch.device, WarpCaster] = {}
+
+    def on(self, device: torch.device) -> WarpCaster:
+        """What renders the part at poses on a GPU; its effort is this one's.
+
+        Raises:
+            InputError: Warp is not installed.
+        """
+        if device not in self._elsewhere:
+            try:
+                from bcppl.rendering.warp_casting import WarpCaster
+            except ImportError as error:
+                raise InputError(
+                    f"poses on {device} are rendered by Warp, which is not installed; install bcppl[gpu], or "
+                    "run on the processor."
+                ) from error
+            caster = self._elsewhere[device] = WarpCaster(self.part, device)
+            caster.effort = self.effort
+        return self._elsewhere[device]
 
     def hits(
         self,
@@ -79,6 +108,14 @@ class PartRenderer(ABC):
                 intrinsics are invalid; the mask is not of its image.
         """
         camera_from_part = self._camera_from_part(camera, world_from_part)
+        if not is_on_host(camera_from_part):
+            return self.on(camera_from_part.device).hits_of(camera, camera_from_part, counted, faces)
+        return self.hits_of(camera, camera_from_part, counted, faces)
+
+    def hits_of(
+        self, camera: Camera, camera_from_part: Tensor, counted: Mask | None, faces: bool = False
+    ) -> Hits:
+        """As `hits`, at valid poses (N, 7) of the part in the camera's frame."""
         counted = None if counted is None else pixel_mask(camera, counted)
         with self.effort.measure(items=len(camera_from_part)) as effort:
             return self._hits(camera, camera_from_part, counted, faces, effort)
@@ -95,7 +132,9 @@ class PartRenderer(ABC):
     @staticmethod
     def _camera_from_part(camera: Camera, world_from_part: Tensor | Array) -> Tensor:
         pose = poses.as_pose(world_from_part, "world_from_part").reshape(-1, 7)
-        return poses.compose(poses.inverse(camera.stated_pose()), pose)
+        with on_host():
+            stated = camera.stated_pose()
+        return poses.compose(beside(poses.inverse(stated), pose), pose)
 
     @abstractmethod
     def _hits(

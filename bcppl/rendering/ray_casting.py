@@ -48,7 +48,7 @@ class RayCaster(PartRenderer):
     Its time is proportional to the number of pixels and hardly depends on the number of faces.
     """
 
-    __caches__ = ("_scene",)  # of the part's mesh
+    __caches__ = ("_scene", *PartRenderer.__caches__)  # of the part's mesh
 
     def __init__(self, part: Part) -> None:
         super().__init__(part)

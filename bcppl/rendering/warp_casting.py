@@ -7,18 +7,22 @@ Without a GPU the renderer that `bcppl.rendering.rasterisation.renderer_for` giv
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 import warp as wp
 from torch import Tensor
 
-from bcppl import poses
+from bcppl import poses, warp_arrays
 from bcppl.arrays import Array, Indices, Mask
+from bcppl.devices import numbers
 from bcppl.effort import Effort
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
 from bcppl.rendering.part_renderer import Hits, PartRenderer
+from bcppl.rendering.warp_likelihood import CastImages
 
 RAYS = 1 << 26  # in one launch: 0.5 GB of depths and faces
 # In place of a face: of a ray that passes the part's bounding sphere, and of another that hits nothing.
@@ -56,15 +60,14 @@ class WarpCaster(PartRenderer):
 
     Args:
         part: the part.
-        device: as Warp names it: "cpu", "cuda", "cuda:1"; a GPU where there is one unless given.
+        device: torch's, or as Warp names it: "cpu", "cuda", "cuda:1"; a GPU where there is one unless given.
     """
 
-    __caches__ = ("_mesh",)  # of the part's mesh
+    __caches__ = ("_mesh", "_images", *PartRenderer.__caches__)  # of the part's mesh
 
-    def __init__(self, part: Part, device: str | None = None) -> None:
+    def __init__(self, part: Part, device: torch.device | str | None = None) -> None:
         super().__init__(part)
-        wp.config.quiet = True
-        self.device = wp.get_device(device)
+        self.device = warp_arrays.warp_device(device)
         vertices = np.asarray(part.vertices, dtype=np.float64)
         # Single precision is finest around zero, so the mesh is centred there.
         self._center = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
@@ -77,11 +80,34 @@ class WarpCaster(PartRenderer):
     def _array(self, values: Array, kind: Any) -> Any:
         return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=kind, device=self.device)
 
+    @cached_property
+    def _images(self) -> CastImages:
+        return CastImages(self._mesh, self._center, self._radius, warp_arrays.torch_device(self.device))
+
+    def gains(self, camera: Camera, world_from_part: Tensor, pixels: Any, law: Any, bias: Tensor) -> Tensor:
+        """By how much the part at poses (N, 7) changes the log-density of images, (N,), on the device.
+
+        Args:
+            camera: that took them.
+            world_from_part: (N, 7) the part's poses, on the device.
+            pixels: `bcppl.distributions.depth.pixels.Pixels` of one image, or one for each particle.
+            law: `bcppl.distributions.depth.pixels.PixelLaw`.
+            bias: (N,) added to what is rendered, m.
+        """
+        camera_from_part = self._camera_from_part(camera, world_from_part)
+        count = int(pixels.valid.any(axis=0).sum())
+        with self.effort.measure(items=len(world_from_part), amount=len(world_from_part) * count):
+            return self._images.gains(camera, camera_from_part, pixels, law, bias)
+
+    def totals(self, depth: Array, behind: Array, shift: Tensor, law: Any) -> Tensor:
+        """Log-densities (N,) of pixels (1 or N, P), the background (P,) behind them moved by shifts (N,)."""
+        return self._images.totals(depth, behind, shift, law)
+
     def _hits(
         self, camera: Camera, camera_from_part: Tensor, counted: Mask | None, faces: bool, effort: Effort
     ) -> Hits:
-        rotation = poses.rotation_matrix(camera_from_part).numpy()
-        offset = camera_from_part[:, :3].numpy() + rotation @ self._center
+        rotation = numbers(poses.rotation_matrix(camera_from_part))
+        offset = numbers(camera_from_part[:, :3]) + rotation @ self._center
         turn = rotation.transpose(0, 2, 1)
         eye = -np.einsum("nij,nj->ni", turn, offset)
         pixels = np.arange(camera.width * camera.height) if counted is None else np.flatnonzero(counted)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, Self, TypeVar
 
 import pyro
+import torch
 from torch import Tensor
 
+from bcppl.devices import moved
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.simplified import simplified
@@ -140,6 +142,11 @@ class Scene:
             for kind, numbered in by_kind.items()
             for address, value in self.likelihoods[kind].observed(numbered).items()
         }
+
+    def on(self, device: torch.device) -> Self:
+        """The same scene with its prior on a device; likelihoods work where the poses are that they get."""
+        prior = moved(self.prior, device)
+        return self if prior is self.prior else replace(self, prior=prior)
 
     @property
     def efforts(self) -> Mapping[str, Effort]:

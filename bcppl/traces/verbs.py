@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.support import freedom_of, refuse_several_poses
+from bcppl.devices import HOST, is_on_host, moved, on_host
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.differentiation.graph import kept
@@ -144,6 +145,16 @@ def constrained(
     later = isinstance(program, Stage) and program.number > 1
     refuse_unfit(trace, observations, trace.addresses if later else ())
     return trace, [a for a in ran.distributions if a in given or a in ran.fixed]
+
+
+def on_host_of(trace: Trace) -> Trace:
+    """The same particles on the host: their values and arguments are moved there, where they are not."""
+    values = list(trace.choices.values())
+    if not values or all(map(is_on_host, values)):
+        return trace
+    with on_host():
+        args, choices = moved((trace.args, trace.choices), HOST)
+        return constrained(trace.program, args, trace.particles, trace.observations, choices)[0]
 
 
 def log_weight(trace: Trace, addresses: list[str]) -> Tensor:

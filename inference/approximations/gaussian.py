@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.devices import HOST, current_device, moved, on_host
 from bcppl.distributions.pose_normals import (
     GaussianMixture,
     PoseFactor,
@@ -90,19 +91,45 @@ class GaussianApproximation:
         self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]
     ) -> GaussianApproximation:
         """The approximation given one more measurement, the `number`-th of the recording."""
-        longer = self.updated().deferring(scene, number, action, observations)
-        return replace(longer, stale=longer.stale or bool(longer.contacts)).updated()
+        with on_host():
+            longer = self.updated().deferring(scene, number, action, observations)
+            return replace(longer, stale=longer.stale or bool(longer.contacts)).updated()
+
+    # It is small: worked on by the host, and copied to where the particles are.
+
+    @property
+    def here(self) -> GaussianApproximation:
+        """The same on the device of the run (`bcppl.devices`)."""
+        return self._on_device
+
+    @cached_property
+    def _on_device(self) -> GaussianApproximation:
+        device = current_device()
+        if device == HOST:
+            return self
+        fits = {name: replace(each, fit=moved(each.fit, device)) for name, each in self.fits.items()}
+        there = replace(
+            self, scene=moved(self.scene, device), fits=fits, quadratic=moved(self.quadratic, device)
+        )
+        with on_host():
+            there.__dict__.update(prior=moved(self.prior, device), mixture=moved(self.mixture, device))
+        there.__dict__["_on_device"] = there
+        return there
 
     def deferring(
         self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]
     ) -> GaussianApproximation:
         """The same with a measurement that changes little; the quadratic approximation is updated later."""
+        scene = moved(scene, HOST)
         sensor = scene.sensor(action)
         if isinstance(sensor, FitsPose):
             name = sensor.viewpoint(action)
             if name in self.fits:
                 return replace(self, scene=scene)
-            fits = {**self.fits, name: Fitted(action, sensor.fit(number, action, observations, self.near))}
+            near = None if self.near is None else moved(self.near, HOST)
+            with on_host():
+                fitted = Fitted(action, sensor.fit(number, action, observations, near))
+            fits = {**self.fits, name: fitted}
             # The estimate moves, so it is asked again which contacts are informative there.
             return replace(self, scene=scene, fits=fits, relevant={})
         if isinstance(sensor, Linearised) and sensor.address(number) in observations:
@@ -114,6 +141,10 @@ class GaussianApproximation:
         """The same with the quadratic approximation of all contacts."""
         if not self.stale:
             return self
+        with on_host():
+            return self._with_quadratic()
+
+    def _with_quadratic(self) -> GaussianApproximation:
         relevant = dict(self.relevant)
         for contact in self.contacts:
             sensor = self.scene.sensor(contact.action)
@@ -173,6 +204,10 @@ class GaussianApproximation:
     @cached_property
     def prior(self) -> GaussianMixture:
         """The pose given the instruments' fits; the model's prior where there is none."""
+        with on_host():
+            return self._prior()
+
+    def _prior(self) -> GaussianMixture:
         prior, fits = self.scene.prior, list(self.fits.values())
         if not fits:
             normal = normal_like(prior)
@@ -202,6 +237,10 @@ class GaussianApproximation:
     @cached_property
     def mixture(self) -> GaussianMixture:
         """The posterior of the part's pose, the nuisance parameters integrated out."""
+        with on_host():
+            return self._posterior()
+
+    def _posterior(self) -> GaussianMixture:
         prior, quadratic = self.prior, self.quadratic
         if quadratic is None:
             return prior
@@ -222,7 +261,8 @@ class GaussianApproximation:
         if not (isinstance(sensor, Contacts) and isinstance(sensor, Linearised)):
             return False
         value = observations.get(sensor.address(number))
-        return value is not None and not sensor.is_informative(action, value, self.prior.centers)
+        with on_host():
+            return value is not None and not sensor.is_informative(action, value, self.prior.centers)
 
     def screens(self, action: Any) -> bool:
         """Whether a measurement is simulated, and what is approximated is a cheap likelihood of it."""
@@ -230,7 +270,7 @@ class GaussianApproximation:
 
     def stratum(self, trace: Any) -> Tensor:
         """The mode of each particle (N,), int64."""
-        return self.mixture.component(trace[self.pose])
+        return self.here.mixture.component(trace[self.pose])
 
     def shortfall(self, trace: Any) -> float:
         """By how many nats the best mode explains all measurements better than the median particle does.
@@ -240,20 +280,21 @@ class GaussianApproximation:
         """
         if self.quadratic is None:
             return -math.inf
-        best, reached = self._at_modes(), self._at_particles(trace)
+        here = self.here
+        best, reached = here._at_modes(), here._at_particles(trace)
         return float(best.max() - reached.median())
 
     def misses_a_mode(self, trace: Any) -> bool:
         """Whether some mode has no particle near it, and is about as probable as the best particle."""
         if self.quadratic is None:
             return False
-        mixture = self.mixture
+        here, mixture = self.here, self.here.mixture
         away = poses.log(mixture.centers, trace[self.pose][:, None])
         squared = torch.einsum("nmi,mij,nmj->nm", away, torch.linalg.inv(mixture.covariances), away)
         alone = (squared > _APART).all(dim=0) & (mixture.log_weights.softmax(dim=0) > _SHARE)
         if not bool(alone.any()):
             return False
-        return bool(self._at_modes()[alone].max() > self._at_particles(trace).max() - _LESS)
+        return bool(here._at_modes()[alone].max() > here._at_particles(trace).max() - _LESS)
 
     def _at_modes(self) -> Tensor:
         """The log-density (M,) of the modes, given all measurements."""

@@ -33,12 +33,14 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import whole_number
+from bcppl.devices import on_host
 from bcppl.distributions.checks import THRESHOLD, Check, Checked, chi_square
 from bcppl.distributions.poses import NormalPose
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded, systematic
 from bcppl.traces import Trace
 from bcppl.traces.series import SeriesTrace
+from bcppl.traces.verbs import on_host_of
 
 __all__ = ["THRESHOLD", "Check", "surprise"]
 
@@ -92,24 +94,26 @@ def surprise(
     checks: dict[str, Check] = {}
     with seeded(seed), torch.no_grad():
         chosen = systematic(population.log_weights, particles)
-        few = trace.chosen(chosen)
+        # They are few: on the host, wherever the particles are.
+        few = on_host_of(trace.chosen(chosen))
         copies: list[Trace] = []
 
         def replicated(address: str) -> Any:
             if not copies:
-                copies.append(trace.chosen(chosen.repeat_interleave(replicas)))
+                copies.append(few.chosen(torch.arange(particles).repeat_interleave(replicas)))
             return copies[0].distributions[address]
 
-        for address in wanted:
-            site, value = few.distributions[address], few[address]
-            if isinstance(site, Checked):
-                check = site.predictive_check(value, partial(replicated, address))
-                if check is not None:
-                    checks[address] = check
-            else:
-                error = _whitened(site, value, particles)
-                if error is not None:
-                    checks[address] = chi_square(error.square().sum(dim=-1), error.shape[-1])
+        with on_host():
+            for address in wanted:
+                site, value = few.distributions[address], few[address]
+                if isinstance(site, Checked):
+                    check = site.predictive_check(value, partial(replicated, address))
+                    if check is not None:
+                        checks[address] = check
+                else:
+                    error = _whitened(site, value, particles)
+                    if error is not None:
+                        checks[address] = chi_square(error.square().sum(dim=-1), error.shape[-1])
     return checks
 
 

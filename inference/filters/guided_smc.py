@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
+from bcppl.devices import HOST, moved, same_random_state
 from bcppl.errors import NoWeightError
 from bcppl.inference.approximations.approximation import Approximation
 from bcppl.inference.approximations.gaussian import GaussianApproximation
@@ -251,7 +252,7 @@ def _certain(population: Population, observed: Observed, far: bool) -> Populatio
     """
     alive = (population.log_weights > -torch.inf).nonzero()[:, 0]
     few = population.trace.chosen(alive[:ASKED])
-    with torch.random.fork_rng(devices=[]):
+    with same_random_state():
         longer, gained = extend(few, *observed)
     if len(longer.choices) == len(few.choices) and not _equal(gained, far):
         return None  # the usual case, decided by a few particles
@@ -296,6 +297,7 @@ def infer(
     screen: bool = True,
     scene: Any = None,
     start: Step | None = None,
+    device: str | torch.device | None = None,
 ) -> Iterator[Step]:
     """Beliefs over a recording: first the prior's, then one step for each measurement.
 
@@ -310,6 +312,7 @@ def infer(
             decides their moves first (`bcppl.inference.filters.screening`), where the model has one.
         scene: `model.prepare(recording)` unless given.
         start: a step to continue from, as for `bcppl.inference.smc`.
+        device: where the particles are, as for `bcppl.inference.smc`.
 
     Raises:
         InputError: a number is out of range, or the model's scene is not made of sensors.
@@ -320,7 +323,7 @@ def infer(
     programs = GaussianPrograms()
 
     def gaussian(scene: Any) -> GaussianApproximation:
-        return GaussianApproximation(model.pose, scene)
+        return GaussianApproximation(model.pose, moved(scene, HOST))
 
     moves = kernel(model.pose, programs.proposals, screen=screen)
 
@@ -338,4 +341,6 @@ def infer(
         return searched(population, independent_proposal)
 
     step = guided(gaussian, programs, moves, sweeps=sweeps, share=share, screen=screen, search=search)
-    return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)
+    return smc(
+        model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start, device=device
+    )

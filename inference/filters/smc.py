@@ -18,6 +18,15 @@ from torch import Tensor
 
 from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief
+from bcppl.devices import (
+    HOST,
+    device_named,
+    moved,
+    on_device,
+    random_state,
+    seeded_state,
+    set_random_state,
+)
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo
 from bcppl.inference.filters.tempering import tempered
@@ -75,17 +84,22 @@ FEW_PARTICLES = 5000
 
 
 @contextmanager
-def own_state(box: list[Tensor], particles: int) -> Iterator[None]:
-    """Torch's generator and threads set to the run's own within, and the caller's put back afterwards."""
-    outside, threads = torch.get_rng_state(), torch.get_num_threads()
-    torch.set_rng_state(box[0])
-    if particles < FEW_PARTICLES:
+def own_state(box: list[Tensor], particles: int, device: torch.device = HOST) -> Iterator[None]:
+    """Torch's generators and threads set to the run's own within, and the caller's put back afterwards.
+
+    What is made within is made on the device.
+    """
+    outside, threads = random_state(device), torch.get_num_threads()
+    set_random_state(box[0], device)
+    # On a GPU the processor has what is small.
+    if particles < FEW_PARTICLES or device != HOST:
         torch.set_num_threads(1)
     try:
-        yield
+        with on_device(device):
+            yield
     finally:
-        box[0] = torch.get_rng_state()
-        torch.set_rng_state(outside)
+        box[0] = random_state(device)
+        set_random_state(outside, device)
         torch.set_num_threads(threads)
 
 
@@ -121,6 +135,7 @@ def smc(
     scene: Any = None,
     start: Step | None = None,
     progress: bool = False,
+    device: str | torch.device | None = None,
 ) -> Iterator[Step]:
     """Sequential Monte Carlo over a recording: the prior's belief first, then one step for each measurement.
 
@@ -134,6 +149,8 @@ def smc(
         start: resume from this step, with its particles and its random state: the steps after it are yielded,
             the same to the bit as those of the run that it was taken from.
         progress: show a bar, on a terminal or in a notebook, until the last step is made.
+        device: where the particles are: "cpu" by default, or "cuda" (see `docs/gpu.md`). A run on a GPU draws
+            other numbers than one on the processor; a run is resumed on the device that it was begun on.
 
     Raises:
         InferenceError: no particle is left with any weight; names the measurement.
@@ -149,7 +166,7 @@ def smc(
     whole_number("SMC is to run {} particles", particles)
     seed_number(seed)
     recording = once_each(recording) if isinstance(recording, Recording) else recording
-    steps = _steps(model, recording, step, particles, seed, scene, start)
+    steps = _steps(model, recording, step, particles, seed, scene, start, device_named(device))
     left = len(recording.measurements) + (1 if start is None else -start.taken)
     return watched(steps, total=left, describe=lambda each: each.info.label, progress=progress)
 
@@ -171,14 +188,16 @@ def _steps(
     seed: int,
     scene: Any,
     start: Step | None,
+    device: torch.device,
 ) -> Iterator[Step]:
     if scene is None:
         _warn_of_problems(recording)
         scene = model.prepare(recording)
+    scene = moved(scene, device)
     measurements = recording.measurements
     if start is None:
-        state = [torch.Generator().manual_seed(seed).get_state()]
-        with own_state(state, particles):
+        state = [seeded_state(seed, device)]
+        with own_state(state, particles, device):
             population = initialize(model, scene, particles)
         if model.pose not in population.trace:
             raise InputError(
@@ -186,7 +205,7 @@ def _steps(
                 f"it samples {', '.join(population.trace.choices) or 'nothing'} before any measurement."
             )
         start = _prior(model, population, state[0])
-        truth = _Truth(model, scene, recording, population, seed)
+        truth = _Truth(model, moved(scene, HOST), recording, population, seed)
         yield start
     else:
         if start.taken > len(measurements):
@@ -195,7 +214,7 @@ def _steps(
                 f"{len(measurements)}; give the recording that it was run on."
             )
         state, population, particles = [start.random_state], start.population, len(start.population)
-        truth = _Truth(model, scene, recording, population, seed)
+        truth = _Truth(model, moved(scene, HOST), recording, population, seed)
         for observed in observations_of(model, scene, measurements[: start.taken]):
             truth.assimilate(observed)
     for count, observed in enumerate(
@@ -209,7 +228,7 @@ def _steps(
             continue
         begun, before = time.perf_counter(), _effort(scene)
         try:
-            with own_state(state, particles):
+            with own_state(state, particles, device):
                 population, happened = step(population, observed)
         except InferenceError as error:
             raise type(error)(f"{label}: {error}") from error
@@ -262,7 +281,7 @@ class _Truth:
         """Extend its trace."""
         if self.trace is not None:
             with own_state(self.state, 1):
-                self.trace, _ = extend(self.trace, *observed)
+                self.trace, _ = extend(self.trace, *moved(observed, HOST))
             if set(self.trace.choices) != self.latent:
                 self.trace = None
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.devices import beside
 from bcppl.distributions.pose_normals import GaussianMixture, transport, widened_mixture
 from bcppl.distributions.poses import MixturePose, NormalPose, NormalTwist
 from bcppl.inference.approximations.gaussian import GaussianApproximation
@@ -32,10 +33,11 @@ _KNOWN = 1e-14  # variance (m^2, rad^2) of a pose that is given
 _STAYING = 0.8  # probability that a particle stays with the same component
 
 
-def forward_kernel(before: GaussianApproximation, after: GaussianApproximation, action: Any) -> Program:
+def forward_kernel(source: GaussianApproximation, target: GaussianApproximation, action: Any) -> Program:
     """Forward kernel: the nuisance parameters that come with a measurement, and the part's pose given it."""
 
     def program(trace: Trace) -> None:
+        before, after = source.here, target.here
         sensor = after.scene.sensor(action)
         if not isinstance(sensor, FitsPose):
             _follow(trace, after, _transported(trace, before, after), ASSIMILATING)
@@ -49,10 +51,11 @@ def forward_kernel(before: GaussianApproximation, after: GaussianApproximation, 
     return program
 
 
-def backward_kernel(before: GaussianApproximation, after: GaussianApproximation, action: Any) -> Program:
+def backward_kernel(source: GaussianApproximation, target: GaussianApproximation, action: Any) -> Program:
     """Backward kernel: the part's pose, and after a contact the nuisance parameters, as before it."""
 
     def program(trace: Trace) -> None:
+        before, after = source.here, target.here
         if isinstance(after.scene.sensor(action), FitsPose):
             pyro.sample(before.pose, before.conditional(trace))
         else:
@@ -61,10 +64,11 @@ def backward_kernel(before: GaussianApproximation, after: GaussianApproximation,
     return program
 
 
-def independent_proposal(approximation: GaussianApproximation) -> Callable[..., None]:
+def independent_proposal(given: GaussianApproximation) -> Callable[..., None]:
     """A program that draws the part's pose and its instruments' nuisance parameters, whatever they were."""
 
     def program(*args: Any) -> None:
+        approximation = given.here
         part = pyro.sample(approximation.pose, widened_mixture(approximation.mixture))
         known = NormalPose(part, part.new_zeros(6, 6) + _KNOWN * torch.eye(6, dtype=torch.float64))
         values: dict[str, Tensor] = {}
@@ -74,20 +78,22 @@ def independent_proposal(approximation: GaussianApproximation) -> Callable[..., 
     return program
 
 
-def conditional_proposal(approximation: GaussianApproximation) -> Program:
+def conditional_proposal(given: GaussianApproximation) -> Program:
     """An independence proposal of the part's pose, from its conditional given the nuisance parameters."""
 
     def program(trace: Trace) -> None:
+        approximation = given.here
         pyro.sample(approximation.pose, approximation.conditional(trace))
 
     return program
 
 
-def joint_random_walk(approximation: GaussianApproximation) -> Program:
+def joint_random_walk(given: GaussianApproximation) -> Program:
     """A random walk of the part's pose with the approximate covariance; nuisance parameters follow it."""
 
     def program(trace: Trace) -> None:
-        size = torch.exp(pyro.sample("walk", dist.Uniform(*SCALES)))
+        approximation = given.here
+        size = torch.exp(pyro.sample("walk", dist.Uniform(*beside(SCALES, trace[approximation.pose]))))
         pose, mixture = trace[approximation.pose], approximation.mixture
         covariance = mixture.covariances[mixture.component(pose)]
         step = (2.38 * size) ** 2 / 6.0

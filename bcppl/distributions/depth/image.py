@@ -16,6 +16,7 @@ from scipy.special import ndtr
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.devices import beside, is_on_host, numbers
 from bcppl.distributions.checks import Check
 from bcppl.distributions.depth.camera_image import CameraImage
 from bcppl.distributions.depth.observed import CACHE, Observed
@@ -148,12 +149,14 @@ class DepthDistribution(CameraImage):
         if not isinstance(self.bias, Tensor) and self.bias == 0.0:
             return None
         bias = torch.as_tensor(self.bias, dtype=torch.float64).detach()
-        return np.ascontiguousarray(bias.expand(len(self.pose)).numpy())
+        return np.ascontiguousarray(numbers(bias.expand(len(self.pose))))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-probability (N,) of a depth image (H, W), or of one for each particle (N, H, W)."""
         self._check_finite()
         seen = self.observed(value)
+        if not is_on_host(self.apparent_pose):
+            return self._on_device(seen)
         hits = self._hits(np.asarray(seen.valid.any(axis=0)))
         bias = np.empty(0) if self._biases is None else self._biases
         moves = bool(len(bias)) and not self.background_is_measured
@@ -172,10 +175,28 @@ class DepthDistribution(CameraImage):
         parallel_sum(work, 0, len(starts), 1, thread_count())
         return torch.from_numpy(seen.power * (total + gains.sum(axis=0)))
 
+    def _on_device(self, seen: Observed) -> Tensor:
+        """Log-probability (N,) at poses on a GPU, where the renderer casts the rays and sums over pixels."""
+        pose = self.apparent_pose
+        caster = self.renderer.on(pose.device)  # type: ignore[attr-defined]
+        given = isinstance(self.bias, Tensor) or self.bias != 0.0
+        bias = torch.as_tensor(self.bias, dtype=torch.float64, device=pose.device).detach().expand(len(pose))
+        moves = given and not self.background_is_measured
+        total = beside(seen.total_without_part, pose)
+        if moves:
+            nothing, known = seen.apart(self._law)
+            total = beside(nothing, pose)
+            if known.any():
+                shown = caster.totals(seen.depth[:, known], seen.behind[known], bias, self._law)
+                total = total + shown
+        pixels = Pixels(seen.depth, seen.valid, seen.behind, seen.without_part, np.empty(0), moves)
+        gains = caster.gains(self.camera, pose, pixels, self._law, bias)
+        return beside(seen.power, pose) * (total + gains)
+
     def without_part(self, value: Tensor) -> Tensor:
         """Log-probability (1 or N,) of an image (H, W), or of N, with no part in view, and no bias."""
         seen = self.observed(value)
-        return torch.from_numpy(seen.power * seen.total_without_part)
+        return beside(seen.power * seen.total_without_part, self.pose)
 
     def _sample(self) -> Tensor:
         images = torch.from_numpy(self.renderer.images(self.camera, self.apparent_pose))
@@ -264,4 +285,4 @@ class DepthDistribution(CameraImage):
 
 def _numbers(values: npt.NDArray[Any] | Tensor | None) -> npt.NDArray[Any] | None:
     """The numbers of a tensor, not copied."""
-    return values.detach().numpy() if isinstance(values, Tensor) else values
+    return numbers(values.detach()) if isinstance(values, Tensor) else values

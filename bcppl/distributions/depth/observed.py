@@ -13,6 +13,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from bcppl.distributions.depth.pixels import PixelLaw, log_totals
 from bcppl.distributions.depth.rendering import Array, Mask
+from bcppl.errors import InputError
 
 MOST_TOTALS = 100_000  # biases whose totals are cached
 
@@ -70,6 +71,21 @@ class Observed:
         if unknown:
             self.totals.update(zip(unknown, self._total(0, law, np.array(unknown)).tolist(), strict=True))
         return np.array([self.totals[b] for b in biases])
+
+    def apart(self, law: PixelLaw) -> tuple[Array, Mask]:
+        """The log-density (1 or N,) of the pixels without a background, and which (P,) have one.
+
+        Raises:
+            InputError: of several images other pixels count, and there is a background.
+        """
+        known = self.valid & np.isfinite(self.behind)
+        if (known != known[:1]).any():
+            raise InputError(
+                "images of which different pixels count are compared with a background on the processor only; "
+                "run there."
+            )
+        nothing = -math.log(law.far - law.near) * (self.valid.sum(axis=1) - known.sum(axis=1))
+        return nothing, known[0]
 
     def _total(self, image: int, law: PixelLaw, biases: Array) -> Array:
         """The log-density of one image without the part, at each of some biases."""

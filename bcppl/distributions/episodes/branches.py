@@ -96,6 +96,11 @@ class Branches(NamedTuple):
         return np.asarray(np.exp(shifted))
 
     @property
+    def on_host(self) -> Branches:
+        """Itself: these are arrays."""
+        return self
+
+    @property
     def of_each(self) -> Branches:
         """The same where what holds for all particles is written for each."""
         count = len(self.number)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from bcppl.devices import beside, is_on_host
+from bcppl.distributions.episodes.alike import AlikeBranches, begun_alike, filtered_alike
 from bcppl.distributions.episodes.branches import Branches, Prior, begun
 from bcppl.distributions.episodes.displaced import Lines, lines_at
 from bcppl.distributions.episodes.linear_errors import LinearErrors
@@ -29,7 +31,7 @@ _REMEMBERED = 5  # a window's rows are those that the next one is given
 class Linearised(NamedTuple):
     """Hypotheses, and what the shared errors of each particle may be, over which the gap is linear."""
 
-    branches: Branches
+    branches: Branches | AlikeBranches
     errors: Spread
 
 
@@ -54,7 +56,7 @@ class FilteredEpisodes(PredictedEpisodes):
     def __post_init__(self) -> None:
         super(ContactManifold, self).__init__(len(self.pose), (self.stamps, COLUMNS))
 
-    def branches(self, rows: Tensor, after: Tensor | None = None) -> Branches:
+    def branches(self, rows: Tensor, after: Tensor | None = None) -> Branches | AlikeBranches:
         """The hypotheses after rows (R, COLUMNS), the first of them `after`, where these were seen before."""
         return self._known(rows, after).branches
 
@@ -85,9 +87,12 @@ class FilteredEpisodes(PredictedEpisodes):
             if known is not None:
                 return known, rows[len(after) :]
         if not place:
-            return Linearised(begun(self._prior(0), len(self.pose)), self._errors_before), rows
+            prior = self._prior(0)
+            start = begun_alike(prior, self.pose) if self._is_alike else begun(prior, len(self.pose))
+            return Linearised(start, self._errors_before), rows
         branches = self._known(rows[:place], after).branches
-        return Linearised(branches, Spread(*moments(branches))), rows[place:]
+        errors = (beside(each, self.pose) for each in moments(branches.on_host))
+        return Linearised(branches, Spread(*errors)), rows[place:]
 
     @property
     def _regresses(self) -> bool:
@@ -95,15 +100,22 @@ class FilteredEpisodes(PredictedEpisodes):
         return bool(self.bench.errors) and not self.blur
 
     @property
+    def _is_alike(self) -> bool:
+        """Whether all particles have the same errors, and are filtered together on a GPU."""
+        return not (self.bench.errors or is_on_host(self.pose))
+
+    @property
     def _errors_before(self) -> Spread:
         """What the shared errors may be before any row."""
         count, (means, variances) = len(self.pose), (self.bench.means, self.bench.variances)
+        means, variances = beside(means, self.pose), beside(variances, self.pose)
         return Spread(means.expand(count, -1), torch.diag(variances).expand(count, -1, -1))
 
     def _variance(self, columns: Tensor, rows: Tensor) -> Tensor:
         """Variances (N, D, R) of gaps a priori, without what the contact's compliance adds."""
         own = rows[:, NOISE] ** 2 + self.blur**2 + self.drift**2 + self.shared**2
-        return own + (columns**2 * self.bench.variances).sum(dim=-1)
+        variances = beside(self.bench.variances, columns)
+        return beside(own, columns) + (columns**2 * variances).sum(dim=-1)
 
     @property
     def _every(self) -> tuple[Hypothesis, ...]:
@@ -125,17 +137,19 @@ class FilteredEpisodes(PredictedEpisodes):
         return lines_at(self.gap(self.pose, rows[:, :7]), self.pose, rows, self.bench)
 
     def _filtered(
-        self, begin: Branches, prior: Prior, rows: Tensor, errors: Spread, free: bool = False
-    ) -> Branches:
+        self, begin: Any, prior: Prior, rows: Tensor, errors: Spread, free: bool = False
+    ) -> Any:
         """The hypotheses after rows, the pose `free` to move about `self.pose` or held there.
 
         The gap is linear over what the shared errors may be.
         """
         if not len(rows):
             return begin
+        segments = segments_of(rows, self._row_errors, self._few if free else self._every)
+        if isinstance(begin, AlikeBranches):
+            distance = self.gap(self.pose, rows[:, :7]).distance
+            return filtered_alike(begin, prior, segments, distance, rows[:, FORCE].numpy())
         lines = self._lines(rows, errors)
-        hypotheses = self._few if free else self._every
-        segments = segments_of(rows, self._row_errors, hypotheses)
         if not free:
             return filtered(begin, prior, segments, lines, rows[:, FORCE])
         trust = self._trust(lines, rows) if self.blur else None

@@ -12,6 +12,7 @@ from scipy.special import bdtrc
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.devices import beside, numbers
 from bcppl.distributions.checks import Check, chi_square
 from bcppl.distributions.episodes.branches import Branches, begun
 from bcppl.distributions.episodes.displaced import lines_at
@@ -92,8 +93,8 @@ class ContactEpisodes(FilteredEpisodes):
         given, rows = given_and_all(value)
         if len(given) == len(rows):
             return self.pose.new_zeros(len(self.pose))
-        before = self.branches(given)
-        return torch.from_numpy(self.branches(rows, given).log_evidence - before.log_evidence)
+        before = self.branches(given).log_evidence
+        return beside(self.branches(rows, given).log_evidence - before, self.pose)
 
     def quadratic(self, value: Tensor) -> Quadratic:
         """The log-likelihood of a window to second order, the shared errors integrated out.
@@ -131,7 +132,7 @@ class ContactEpisodes(FilteredEpisodes):
         gaps = self.gap(self.pose, stood)
         distance = gaps.distance
         if self.is_displaced:
-            branches = self.branches(given_and_all(value)[1])
+            branches = self.branches(given_and_all(value)[1]).on_host
             used = torch.nan_to_num(value)
             used[:, :7] = stood
             distance = distance + self._shift(gaps, used, branches)
@@ -151,11 +152,12 @@ class ContactEpisodes(FilteredEpisodes):
             return []
         segments = segments_of(rows, self._row_errors, self._every)
         times = rows[segments.first[segments.contact == 1], TIME].tolist()
-        return probable_jumps(self.branches(rows), self.bench, times)
+        return probable_jumps(self.branches(rows).on_host, self.bench, times)
 
     def shared_posterior(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """Mean (N, M) and covariance (N, M, M) of the shared errors' parameters, as `shared_moments`."""
-        return moments(self.branches(value[:0] if is_predicted(value) else given_and_all(value)[1]))
+        rows = value[:0] if is_predicted(value) else given_and_all(value)[1]
+        return moments(self.branches(rows).on_host)
 
     def shared_moments(self, value: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Means and variances (N, M) of each shared error, given a window's rows and those before them."""
@@ -173,7 +175,7 @@ class ContactEpisodes(FilteredEpisodes):
 
         The place there has an error of its own (`shared`), as every contact has.
         """
-        branches = self.branches(given_and_all(value)[1])
+        branches = self.branches(given_and_all(value)[1]).on_host
         row = world_from_peg.new_zeros(1, COLUMNS)
         row[0, :7] = world_from_peg
         twist = drawn(branches, draws) @ self.bench.effect(row).twist[0].T
@@ -183,7 +185,7 @@ class ContactEpisodes(FilteredEpisodes):
         turn = poses.rotation_matrix(world_from_peg)
         measured = world_from_peg.expand(*twist.shape[:-1], 7)
         true = poses.retract(measured, torch.cat([twist[..., :3] @ turn.T, twist[..., 3:]], dim=-1))
-        part = self.pose[:, None].expand(*twist.shape[:-1], 7)
+        part = beside(self.pose, twist)[:, None].expand(*twist.shape[:-1], 7)
         return poses.compose(measured, poses.compose(poses.inverse(true), part))
 
     def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check | None:
@@ -195,12 +197,12 @@ class ContactEpisodes(FilteredEpisodes):
         if not len(new):
             return None
         whole, count = Check(1.0, "contacts", 0.0), int((new[:, FELT] == 1.0).sum())
-        branches = self.branches(rows, given)
+        branches = self.branches(rows, given).on_host
         if count:
             squared = branches.squared.sum(axis=2)
             if bool((given[:, FELT] == 1.0).any()):
                 # Of the rows that are new: those before them are squared alike in both.
-                before = self.branches(given)
+                before = self.branches(given).on_host
                 squared = squared - (before.weights * before.squared.sum(axis=2)).sum(axis=1, keepdims=True)
             whole = chi_square(torch.from_numpy((branches.weights * squared).sum(axis=1)), count, "contacts")
         free = new[new[:, FELT] == 0.0]
@@ -208,7 +210,7 @@ class ContactEpisodes(FilteredEpisodes):
             return whole
         gaps = self.gap(self.pose, free[:, :7])
         deep = (gaps.distance < -_FAR * self._spread_at(gaps, free)).sum(dim=1)
-        outliers = float(bdtrc(deep.numpy() - 1, len(free), self.outlier).mean())
+        outliers = float(bdtrc(numbers(deep) - 1, len(free), self.outlier).mean())
         return Check(min(1.0, 2.0 * min(whole.probability, outliers)), "contacts", whole.excess)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
@@ -218,7 +220,7 @@ class ContactEpisodes(FilteredEpisodes):
     def _spread_at(self, gaps: Gaps, rows: Tensor) -> Tensor:
         """Standard deviations (N, R) of the gaps of rows without contact, a priori."""
         prior, lines = self._prior(0), lines_at(gaps, self.pose, rows, self.bench)
-        weights = torch.from_numpy(np.bincount(prior.delay, np.exp(prior.log_weight)))
+        weights = beside(np.bincount(prior.delay, np.exp(prior.log_weight)), self.pose)
         variances = self._variance(lines.columns, rows) + lines.moved**2
         return torch.einsum("d,ndr->nr", weights, variances).sqrt()
 

@@ -16,6 +16,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from bcppl.devices import HOST, on_host
 from bcppl.distributions.episodes.rows import COLUMNS, late
 
 
@@ -109,12 +110,14 @@ class LinearErrors:
     @cached_property
     def means(self) -> Tensor:
         """(M,)."""
-        return torch.cat([torch.zeros(0, dtype=torch.float64), *(e.means for e in self.errors)])
+        with on_host():
+            return torch.cat([torch.zeros(0, dtype=torch.float64), *(e.means for e in self.errors)])
 
     @cached_property
     def variances(self) -> Tensor:
         """(M,)."""
-        return torch.cat([torch.zeros(0, dtype=torch.float64), *(e.variances for e in self.errors)])
+        with on_host():
+            return torch.cat([torch.zeros(0, dtype=torch.float64), *(e.variances for e in self.errors)])
 
     @cached_property
     def jumps(self) -> list[Jump]:
@@ -123,7 +126,7 @@ class LinearErrors:
         for error in self.errors:
             place = self.slices[error.name]
             for jump in (each for each in error.jumps if each.probability > 0.0):
-                variances = torch.zeros(total, dtype=torch.float64)
+                variances = torch.zeros(total, dtype=torch.float64, device=HOST)
                 variances[place] = jump.variances
                 jumps.append(jump._replace(variances=variances))
         return jumps
@@ -131,7 +134,7 @@ class LinearErrors:
     @cached_property
     def changes(self) -> list[Change]:
         """All that may happen at an episode, where jumps are independent; nothing comes first."""
-        changes = [Change((), 1.0, torch.zeros(len(self.means), dtype=torch.float64))]
+        changes = [Change((), 1.0, torch.zeros(len(self.means), dtype=torch.float64, device=HOST))]
         for number, jump in enumerate(self.jumps):
             none = [c._replace(probability=c.probability * (1.0 - jump.probability)) for c in changes]
             changes = none + [
@@ -154,11 +157,13 @@ class LinearErrors:
 
     def effect_again(self, rows: Tensor) -> Effect:
         """The same, remembered: for rows that many parts are compared at."""
-        return _effect(self, rows.numpy().tobytes())
+        with on_host():
+            return _effect(self, rows.numpy().tobytes())
 
     def late_effects(self, rows: Tensor) -> tuple[Tensor, Effect]:
         """Twists (D, R, 6) of the peg by each delay at rows (R, COLUMNS), and effects (D, R, ...) there."""
-        return _late_effects(self, rows.numpy().tobytes())
+        with on_host():
+            return _late_effects(self, rows.numpy().tobytes())
 
 
 # The same rows are evaluated at many poses of the part.

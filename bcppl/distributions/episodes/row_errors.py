@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bcppl.arrays import Array, Indices
 from bcppl.compiled import compiled
+from bcppl.devices import on_host
 from bcppl.distributions.episodes.branches import Segments
 from bcppl.distributions.episodes.conditioning import factorise
 from bcppl.distributions.episodes.rows import EPISODE, FELT, FORCE, NOISE, TIME
@@ -48,7 +49,8 @@ class RowErrors(NamedTuple):
 def segments_of(rows: Tensor, errors: RowErrors, hypotheses: tuple[Hypothesis, ...]) -> Segments:
     """The segments of rows (R, COLUMNS), with their errors under each hypothesis."""
     columns = rows[:, [FELT, NOISE, FORCE, TIME, EPISODE]].contiguous()
-    return _segments(columns.numpy().tobytes(), errors, hypotheses)
+    with on_host():
+        return _segments(columns.numpy().tobytes(), errors, hypotheses)
 
 
 @lru_cache(maxsize=64)

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from bcppl.arrays import Array
 from bcppl.compiled import compiled, summed
+from bcppl.devices import numbers
 from bcppl.distributions.episodes.branches import INLIER, KEPT, OUTLIER, Branches, Prior, Segments
 from bcppl.distributions.episodes.conditioning import condition, dot, factorise, set_joint, squared_by, whiten
 from bcppl.distributions.episodes.displaced import Lines
@@ -32,9 +33,9 @@ from bcppl.threads import parallel_sum, thread_count
 
 # Nats below the most probable hypothesis, from which on one is dropped: at the release of a touch the right
 # delay of the wrench was 12 below another, and in the end 46 above it.
-_FAINT = 25.0
+FAINT = 25.0
 _UNLIKELY = 10.0  # the same before an episode, of a hypothesis with a change
-_CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
+CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
 _LOG_TWO_PI = math.log(2.0 * math.pi)
 _SURPRISING = 1.0  # standard deviations of a chi-square
 # Particles of a chunk of work, and rows of all of them, at least: fewer take less than to wake a thread.
@@ -95,7 +96,7 @@ def filtered(
     trust = lines.slope.new_zeros(0, 0, 0) if trust is None else trust
     of_lines = (lines.slope, lines.late, lines.twist, lines.offset)
     arrays = (lines.distance, force, own, *of_lines, trust, lines.residual)
-    given = _Gaps(*(np.ascontiguousarray(each.numpy()) for each in arrays))
+    given = _Gaps(*(np.ascontiguousarray(numbers(each)) for each in arrays))
 
     def work(begin: int, end: int) -> int:
         _filter(begin, end, before, after, prior, segments, given)
@@ -193,7 +194,7 @@ def _filter(
                     column = columns[delay, 0]
                     if not filled[delay]:
                         distance[delay, 0], filled[delay] = _line(gaps, n, delay, first, column), True
-                    if distance[delay, 0] > _CLEAR:
+                    if distance[delay, 0] > CLEAR:
                         continue
                     gap = distance[delay, 0] + dot(column, mean[n, b])
                     variance = segments.own[which[n, b], first] + squared_by(covariance[n, b], column, pull)
@@ -284,7 +285,7 @@ def _filter(
                 if crowded:
                     c = int(rank[:found].argmax())
                     rank[c] = -np.inf
-                if weight[c] < best - _FAINT:
+                if weight[c] < best - FAINT:
                     continue
                 b, change = source[c], kind[c] // 2
                 h = old_which[b]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
 
 import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 
+from bcppl.devices import moved
 from bcppl.poses import Freedom
 
 # A held axis may stray by rounding over thousands of moves, never by a nanometre.
@@ -27,6 +28,14 @@ class PoseDistribution(TorchDistribution):
         self.center = center
         self.freedom = freedom
         super().__init__(torch.Size(center.shape[:-1]), torch.Size([7]), validate_args=False)
+
+    def on(self, device: torch.device) -> Self:
+        """The same distribution with its numbers on a device."""
+        if self.center.device == device:
+            return self
+        new = type(self).__new__(type(self))
+        new.__dict__.update({name: moved(value, device) if isinstance(value, Tensor) else value for name, value in self.__dict__.items()})
+        return new
 
     def expand(self, batch_shape: Any, _instance: Any = None) -> PoseDistribution:
         """The same distribution for a batch of draws, one for each particle of a plate."""

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bcppl import poses, quaternions
 from bcppl.arguments import number_within
+from bcppl.devices import beside, numbers
 from bcppl.distributions.parameters import Range
 from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
 from bcppl.errors import InputError
@@ -50,10 +51,10 @@ class _BoxPose(PoseDistribution):
             that at the centre.
         """
         if not self.tail:
-            return torch.stack([-self.widths, self.widths]), torch.zeros(1, dtype=torch.float64)
-        reach = torch.tensor([-FARTHEST, self.tail - 1.0, 1.0 - self.tail, FARTHEST], dtype=torch.float64)
+            return torch.stack([-self.widths, self.widths]), self.widths.new_zeros(1)
+        reach = self.widths.new_tensor([-FARTHEST, self.tail - 1.0, 1.0 - self.tail, FARTHEST])
         lower = math.log(self.tail / (FARTHEST - 1.0 + self.tail))
-        return reach[:, None] * self.widths, torch.tensor([lower, 0.0, lower], dtype=torch.float64)
+        return reach[:, None] * self.widths, self.widths.new_tensor([lower, 0.0, lower])
 
     def _translations(self, uniform: Tensor) -> Tensor:
         """The displacements (..., 3) at quantiles (..., 3)."""
@@ -134,9 +135,10 @@ def _haar_angle(shape: torch.Size, largest: float) -> Tensor:
     """Rotation angles of Haar-distributed rotations within `largest`: density proportional to 1 - cos a."""
     # Inverse of the distribution function a - sin a by a fine table: exact to 1e-9 of the range.
     table = np.linspace(0.0, largest, 20001)
-    uniform = torch.rand(*shape, dtype=torch.float64).numpy()
+    uniform = torch.rand(*shape, dtype=torch.float64)
     cumulative = table - np.sin(table)
-    return torch.from_numpy(np.asarray(np.interp(uniform * cumulative[-1], cumulative, table)))
+    angle = np.asarray(np.interp(numbers(uniform) * cumulative[-1], cumulative, table))
+    return beside(angle, uniform)
 
 
 class SwingTwistPose(_BoxPose):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -10,7 +10,9 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arrays import Array
+from bcppl.devices import is_on_host
 from bcppl.effort import Effort
+from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.gap.distance_grid import RefinedGrid, distance_grid
 from bcppl.geometry.gap.edges import by_edges
@@ -20,6 +22,9 @@ from bcppl.geometry.gap.solids import solids_of
 from bcppl.geometry.gap.vertices import NEAR, by_vertices
 from bcppl.geometry.parts import Part
 from bcppl.threads import parallel_sum, thread_count
+
+if TYPE_CHECKING:
+    from bcppl.geometry.gap.warp_gap import WarpGap
 
 _MARGIN = 0.012  # m around the part that the grid covers
 _CHUNK = 8  # particles of a chunk of work, at least
@@ -59,6 +64,8 @@ class PegGap:
     may be the closest are computed exactly. The distance of an edge to the peg is that to its closest plane:
     exact in contact, an underestimate beside the peg's own edges and vertices.
 
+    Poses of the part on a GPU are measured there (`on`).
+
     Attributes:
         part, peg: the solids.
         effort: calls, and pairs of poses as `items`.
@@ -67,20 +74,41 @@ class PegGap:
         InputError: a mesh is empty, open or not finite.
     """
 
-    __caches__: tuple[str, ...] = ("_grid",)  # of the part
+    __caches__: tuple[str, ...] = ("_grid", "_elsewhere")  # of the part
 
     def __init__(self, part: Part, peg: Part) -> None:
         self.part, self.peg = part, peg
         self.effort = Effort()
         self._signed = SignedDistance(part)
         self._grid: RefinedGrid | None = None
+        self._elsewhere: dict[torch.device, WarpGap] = {}
         self._edges = sharp_edges(part)
         self._solids = solids_of(peg)
 
     def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gap:
         """Gaps (N, T) at poses (N, 7) of the part and (T, 7) of the peg, or (N, T, 7), one per particle."""
+        if not is_on_host(world_from_part):
+            return self.on(world_from_part.device)(world_from_part, world_from_peg)
         arrays = self.evaluate(frames_of(world_from_part), frames_of(world_from_peg))
         return Gap(*map(torch.from_numpy, arrays))
+
+    def on(self, device: torch.device) -> WarpGap:
+        """What measures the gap at poses on a GPU; its effort is this one's.
+
+        Raises:
+            InputError: Warp is not installed.
+        """
+        if device not in self._elsewhere:
+            try:
+                from bcppl.geometry.gap.warp_gap import WarpGap
+            except ImportError as error:
+                raise InputError(
+                    f"gaps at poses on {device} are measured by Warp, which is not installed; install "
+                    "bcppl[gpu], or run on the processor."
+                ) from error
+            gap = self._elsewhere[device] = WarpGap(self.part, self.peg, device)
+            gap.effort = self.effort
+        return self._elsewhere[device]
 
     def evaluate(self, part: Frames, peg: Frames) -> tuple[Array, Array, Array]:
         """The fields of `Gap` as arrays, at frames (N,) of the part and (T,) or (N, T) of the peg."""

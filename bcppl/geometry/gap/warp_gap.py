@@ -11,17 +11,20 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 import warp as wp
+from torch import Tensor
 
+from bcppl import poses, warp_arrays
 from bcppl.arrays import Array
+from bcppl.devices import beside, numbers
 from bcppl.geometry.distance import closed_mesh
 from bcppl.geometry.gap.frames import Frames
-from bcppl.geometry.gap.peg_gap import PegGap
+from bcppl.geometry.gap.peg_gap import Gap, PegGap
 from bcppl.geometry.gap.sharp_edges import CANCELLED
 from bcppl.geometry.gap.vertices import FADING, NEAR
 from bcppl.geometry.parts import Part
 
-PAIRS = 1 << 22  # of poses in one launch
 FAR = wp.constant(1e6)  # m
 SURFACE = wp.constant(1e-7)  # m, up to which the direction to the closest point is rounding
 NOWHERE = wp.constant(-1e6)
@@ -238,15 +241,14 @@ class WarpGap(PegGap):
 
     Args:
         part, peg: the solids.
-        device: as Warp names it: "cpu", "cuda", "cuda:1"; a GPU where there is one unless given.
+        device: torch's, or as Warp names it: "cpu", "cuda", "cuda:1"; a GPU where there is one unless given.
     """
 
-    __caches__ = ("_bodies", "_mesh")  # of the part and the peg
+    __caches__ = ("_bodies", "_mesh", *PegGap.__caches__)  # of the part and the peg
 
-    def __init__(self, part: Part, peg: Part, device: str | None = None) -> None:
+    def __init__(self, part: Part, peg: Part, device: torch.device | str | None = None) -> None:
         super().__init__(part, peg)
-        wp.config.quiet = True
-        self.device = wp.get_device(device)
+        self.device = warp_arrays.warp_device(device)
         mesh = closed_mesh(part)
         # Single precision is finest around zero, so the mesh is centred there.
         self._center = mesh.bounds.mean(axis=0)
@@ -268,34 +270,44 @@ class WarpGap(PegGap):
         self._bodies = bodies
 
     def _array(self, values: Array, kind: Any) -> Any:
-        wide = kind in (wp.mat33d, wp.vec3d)
-        given = np.ascontiguousarray(values, np.float64 if wide else np.float32)
-        return wp.array(given, dtype=kind, device=self.device)
+        return wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=self.device)
+
+    def __call__(self, world_from_part: Tensor, world_from_peg: Tensor) -> Gap:
+        """Gaps (N, T) where the poses (N, 7) of the part are, at (T, 7) of the peg, or (N, T, 7)."""
+        device = warp_arrays.torch_device(self.device)
+        part, peg = (each.detach().to(device) for each in (world_from_part, world_from_peg))
+        peg = peg if peg.ndim == 3 else peg[None]
+        with self.effort.measure(items=len(part) * peg.shape[1]):
+            turns = [poses.rotation_matrix(each) for each in (part, peg)]
+            distance, witness, normal = self._launch(turns[0], part[:, :3], turns[1], peg[..., :3])
+            middle = torch.as_tensor(self._center, dtype=torch.float64, device=device)
+            found = (distance.double(), witness.double() + middle, normal.double())
+        return Gap(*(beside(each, world_from_part) for each in found))
 
     def evaluate(self, part: Frames, peg: Frames) -> tuple[Array, Array, Array]:
         """The fields of `Gap` as arrays, at frames (N,) of the part and (T,) or (N, T) of the peg."""
         peg = peg if peg.translation.ndim == 3 else Frames(peg.rotation[None], peg.translation[None])
-        particles, stamps = len(part.translation), peg.translation.shape[1]
-        distance = np.empty((particles, stamps))
-        witness, normal = np.empty((particles, stamps, 3)), np.empty((particles, stamps, 3))
-        most = max(1, PAIRS // max(1, stamps))
-        with self.effort.measure(items=particles * stamps):
-            for first in range(0, particles if stamps else 0, most):
-                own = slice(first, first + most)
-                pegs = peg if len(peg.rotation) == 1 else Frames(*(each[own] for each in peg))
-                found = self._launch(Frames(*(each[own] for each in part)), pegs)
-                distance[own], witness[own], normal[own] = (each.numpy() for each in found)
+        device = warp_arrays.torch_device(self.device)
+        with self.effort.measure(items=len(part.translation) * peg.translation.shape[1]):
+            given = (torch.from_numpy(np.ascontiguousarray(each)).to(device) for each in (*part, *peg))
+            distance, witness, normal = (numbers(each.double()) for each in self._launch(*given))
         return distance, witness + self._center, normal
 
-    def _launch(self, part: Frames, peg: Frames) -> list[Any]:
-        shape = (len(part.translation), peg.translation.shape[1])
-        kinds = (wp.mat33d, wp.vec3d)
-        given = [
-            self._array(each, kind)
-            for frames in (part, peg)
-            for each, kind in zip(frames, kinds, strict=True)
+    def _launch(self, *frames: Tensor) -> list[Tensor]:
+        """Distances (N, T), witness points about the mesh's centre and normals, in single precision.
+
+        Frames are turns (N, 3, 3) and shifts (N, 3) of the part, and (1 or N, T, ...) of the peg.
+        """
+        shape = (len(frames[0]), frames[2].shape[1])
+        results = [frames[0].new_empty((*shape, *more), dtype=torch.float32) for more in ((), (3,), (3,))]
+        if 0 in shape:
+            return results
+        kinds = (wp.mat33d, wp.vec3d) * 2
+        given = [warp_arrays.array_of(each, kind) for each, kind in zip(frames, kinds, strict=True)]
+        written = [
+            warp_arrays.array_of(each, kind)
+            for each, kind in zip(results, (wp.float32, wp.vec3, wp.vec3), strict=True)
         ]
-        results = [wp.empty(shape, dtype=kind, device=self.device) for kind in (float, wp.vec3, wp.vec3)]
         inputs = [self._bodies, *given, wp.vec3d(*map(float, self._center))]
-        wp.launch(_measure, dim=shape, inputs=inputs, outputs=results, device=self.device)
+        warp_arrays.launch(_measure, shape, inputs, written)
         return results

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.devices import beside, same_random_state
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import FittedMixture, fitted_mixture
 from bcppl.distributions.pose_normals import (
@@ -213,7 +214,7 @@ class ErringCamera:
         turns = box_turns(self.renderer.part)
         spread = torch.hypot(normal_like(prior).covariance.diagonal().sqrt(), errors)
         bias = torch.tensor([self.settings.bias], dtype=torch.float64)
-        with torch.random.fork_rng(devices=[]):
+        with same_random_state():
             torch.manual_seed(0)  # a fit depends on the image alone
             fit = fitted_mixture(log_density, torch.cat([spread, bias]), SHARPEST, alike)
         # Weights are of the likelihood alone, in the poses' base measure.
@@ -352,7 +353,7 @@ class ErringCamera:
         off = fit.means[:, :6] + away[..., None] * both / own[:, None]
         covariances = fit.covariances[:, :6, :6] - both[:, :, None] * both[:, None] / own[:, None, None]
         return GaussianMixture(
-            poses.retract(self.prior.center, off),
+            poses.retract(beside(self.prior.center, off), off),
             covariances.expand(len(bias), -1, 6, 6),
             fit.log_weights - 0.5 * (away.square() / own + own.log()),
         )
@@ -360,7 +361,7 @@ class ErringCamera:
 
 def with_bias(camera: Camera, part: Tensor, bias: Tensor | float) -> Tensor:
     """The apparent pose (..., 7) of a part (..., 7) when a bias (...,) in metres is added to the ranges."""
-    bias = torch.as_tensor(bias, dtype=torch.float64)
+    bias = torch.as_tensor(bias, dtype=torch.float64, device=part.device)
     moved = part[..., :3] + bias[..., None] * line_of_sight(camera, part)
     return torch.cat([moved, part[..., 3:]], dim=-1)
 

@@ -15,6 +15,7 @@ from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, cell_ends
 from bcppl.contact.sensing.location import ContactSensing
+from bcppl.devices import numbers
 from bcppl.distributions.episodes.filtered import Linearised
 from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FELT, GIVEN, SECONDS, padded
 from bcppl.distributions.manifold import Gaps, MeasuresGap
@@ -110,7 +111,7 @@ class RememberedGaps:
         """Gaps at poses (N, 7), those of `part`, and (T, 7) or (N, T, 7)."""
         if world_from_part is not self.part or world_from_peg.ndim != 2:
             return self.gap(world_from_part, world_from_peg)
-        keys = [row.tobytes() for row in world_from_peg.numpy()]
+        keys = [row.tobytes() for row in numbers(world_from_peg)]
         new = [k for k, key in enumerate(keys) if key not in self._number]
         if new:
             measured = self.gap(self.part, world_from_peg[new])

@@ -100,7 +100,7 @@ class InstrumentError:
         """
         whole = self.covariance([*(each.camera for each in before), camera], part)
         size = 6 * len(before)
-        eye = torch.eye(6, dtype=torch.float64).expand(*part.shape[:-1], 6, 6)
+        eye = torch.eye(6, dtype=torch.float64, device=part.device).expand(*part.shape[:-1], 6, 6)
         if not before:
             return Prediction(part.new_zeros(*part.shape[:-1], 6), whole, eye)
         away = torch.cat(
@@ -130,7 +130,7 @@ class InstrumentError:
 
         if len(cameras) == 1:
             return PoseFactor(center, covariance)
-        alike = torch.eye(6, dtype=torch.float64).repeat(len(cameras), 1)
+        alike = torch.eye(6, dtype=torch.float64, device=center.device).repeat(len(cameras), 1)
 
         def combined(center: Tensor) -> Tensor:
             return torch.linalg.inv(alike.T @ torch.linalg.solve(covariance(center), alike))

@@ -1,0 +1,153 @@
+"""Where numbers are worked on: the processor, or a GPU of torch's.
+
+A run decides once: within `on_device` whatever is made is made there. All else follows the tensors that it is
+given. Numbers of particles stay on the device; what is small, the same for all of them, and costs by
+operations rather than by numbers (an approximation, the rows of a probe, an image) stays on the host, and is
+worked on within `on_host`. `numbers` is the way of tensors to compiled code of the processor, `beside` the
+way back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from bcppl.errors import InputError
+
+T = TypeVar("T")
+HOST = torch.device("cpu")
+
+
+def device_named(name: str | torch.device | None) -> torch.device:
+    """Torch's device of a name, such as "cuda" or "cuda:1"; the processor for None.
+
+    Raises:
+        InputError: it is neither the processor nor a GPU that torch reaches.
+    """
+    if name is None:
+        return HOST
+    try:
+        device = torch.device(name)
+    except (RuntimeError, TypeError) as error:
+        raise InputError(f"{name!r} names no device; give 'cpu' or 'cuda'.") from error
+    if device.type == "cuda":
+        if not torch.cuda.is_available():
+            raise InputError("device 'cuda' was asked for, and torch reaches no GPU; give 'cpu'.")
+        if device.index is None:
+            device = torch.device("cuda", torch.cuda.current_device())
+        if device.index >= torch.cuda.device_count():
+            raise InputError(f"{name!r} was asked for, and torch reaches {torch.cuda.device_count()} GPUs.")
+    elif device.type != "cpu":
+        raise InputError(f"runs are made on 'cpu' or 'cuda', not on {name!r}.")
+    return device
+
+
+def current_device() -> torch.device:
+    """The device of the run that this is part of; the processor outside of runs."""
+    return torch.get_default_device()
+
+
+@contextmanager
+def on_device(device: torch.device) -> Iterator[None]:
+    """What is made within is made on the device."""
+    # A context costs a microsecond for each operation: none where nothing changes.
+    if device == current_device():
+        yield
+        return
+    with device:
+        yield
+
+
+def on_host() -> Any:
+    """What is made within is made on the processor."""
+    return on_device(HOST)
+
+
+def is_on_host(tensor: Tensor) -> bool:
+    """Whether compiled code of the processor can read a tensor as it is."""
+    return tensor.device.type == "cpu"
+
+
+def numbers(tensor: Tensor) -> npt.NDArray[Any]:
+    """The numbers of a tensor, wherever it is; not copied where that is the host."""
+    return np.asarray((tensor if is_on_host(tensor) else tensor.detach().cpu()).numpy())
+
+
+def beside(values: npt.NDArray[Any] | Tensor, other: Tensor) -> Tensor:
+    """The numbers on the device of another tensor; not copied where that is the host."""
+    tensor = torch.from_numpy(values) if isinstance(values, np.ndarray) else values
+    return tensor if tensor.device == other.device else tensor.to(other.device)
+
+
+def moved(value: T, device: torch.device) -> T:
+    """A value whose tensors are on a device: a tensor, or what holds some.
+
+    That is a tuple or mapping of such values, or an object with a method `on`, which is given the device;
+    anything else is returned as it is.
+    """
+    result: Any = value
+    if isinstance(value, Tensor):
+        result = value if value.device == device else value.to(device)
+    elif isinstance(value, tuple):
+        each = [moved(one, device) for one in value]
+        result = value._make(each) if hasattr(value, "_make") else tuple(each)
+    elif isinstance(value, Mapping):
+        result = {name: moved(one, device) for name, one in value.items()}
+    elif hasattr(value, "on"):
+        result = value.on(device)
+    return result  # type: ignore[no-any-return]
+
+
+_COPIES: dict[tuple[int, torch.device, torch.dtype], Tensor] = {}
+
+
+def constant(values: Tensor, like: Tensor) -> Tensor:
+    """A constant of a module on the device of another tensor, numbers of its type; copied once for each."""
+    kind = like.dtype if values.is_floating_point() else values.dtype
+    if values.device == like.device and values.dtype == kind:
+        return values
+    key = id(values), like.device, kind
+    if key not in _COPIES:
+        _COPIES[key] = values.to(device=like.device, dtype=kind)
+    return _COPIES[key]
+
+
+def random_state(device: torch.device) -> Tensor:
+    """The state of torch's generators, bytes: that of the processor, then that of a GPU."""
+    state = torch.get_rng_state()
+    if device.type == "cpu":
+        return state
+    return torch.cat([state, torch.cuda.get_rng_state(device)])
+
+
+def set_random_state(state: Tensor, device: torch.device) -> None:
+    """Set torch's generators to a state as of `random_state`."""
+    size = len(torch.get_rng_state())
+    torch.set_rng_state(state[:size])
+    if device.type != "cpu":
+        torch.cuda.set_rng_state(state[size:], device)
+
+
+def seeded_state(seed: int, device: torch.device) -> Tensor:
+    """The state of generators that are seeded."""
+    state = torch.Generator(HOST).manual_seed(seed).get_state()
+    if device.type == "cpu":
+        return state
+    return torch.cat([state, torch.Generator(device).manual_seed(seed).get_state()])
+
+
+@contextmanager
+def same_random_state() -> Iterator[None]:
+    """Torch's generators, that of the run's device too, are afterwards as they were before."""
+    device = current_device()
+    state = random_state(device)
+    try:
+        yield
+    finally:
+        set_random_state(state, device)

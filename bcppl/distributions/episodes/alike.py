@@ -1,0 +1,138 @@
+"""The filter over a probe's episodes where nothing is learned of shared errors: sums over particles, by torch.
+
+Without parameters an episode's errors are correlated alike in all particles, and its hypotheses never
+multiply: what the compiled filter (`bcppl.distributions.episodes.switching_filter`) does particle by particle
+is a few operations on all of them. On a GPU it is evaluated so, where the particles are.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.special import log_ndtr
+
+from bcppl.arrays import Array
+from bcppl.devices import beside, numbers
+from bcppl.distributions.episodes.branches import Branches, Prior, Segments
+from bcppl.distributions.episodes.switching_filter import CLEAR, FAINT
+
+_FREE = 64  # rows without contact at a time: they take memory
+
+
+@dataclass(frozen=True, eq=False)
+class AlikeBranches:
+    """The H hypotheses of N particles after some rows, on a device; none has parameters.
+
+    Attributes:
+        log_weight: (N, H) unnormalised; -inf for one that is dropped.
+        squared: (N, H, E) of each episode so far its squared whitened errors, as predicted.
+    """
+
+    log_weight: Tensor
+    squared: Tensor
+
+    @property
+    def log_evidence(self) -> Tensor:
+        """(N,) the log-likelihood of the rows so far."""
+        return self.log_weight.logsumexp(dim=1)
+
+    @property
+    def of_each(self) -> AlikeBranches:
+        """Itself: every particle's are written."""
+        return self
+
+    @property
+    def on_host(self) -> Branches:
+        """The same as the compiled filter gives it, but for what is dropped, which has no weight here."""
+        log_weight, squared = numbers(self.log_weight), numbers(self.squared)
+        particles, hypotheses = log_weight.shape
+        return Branches(
+            number=np.full(particles, hypotheses),
+            log_weight=log_weight,
+            which=np.broadcast_to(np.arange(hypotheses), log_weight.shape).copy(),
+            mean=np.zeros((particles, hypotheses, 0)),
+            covariance=np.zeros((particles, hypotheses, 0, 0)),
+            event=np.zeros(squared.shape, np.int64),
+            squared=squared,
+        )
+
+
+def begun_alike(prior: Prior, pose: Tensor) -> AlikeBranches:
+    """The hypotheses of the particles at poses (N, 7) before the first row."""
+    log_weight = beside(np.asarray(prior.log_weight), pose).expand(len(pose), -1)
+    return AlikeBranches(log_weight, log_weight.new_zeros(*log_weight.shape, 0))
+
+
+def filtered_alike(
+    before: AlikeBranches, prior: Prior, segments: Segments, distance: Tensor, force: Array
+) -> AlikeBranches:
+    """The hypotheses after further rows, as `switching_filter.filtered`.
+
+    Args:
+        before: after the rows before these.
+        prior: of all hypotheses, which differ in no delay.
+        segments: of these rows.
+        distance: (N, R) the gaps, m.
+        force: (R,) N.
+    """
+    log_weight, squared = before.log_weight, [before.squared]
+    free: list[int] = []
+
+    def put(values: Array) -> Tensor:
+        return beside(np.ascontiguousarray(values), distance)
+
+    own, compliance = put(segments.own), put(prior.compliance)
+    forces, log_in = put(force), math.log1p(-prior.outlier)
+    log_out = math.log(prior.outlier) if prior.outlier > 0.0 else -math.inf
+    ends = zip(segments.first.tolist(), segments.last.tolist(), segments.contact.tolist(), strict=True)
+    for s, (first, last, contact) in enumerate(ends):
+        if not contact:
+            free.append(first)
+            continue
+        log_weight = log_weight + _of_free(distance, free, own, log_in, log_out)
+        free, rows = [], last - first
+        error = distance[:, None, first:last] + compliance[:, None] * forces[first:last]
+        factor = _lower(segments.factor[:, first:last, :rows])
+        white = torch.einsum("hij,nhj->nhi", put(factor), error)
+        square = white.square().sum(dim=2)
+        size = put(segments.log_determinant[:, s] + rows * math.log(2.0 * math.pi))
+        inlier = log_in - 0.5 * (square + size)
+        stray = torch.full_like(inlier, log_out - rows * math.log(prior.farthest))
+        log_weight = log_weight + torch.logaddexp(inlier, stray)
+        faint = log_weight < log_weight.amax(dim=1, keepdim=True) - FAINT
+        log_weight = log_weight.masked_fill(faint, -torch.inf)
+        squared.append(square[..., None])
+    log_weight = log_weight + _of_free(distance, free, own, log_in, log_out)
+    return replace(before, log_weight=log_weight, squared=torch.cat(squared, dim=2))
+
+
+def _of_free(distance: Tensor, rows: list[int], own: Tensor, log_in: float, log_out: float) -> Tensor:
+    """The log-probability (N, H) that the gaps at rows without contact are positive."""
+    total = distance.new_zeros(len(distance), len(own))
+    for first in range(0, len(rows), _FREE):
+        which = slice(rows[first], rows[min(first + _FREE, len(rows)) - 1] + 1)
+        if which.stop - which.start != len(rows[first : first + _FREE]):
+            raise AssertionError("rows without contact between two episodes follow one another")
+        gap = distance[:, which]
+        # Of many hypotheses few differ in the noise of a row.
+        alike, whose = own[:, which].sqrt().unique(dim=0, return_inverse=True)
+        score = gap[:, None] / alike
+        either = torch.logaddexp(log_in + log_ndtr(score), torch.full_like(score, log_out))
+        either = torch.where(gap[:, None] > CLEAR, 0.0, either)
+        total = total + either.sum(dim=2)[:, whose]
+    return total
+
+
+def _lower(factor: Array) -> Array:
+    """The inverses (H, n, n) of Cholesky factors whose diagonals are inverted already."""
+    inverse = np.zeros(factor.shape)
+    for i in range(factor.shape[1]):
+        inverse[:, i, i] = factor[:, i, i]
+        for j in range(i):
+            rest = -(factor[:, i, j:i] * inverse[:, j:i, j]).sum(axis=1)
+            inverse[:, i, j] = rest * factor[:, i, i]
+    return inverse
