@@ -142,6 +142,15 @@ def seeded_state(seed: int, device: torch.device) -> Tensor:
     return torch.cat([state, torch.Generator(device).manual_seed(seed).get_state()])
 
 
+def seed_here(seed: int) -> None:
+    """Seed torch's generators of the processor and of the run's device, and no others."""
+    # `torch.manual_seed` would seed those of all GPUs, also within `on_host`.
+    device = current_device()
+    torch.default_generator.manual_seed(seed)
+    if device.type != "cpu":
+        torch.cuda.set_rng_state(torch.Generator(device).manual_seed(seed).get_state(), device)
+
+
 @contextmanager
 def same_random_state() -> Iterator[None]:
     """Torch's generators, that of the run's device too, are afterwards as they were before."""

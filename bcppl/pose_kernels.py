@@ -6,8 +6,10 @@ of these is one. Rows are poses `[x, y, z, qw, qx, qy, qz]`; an operand with one
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
+from importlib.util import find_spec
 
 import numpy as np
 import torch
@@ -22,16 +24,22 @@ SMALL = 1e-4  # rad: below, a series' first term is exact to rounding
 Kernel = Callable[[Array, Array, Array], None]
 
 
+@functools.cache
+def _has_warp() -> bool:
+    return find_spec("warp") is not None
+
+
 def fused(kernel: Kernel, first: Tensor, second: Tensor, *shape: int) -> Tensor | None:
     """A kernel's result (..., *shape) of operands (..., K) that broadcast; None where torch computes it.
 
-    That is where a gradient is asked for, with numbers of another type, and on a GPU.
+    That is where a gradient is asked for, with numbers of another type, and on a GPU without Warp.
     """
     if first.requires_grad or second.requires_grad:
         return None
     if first.dtype is not torch.float64 or second.dtype is not torch.float64:
         return None
-    if not (is_on_host(first) and is_on_host(second)):
+    there = not (is_on_host(first) and is_on_host(second))
+    if there and (first.device != second.device or not _has_warp()):
         return None
     batch = first.shape[:-1]
     if batch != second.shape[:-1]:
@@ -40,6 +48,12 @@ def fused(kernel: Kernel, first: Tensor, second: Tensor, *shape: int) -> Tensor 
             each if each.shape[:-1].numel() == 1 else each.expand(*batch, each.shape[-1])
             for each in (first, second)
         )
+    if there:
+        from bcppl.warp_poses import fused_there
+
+        flat = [each.reshape(-1, each.shape[-1]) for each in (first, second)]
+        rows = max(map(len, flat)) if batch.numel() else 0
+        return fused_there(kernel, *flat, rows, *shape).reshape(*batch, *shape)
     own, rest = first.numpy().reshape(-1, first.shape[-1]), second.numpy().reshape(-1, second.shape[-1])
     result = np.empty((max(len(own), len(rest)), *shape)) if batch.numel() else np.empty((0, *shape))
     kernel(own, rest, result)

@@ -13,6 +13,7 @@ import warp as wp
 from torch import Tensor
 
 wp.config.quiet = True
+wp.init()
 
 
 def warp_device(device: torch.device | str | None) -> Any:
@@ -30,6 +31,11 @@ def torch_device(device: Any) -> torch.device:
 def array_of(tensor: Tensor, kind: Any) -> Any:
     """A tensor as an array of some kind, such as `wp.vec3`, whose numbers have the tensor's type."""
     return wp.from_torch(tensor.detach().contiguous(), dtype=kind, requires_grad=False)
+
+
+def rows_of(tensor: Tensor) -> Any:
+    """A tensor (N, K) as an array of numbers."""
+    return array_of(tensor, wp.float64)
 
 
 def launch(kernel: Any, shape: int | Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any]) -> None:

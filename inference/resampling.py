@@ -24,7 +24,7 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, seed_number, whole_number
 from bcppl.beliefs import normalised
-from bcppl.devices import same_random_state
+from bcppl.devices import same_random_state, seed_here
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 
@@ -33,7 +33,7 @@ from bcppl.inference.population import Population
 def seeded(seed: int) -> Iterator[None]:
     """Torch's generator seeded within, and restored afterwards."""
     with same_random_state():
-        torch.manual_seed(seed_number(seed))
+        seed_here(seed_number(seed))
         yield
 
 

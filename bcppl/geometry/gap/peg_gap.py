@@ -26,7 +26,7 @@ from bcppl.threads import parallel_sum, thread_count
 if TYPE_CHECKING:
     from bcppl.geometry.gap.warp_gap import WarpGap
 
-_MARGIN = 0.012  # m around the part that the grid covers
+MARGIN = 0.012  # m around the part that the grid covers
 _CHUNK = 8  # particles of a chunk of work, at least
 _PAIRS = 2000  # pairs of poses of a chunk, at least: they take milliseconds, and to wake a thread a tenth
 
@@ -116,7 +116,7 @@ class PegGap:
         particles, stamps = len(part.translation), peg.translation.shape[1]
         with self.effort.measure(items=particles * stamps):
             if self._grid is None:
-                self._grid = RefinedGrid(distance_grid(self.part, self._signed, _MARGIN), self._signed, NEAR)
+                self._grid = RefinedGrid(distance_grid(self.part, self._signed, MARGIN), self._signed, NEAR)
             distance = np.empty((particles, stamps))
             witness, normal = np.empty((particles, stamps, 3)), np.empty((particles, stamps, 3))
             result, grid, surface = (distance, witness, normal), self._grid.grid, self._signed.surface

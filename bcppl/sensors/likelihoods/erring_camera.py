@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.devices import beside, same_random_state
+from bcppl.devices import beside, same_random_state, seed_here
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import FittedMixture, fitted_mixture
 from bcppl.distributions.pose_normals import (
@@ -215,7 +215,7 @@ class ErringCamera:
         spread = torch.hypot(normal_like(prior).covariance.diagonal().sqrt(), errors)
         bias = torch.tensor([self.settings.bias], dtype=torch.float64)
         with same_random_state():
-            torch.manual_seed(0)  # a fit depends on the image alone
+            seed_here(0)  # a fit depends on the image alone
             fit = fitted_mixture(log_density, torch.cat([spread, bias]), SHARPEST, alike)
         # Weights are of the likelihood alone, in the poses' base measure.
         own = 0.5 * (fit.means[:, :6] / spread).square().sum(dim=1)
