@@ -48,20 +48,42 @@ def device_named(name: str | torch.device | None) -> torch.device:
     return device
 
 
+_current = HOST
+
+
 def current_device() -> torch.device:
     """The device of the run that this is part of; the processor outside of runs."""
-    return torch.get_default_device()
+    return _current
 
 
 @contextmanager
 def on_device(device: torch.device) -> Iterator[None]:
-    """What is made within is made on the device."""
-    # A context costs a microsecond for each operation: none where nothing changes.
-    if device == current_device():
+    """What is made within is made on the device, unless it is made of what is elsewhere.
+
+    That holds for the whole process, as do torch's generators and the number of its threads.
+    """
+    before = _current
+    if device == before:
         yield
         return
-    with device:
+    _work_on(device)
+    try:
         yield
+    finally:
+        _work_on(before)
+
+
+def _work_on(device: torch.device) -> None:
+    # Torch's own context, `with device:`, looks at each operation in Python: a run of 10,000 particles made
+    # 730,000, which took a quarter of its time.
+    global _current
+    wide = torch.get_default_dtype() is torch.float64
+    if device.type == "cpu":
+        torch.set_default_tensor_type(torch.DoubleTensor if wide else torch.FloatTensor)
+    else:
+        torch.cuda.set_device(device)
+        torch.set_default_tensor_type(torch.cuda.DoubleTensor if wide else torch.cuda.FloatTensor)
+    _current = device
 
 
 def on_host() -> Any:

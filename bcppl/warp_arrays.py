@@ -5,6 +5,7 @@ A kernel is launched on torch's stream: it reads what torch has written before, 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -33,13 +34,35 @@ def array_of(tensor: Tensor, kind: Any) -> Any:
     return wp.from_torch(tensor.detach().contiguous(), dtype=kind, requires_grad=False)
 
 
-def rows_of(tensor: Tensor) -> Any:
-    """A tensor (N, K) as an array of numbers."""
-    return array_of(tensor, wp.float64)
+def argument_of(tensor: Tensor, kind: Any) -> Any:
+    """The same for one launch, which takes half as long; the tensor, contiguous, is kept by the caller."""
+    return wp.from_torch(tensor, dtype=kind, requires_grad=False, return_ctype=True)
 
 
-def launch(kernel: Any, shape: int | Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
-    """Launch a kernel on the device of its first output, an array."""
-    device = outputs[0].device
-    stream = wp.stream_from_torch(torch_device(device)) if device.is_cuda else None
-    wp.launch(kernel, dim=shape, inputs=[*inputs], outputs=[*outputs], device=device, stream=stream)
+@functools.cache
+def _stream(handle: int, device: torch.device) -> Any:
+    return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
+
+
+def launch(
+    kernel: Any,
+    shape: int | Sequence[int],
+    inputs: Sequence[Any],
+    outputs: Sequence[tuple[Tensor, Any]],
+) -> None:
+    """Launch a kernel.
+
+    Args:
+        kernel: one of Warp's.
+        shape: of its threads.
+        inputs: a pair of a tensor and the kind of its entries for an array; anything else as Warp takes it.
+        outputs: such pairs, contiguous, on the device of the launch.
+    """
+    device = outputs[0][0].device
+    given = [(each[0].detach().contiguous(), each[1]) if isinstance(each, tuple) else each for each in inputs]
+    arguments = [argument_of(*each) if isinstance(each, tuple) else each for each in (*given, *outputs)]
+    if device.type == "cpu":
+        wp.launch(kernel, dim=shape, inputs=arguments, device="cpu")
+        return
+    stream = _stream(torch.cuda.current_stream(device).cuda_stream, device)
+    wp.launch(kernel, dim=shape, inputs=arguments, stream=stream)

@@ -204,6 +204,6 @@ def fused_there(kernel: Any, first: Tensor, second: Tensor, rows: int, *shape: i
     """A kernel's result (rows, *shape) of operands (1 or rows, K) on a GPU."""
     result = first.new_empty(rows, *shape)
     if rows:
-        given = [warp_arrays.rows_of(each) for each in (first, second)]
-        warp_arrays.launch(_OF[kernel], rows, given, [warp_arrays.rows_of(result.view(rows, -1))])
+        written = [(result.view(rows, -1), wp.float64)]
+        warp_arrays.launch(_OF[kernel], rows, [(first, wp.float64), (second, wp.float64)], written)
     return result

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.devices import is_on_host
 from bcppl.distributions.poses import BoxedNormal, MixturePose, NormalPose, NormalTwist
 from bcppl.distributions.poses.boxed import log_mass
 
@@ -24,6 +25,7 @@ from bcppl.distributions.poses.boxed import log_mass
 WIDTHS = (1.1, 3.0, 3.0)  # standard deviations
 SHARES = (0.6, 0.1, 0.3)  # probabilities, the last of all six axes together
 COPIES = 8
+_TOGETHER = 4096  # eigenvalue problems that a GPU is given at a time
 _LEVER = 0.02  # m: a rotation is as long as the displacement that it gives there
 
 _SWEEPS = 3  # of expectation propagation over the axes
@@ -119,8 +121,8 @@ def widened_mixture(mixture: GaussianMixture) -> MixturePose:
     """A mixture of M Gaussians for each of N particles, each mixed with wider ones (`WIDTHS`)."""
     centers, covariances = mixture.centers, mixture.covariances
     same, every, along = (width**2 for width in WIDTHS)
-    units = torch.tensor([1.0] * 3 + [1.0 / _LEVER] * 3, dtype=torch.float64)
-    values, axes = torch.linalg.eigh(covariances / (units[:, None] * units))
+    units = covariances.new_tensor([1.0] * 3 + [1.0 / _LEVER] * 3)
+    values, axes = _eigh(covariances / (units[:, None] * units))
     longest = units[:, None] * axes * values.clamp(min=0.0).sqrt()[..., None, :]  # (..., 6, 6), by column
     wider = (along - same) * longest.mT[..., :, None] * longest.mT[..., None, :]
     wide = torch.cat(
@@ -130,7 +132,7 @@ def widened_mixture(mixture: GaussianMixture) -> MixturePose:
         ],
         dim=-3,
     )
-    shares = torch.tensor([*SHARES[:2], *[SHARES[2] / 6.0] * 6], dtype=torch.float64)
+    shares = covariances.new_tensor([*SHARES[:2], *[SHARES[2] / 6.0] * 6])
     log_weights = mixture.log_weights.log_softmax(dim=-1)[..., None] + shares.log()
     return MixturePose(
         log_weights.flatten(-2),
@@ -138,6 +140,17 @@ def widened_mixture(mixture: GaussianMixture) -> MixturePose:
         wide.flatten(-4, -3),
         twists=True,
     )
+
+
+def _eigh(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues and eigenvectors of symmetric matrices (..., d, d)."""
+    flat = matrices.reshape(-1, *matrices.shape[-2:])
+    if is_on_host(matrices) or len(flat) <= _TOGETHER:
+        return torch.linalg.eigh(matrices)  # type: ignore[no-any-return]
+    # CUDA's solver takes half a megabyte of memory for each, and fails with 100,000.
+    each = [torch.linalg.eigh(some) for some in flat.split(_TOGETHER)]
+    values, axes = (torch.cat(parts) for parts in zip(*each, strict=True))
+    return values.reshape(matrices.shape[:-1]), axes.reshape(matrices.shape)
 
 
 def matched(mixture: MixturePose) -> NormalTwist:
@@ -253,4 +266,4 @@ def _limits(prior: Any) -> Tensor:
     """The largest deviations (6,) of a prior along and about its axes, metres and radians."""
     angle = getattr(prior, "angle", None)
     turns = [angle] * 3 if angle is not None else [prior.tilt, prior.tilt, prior.yaw]
-    return torch.cat([torch.as_tensor(prior.widths), torch.tensor(turns, dtype=torch.float64)])
+    return torch.cat([torch.as_tensor(prior.widths), torch.tensor(turns, dtype=torch.float64, device=prior.widths.device)])

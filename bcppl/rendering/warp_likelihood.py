@@ -18,7 +18,8 @@ from bcppl.arrays import Array, Mask
 from bcppl.devices import beside
 from bcppl.geometry.camera import Camera
 
-STRIPES = 64  # sums of each particle: neighbouring threads then cast neighbouring rays
+# Sums of each particle, at least, so that neighbouring threads cast neighbouring rays, and threads in all.
+STRIPES, THREADS = 64, 1 << 20
 REACH = wp.constant(1e6)  # m, beyond which nothing is hit
 UNKNOWN = wp.constant(wp.float64(1e300))  # m: no background
 
@@ -148,30 +149,31 @@ class CastImages:
         turn = poses.rotation_matrix(camera_from_part).transpose(-1, -2)
         offset = camera_from_part[:, :3, None] + turn.transpose(-1, -2) @ self._center[:, None]
         eye = -(turn @ offset)[..., 0]
-        shape = (len(eye), STRIPES)
+        stripes = max(STRIPES, THREADS // max(1, len(eye)) // 32 * 32)
+        shape = (len(eye), min(stripes, camera.width * camera.height))
         gains = torch.empty(shape, dtype=torch.float64, device=self._device)
         inputs = [
             self._mesh.id,
-            warp_arrays.array_of(turn.to(torch.float32), wp.mat33),
-            warp_arrays.array_of(eye.to(torch.float32), wp.vec3),
+            (turn.to(torch.float32), wp.mat33),
+            (eye.to(torch.float32), wp.vec3),
             self._radius,
-            warp_arrays.array_of(bias, wp.float64),
+            (bias, wp.float64),
             self._image(camera, seen),
             _law_of(law),
         ]
-        warp_arrays.launch(_sum_gains, shape, inputs, [warp_arrays.array_of(gains, wp.float64)])
+        warp_arrays.launch(_sum_gains, shape, inputs, [(gains, wp.float64)])
         return gains.sum(dim=1)
 
     def totals(self, depth: Array, behind: Array, shift: Tensor, law: Any) -> Tensor:
         """Log-densities (N,) of pixels (1 or N, P), the background (P,) behind them moved by shifts (N,)."""
-        total = torch.empty_like(shift)
+        total = torch.empty(len(shift), dtype=torch.float64, device=self._device)
         inputs = [
-            warp_arrays.array_of(beside(np.ascontiguousarray(depth), shift), wp.float64),
-            warp_arrays.array_of(beside(np.ascontiguousarray(behind), shift), wp.float64),
-            warp_arrays.array_of(shift, wp.float64),
+            (beside(np.ascontiguousarray(depth), shift), wp.float64),
+            (beside(np.ascontiguousarray(behind), shift), wp.float64),
+            (shift, wp.float64),
             _law_of(law),
         ]
-        warp_arrays.launch(_sum_shifted, len(shift), inputs, [warp_arrays.array_of(total, wp.float64)])
+        warp_arrays.launch(_sum_shifted, len(shift), inputs, [(total, wp.float64)])
         return total
 
     def _image(self, camera: Camera, seen: Any) -> Image:

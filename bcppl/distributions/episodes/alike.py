@@ -85,17 +85,19 @@ def filtered_alike(
     def put(values: Array) -> Tensor:
         return beside(np.ascontiguousarray(values), distance)
 
-    own, compliance = put(segments.own), put(prior.compliance)
-    forces, log_in = put(force), math.log1p(-prior.outlier)
+    # Of many hypotheses few differ in the noise of a row.
+    noises, whose = np.unique(np.sqrt(segments.own), axis=0, return_inverse=True)
+    own, of_each = put(noises), put(whose.reshape(-1))
+    sunk, log_in = put(prior.compliance[:, None] * force), math.log1p(-prior.outlier)
     log_out = math.log(prior.outlier) if prior.outlier > 0.0 else -math.inf
     ends = zip(segments.first.tolist(), segments.last.tolist(), segments.contact.tolist(), strict=True)
     for s, (first, last, contact) in enumerate(ends):
         if not contact:
             free.append(first)
             continue
-        log_weight = log_weight + _of_free(distance, free, own, log_in, log_out)
+        log_weight = log_weight + _of_free(distance, free, own, log_in, log_out)[:, of_each]
         free, rows = [], last - first
-        error = distance[:, None, first:last] + compliance[:, None] * forces[first:last]
+        error = distance[:, None, first:last] + sunk[:, first:last]
         factor = _lower(segments.factor[:, first:last, :rows])
         white = torch.einsum("hij,nhj->nhi", put(factor), error)
         square = white.square().sum(dim=2)
@@ -106,24 +108,22 @@ def filtered_alike(
         faint = log_weight < log_weight.amax(dim=1, keepdim=True) - FAINT
         log_weight = log_weight.masked_fill(faint, -torch.inf)
         squared.append(square[..., None])
-    log_weight = log_weight + _of_free(distance, free, own, log_in, log_out)
+    log_weight = log_weight + _of_free(distance, free, own, log_in, log_out)[:, of_each]
     return replace(before, log_weight=log_weight, squared=torch.cat(squared, dim=2))
 
 
 def _of_free(distance: Tensor, rows: list[int], own: Tensor, log_in: float, log_out: float) -> Tensor:
-    """The log-probability (N, H) that the gaps at rows without contact are positive."""
+    """The log-probability (N, K) that the gaps at rows without contact are positive, for noises (K, R)."""
     total = distance.new_zeros(len(distance), len(own))
     for first in range(0, len(rows), _FREE):
         which = slice(rows[first], rows[min(first + _FREE, len(rows)) - 1] + 1)
         if which.stop - which.start != len(rows[first : first + _FREE]):
             raise AssertionError("rows without contact between two episodes follow one another")
         gap = distance[:, which]
-        # Of many hypotheses few differ in the noise of a row.
-        alike, whose = own[:, which].sqrt().unique(dim=0, return_inverse=True)
-        score = gap[:, None] / alike
+        score = gap[:, None] / own[:, which]
         either = torch.logaddexp(log_in + log_ndtr(score), torch.full_like(score, log_out))
         either = torch.where(gap[:, None] > CLEAR, 0.0, either)
-        total = total + either.sum(dim=2)[:, whose]
+        total = total + either.sum(dim=2)
     return total
 
 

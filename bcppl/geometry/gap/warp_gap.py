@@ -338,7 +338,7 @@ def _measure(
     witness: wp.array2d[wp.vec3],
     normal: wp.array2d[wp.vec3],
 ) -> None:
-    n, t = wp.tid()
+    t, n = wp.tid()
     own = wp.min(n, peg_turn.shape[0] - 1)
     # The peg in the part's frame, about the mesh's centre: from there on single precision is enough.
     back = wp.transpose(part_turn[n])
@@ -368,6 +368,8 @@ class WarpGap(PegGap):
         mesh = closed_mesh(part)
         # Single precision is finest around zero, so the mesh is centred there.
         self._center = mesh.bounds.mean(axis=0)
+        middle = torch.from_numpy(np.asarray(self._center, np.float64))
+        self._middle = middle.to(warp_arrays.torch_device(self.device))
         faces = wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=int, device=self.device)
         vertices = self._array(mesh.vertices - self._center, wp.vec3)
         self._mesh = wp.Mesh(vertices, faces, support_winding_number=True)
@@ -407,8 +409,7 @@ class WarpGap(PegGap):
         with self.effort.measure(items=len(part) * peg.shape[1]):
             turns = [poses.rotation_matrix(each) for each in (part, peg)]
             distance, witness, normal = self._launch(turns[0], part[:, :3], turns[1], peg[..., :3])
-            middle = torch.as_tensor(self._center, dtype=torch.float64, device=device)
-            found = (distance.double(), witness.double() + middle, normal.double())
+            found = (distance.double(), witness.double() + self._middle, normal.double())
         return Gap(*(beside(each, world_from_part) for each in found))
 
     def evaluate(self, part: Frames, peg: Frames) -> tuple[Array, Array, Array]:
@@ -430,11 +431,8 @@ class WarpGap(PegGap):
         if 0 in shape:
             return results
         kinds = (wp.mat33d, wp.vec3d) * 2
-        given = [warp_arrays.array_of(each, kind) for each, kind in zip(frames, kinds, strict=True)]
-        written = [
-            warp_arrays.array_of(each, kind)
-            for each, kind in zip(results, (wp.float32, wp.vec3, wp.vec3), strict=True)
-        ]
-        inputs = [self._bodies, *given, wp.vec3d(*map(float, self._center))]
-        warp_arrays.launch(_measure, shape, inputs, written)
+        written = list(zip(results, (wp.float32, wp.vec3, wp.vec3), strict=True))
+        inputs = [self._bodies, *zip(frames, kinds, strict=True), wp.vec3d(*map(float, self._center))]
+        # Neighbouring threads measure one pose of the peg, at which they do about the same.
+        warp_arrays.launch(_measure, shape[::-1], inputs, written)
         return results
