@@ -33,10 +33,10 @@ def cast(caster: Any, camera: Any, camera_from_part: Tensor, rays: Tensor) -> Ca
     rays = torch.nn.functional.normalize(rays, dim=1).to(turn)
     given = [
         caster._mesh.id,
-        warp_arrays.array_of(turn.to(torch.float32), wp.mat33),
-        warp_arrays.array_of(-(turn @ offset)[..., 0].to(torch.float32), wp.vec3),
-        warp_arrays.array_of(rays.to(torch.float32), wp.vec3),
+        (turn.to(torch.float32), wp.mat33),
+        (-(turn @ offset)[..., 0].to(torch.float32), wp.vec3),
+        (rays.to(torch.float32), wp.vec3),
     ]
     shape = (len(turn), len(rays))
-    depth = warp_arrays.array_of(torch.empty(shape, dtype=torch.float32, device=turn.device), wp.float32)
+    depth = (torch.empty(shape, dtype=torch.float32, device=turn.device), wp.float32)
     return lambda: warp_arrays.launch(_cast, shape, given, [depth])
