@@ -51,9 +51,9 @@ def fused(kernel: Kernel, first: Tensor, second: Tensor, *shape: int) -> Tensor 
     if there:
         from bcppl.warp_poses import fused_there
 
-        flat = [each.reshape(-1, each.shape[-1]) for each in (first, second)]
-        rows = max(map(len, flat)) if batch.numel() else 0
-        return fused_there(kernel, *flat, rows, *shape).reshape(*batch, *shape)
+        one, other = (each.reshape(-1, each.shape[-1]) for each in (first, second))
+        rows = max(len(one), len(other)) if batch.numel() else 0
+        return fused_there(kernel, one, other, rows, *shape).reshape(*batch, *shape)
     own, rest = first.numpy().reshape(-1, first.shape[-1]), second.numpy().reshape(-1, second.shape[-1])
     result = np.empty((max(len(own), len(rest)), *shape)) if batch.numel() else np.empty((0, *shape))
     kernel(own, rest, result)

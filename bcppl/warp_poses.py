@@ -1,4 +1,4 @@
-"""The loops of `bcppl.pose_kernels` by Warp, a thread for each row: one launch in place of twenty of torch's."""
+"""The loops of `bcppl.pose_kernels` by Warp, a thread for each row: one launch in place of twenty."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _rotated(q: wp.vec4d, v: wp.vec3d) -> wp.vec3d:
 
 
 @wp.func  # type: ignore[untyped-decorator]
-def _put(result: wp.array2d[wp.float64], n: int, shift: wp.vec3d, turn: wp.vec4d):  # type: ignore[no-untyped-def]
+def _put(result: wp.array2d[wp.float64], n: int, shift: wp.vec3d, turn: wp.vec4d) -> None:
     unit = wp.normalize(turn)
     for k in range(3):
         result[n, k] = shift[k]
@@ -53,7 +53,7 @@ def _put(result: wp.array2d[wp.float64], n: int, shift: wp.vec3d, turn: wp.vec4d
 @wp.func  # type: ignore[untyped-decorator]
 def _retracted(
     pose: wp.array2d[wp.float64], n: int, shift: wp.vec3d, w: wp.vec3d, result: wp.array2d[wp.float64], m: int
-):  # type: ignore[no-untyped-def]
+) -> None:
     half = HALF * wp.length(w)
     share = HALF
     if half > ZERO:
@@ -86,6 +86,7 @@ def _bent(w: wp.vec3d, v: wp.vec3d, once: wp.float64, twice: wp.float64) -> wp.v
 def retract(
     first: wp.array2d[wp.float64], second: wp.array2d[wp.float64], result: wp.array2d[wp.float64]
 ) -> None:
+    """Poses (N, 7) moved by tangents (N, 6)."""
     m = wp.tid()
     n = wp.min(m, first.shape[0] - 1)
     k = wp.min(m, second.shape[0] - 1)
@@ -96,6 +97,7 @@ def retract(
 def exp(
     first: wp.array2d[wp.float64], second: wp.array2d[wp.float64], result: wp.array2d[wp.float64]
 ) -> None:
+    """Poses (N, 7) moved by constant twists (N, 6)."""
     m = wp.tid()
     n = wp.min(m, first.shape[0] - 1)
     k = wp.min(m, second.shape[0] - 1)
@@ -114,6 +116,7 @@ def exp(
 def local(
     first: wp.array2d[wp.float64], second: wp.array2d[wp.float64], result: wp.array2d[wp.float64]
 ) -> None:
+    """The tangents (N, 6) from poses (N, 7) to others."""
     m = wp.tid()
     n = wp.min(m, first.shape[0] - 1)
     k = wp.min(m, second.shape[0] - 1)
@@ -128,6 +131,7 @@ def local(
 def log(
     first: wp.array2d[wp.float64], second: wp.array2d[wp.float64], result: wp.array2d[wp.float64]
 ) -> None:
+    """The twists (N, 6) from poses (N, 7) to others."""
     m = wp.tid()
     n = wp.min(m, first.shape[0] - 1)
     k = wp.min(m, second.shape[0] - 1)
@@ -147,6 +151,7 @@ def log(
 def compose(
     first: wp.array2d[wp.float64], second: wp.array2d[wp.float64], result: wp.array2d[wp.float64]
 ) -> None:
+    """Poses (N, 7) one after the other."""
     m = wp.tid()
     n = wp.min(m, first.shape[0] - 1)
     k = wp.min(m, second.shape[0] - 1)
@@ -158,6 +163,7 @@ def compose(
 def inverse(
     first: wp.array2d[wp.float64], second: wp.array2d[wp.float64], result: wp.array2d[wp.float64]
 ) -> None:
+    """The inverse of poses (N, 7)."""
     m = wp.tid()
     q = _turn(first, m)
     back = wp.vec4d(q[0], -q[1], -q[2], -q[3])
@@ -172,6 +178,7 @@ def inverse(
 def rotation_matrix(
     first: wp.array2d[wp.float64], second: wp.array2d[wp.float64], result: wp.array2d[wp.float64]
 ) -> None:
+    """The rotations (N, 9) of poses (N, 7), row by row."""
     m = wp.tid()
     q = _turn(first, m)
     w = q[0]

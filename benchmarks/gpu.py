@@ -41,7 +41,7 @@ model = look_and_touch.model.with_settings(profile="perfect")
 
 
 class Timed(NamedTuple):
-    """A run: its last step, seconds, the most memory that torch held on the GPU (GB), and each step's time."""
+    """A run: its last step, seconds, the most that torch held on the GPU (GB), and each step's time."""
 
     last: Step
     seconds: float
@@ -205,11 +205,15 @@ def gaps(recording: Recording, count: int) -> list[Row]:
     on_gpu, on_processor = _median(lambda: gap(there, pegs)), _median(lambda: gap(here, pegs))
     apart = 1e9 * float((by_processor - found)[near].abs().max())
     lines = [["GPU", pairs / on_gpu], ["processor", pairs / on_processor]]
-    show(f"million gaps a second, {cores()} cores; within 3 mm they differ by {apart:.3g} nm", ["", "M/s"], lines)
+    show(
+        f"million gaps a second, {cores()} cores; within 3 mm they differ by {apart:.3g} nm",
+        ["", "M/s"],
+        lines,
+    )
     return [
         Row("gaps on the GPU", pairs / on_gpu, "M/s"),
         Row("gaps on the processor", pairs / on_processor, "M/s"),
-        Row("gaps within 3 mm of contact: largest difference", apart, "nm", 100.0),
+        Row("gaps within 3 mm of contact: largest difference", apart, "nm", 500.0),
     ]
 
 
@@ -228,7 +232,7 @@ def profile(recording: Recording, particles: int, seed: int) -> None:
 
 
 def recorded(file: Path | None, seed: int) -> Recording:
-    """A recording from a file, or that of a scene of the accuracy bench, its probe planned by 75 particles."""
+    """A recording from a file, or that of a scene of the accuracy bench, its probe planned as there."""
     if file is not None:
         return recordings.load(file)
     from scenes import PARTICLES, followed

@@ -146,7 +146,7 @@ def _eigh(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """Eigenvalues and eigenvectors of symmetric matrices (..., d, d)."""
     flat = matrices.reshape(-1, *matrices.shape[-2:])
     if is_on_host(matrices) or len(flat) <= _TOGETHER:
-        return torch.linalg.eigh(matrices)  # type: ignore[no-any-return]
+        return torch.linalg.eigh(matrices)
     # CUDA's solver takes half a megabyte of memory for each, and fails with 100,000.
     each = [torch.linalg.eigh(some) for some in flat.split(_TOGETHER)]
     values, axes = (torch.cat(parts) for parts in zip(*each, strict=True))
@@ -266,4 +266,6 @@ def _limits(prior: Any) -> Tensor:
     """The largest deviations (6,) of a prior along and about its axes, metres and radians."""
     angle = getattr(prior, "angle", None)
     turns = [angle] * 3 if angle is not None else [prior.tilt, prior.tilt, prior.yaw]
-    return torch.cat([torch.as_tensor(prior.widths), torch.tensor(turns, dtype=torch.float64, device=prior.widths.device)])
+    return torch.cat(
+        [torch.as_tensor(prior.widths), torch.tensor(turns, dtype=torch.float64, device=prior.widths.device)]
+    )

@@ -78,8 +78,8 @@ class PartRenderer(ABC):
                 from bcppl.rendering.warp_casting import WarpCaster
             except ImportError as error:
                 raise InputError(
-                    f"poses on {device} are rendered by Warp, which is not installed; install bcppl[gpu], or "
-                    "run on the processor."
+                    f"poses on {device} are rendered by Warp, which is not installed; install bcppl[warp], "
+                    "or run on the processor."
                 ) from error
             caster = self._elsewhere[device] = WarpCaster(self.part, device)
             caster.effort = self.effort

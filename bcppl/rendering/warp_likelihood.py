@@ -14,7 +14,7 @@ import warp as wp
 from torch import Tensor
 
 from bcppl import poses, warp_arrays
-from bcppl.arrays import Array, Mask
+from bcppl.arrays import Array
 from bcppl.devices import beside
 from bcppl.geometry.camera import Camera
 
@@ -134,7 +134,7 @@ class CastImages:
         self._mesh, self._radius, self._device = mesh, radius, device
         self._center = torch.as_tensor(center, dtype=torch.float64, device=device)
         # The numbers of the newest images, which the particles of many calls are compared with.
-        self._images: dict[int, tuple[Any, Mask, Image]] = {}
+        self._images: dict[int, tuple[Any, Image]] = {}
 
     def gains(self, camera: Camera, camera_from_part: Tensor, seen: Any, law: Any, bias: Tensor) -> Tensor:
         """By how much a part at poses (N, 7) changes the log-density of images, (N,).
@@ -179,8 +179,8 @@ class CastImages:
     def _image(self, camera: Camera, seen: Any) -> Image:
         key = id(seen.depth)
         known = self._images.get(key)
-        if known is not None and known[0] is seen.depth and known[2].moves == int(seen.moves):
-            return known[2]
+        if known is not None and known[0] is seen.depth and known[1].moves == int(seen.moves):
+            return known[1]
         which = np.flatnonzero(seen.valid.any(axis=0))
 
         def array(values: Any, kind: Any, number: Any) -> Any:
@@ -197,7 +197,7 @@ class CastImages:
         image.moves = int(seen.moves)
         for old in list(self._images)[:-7]:
             del self._images[old]
-        self._images[key] = (seen.depth, which, image)
+        self._images[key] = (seen.depth, image)
         return image
 
 

@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bcppl.distributions.support import freedom_of, refuse_several_poses
 from bcppl.devices import HOST, is_on_host, moved, on_host
+from bcppl.distributions.support import freedom_of, refuse_several_poses
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.differentiation.graph import kept

@@ -91,31 +91,24 @@ class GaussianApproximation:
         self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]
     ) -> GaussianApproximation:
         """The approximation given one more measurement, the `number`-th of the recording."""
-        with on_host():
-            longer = self.updated().deferring(scene, number, action, observations)
-            return replace(longer, stale=longer.stale or bool(longer.contacts)).updated()
-
-    # It is small: worked on by the host, and copied to where the particles are.
-
-    @property
-    def here(self) -> GaussianApproximation:
-        """The same on the device of the run (`bcppl.devices`)."""
-        return self._on_device
+        longer = self.updated().deferring(scene, number, action, observations)
+        return replace(longer, stale=longer.stale or bool(longer.contacts)).updated()
 
     @cached_property
-    def _on_device(self) -> GaussianApproximation:
+    def here(self) -> GaussianApproximation:
+        """The same on the device of the run (`bcppl.devices`): it is worked on by the host, being small."""
         device = current_device()
         if device == HOST:
             return self
         fits = {name: replace(each, fit=moved(each.fit, device)) for name, each in self.fits.items()}
-        there = replace(
-            self, scene=moved(self.scene, device), fits=fits, quadratic=moved(self.quadratic, device)
+        scene, quadratic = moved(self.scene, device), moved(self.quadratic, device)
+        there = replace(self, scene=scene, fits=fits, quadratic=quadratic)
+        there.__dict__.update(
+            here=there, prior=moved(self.prior, device), mixture=moved(self.mixture, device)
         )
-        with on_host():
-            there.__dict__.update(prior=moved(self.prior, device), mixture=moved(self.mixture, device))
-        there.__dict__["_on_device"] = there
         return there
 
+    @on_host()
     def deferring(
         self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]
     ) -> GaussianApproximation:
@@ -126,10 +119,8 @@ class GaussianApproximation:
             name = sensor.viewpoint(action)
             if name in self.fits:
                 return replace(self, scene=scene)
-            near = None if self.near is None else moved(self.near, HOST)
-            with on_host():
-                fitted = Fitted(action, sensor.fit(number, action, observations, near))
-            fits = {**self.fits, name: fitted}
+            near = moved(self.near, HOST)
+            fits = {**self.fits, name: Fitted(action, sensor.fit(number, action, observations, near))}
             # The estimate moves, so it is asked again which contacts are informative there.
             return replace(self, scene=scene, fits=fits, relevant={})
         if isinstance(sensor, Linearised) and sensor.address(number) in observations:
@@ -137,14 +128,11 @@ class GaussianApproximation:
             return replace(self, scene=scene, contacts=(*self.contacts, contact), stale=True)
         return replace(self, scene=scene)
 
+    @on_host()
     def updated(self) -> GaussianApproximation:
         """The same with the quadratic approximation of all contacts."""
         if not self.stale:
             return self
-        with on_host():
-            return self._with_quadratic()
-
-    def _with_quadratic(self) -> GaussianApproximation:
         relevant = dict(self.relevant)
         for contact in self.contacts:
             sensor = self.scene.sensor(contact.action)
@@ -202,12 +190,9 @@ class GaussianApproximation:
         return len(wide) > 1 or bool((wide > UNSURE).any())
 
     @cached_property
+    @on_host()
     def prior(self) -> GaussianMixture:
         """The pose given the instruments' fits; the model's prior where there is none."""
-        with on_host():
-            return self._prior()
-
-    def _prior(self) -> GaussianMixture:
         prior, fits = self.scene.prior, list(self.fits.values())
         if not fits:
             normal = normal_like(prior)
@@ -235,12 +220,9 @@ class GaussianApproximation:
         )
 
     @cached_property
+    @on_host()
     def mixture(self) -> GaussianMixture:
         """The posterior of the part's pose, the nuisance parameters integrated out."""
-        with on_host():
-            return self._posterior()
-
-    def _posterior(self) -> GaussianMixture:
         prior, quadratic = self.prior, self.quadratic
         if quadratic is None:
             return prior
@@ -255,14 +237,14 @@ class GaussianApproximation:
         """Whether the instruments leave several modes."""
         return len(self.prior.log_weights) > 1
 
+    @on_host()
     def is_far(self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]) -> bool:
         """Whether a contact is too far from where the instruments place the part to depend on its pose."""
         sensor = scene.sensor(action)
         if not (isinstance(sensor, Contacts) and isinstance(sensor, Linearised)):
             return False
         value = observations.get(sensor.address(number))
-        with on_host():
-            return value is not None and not sensor.is_informative(action, value, self.prior.centers)
+        return value is not None and not sensor.is_informative(action, value, self.prior.centers)
 
     def screens(self, action: Any) -> bool:
         """Whether a measurement is simulated, and what is approximated is a cheap likelihood of it."""

@@ -81,8 +81,8 @@ class Observed:
         known = self.valid & np.isfinite(self.behind)
         if (known != known[:1]).any():
             raise InputError(
-                "images of which different pixels count are compared with a background on the processor only; "
-                "run there."
+                "images of which different pixels count are compared with a background on the processor "
+                "only; run there."
             )
         nothing = -math.log(law.far - law.near) * (self.valid.sum(axis=1) - known.sum(axis=1))
         return nothing, known[0]

@@ -1,4 +1,4 @@
-"""The filter over a probe's episodes where nothing is learned of shared errors: sums over particles, by torch.
+"""The filter over a probe's episodes where nothing is learned of shared errors, for all particles by torch.
 
 Without parameters an episode's errors are correlated alike in all particles, and its hypotheses never
 multiply: what the compiled filter (`bcppl.distributions.episodes.switching_filter`) does particle by particle
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.special import log_ndtr
 
-from bcppl.arrays import Array
+from bcppl.arrays import Array, Indices
 from bcppl.devices import beside, numbers
 from bcppl.distributions.episodes.branches import Branches, Prior, Segments
 from bcppl.distributions.episodes.switching_filter import CLEAR, FAINT
@@ -82,7 +82,7 @@ def filtered_alike(
     log_weight, squared = before.log_weight, [before.squared]
     free: list[int] = []
 
-    def put(values: Array) -> Tensor:
+    def put(values: Array | Indices) -> Tensor:
         return beside(np.ascontiguousarray(values), distance)
 
     # Of many hypotheses few differ in the noise of a row.

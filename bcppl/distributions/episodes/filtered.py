@@ -136,9 +136,7 @@ class FilteredEpisodes(PredictedEpisodes):
             return regressed(self.solids or self.gap, self.pose, rows, self.bench, errors)
         return lines_at(self.gap(self.pose, rows[:, :7]), self.pose, rows, self.bench)
 
-    def _filtered(
-        self, begin: Any, prior: Prior, rows: Tensor, errors: Spread, free: bool = False
-    ) -> Any:
+    def _filtered(self, begin: Any, prior: Prior, rows: Tensor, errors: Spread, free: bool = False) -> Any:
         """The hypotheses after rows, the pose `free` to move about `self.pose` or held there.
 
         The gap is linear over what the shared errors may be.

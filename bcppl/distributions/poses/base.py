@@ -34,7 +34,12 @@ class PoseDistribution(TorchDistribution):
         if self.center.device == device:
             return self
         new = type(self).__new__(type(self))
-        new.__dict__.update({name: moved(value, device) if isinstance(value, Tensor) else value for name, value in self.__dict__.items()})
+        new.__dict__.update(
+            {
+                name: moved(value, device) if isinstance(value, Tensor) else value
+                for name, value in self.__dict__.items()
+            }
+        )
         return new
 
     def expand(self, batch_shape: Any, _instance: Any = None) -> PoseDistribution:

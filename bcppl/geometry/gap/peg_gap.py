@@ -104,7 +104,7 @@ class PegGap:
             except ImportError as error:
                 raise InputError(
                     f"gaps at poses on {device} are measured by Warp, which is not installed; install "
-                    "bcppl[gpu], or run on the processor."
+                    "bcppl[warp], or run on the processor."
                 ) from error
             gap = self._elsewhere[device] = WarpGap(self.part, self.peg, device)
             gap.effort = self.effort
