@@ -16,6 +16,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arrays import Array, Indices, Mask, Numbers
+from bcppl.devices import is_on_host
 from bcppl.effort import Effort
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
@@ -78,9 +79,9 @@ class Rasteriser(PartRenderer):
 
     def images(self, camera: Camera, world_from_part: Tensor | Array) -> Array:
         """As `PartRenderer.images`, without collecting hits."""
-        if camera.is_distorted:
-            return super().images(camera, world_from_part)
         camera_from_part = self._camera_from_part(camera, world_from_part)
+        if camera.is_distorted or not is_on_host(camera_from_part):
+            return super().images(camera, world_from_part)
         with self.effort.measure(items=len(camera_from_part)) as effort:
             rows, columns = np.arange(camera.height), np.arange(camera.width)
             mesh = self._posed(camera, camera_from_part, rows, columns)

@@ -80,6 +80,10 @@ class WarpCaster(PartRenderer):
     def _array(self, values: Array, kind: Any) -> Any:
         return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=kind, device=self.device)
 
+    def on(self, device: torch.device) -> WarpCaster:
+        """Itself on its own device; else as `PartRenderer.on`."""
+        return self if warp_arrays.torch_device(self.device) == device else super().on(device)
+
     @cached_property
     def _images(self) -> CastImages:
         return CastImages(self._mesh, self._center, self._radius, warp_arrays.torch_device(self.device))

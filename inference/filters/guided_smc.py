@@ -315,7 +315,8 @@ def infer(
         device: where the particles are, as for `bcppl.inference.smc`.
 
     Raises:
-        InputError: a number is out of range, or the model's scene is not made of sensors.
+        InputError: a number is out of range, the model's scene is not made of sensors, or there is no such
+            device.
     """
     particles = whole_number("SMC is to run {} particles", particles)
     sweeps = whole_number("SMC is to make {} sweeps", sweeps)

@@ -155,7 +155,8 @@ def smc(
     Raises:
         InferenceError: no particle is left with any weight; names the measurement.
         InputError: the particles or the seed are no whole number, the program samples no pose at
-            `model.pose`, or `start` has assimilated more measurements than there are.
+            `model.pose`, `start` has assimilated more measurements than there are or was made on another
+            device, or there is no such device.
 
     Warns:
         RuntimeWarning: the recording has a problem (`bcppl.recordings.problems`, checked where no scene is
@@ -212,6 +213,10 @@ def _steps(
             raise InputError(
                 f"a run is to be resumed after {start.taken} measurements, but the recording has "
                 f"{len(measurements)}; give the recording that it was run on."
+            )
+        if len(start.random_state) != len(seeded_state(seed, device)):
+            raise InputError(
+                f"a run is to be resumed on {device}, and was begun elsewhere; resume it on the same device."
             )
         state, population, particles = [start.random_state], start.population, len(start.population)
         truth = _Truth(model, moved(scene, HOST), recording, population, seed)
