@@ -1,8 +1,8 @@
 """A stand-in for a GPU: the processor works, under another device's name, and refuses what CUDA would.
 
-Within `stand_in` tensors made on or moved to `GPU` are marked as there. Torch's functions refuse to mix them
-with those of the host (indices and numbers aside), and `Tensor.numpy()` refuses them. Kernels of Warp's run on
-its processor back end.
+Within `stand_in` tensors made on or moved to `GPU` are marked as there. Torch's functions refuse to mix
+them with those of the host (indices and numbers aside), and `Tensor.numpy()` refuses them. Kernels of Warp's
+run on its processor back end.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def _work_on(device: torch.device) -> None:
 
 @contextmanager
 def stand_in(patch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Runs with `device="cuda"` are made on the stand-in; their numbers are those that the host would draw."""
+    """Runs with `device="cuda"` are made on the stand-in, with the random numbers of the host."""
     patch.setattr(devices, "_work_on", _work_on)
     replaced = {
         "device_named": lambda name: devices.HOST if name is None else GPU,

@@ -137,7 +137,9 @@ class Belief:
     @cached_property
     def distinct(self) -> int:
         """The number of distinct particles with weight."""
-        return len(self.merged)
+        # Rows take ten times as long to sort as one number, which tells all apart unless some are copies.
+        along = self.world_from_part[self.weights > 0.0, 0]
+        return len(along) if len(along.unique()) == len(along) else len(self.merged)
 
     @cached_property
     def mean(self) -> Tensor:

@@ -120,6 +120,8 @@ class RememberedGaps:
             self._distance = torch.cat([self._distance, measured.distance], dim=1)
             self._gradient = torch.cat([self._gradient, measured.gradient(self.part)], dim=1)
         used = [self._number[key] for key in keys]
+        if used == list(range(self._distance.shape[1])):
+            return Measured(self._distance, self._gradient)
         return Measured(self._distance[:, used], self._gradient[:, used])
 
 
