@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.episodes.branches import Branches, Prior, begun
+from bcppl.distributions.episodes.couples import MeasuresWitness
 from bcppl.distributions.episodes.displaced import Lines, lines_at
 from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.posterior import moments
@@ -19,7 +20,7 @@ from bcppl.distributions.episodes.regressed import Spread, regressed
 from bcppl.distributions.episodes.row_errors import Hypothesis, RowErrors, segments_of
 from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FORCE, NOISE, is_cut, last_end
 from bcppl.distributions.episodes.switching_filter import filtered
-from bcppl.distributions.manifold import FARTHEST, ContactManifold, MeasuresGap
+from bcppl.distributions.manifold import FARTHEST, ContactManifold
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 
 _FAR = 4.0  # standard deviations
@@ -49,7 +50,7 @@ class FilteredEpisodes(PredictedEpisodes):
     bench: LinearErrors = field(default_factory=LinearErrors)
     hypotheses: tuple[Hypothesis, ...] = ()
     memory: dict[bytes, Linearised] = field(default_factory=dict)
-    solids: MeasuresGap | None = None
+    solids: MeasuresWitness | None = None
 
     def __post_init__(self) -> None:
         super(ContactManifold, self).__init__(len(self.pose), (self.stamps, COLUMNS))

@@ -14,6 +14,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.checks import Check, chi_square
 from bcppl.distributions.episodes.branches import Branches, begun
+from bcppl.distributions.episodes.couples import coupled, log_blocked
 from bcppl.distributions.episodes.displaced import lines_at
 from bcppl.distributions.episodes.filtered import FilteredEpisodes
 from bcppl.distributions.episodes.posterior import drawn, moments, probable_jumps
@@ -93,7 +94,12 @@ class ContactEpisodes(FilteredEpisodes):
         if len(given) == len(rows):
             return self.pose.new_zeros(len(self.pose))
         before = self.branches(given)
-        return torch.from_numpy(self.branches(rows, given).log_evidence - before.log_evidence)
+        evidence = torch.from_numpy(self.branches(rows, given).log_evidence - before.log_evidence)
+        pressed = coupled(rows[len(given) :])
+        if self.solids is None or not len(pressed):
+            return evidence
+        spread = self._spread_at(self.solids(self.pose, pressed[:, :7]), pressed)
+        return evidence + log_blocked(self.solids, self.pose, pressed, spread)
 
     def quadratic(self, value: Tensor) -> Quadratic:
         """The log-likelihood of a window to second order, the shared errors integrated out.
