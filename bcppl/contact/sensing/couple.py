@@ -44,7 +44,8 @@ def turn_against(wrench: Array, peg: Part) -> Array:
     """The rotation of a peg against the couple on it, which its contacts prevent.
 
     Args:
-        wrench, peg: as of `couple_of`.
+        wrench: (R, 6) on the peg, as of `couple_of`.
+        peg: that is held.
 
     Returns:
         (R, 3) a rotation vector in the peg's frame, rad, by which a place as far off as the peg is wide moves

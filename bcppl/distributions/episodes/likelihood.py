@@ -57,8 +57,10 @@ class ContactEpisodes(FilteredEpisodes):
     is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear over what that may
     be (`bcppl.distributions.episodes.regressed`), given the rows until a few before (`rows.last_end`).
 
-    A row without contact has the probability that a gap about d is positive, as in `ContactManifold`; an
-    episode is an outlier as a whole.
+    A row without contact has the probability that a gap about d is positive, as in `ContactManifold`, or
+    about zero: a peg may rub along the part with a force that is not felt. An episode is an outlier as a
+    whole. Where a torque is one that no single contact exerts, an episode has besides the probability that
+    the peg is not free to turn against it (`bcppl.distributions.episodes.couples`).
 
     The event is (T, COLUMNS): world_from_peg; 1 with contact, 0 without, NaN for a row that is not used;
     noise (m) of the row; force (N); time (s); the number of the episode; 1 for a given row; the wrench on the

@@ -11,8 +11,8 @@ Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, IEEE 
 probability is conditional on those before it, so the product is a density of all rows, whatever was dropped,
 but for the share of what was.
 
-A row without contact has the probability that its gap is positive, and the parameters the first two moments
-given that (assumed density filtering).
+A row without contact has the probability that its gap is positive, or about zero where the peg rubs along
+the part, and the parameters the first two moments given that (assumed density filtering).
 """
 
 from __future__ import annotations
@@ -217,7 +217,7 @@ def _filter(
                         either = _log_sum(log_in + positive, log_out)
                     inside = log_in + positive
                     log_weight[n, b] += either
-                    if parameters and inside > log_out and score < 5.0:
+                    if parameters and inside > log_out and positive < 0.0:
                         density = math.exp(-0.5 * score**2 - 0.5 * _LOG_TWO_PI - positive)
                         hazard = density * (1.0 - RUBBING * score)
                         bend = density * (score + RUBBING - RUBBING * score**2) + hazard**2
