@@ -35,9 +35,12 @@ class MeasuresWitness(Protocol):
 
 def coupled(rows: Tensor) -> Tensor:
     """Of each episode of rows (R, COLUMNS) with couples, the row (E, COLUMNS) that is pressed hardest."""
-    found = np.flatnonzero((torch.nan_to_num(rows[:, TURN]) != 0.0).any(dim=1).numpy())
-    found = found[np.argsort(-rows[found, FORCE].numpy(), kind="stable")]
-    _, first = np.unique(rows[found, EPISODE].numpy(), return_index=True)
+    columns = rows.numpy()
+    found = np.flatnonzero(np.nan_to_num(columns[:, TURN]).any(axis=1))
+    if not len(found):
+        return rows[:0]
+    found = found[np.argsort(-columns[found, FORCE], kind="stable")]
+    _, first = np.unique(columns[found, EPISODE], return_index=True)
     return rows[np.sort(found[first])]
 
 
