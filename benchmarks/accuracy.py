@@ -51,6 +51,7 @@ NAMES = (
 WORDS = dict(zip(Moment._fields, NAMES, strict=True))
 UNITS = dict.fromkeys(Moment._fields[:5], "mm") | dict.fromkeys(Moment._fields[5:], "deg")
 STAGES = (VISION, "planning", "touch")
+LATENCIES = {"view": 0.5, "window": 0.25}  # s, of 95 % of the measurements
 TAILS = (("90 %", 0.9), ("99 %", 0.99), ("worst", 1.0))
 TAIL_GOALS = {0.9: 0.35, 0.99: 1.0, 1.0: 2.0}  # mm, of the ADD at the end
 COVERED = {0.5: 41.0, 0.9: 84.0}  # % of scenes, at least: the 99 % interval of 200 scenes
@@ -174,6 +175,11 @@ def rows_of(found: Sequence[Probed], alone: bool) -> list[Row]:
     for stage in STAGES:
         spent = [one.seconds[stage] for one in found if stage in one.seconds]
         rows.append(Row(f"wall of {stage}, median", quantile(spent, 0.5), "s"))
+    for kind, goal in LATENCIES.items():
+        spent = [seconds for one in found for seconds in one.waits.get(kind, ())]
+        for name, level in (("median", 0.5), ("95 %", 0.95), ("worst", 1.0)):
+            asked_of = goal if alone and level == 0.95 else None
+            rows.append(Row(f"wall of a {kind}, {name}", quantile(spent, level), "s", asked_of))
     for name in sorted({name for one in found for name in one.efforts}):
         spent = [one.efforts[name][0] for one in found if name in one.efforts]
         made = [one.efforts[name][1] for one in found if name in one.efforts]

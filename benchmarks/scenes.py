@@ -99,6 +99,7 @@ class Probed:
         holds: by name of the moment, and by region and mass, whether it held the truth.
         curve: ADD over time.
         seconds: wall time of "vision", "planning" and "touch".
+        waits: by kind, "view" or "window", the wall time of each measurement.
         efforts: by simulator, wall time (s) and what it made (images or gaps).
         tempered: how many measurements were tempered.
         warned: whether a run would have warned of a measurement (`bcppl.cli.predictive_checks`).
@@ -114,6 +115,7 @@ class Probed:
     holds: dict[str, dict[tuple[str, float], bool]] = field(default_factory=dict)
     curve: Curve = field(default_factory=lambda: Curve([], [], []))
     seconds: dict[str, float] = field(default_factory=dict)
+    waits: dict[str, list[float]] = field(default_factory=dict)
     efforts: dict[str, tuple[float, int]] = field(default_factory=dict)
     tempered: int = 0
     warned: bool = False
@@ -220,13 +222,13 @@ def followed(
         found.part, found.clearance = scene.kind.name, round(1e3 * scene.clearance, 6)
         look = scene.look()
         with timed(found.seconds, "vision"):
-            for step in default_run(look, particles, chosen):
+            for step in waited(default_run(look, particles, chosen), found.waits):
                 steps.append(step)
         with timed(found.seconds, "planning"):
             plan = three_two_one(steps[-1].belief, scene.part, scene.peg)
         recording = scene.probe(plan)
         with timed(found.seconds, "touch"):
-            for step in default_run(recording, particles, chosen, start=steps[-1]):
+            for step in waited(default_run(recording, particles, chosen, start=steps[-1]), found.waits):
                 steps.append(step)
     except Exception as error:
         found.missed = one_line(error)
@@ -236,6 +238,15 @@ def followed(
     except Exception as error:
         found.missed = found.missed or one_line(error)
     return found, steps, recording
+
+
+def waited(steps: Iterator[Step], waits: dict[str, list[float]]) -> Iterator[Step]:
+    """The steps; adds to `waits` how long each took, by kind."""
+    begun = time.perf_counter()
+    for step in steps:
+        waits.setdefault(step.info.label.split()[0], []).append(time.perf_counter() - begun)
+        yield step
+        begun = time.perf_counter()
 
 
 def judge(found: Probed, steps: Sequence[Step], scene: BenchScene) -> None:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from torch import Tensor
 
 from bcppl.arguments import named, number_within, whole_number
 from bcppl.errors import InputError
+
+_PLAIN = frozenset({float, int, NoneType})
 
 
 @dataclass(frozen=True)
@@ -80,9 +83,22 @@ def ranges(kind: type) -> dict[str, Range]:
 def check_parameters(owner: Any) -> None:
     """Check the fields that declare a range, and make them floats and ints."""
     kind: type = type(owner)
-    for name, allowed in ranges(kind).items():
-        what = f"{kind.__name__} has {name} = {{}}"
-        object.__setattr__(owner, name, allowed.checked(what, getattr(owner, name)))
+    values = tuple(getattr(owner, name) for name in ranges(kind))
+    types = tuple(map(type, values))
+    # Programs make the same distributions again and again.
+    checked = _checked_before if _PLAIN.issuperset(types) else _checked
+    for name, value, given in zip(ranges(kind), checked(kind, types, values), values, strict=True):
+        if value is not given:
+            object.__setattr__(owner, name, value)
+
+
+def _checked(kind: type, types: tuple[type, ...], values: tuple[Any, ...]) -> list[Any]:
+    """The values of a class's fields as they are kept; equal ones of other types are others."""
+    each = zip(ranges(kind).items(), values, strict=True)
+    return [allowed.checked(f"{kind.__name__} has {name} = {{}}", value) for (name, allowed), value in each]
+
+
+_checked_before = lru_cache(maxsize=1024)(_checked)
 
 
 def check_shape(where: str, name: str, value: Any, *shapes: tuple[int, ...]) -> None:

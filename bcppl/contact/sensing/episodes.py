@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.signal import savgol_filter
+from scipy.signal import savgol_coeffs, savgol_filter
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -25,6 +25,7 @@ _RESTING, _SLIDING = 0.01, 0.02  # m/s: below the one a peg rests, above the oth
 _FRICTION = 0.5  # a peg that slides moves across its force by so much more than along it
 _ASKEW = 0.3  # of an acceleration may be felt in any direction: the tool turns, and its mass lies elsewhere
 _SMOOTH = 0.01  # s to either side of a stamp, over which velocity and acceleration are estimated
+_AMID = 0.05  # s to either side of a stamp without contact, over which its pose is
 # s without contact that end an episode. Where a peg comes to rest or begins to slide another begins, and in
 # each cell: an episode is an outlier as a whole.
 _BREAK = 0.05
@@ -99,9 +100,15 @@ class EpisodeExtractor:
         return max(1, round(_SMOOTH / self.step))
 
     @property
+    def _amid(self) -> int:
+        """The same over which the pose of one amid free motion is estimated."""
+        return max(1, round(_AMID / self.step))
+
+    @property
     def _lag(self) -> float:
         """Seconds after which a stamp and the one after it are decided: what comes later changes nothing."""
-        return self.step * (1 + max(self._half, round(self.detector.agreement / self.step)))
+        around = max(self._half, self._amid, round(self.detector.agreement / self.step))
+        return self.step * (1 + around)
 
     def rows(self, time: Array, pose: Array, wrench: Array, last: bool) -> Rows:
         """The rows that are complete, of all stamps so far.
@@ -132,7 +139,30 @@ class EpisodeExtractor:
             k += 1
         self._done = float(time[end - 1]) if end > begin else self._done
         self._begins = True
-        return _rows(groups, time, pose, size, speed, wrench, self.delays)
+        return self._with_free(_rows(groups, time, pose, size, speed, wrench, self.delays), groups, seen)
+
+    def _with_free(self, rows: Rows, groups: list[tuple[slice, float, int]], seen: _Stamps) -> Rows:
+        """The rows, those amid free motion by parabolas through the stamps on either side.
+
+        There the peg is free before and after: how late the wrench is does not matter.
+        """
+        width = 2 * self._amid + 1
+        free = np.flatnonzero(rows.felt == 0.0)
+        if len(seen.time) < width or not len(free):
+            return rows
+        middle = np.array([groups[k][0].start for k in free])
+        first, last = middle - self._amid, middle + self._amid
+        inside = (first >= 0) & (last < len(seen.time))
+        first, last = np.where(inside, first, 0), np.where(inside, last, 0)
+        touched = np.append(0, np.cumsum(seen.felt != 0.0))
+        inside &= touched[last + 1] == touched[first]
+        inside &= seen.time[last] - seen.time[first] < (width - 0.5) * self.step
+        free, middle = free[inside], middle[inside]
+        smooth = savgol_filter(_continuous(seen.pose), width, 2, axis=0)[middle]
+        smooth[:, 3:] /= np.linalg.norm(smooth[:, 3:], axis=1, keepdims=True)
+        rows.world_from_peg[free], rows.speed[free] = smooth, 0.0
+        rows.stamps[free] = 1.0 / (savgol_coeffs(width, 2) ** 2).sum()
+        return rows
 
     def _contact_row(self, first: int, end: int, seen: _Stamps) -> int:
         """The index after a row's last stamp; the row's episode is `_episode`."""
@@ -227,10 +257,7 @@ def _rows(
         each = [values[own].mean(axis=0) for own in slices]
         return np.array(each).reshape(len(slices), *values.shape[1:])
 
-    smooth = pose.copy()  # no quaternion changes its sign
-    smooth[1:, 3:] *= np.cumprod(np.where((pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1) < 0.0, -1.0, 1.0))[
-        :, None
-    ]
+    smooth = _continuous(pose)
     earlier = np.empty((len(groups), len(delays), 7))
     for k, delay in enumerate(delays):
         then = [np.interp(time - delay, time, column) for column in smooth.T]
@@ -249,3 +276,11 @@ def _rows(
         averaged(wrench),
         earlier,
     )
+
+
+def _continuous(pose: Array) -> Array:
+    """Poses (T, 7) of which no quaternion changes its sign."""
+    smooth = pose.copy()
+    turned = (pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1) < 0.0
+    smooth[1:, 3:] *= np.cumprod(np.where(turned, -1.0, 1.0))[:, None]
+    return smooth

@@ -18,7 +18,7 @@ from torch.special import log_ndtr
 from bcppl.arrays import Array, Indices
 from bcppl.devices import beside, numbers
 from bcppl.distributions.episodes.branches import Branches, Prior, Segments
-from bcppl.distributions.episodes.switching_filter import CLEAR, FAINT
+from bcppl.distributions.episodes.switching_filter import CLEAR, FAINT, RUBBING
 
 _FREE = 64  # rows without contact at a time: they take memory
 
@@ -113,7 +113,7 @@ def filtered_alike(
 
 
 def _of_free(distance: Tensor, rows: list[int], own: Tensor, log_in: float, log_out: float) -> Tensor:
-    """The log-probability (N, K) that the gaps at rows without contact are positive, for noises (K, R)."""
+    """The log-probability (N, K) of rows without contact, as of `switching_filter`, for noises (K, R)."""
     total = distance.new_zeros(len(distance), len(own))
     for first in range(0, len(rows), _FREE):
         which = slice(rows[first], rows[min(first + _FREE, len(rows)) - 1] + 1)
@@ -121,7 +121,9 @@ def _of_free(distance: Tensor, rows: list[int], own: Tensor, log_in: float, log_
             raise AssertionError("rows without contact between two episodes follow one another")
         gap = distance[:, which]
         score = gap[:, None] / own[:, which]
-        either = torch.logaddexp(log_in + log_ndtr(score), torch.full_like(score, log_out))
+        log_density = -0.5 * score.square() - 0.5 * math.log(2.0 * math.pi)
+        positive = torch.logaddexp(log_ndtr(score), math.log(RUBBING) + log_density).clamp(max=0.0)
+        either = torch.logaddexp(log_in + positive, torch.full_like(score, log_out))
         either = torch.where(gap[:, None] > CLEAR, 0.0, either)
         total = total + either.sum(dim=2)
     return total

@@ -12,6 +12,7 @@ from torch import Tensor
 from bcppl.devices import beside, is_on_host
 from bcppl.distributions.episodes.alike import AlikeBranches, begun_alike, filtered_alike
 from bcppl.distributions.episodes.branches import Branches, Prior, begun
+from bcppl.distributions.episodes.couples import MeasuresWitness
 from bcppl.distributions.episodes.displaced import Lines, lines_at
 from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.posterior import moments
@@ -21,7 +22,7 @@ from bcppl.distributions.episodes.regressed import Spread, regressed
 from bcppl.distributions.episodes.row_errors import Hypothesis, RowErrors, segments_of
 from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FORCE, NOISE, is_cut, last_end
 from bcppl.distributions.episodes.switching_filter import filtered
-from bcppl.distributions.manifold import FARTHEST, ContactManifold, MeasuresGap
+from bcppl.distributions.manifold import FARTHEST, ContactManifold
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 
 _FAR = 4.0  # standard deviations
@@ -51,7 +52,7 @@ class FilteredEpisodes(PredictedEpisodes):
     bench: LinearErrors = field(default_factory=LinearErrors)
     hypotheses: tuple[Hypothesis, ...] = ()
     memory: dict[bytes, Linearised] = field(default_factory=dict)
-    solids: MeasuresGap | None = None
+    solids: MeasuresWitness | None = None
 
     def __post_init__(self) -> None:
         super(ContactManifold, self).__init__(len(self.pose), (self.stamps, COLUMNS))

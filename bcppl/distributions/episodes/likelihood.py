@@ -15,6 +15,7 @@ from bcppl import poses
 from bcppl.devices import beside, numbers
 from bcppl.distributions.checks import Check, chi_square
 from bcppl.distributions.episodes.branches import Branches, begun
+from bcppl.distributions.episodes.couples import coupled, log_blocked
 from bcppl.distributions.episodes.displaced import lines_at
 from bcppl.distributions.episodes.filtered import FilteredEpisodes
 from bcppl.distributions.episodes.posterior import drawn, moments, probable_jumps
@@ -57,8 +58,10 @@ class ContactEpisodes(FilteredEpisodes):
     is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear over what that may
     be (`bcppl.distributions.episodes.regressed`), given the rows until a few before (`rows.last_end`).
 
-    A row without contact has the probability that a gap about d is positive, as in `ContactManifold`; an
-    episode is an outlier as a whole.
+    A row without contact has the probability that a gap about d is positive, as in `ContactManifold`, or
+    about zero: a peg may rub along the part with a force that is not felt. An episode is an outlier as a
+    whole. Where a torque is one that no single contact exerts, an episode has besides the probability that
+    the peg is not free to turn against it (`bcppl.distributions.episodes.couples`).
 
     The event is (T, COLUMNS): world_from_peg; 1 with contact, 0 without, NaN for a row that is not used;
     noise (m) of the row; force (N); time (s); the number of the episode; 1 for a given row; the wrench on the
@@ -94,7 +97,12 @@ class ContactEpisodes(FilteredEpisodes):
         if len(given) == len(rows):
             return self.pose.new_zeros(len(self.pose))
         before = self.branches(given).log_evidence
-        return beside(self.branches(rows, given).log_evidence - before, self.pose)
+        evidence = beside(self.branches(rows, given).log_evidence - before, self.pose)
+        pressed = coupled(rows[len(given) :])
+        if self.solids is None or not len(pressed):
+            return evidence
+        spread = self._spread_at(self.solids(self.pose, pressed[:, :7]), pressed)
+        return evidence + log_blocked(self.solids, self.pose, pressed, spread)
 
     def quadratic(self, value: Tensor) -> Quadratic:
         """The log-likelihood of a window to second order, the shared errors integrated out.

@@ -11,8 +11,8 @@ Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, IEEE 
 probability is conditional on those before it, so the product is a density of all rows, whatever was dropped,
 but for the share of what was.
 
-A row without contact has the probability that its gap is positive, and the parameters the first two moments
-given that (assumed density filtering).
+A row without contact has the probability that its gap is positive, or about zero where the peg rubs along
+the part, and the parameters the first two moments given that (assumed density filtering).
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from bcppl.threads import parallel_sum, thread_count
 # delay of the wrench was 12 below another, and in the end 46 above it.
 FAINT = 25.0
 _UNLIKELY = 10.0  # the same before an episode, of a hypothesis with a change
+RUBBING = 1.0  # standard deviations of the gap by which a command may be blocked without being felt
 CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
 _LOG_TWO_PI = math.log(2.0 * math.pi)
 _SURPRISING = 1.0  # standard deviations of a chi-square
@@ -114,6 +115,16 @@ def _log_ndtr(z: float) -> float:
         return math.log(0.5 * math.erfc(-z / math.sqrt(2.0)))
     inverse = 1.0 / (z * z)
     return -0.5 * z * z - math.log(-z) - 0.5 * _LOG_TWO_PI + math.log(1.0 - inverse + 3.0 * inverse**2)
+
+
+@compiled
+def _log_free(score: float) -> float:
+    """Log-probability of a row without contact whose gap is so many standard deviations.
+
+    A peg may rub along the part with a force that is not felt, and is then at its surface.
+    """
+    log_density = -0.5 * score * score - 0.5 * _LOG_TWO_PI
+    return min(0.0, _log_sum(_log_ndtr(score), math.log(RUBBING) + log_density))
 
 
 @compiled
@@ -203,13 +214,15 @@ def _filter(
                     # Hypotheses that differ in the compliance alone are the same without contact.
                     if gap / root != score:
                         score = gap / root
-                        positive = _log_ndtr(score)
+                        positive = _log_free(score)
                         either = _log_sum(log_in + positive, log_out)
                     inside = log_in + positive
                     log_weight[n, b] += either
-                    if parameters and inside > log_out and score < 5.0:
-                        hazard = math.exp(-0.5 * score**2 - 0.5 * _LOG_TWO_PI - positive)
-                        bend = hazard * (hazard + score) / variance
+                    if parameters and inside > log_out and positive < 0.0:
+                        density = math.exp(-0.5 * score**2 - 0.5 * _LOG_TWO_PI - positive)
+                        hazard = density * (1.0 - RUBBING * score)
+                        bend = density * (score + RUBBING - RUBBING * score**2) + hazard**2
+                        bend = max(bend, 0.0) / variance
                         for a in range(parameters):
                             mean[n, b, a] += pull[a] / root * hazard
                             share = pull[a] * bend

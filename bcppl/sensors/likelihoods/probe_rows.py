@@ -13,6 +13,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.arrays import Array, Indices
 from bcppl.contact.sensing.contact_detection import ContactDetector
+from bcppl.contact.sensing.couple import turn_against
 from bcppl.contact.sensing.episodes import EpisodeExtractor, cell_ends
 from bcppl.contact.sensing.location import ContactSensing
 from bcppl.devices import numbers
@@ -204,6 +205,8 @@ class ProbeRows:
         peg_from_world = poses.inverse(torch.from_numpy(rows.world_from_peg))[:, None]
         earlier = poses.compose(peg_from_world, torch.from_numpy(rows.earlier))
         twists = poses.local(poses.identity(), earlier).flatten(1).numpy()
-        columns += [rows.wrench, np.zeros((len(noise), 6)), twists]
+        turn, felt = np.zeros((len(noise), 3)), rows.felt == 1.0
+        turn[felt] = turn_against(rows.wrench[felt], self.sensing.peg)
+        columns += [rows.wrench, np.zeros((len(noise), 6)), turn, twists]
         every = padded(torch.from_numpy(np.column_stack([rows.world_from_peg, *columns])), len(noise))
         return every if settings.free_space else every[every[:, FELT] == 1.0]
