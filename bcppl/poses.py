@@ -49,7 +49,9 @@ def as_pose(values: object, name: str = "pose") -> Tensor:
     """
     pose = torch.as_tensor(values, dtype=torch.float64)
     # Of many on a GPU only whether all are valid is asked there.
-    if (is_on_host(pose) or not bool(_are_valid(pose))) and (problem := pose_problem(name, numbers(pose))):
+    if (is_on_host(pose) or not bool(_are_valid(pose))) and (
+        problem := pose_problem(name, numbers(pose.detach()))
+    ):
         raise InputError(problem)
     return torch.cat([pose[..., :3], pose[..., 3:] / pose[..., 3:].norm(dim=-1)[..., None]], dim=-1)
 

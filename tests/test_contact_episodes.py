@@ -21,7 +21,9 @@ from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, Rows
 from bcppl.contact.touch import Touch
 from bcppl.distributions.episodes import ContactEpisodes, Grasp, Hypothesis, LinearErrors
+from bcppl.distributions.episodes.alike import begun_alike, filtered_alike
 from bcppl.distributions.episodes.prior import NOISES, WIDE
+from bcppl.distributions.episodes.row_errors import segments_of
 from bcppl.distributions.episodes.rows import COLUMNS, FELT, FORCE, GIVEN, TIME, WRENCH, new_rows
 from bcppl.distributions.manifold import FARTHEST
 from bcppl.geometry.extrusion import block, box_peg
@@ -93,6 +95,22 @@ def test_it_is_the_dense_gaussian_of_a_stationary_process_an_uncertain_complianc
     torch.testing.assert_close(site(pose, 8).log_prob(MIXED), expected, rtol=1e-7, atol=2e-5)
     for name in ("drift", "varying", "rough"):  # mutants without one of the errors
         assert float((site(pose, 8, **{name: 0.0}).log_prob(MIXED) - expected).abs().max()) > 0.01, name
+
+
+def test_for_all_particles_together_it_is_the_same() -> None:
+    """As it is evaluated on a GPU, here on the processor: rows at once, and those after others."""
+    pose = around(30)
+    whole = site(pose, 8)
+    prior, distance = whole._prior(0), ledge(pose, MIXED[:, :7]).distance
+    branches = begun_alike(prior, pose)
+    for rows in (slice(0, 4), slice(4, 8)):
+        segments = segments_of(MIXED[rows], whole._row_errors, whole._every)
+        branches = filtered_alike(branches, prior, segments, distance[:, rows], MIXED[rows, FORCE].numpy())
+    expected = torch.from_numpy(whole.branches(MIXED).log_evidence)
+    torch.testing.assert_close(branches.log_evidence, expected, rtol=0.0, atol=1e-9)
+    both = branches.on_host, whole.branches(MIXED)
+    squares = [(each.weights[..., None] * each.squared).sum(axis=1) for each in both]
+    np.testing.assert_allclose(*squares, rtol=1e-9)
 
 
 def test_a_row_given_before_counts_once() -> None:
