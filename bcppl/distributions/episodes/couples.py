@@ -12,7 +12,7 @@ from torch.special import log_ndtr
 
 from bcppl import poses
 from bcppl.devices import beside
-from bcppl.distributions.episodes.rows import EPISODE, FORCE, TURN
+from bcppl.distributions.episodes.rows import TURN
 from bcppl.distributions.manifold import Gaps
 
 _TURNED, _SPREADS = 0.0004, 8.0  # m by which `TURN` moves a place as far off as the peg is wide; deviations
@@ -35,14 +35,8 @@ class MeasuresWitness(Protocol):
 
 
 def coupled(rows: Tensor) -> Tensor:
-    """Of each episode of rows (R, COLUMNS) with couples, the row (E, COLUMNS) that is pressed hardest."""
-    columns = rows.numpy()
-    found = np.flatnonzero(np.nan_to_num(columns[:, TURN]).any(axis=1))
-    if not len(found):
-        return rows[:0]
-    found = found[np.argsort(-columns[found, FORCE], kind="stable")]
-    _, first = np.unique(columns[found, EPISODE], return_index=True)
-    return rows[np.sort(found[first])]
+    """Those of rows (R, COLUMNS) that speak of couples, (E, COLUMNS)."""
+    return torch.from_numpy(rows.numpy()[np.nan_to_num(rows.numpy()[:, TURN]).any(axis=1)])
 
 
 def log_blocked(measure: MeasuresWitness, pose: Tensor, rows: Tensor, spread: Tensor) -> Tensor:

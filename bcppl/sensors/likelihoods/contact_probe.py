@@ -205,8 +205,11 @@ class ContactProbe:
         """The rows by address, those of all earlier windows given; each probe's wrench is tared whole."""
         each: dict[int, Tensor] = {}
         for windows in by_probe(measurements):
+            before = max((float(rows[:, EPISODE].max()) for rows in each.values() if len(rows)), default=-1.0)
             for k, rows in self._of_probe(windows).items():
-                each[windows[k].number] = rows
+                # Episodes of another probe are others.
+                number = rows[:, EPISODE] + torch.where(rows[:, EPISODE] >= 0.0, before + 1.0, 0.0)
+                each[windows[k].number] = rows.index_copy(1, torch.tensor([EPISODE]), number[:, None])
         ordered = [(n, each[n]) for n, _ in measurements if n in each]
         room = [capacity(m.action) for n, m in measurements if n in each]
         return {f"touch_{n}": value for n, value in after_those_before(ordered, room).items()}

@@ -18,7 +18,7 @@ from bcppl.contact.sensing.episodes import EpisodeExtractor, cell_ends
 from bcppl.contact.sensing.location import ContactSensing
 from bcppl.devices import numbers
 from bcppl.distributions.episodes.filtered import Linearised
-from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FELT, GIVEN, SECONDS, padded
+from bcppl.distributions.episodes.rows import COLUMNS, FELT, GIVEN, SECONDS, padded
 from bcppl.distributions.manifold import Gaps, MeasuresGap
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors.measurements import Measurement
@@ -73,8 +73,6 @@ def after_those_before(each: Sequence[tuple[int, Tensor]], room: Sequence[int]) 
     given, values = torch.empty(0, COLUMNS, dtype=torch.float64), {}
     for (number, new), most in zip(each, room, strict=True):
         rows = new.clone()
-        if len(given):  # episodes of other probes are others
-            rows[:, EPISODE] += 1.0 + given[:, EPISODE].max()
         values[number] = padded(torch.cat([given[max(0, len(given) + len(rows) - most) :], rows]), most)
         rows[:, GIVEN] = 1.0
         given = torch.cat([given, rows])[-_REMEMBERED:]
@@ -205,8 +203,12 @@ class ProbeRows:
         peg_from_world = poses.inverse(torch.from_numpy(rows.world_from_peg))[:, None]
         earlier = poses.compose(peg_from_world, torch.from_numpy(rows.earlier))
         twists = poses.local(poses.identity(), earlier).flatten(1).numpy()
-        turn, felt = np.zeros((len(noise), 3)), rows.felt == 1.0
-        turn[felt] = turn_against(rows.wrench[felt], self.sensing.peg)
+        # Of an episode, in each cell, the row that is pressed hardest speaks of couples.
+        turn = np.zeros((len(noise), 3))
+        for episode in np.unique(rows.episode[rows.felt == 1.0]):
+            own = np.flatnonzero(rows.episode == episode)
+            hardest = own[[rows.force[own].argmax()]]
+            turn[hardest] = turn_against(rows.wrench[hardest], self.sensing.peg)
         columns += [rows.wrench, np.zeros((len(noise), 6)), turn, twists]
         every = padded(torch.from_numpy(np.column_stack([rows.world_from_peg, *columns])), len(noise))
         return every if settings.free_space else every[every[:, FELT] == 1.0]
