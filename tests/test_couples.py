@@ -11,8 +11,9 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.contact.sensing.couple import LEAST, couple_of, turn_against
+from bcppl.distributions.episodes import ContactEpisodes
 from bcppl.distributions.episodes.couples import coupled, log_blocked
-from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FORCE, TURN
+from bcppl.distributions.episodes.rows import COLUMNS, FELT, FORCE, GIVEN, NOISE, TIME, TURN
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.holes import fit_in, hole_of
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
@@ -110,10 +111,22 @@ def test_it_is_the_same_wherever_part_and_peg_are_together() -> None:
     torch.testing.assert_close(both[0], both[1], rtol=1e-6, atol=1e-6)
 
 
-def test_of_an_episode_the_row_that_is_pressed_hardest_speaks() -> None:
-    rows = torch.zeros(6, COLUMNS, dtype=torch.float64)
-    rows[:, EPISODE] = torch.tensor([0, 0, 0, 1, 1, -1])
-    rows[:, FORCE] = torch.tensor([3.0, 9.0, 5.0, 2.0, 1.0, 0.0])
-    rows[[0, 2, 4], TURN.start] = 0.05
-    rows[5, TURN] = torch.nan
-    assert coupled(rows)[:, FORCE].tolist() == [5.0, 1.0]
+def test_a_couple_counts_once_however_rows_are_cut() -> None:
+    torch.manual_seed(0)
+    truth = poses.retract(torch.from_numpy(scene().truth), 1e-4 * torch.randn(5, 6, dtype=torch.float64))
+    rows = row(jammed(), about_the_hole(0.02)).repeat(4, 1)
+    rows[:, FELT], rows[:, NOISE], rows[:, FORCE] = 1.0, 3e-5, 10.0
+    rows[:, TIME] = 0.1 * torch.arange(4)
+    rows[[0, 1, 3], TURN] = torch.tensor([[0.0] * 3, [torch.nan] * 3, [0.0] * 3], dtype=torch.float64)
+
+    def site(value: Tensor) -> Tensor:
+        return ContactEpisodes(gap(), truth, len(value), 5e-5, 1e-5, solids=gap()).log_prob(value)
+
+    assert len(coupled(rows)) == 1
+    given = rows.clone()
+    given[:2, GIVEN] = 1.0
+    torch.testing.assert_close(site(rows[:2]) + site(given), site(rows), rtol=1e-9, atol=1e-9)
+    without = rows.clone()
+    without[:, TURN] = 0.0
+    spoken = site(rows) - site(without)
+    assert bool((spoken <= 0.0).all()) and bool((spoken >= FREE - 1e-9).all())
