@@ -202,7 +202,8 @@ def figure(outcomes: dict[Task, Outcome], file: Path) -> None:
 def main() -> None:
     parser = options(__doc__ or "")
     parser.add_argument("--scenes", type=int, help=f"how many; {SCENES}, {COMPARED} with --ways or --noise")
-    parser.add_argument("--ways", nargs="*", choices=list(WAYS), help="compare these; all if none is named")
+    ways = [GEOMETRY, *WAYS]
+    parser.add_argument("--ways", nargs="*", choices=ways, help="compare these; all if none is named")
     parser.add_argument("--noise", nargs="*", type=float, help="of the peg's position, mm; 0.05, 0.3 and 1")
     parser.add_argument("--double", action="store_true", help="two contacts at once, by geometry and physics")
     parser.add_argument("--jobs", type=int, default=1, help="scenes at a time, of one thread each")
@@ -220,7 +221,7 @@ def main() -> None:
     else:
         noises, ways = [NOISE], list(WAYS) if arguments.ways == [] else arguments.ways or [DEFAULT]
     if arguments.double:
-        ways = [GEOMETRY, DEFAULT, "and the wrench"]
+        ways = arguments.ways or [GEOMETRY, DEFAULT, WRENCH]
     seeds = range(arguments.seed, arguments.seed + count)
     groups = [(noise, way, probe) for probe in probes for noise in noises for way in ways]
     tasks = [Task(seed, *group) for seed in seeds for group in groups]
