@@ -117,7 +117,7 @@ def test_a_couple_counts_once_however_rows_are_cut() -> None:
     rows = row(jammed(), about_the_hole(0.02)).repeat(4, 1)
     rows[:, FELT], rows[:, NOISE], rows[:, FORCE] = 1.0, 3e-5, 10.0
     rows[:, TIME] = 0.1 * torch.arange(4)
-    rows[[0, 1, 3], TURN] = torch.tensor([[0.0] * 3, [torch.nan] * 3, [0.0] * 3], dtype=torch.float64)
+    rows[[0, 2, 3], TURN] = torch.tensor([[0.0] * 3, [torch.nan] * 3, [0.0] * 3], dtype=torch.float64)
 
     def site(value: Tensor) -> Tensor:
         return ContactEpisodes(gap(), truth, len(value), 5e-5, 1e-5, solids=gap()).log_prob(value)
