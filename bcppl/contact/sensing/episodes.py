@@ -26,7 +26,8 @@ _FRICTION = 0.5  # a peg that slides moves across its force by so much more than
 _ASKEW = 0.3  # of an acceleration may be felt in any direction: the tool turns, and its mass lies elsewhere
 _SMOOTH = 0.01  # s to either side of a stamp, over which velocity and acceleration are estimated
 _AMID = 0.05  # s to either side of a stamp without contact, over which its pose is
-# s without contact that end an episode. Where a peg comes to rest or begins to slide another begins.
+# s without contact that end an episode. Where a peg comes to rest or begins to slide another begins, and in
+# each cell: an episode is an outlier as a whole.
 _BREAK = 0.05
 
 
@@ -40,7 +41,7 @@ class Rows(NamedTuple):
         speed: (R,) m/s, in contact along its normal, at least.
         force: (R,) N.
         time: (R,) s.
-        episode: (R,) the number of the contact, at rest or sliding; -1 without contact.
+        episode: (R,) the number of the contact, at rest or sliding, within a cell; -1 without contact.
         wrench: (R, 6) on the peg, in its frame, N and N m.
         earlier: (R, K, 7) where the peg was, by each of the extractor's delays before.
     """
@@ -89,6 +90,7 @@ class EpisodeExtractor:
     _episode: int = -1
     _onset: float = -math.inf
     _last_contact: float = -math.inf
+    _begins: bool = True  # a cell, and so an episode
     _moving: bool = False
     _last_free: tuple[float, Array] | None = None
 
@@ -136,6 +138,7 @@ class EpisodeExtractor:
                 self._last_free = time[k], pose[k, :3]
             k += 1
         self._done = float(time[end - 1]) if end > begin else self._done
+        self._begins = True
         return self._with_free(_rows(groups, time, pose, size, speed, wrench, self.delays), groups, seen)
 
     def _with_free(self, rows: Rows, groups: list[tuple[slice, float, int]], seen: _Stamps) -> Rows:
@@ -168,6 +171,7 @@ class EpisodeExtractor:
         broken = now - self._last_contact > max(_BREAK, 1.5 * self.step) or (seen.felt[between] == 0.0).any()
         if broken:
             self._onset = now
+        broken |= self._begins
         longest = min(LONGEST, max(SHORTEST, _GROWTH * (now - self._onset)))
         stop = first + 1
         while stop < end and seen.felt[stop] == 1.0 and seen.time[stop] - now < longest - 1e-6:
@@ -180,7 +184,7 @@ class EpisodeExtractor:
         moving = seen.pace[first:stop].mean() > (_RESTING if self._moving else _SLIDING)
         if broken or moving != self._moving:
             self._episode += 1
-        self._moving, self._last_contact = moving, seen.time[stop - 1]
+        self._moving, self._last_contact, self._begins = moving, seen.time[stop - 1], False
         return stop
 
     def _is_new(self, k: int, time: Array, pose: Array, felt: Array) -> bool:
