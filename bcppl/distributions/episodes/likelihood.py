@@ -65,7 +65,7 @@ class ContactEpisodes(FilteredEpisodes):
 
     The event is (T, COLUMNS): world_from_peg; 1 with contact, 0 without, NaN for a row that is not used;
     noise (m) of the row; force (N); time (s); the number of the episode; 1 for a given row; the wrench on the
-    peg (N and N m, in its frame); the rotation vector (rad, in its frame) that contacts prevent (`rows.TURN`),
+    peg (N and N m, in its frame); the rotation vector (rad, there) that contacts prevent (`rows.TURN`),
     0 for none; twists (m and rad, in its frame) to where it was a little earlier (`rows.EARLIER`). Where
     `motion` predicts the rows there are no forces and times: these are NaN, and the rows are distributed as
     in `ContactManifold`.
