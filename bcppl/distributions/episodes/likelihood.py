@@ -240,7 +240,8 @@ class ContactEpisodes(FilteredEpisodes):
         delay = torch.from_numpy(self._prior(0).delay[branches.which])  # (N, B)
         particle = torch.arange(len(delay))[:, None]
         each = moved[particle, delay]
-        each = each + torch.einsum("nbrm,nbm->nbr", columns[particle, delay], torch.from_numpy(branches.mean))
+        shared = torch.from_numpy(branches.mean[..., : columns.shape[-1]])
+        each = each + torch.einsum("nbrm,nbm->nbr", columns[particle, delay], shared)
         return (torch.from_numpy(branches.weights)[..., None] * each).sum(dim=1)
 
     def _quadratic_of(self, rows: Tensor) -> Quadratic:
