@@ -82,9 +82,14 @@ def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, .
             joint[:, begin:end, : end - begin] = both
     common = torch.stack([(scale * errors.shared) ** 2, (errors.varying * compliance) ** 2], dim=1)
     begins = contact[first] & (continues[first] != 1.0)
-    tensors = (first, last, contact[first].to(torch.int64), begins.to(torch.int64), alone, common, joint)
     segments = Segments(
-        *(np.ascontiguousarray(each.numpy()) for each in tensors),
+        first=first.numpy(),
+        last=last.numpy(),
+        contact=contact[first].to(torch.int64).numpy(),
+        begins=begins.to(torch.int64).numpy(),
+        own=np.ascontiguousarray(alone.numpy()),
+        common=np.ascontiguousarray(common.numpy()),
+        errors=joint.numpy(),
         factor=np.zeros(joint.shape),
         log_determinant=np.zeros((len(joint), len(first))),
         white=np.zeros((*joint.shape[:2], OF_CONTACT)),
