@@ -12,7 +12,7 @@ import math
 from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -38,6 +38,7 @@ from bcppl.errors import InputError
 from bcppl.inference.approximations.laplace import (
     Normal,
     QuadraticApproximation,
+    Search,
     quadratic_approximation,
     together,
 )
@@ -156,6 +157,7 @@ class GaussianApproximation:
         before = None if self.quadratic is None else self.mixture
         own = torch.zeros(0) if before is None else known.component(before.centers)
         heading = next((heading for heading in headings if heading is not None), None)
+        entering = [(sensor, c) for sensor, c in by_sensor if isinstance(sensor, EntersHole)]
         each = []
         for k, (center, covariance) in enumerate(zip(known.centers, known.covariances, strict=True)):
             mine = None
@@ -163,9 +165,10 @@ class GaussianApproximation:
                 mine = GaussianMixture(*(values[own == k] for values in before))
             normal = Normal(center[None], torch.linalg.inv(covariance)[None])
             near = center[None] if mine is None else torch.cat([center[None], mine.centers])
-            inside = [sensor.in_hole(c, near) for sensor, c in by_sensor if isinstance(sensor, EntersHole)]
+            inside = [sensor.in_hole(c, near) for sensor, c in entering]
             inside = [places for places in inside if len(places.part)]
-            each.append(quadratic_approximation(sites, normal, mine, heading, everywhere, inside, nearby))
+            search = Search(heading, everywhere, tuple(partial(s.at_mouth, c) for s, c in entering))
+            each.append(quadratic_approximation(sites, normal, mine, search, inside, nearby))
         quadratic = each[0] if len(each) == 1 else together(each, known)
         return replace(self, quadratic=quadratic, relevant=relevant, stale=False)
 
