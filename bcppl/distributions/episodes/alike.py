@@ -18,7 +18,7 @@ from torch.special import log_ndtr
 from bcppl.arrays import Array, Indices
 from bcppl.devices import beside, numbers
 from bcppl.distributions.episodes.branches import OF_CONTACT, Branches, Prior, Segments
-from bcppl.distributions.episodes.switching_filter import CLEAR, FAINT, RUBBING
+from bcppl.distributions.episodes.switching_filter import BETWEEN, CLEAR, FAINT, RUBBING
 
 _FREE = 64  # rows without contact at a time: they take memory
 
@@ -139,7 +139,7 @@ def _of_free(distance: Tensor, rows: list[int], own: Tensor, log_in: float, log_
         if which.stop - which.start != len(rows[first : first + _FREE]):
             raise AssertionError("rows without contact between two episodes follow one another")
         gap = distance[:, which]
-        score = gap[:, None] / own[:, which]
+        score = gap[:, None] / own[:, which] + BETWEEN
         log_density = -0.5 * score.square() - 0.5 * math.log(2.0 * math.pi)
         positive = torch.logaddexp(log_ndtr(score), math.log(RUBBING) + log_density).clamp(max=0.0)
         either = torch.logaddexp(log_in + positive, torch.full_like(score, log_out))

@@ -53,6 +53,9 @@ from bcppl.threads import parallel_sum, thread_count
 # delay of the wrench was 12 below another, and in the end 46 above it.
 FAINT = 25.0
 _UNLIKELY = 10.0  # the same before an episode, of a hypothesis with a change
+# Standard deviations by which the gap of a peg between two walls seems less: it is the least of two that err in
+# opposite directions, the mean size of a normal error.
+BETWEEN = math.sqrt(2.0 / math.pi)
 RUBBING = 1.0  # standard deviations of the gap by which a command may be blocked without being felt
 CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
 _LOG_TWO_PI = math.log(2.0 * math.pi)
@@ -139,7 +142,8 @@ def _log_ndtr(z: float) -> float:
 def _log_free(score: float) -> float:
     """Log-probability of a row without contact whose gap is so many standard deviations.
 
-    A peg may rub along the part with a force that is not felt, and is then at its surface.
+    A peg may rub along the part with a force that is not felt, and is then at its surface. The score is that
+    of a peg between two walls: `BETWEEN` is added.
     """
     log_density = -0.5 * score * score - 0.5 * _LOG_TWO_PI
     return min(0.0, _log_sum(_log_ndtr(score), math.log(RUBBING) + log_density))
@@ -236,8 +240,8 @@ def _filter(
                     variance += dot(gaps.residual[n, first], gaps.residual[n, first])
                     root = math.sqrt(variance)
                     # Hypotheses that differ in the compliance alone are the same without contact.
-                    if gap / root != score:
-                        score = gap / root
+                    if gap / root + BETWEEN != score:
+                        score = gap / root + BETWEEN
                         positive = _log_free(score)
                         either = _log_sum(log_in + positive, log_out)
                     inside = log_in + positive
