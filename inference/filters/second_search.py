@@ -9,6 +9,7 @@ it is needed, the evidence is consistent rather than unbiased.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -23,7 +24,9 @@ MISSED = 10.0  # nats by which a mode is better than half of the particles: in s
 COPIES = 20  # draws for each particle: the approximation leaves some per cent of them effective
 
 
-def searched(population: Population, proposal: Callable[[Any], Callable[..., Any]]) -> Population:
+def searched(
+    population: Population, proposal: Callable[[Any], Callable[..., Any]], stuck: bool = False
+) -> Population:
     """The population, or one joined with draws of its approximation where that explains all far better.
 
     So it is where no particle is near a mode that is about as probable: particles that all went to another
@@ -34,9 +37,15 @@ def searched(population: Population, proposal: Callable[[Any], Callable[..., Any
         population: weighted for all measurements of its trace. Its approximation has methods `shortfall` and
             `misses_a_mode`.
         proposal: of all latent values, given the approximation.
+        stuck: whether moves hardly displace the particles: those that die out along a ridge are then drawn
+            again, and where some explains all far better than the approximation does, its modes are searched
+            for again first, from the particles and from many places.
     """
     approximation, trace = population.approximation, population.trace
-    if approximation.shortfall(trace) < MISSED and not approximation.misses_a_mode(trace):
+    if stuck and approximation.shortfall(trace) > -math.inf:
+        if approximation.is_exceeded(trace):
+            approximation = approximation.following(trace)
+    elif approximation.shortfall(trace) < MISSED and not approximation.misses_a_mode(trace):
         return population
     return joined_with_draws(population, approximation, proposal)
 
