@@ -276,6 +276,8 @@ class GaussianApproximation:
 
     def is_exceeded(self, trace: Any) -> bool:
         """Whether some particle explains all measurements far better than all modes do."""
+        if self.quadratic is None:
+            return False
         here = self.here
         return bool(here._at_particles(trace).max() > here._at_modes().max() + _BETTER)
 

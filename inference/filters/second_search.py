@@ -30,24 +30,26 @@ def searched(
     """The population, or one joined with draws of its approximation where that explains all far better.
 
     So it is where no particle is near a mode that is about as probable: particles that all went to another
-    one, which seemed better when less was measured, do not come back by themselves. It costs nothing where
-    particles are near all modes, and `COPIES` evaluations of all measurements for each particle elsewhere.
+    one, which seemed better when less was measured, do not come back by themselves. Where a particle explains
+    all far better than the modes of the approximation do, these are searched for again first, from particles
+    and from many places: the next measurement would move all to where it is known to be worse. It costs
+    nothing where particles are near all modes, and `COPIES` evaluations of all measurements for each particle
+    elsewhere.
 
     Args:
         population: weighted for all measurements of its trace. Its approximation has methods `shortfall` and
             `misses_a_mode`.
         proposal: of all latent values, given the approximation.
         stuck: whether moves hardly displace the particles: those that die out along a ridge are then drawn
-            again, and where some explains all far better than the approximation does, its modes are searched
-            for again first, from the particles and from many places.
+            again.
     """
     approximation, trace = population.approximation, population.trace
-    if stuck and approximation.shortfall(trace) > -math.inf:
-        if approximation.is_exceeded(trace):
-            approximation = approximation.following(trace)
-    elif approximation.shortfall(trace) < MISSED and not approximation.misses_a_mode(trace):
-        return population
-    return joined_with_draws(population, approximation, proposal)
+    if approximation.is_exceeded(trace):
+        approximation = approximation.following(trace)
+        population = population.with_approximation(approximation)
+    shortfall = approximation.shortfall(trace)
+    drawn = shortfall >= MISSED or (stuck and shortfall > -math.inf) or approximation.misses_a_mode(trace)
+    return joined_with_draws(population, approximation, proposal) if drawn else population
 
 
 def joined_with_draws(
