@@ -43,13 +43,24 @@ def searched(
         stuck: whether moves hardly displace the particles: those that die out along a ridge are then drawn
             again.
     """
+    population = _followed(population)
     approximation, trace = population.approximation, population.trace
-    if approximation.is_exceeded(trace):
-        approximation = approximation.following(trace)
-        population = population.with_approximation(approximation)
     shortfall = approximation.shortfall(trace)
-    drawn = shortfall >= MISSED or (stuck and shortfall > -math.inf) or approximation.misses_a_mode(trace)
-    return joined_with_draws(population, approximation, proposal) if drawn else population
+    if (
+        shortfall < MISSED
+        and not (stuck and shortfall > -math.inf)
+        and not approximation.misses_a_mode(trace)
+    ):
+        return population
+    return _followed(joined_with_draws(population, approximation, proposal))
+
+
+def _followed(population: Population) -> Population:
+    """The population whose approximation is, where some particle is far better, searched for again."""
+    approximation, trace = population.approximation, population.trace
+    if not approximation.is_exceeded(trace):
+        return population
+    return population.with_approximation(approximation.following(trace))
 
 
 def joined_with_draws(
