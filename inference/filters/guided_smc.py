@@ -68,8 +68,8 @@ MOST, ROOM = 40, 40_000
 # modes' shares.
 SEVERAL = 1800
 # Sweeps are made until the poses are displaced by so many variances, and no more than so many: one displaces
-# them by .3 to 2 where touches tell them, and by .02 to .1 along a bent ridge such as a peg wedged in a hole's
-# mouth leaves. There particles die out along it from window to window, and what is left is sure of a part.
+# them by .3 to 2 where touches tell them, and by .02 to .1 along a bent ridge such as a peg wedged in a hole
+# leaves. There particles die out along it from window to window, and what is left is sure of a part.
 DISPLACED, MOST_SWEEPS = 0.25, 2
 LEAST = 0.03  # of N: where even with so many copies less would be left, the measurement is tempered
 

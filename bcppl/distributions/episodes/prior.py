@@ -13,9 +13,9 @@ from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.row_errors import Hypothesis
 from bcppl.distributions.manifold import FARTHEST
 
-# Of contacts, after their probabilities: a factor of the rows' own errors, and a force. A peg that bounces off
-# an edge or sinks into it touches less exactly than one that is pressed on a face; one that is wedged between
-# two walls is pressed into them by forces of some 10 N that cancel in the wrench.
+# Of contacts, after their probabilities: a factor of the rows' own errors, and a force. A peg that bounces
+# off an edge or sinks into it touches less exactly than one that is pressed on a face; one that is wedged
+# between two walls is pressed into them by forces of some 10 N that cancel in the wrench.
 MANNERS = ((0.8, 1.0, 0.0), (0.15, 2.5, 0.0), (0.05, 1.0, 10.0))
 # Nodes of the compliance, in decades from its median: they are closer than `varying` is wide.
 _DECADES = torch.linspace(-1.25, 1.25, 11, dtype=torch.float64)

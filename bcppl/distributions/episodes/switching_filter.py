@@ -53,8 +53,8 @@ from bcppl.threads import parallel_sum, thread_count
 # delay of the wrench was 12 below another, and in the end 46 above it.
 FAINT = 25.0
 _UNLIKELY = 10.0  # the same before an episode, of a hypothesis with a change
-# Standard deviations by which the gap of a peg between two walls seems less: it is the least of two that err in
-# opposite directions, the mean size of a normal error.
+# Standard deviations by which the gap of a peg between two walls seems less: it is the least of two that err
+# in opposite directions, so by the mean size of a normal error.
 BETWEEN = math.sqrt(2.0 / math.pi)
 RUBBING = 1.0  # standard deviations of the gap by which a command may be blocked without being felt
 CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing

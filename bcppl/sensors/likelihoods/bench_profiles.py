@@ -84,8 +84,8 @@ class BenchProfile:
     def hypotheses(compliance: float) -> tuple[Hypothesis, ...]:
         """How good the bench is, given the median compliance (m/N) of part and peg where they touch.
 
-        What differs from it, and what a wedged peg sinks in, is among the compliance of arm and grip. Contacts or shared errors may be wider
-        than stated, not both.
+        What differs from it, and what a wedged peg sinks in, is among the compliance of arm and grip.
+        Contacts or shared errors may be wider than stated, not both.
         """
         return tuple(
             Hypothesis(math.log(common * share), compliance, noise, scale)
