@@ -52,9 +52,9 @@ class ContactEpisodes(FilteredEpisodes):
     The compliance c of part and peg is common to a recording and log-normal; all errors but those in c are
     wider by a common factor with some probability, or each contact is deeper by c times a force that cancels
     in the wrench, as where a peg is wedged (`prior.MANNERS`); both are integrated out by a sum over nodes. So
-    a row adds what it adds whatever the rate, and the product of the windows' likelihoods does not depend on how a probe is cut into them: a
-    row that an earlier window has used is in the value again, marked as given, and the log-likelihood is that
-    of all rows minus that of the given ones.
+    a row adds what it adds whatever the rate, and the product of the windows' likelihoods does not depend on
+    how a probe is cut into them: a row that an earlier window has used is in the value again, marked as
+    given, and the log-likelihood is that of all rows minus that of the given ones.
 
     What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap and
     is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear over what that may
@@ -62,8 +62,9 @@ class ContactEpisodes(FilteredEpisodes):
 
     A row without contact has the probability that a gap about d is positive, as in `ContactManifold`, or
     about zero: a peg may rub along the part with a force that is not felt. Between two walls the gap seems
-    less than it is, which the probability allows for. An episode is an outlier as a whole. Where a torque is one that no single contact exerts, an episode has besides the probability that
-    the peg is not free to turn against it (`bcppl.distributions.episodes.couples`).
+    less than it is, which the probability allows for. An episode is an outlier as a whole. Where a torque is
+    one that no single contact exerts, an episode has besides the probability that the peg is not free to turn
+    against it (`bcppl.distributions.episodes.couples`).
 
     The event is (T, COLUMNS): world_from_peg; 1 with contact, 0 without, NaN for a row that is not used;
     noise (m) of the row; force (N); time (s); the number of the episode; 1 for a given row; the wrench on the
