@@ -22,7 +22,7 @@ from bcppl.contact.sensing.episodes import EpisodeExtractor, Rows
 from bcppl.contact.touch import Touch
 from bcppl.distributions.episodes import ContactEpisodes, Grasp, Hypothesis, LinearErrors
 from bcppl.distributions.episodes.alike import begun_alike, filtered_alike
-from bcppl.distributions.episodes.prior import MANNERS, WIDE
+from bcppl.distributions.episodes.prior import NOISES, WIDE
 from bcppl.distributions.episodes.row_errors import segments_of
 from bcppl.distributions.episodes.rows import (
     COLUMNS,
@@ -83,9 +83,7 @@ def test_it_is_the_dense_gaussian_of_a_stationary_process_an_uncertain_complianc
     nodes = torch.linspace(-1.25, 1.25, 11, dtype=torch.float64)
     weights = (-0.5 * (nodes / 0.5) ** 2).log_softmax(dim=0)
     sums = []
-    for (decade, weight), (share, scale, squeezed) in itertools.product(
-        zip(nodes, weights, strict=True), MANNERS
-    ):
+    for (decade, weight), (share, scale) in itertools.product(zip(nodes, weights, strict=True), NOISES):
         compliance, total = COMPLIANCE * 10.0**decade, (weight + math.log(share)).expand(len(pose))
         for own in ([0, 1, 2], [4, 5, 6]):
             force, time, noise = MIXED[own, 9], MIXED[own, 10], MIXED[own, 8]
@@ -93,10 +91,7 @@ def test_it_is_the_dense_gaussian_of_a_stationary_process_an_uncertain_complianc
             covariance = scale**2 * (DRIFT**2 * torch.exp(-apart / LASTING) + SHARED**2)
             covariance = covariance + (VARYING * compliance) ** 2 * force[:, None] * force
             covariance = covariance + torch.diag((scale * noise) ** 2 + (ROUGH * compliance * force) ** 2)
-            covariance = covariance + (compliance * squeezed) ** 2
-            inlier = MultivariateNormal(-compliance * (force + squeezed), covariance).log_prob(
-                distance[:, own]
-            )
+            inlier = MultivariateNormal(-compliance * force, covariance).log_prob(distance[:, own])
             stray = torch.full_like(inlier, math.log(OUTLIER) - 3 * math.log(FARTHEST))
             total = total + torch.logaddexp(inlier + math.log1p(-OUTLIER), stray)
         for k in (3, 7):

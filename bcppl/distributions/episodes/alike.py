@@ -103,7 +103,7 @@ def filtered_alike(
         log_weight = log_weight + _of_free(distance, free, own, log_in, log_out)[:, of_each]
         free, rows = [], last - first
         if segments.begins[s]:
-            mean = put(segments.expected).expand_as(mean)
+            mean = torch.zeros_like(mean)
             covariance = torch.diag_embed(put(segments.common)).expand_as(covariance)
         by = put(np.stack([np.ones(rows), force[first:last]]))
         error = distance[:, None, first:last] + sunk[:, first:last] + mean @ by

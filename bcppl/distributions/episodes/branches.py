@@ -23,8 +23,7 @@ class Segments(NamedTuple):
         contact: (S,) 1 for an episode.
         begins: (S,) 1 for an episode whose contact is not that of the episode before.
         own: (H, R) of each hypothesis, variances of the errors of rows without contact, m^2.
-        expected, common: (H, 2) means and variances of the parameters of a contact that begins, m and m/N,
-            and squared.
+        common: (H, 2) variances of the parameters of a contact that begins, m^2 and (m/N)^2.
         errors: (H, R, E) covariances of a row's error with those of its episode up to it, m^2, but for what
             the parameters of its contact add.
         factor: (H, R, E) their Cholesky factors, with inverted diagonals.
@@ -39,7 +38,6 @@ class Segments(NamedTuple):
     contact: Indices
     begins: Indices
     own: Array
-    expected: Array
     common: Array
     errors: Array
     factor: Array

@@ -30,11 +30,11 @@ def squared_by(covariance: Array, column: Array, product: Array) -> float:
 
 
 @compiled
-def begin_contact(mean: Array, covariance: Array, expected: Array, variances: Array) -> None:
-    """Set the last parameters, those of a contact, to ones of which only means and variances are known."""
+def begin_contact(mean: Array, covariance: Array, variances: Array) -> None:
+    """Set the last parameters, those of a contact, to ones of which nothing is known but their variances."""
     for k in range(len(variances)):
         a = len(mean) - len(variances) + k
-        mean[a] = expected[k]
+        mean[a] = 0.0
         covariance[a, :] = 0.0
         covariance[:, a] = 0.0
         covariance[a, a] = variances[k]

@@ -50,11 +50,10 @@ class ContactEpisodes(FilteredEpisodes):
     noise of the rows, a stationary Ornstein-Uhlenbeck process in time, the unknown geometry, and a compliance
     that differs from contact to contact by a factor. The last two are the same in all episodes of a contact.
     The compliance c of part and peg is common to a recording and log-normal; all errors but those in c are
-    wider by a common factor with some probability, or each contact is deeper by c times a force that cancels
-    in the wrench, as where a peg is wedged (`prior.MANNERS`); both are integrated out by a sum over nodes. So
-    a row adds what it adds whatever the rate, and the product of the windows' likelihoods does not depend on
-    how a probe is cut into them: a row that an earlier window has used is in the value again, marked as
-    given, and the log-likelihood is that of all rows minus that of the given ones.
+    wider by a common factor with some probability (`prior.NOISES`); both are integrated out by a sum over
+    nodes. So a row adds what it adds whatever the rate, and the product of the windows' likelihoods does not
+    depend on how a probe is cut into them: a row that an earlier window has used is in the value again,
+    marked as given, and the log-likelihood is that of all rows minus that of the given ones.
 
     What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap and
     is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear over what that may

@@ -13,10 +13,9 @@ from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.row_errors import Hypothesis
 from bcppl.distributions.manifold import FARTHEST
 
-# Of contacts, after their probabilities: a factor of the rows' own errors, and a force. A peg that bounces
-# off an edge or sinks into it touches less exactly than one that is pressed on a face; one that is wedged
-# between two walls is pressed into them by forces of some 10 N that cancel in the wrench.
-MANNERS = ((0.8, 1.0, 0.0), (0.15, 2.5, 0.0), (0.05, 1.0, 10.0))
+# Factors of the rows' own errors, after their probabilities: a peg that bounces off an edge or sinks into it
+# touches less exactly than one that is pressed on a face.
+NOISES = ((0.85, 1.0), (0.15, 2.5))
 # Nodes of the compliance, in decades from its median: they are closer than `varying` is wide.
 _DECADES = torch.linspace(-1.25, 1.25, 11, dtype=torch.float64)
 # Standard deviations, m and rad, of the pose about which a likelihood is approximated: far wider than what
@@ -29,13 +28,13 @@ WIDE = torch.tensor([0.1] * 3 + [1.0] * 3, dtype=torch.float64)
 def nodes_of(compliance: float, uncertain: float, every: int = 1) -> tuple[Hypothesis, ...]:
     """Each `every`-th node of a compliance with a median, m/N, and a deviation of its decimal logarithm.
 
-    Each with each of `MANNERS`.
+    Each with each scale of `NOISES`.
     """
     weights = (-0.5 * (_DECADES / uncertain) ** 2).log_softmax(dim=0)[::every].tolist()
     nodes = (compliance * 10.0**_DECADES)[::every].tolist()
     return tuple(
-        Hypothesis(weight + math.log(share), node, noise, squeezed=squeezed)
-        for share, noise, squeezed in MANNERS
+        Hypothesis(weight + math.log(share), node, noise)
+        for share, noise in NOISES
         for weight, node in zip(weights, nodes, strict=True)
     )
 
@@ -54,7 +53,7 @@ def with_delays(hypotheses: tuple[Hypothesis, ...], bench: LinearErrors) -> tupl
 def prior_of(bench: LinearErrors, hypotheses: tuple[Hypothesis, ...], outlier: float, pose: int) -> Prior:
     """The prior of hypotheses with delays, with so many parameters of the pose before the shared errors'."""
     own, none, changes = np.zeros(pose), np.zeros(OF_CONTACT), bench.changes
-    log_weight, compliance, _, scale, delay, _ = np.array(hypotheses).T.copy()
+    log_weight, compliance, _, scale, delay = np.array(hypotheses).T.copy()
     changed = np.array([np.concatenate([own, c.variances.numpy(), none]) for c in changes])
     return Prior(
         log_weight=log_weight,

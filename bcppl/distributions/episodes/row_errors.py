@@ -26,8 +26,6 @@ class Hypothesis(NamedTuple):
         noise: by which the rows' own errors are wider than stated.
         scale: by which the errors that all touches share are wider than stated.
         delay: the interval in which the wrench's delay lies, from 1 on (`rows.late`); 0 for no delay.
-        squeezed: the mean of forces that cancel in the wrench, as those of two walls on a peg between them;
-            they press it into these by the compliance. N.
     """
 
     log_weight: float
@@ -35,7 +33,6 @@ class Hypothesis(NamedTuple):
     noise: float = 1.0
     scale: float = 1.0
     delay: int = 0
-    squeezed: float = 0.0
 
 
 class RowErrors(NamedTuple):
@@ -83,11 +80,7 @@ def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, .
             lasting = errors.drift**2 * torch.exp(-apart / errors.lasting)
             both = scale[:, None, None] ** 2 * lasting + torch.diag_embed(own[:, begin:end])
             joint[:, begin:end, : end - begin] = both
-    # Of an exponential distribution the deviation is the mean.
-    pressed = compliance * torch.tensor([h.squeezed for h in hypotheses], dtype=torch.float64)
-    expected = torch.stack([pressed, torch.zeros_like(pressed)], dim=1)
-    offset = (scale * errors.shared) ** 2 + pressed**2
-    common = torch.stack([offset, (errors.varying * compliance) ** 2], dim=1)
+    common = torch.stack([(scale * errors.shared) ** 2, (errors.varying * compliance) ** 2], dim=1)
     begins = contact[first] & (continues[first] != 1.0)
     segments = Segments(
         first=first.numpy(),
@@ -95,7 +88,6 @@ def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, .
         contact=contact[first].to(torch.int64).numpy(),
         begins=begins.to(torch.int64).numpy(),
         own=np.ascontiguousarray(alone.numpy()),
-        expected=np.ascontiguousarray(expected.numpy()),
         common=np.ascontiguousarray(common.numpy()),
         errors=joint.numpy(),
         factor=np.zeros(joint.shape),

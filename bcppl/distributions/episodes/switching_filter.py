@@ -266,7 +266,7 @@ def _filter(
                 h = which[n, b]
                 delay = prior.delay[h]
                 if segments.begins[s] == 1:
-                    begin_contact(mean[n, b], covariance[n, b], segments.expected[h], segments.common[h])
+                    begin_contact(mean[n, b], covariance[n, b], segments.common[h])
                 slope, own_pull, joint = columns[delay, :rows], pulls[b, :rows], joints[b]
                 for i in range(rows):
                     share = gaps.trust[n, delay, first + i] if gaps.trust.size else 1.0

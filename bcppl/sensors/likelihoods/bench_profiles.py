@@ -31,7 +31,7 @@ from bcppl.distributions.episodes import (
     PartSlides,
     Size,
 )
-from bcppl.distributions.episodes.prior import MANNERS
+from bcppl.distributions.episodes.prior import NOISES
 from bcppl.errors import InputError
 
 Point = tuple[float, float, float]
@@ -84,14 +84,14 @@ class BenchProfile:
     def hypotheses(compliance: float) -> tuple[Hypothesis, ...]:
         """How good the bench is, given the median compliance (m/N) of part and peg where they touch.
 
-        What differs from it, and what a wedged peg sinks in, is among the compliance of arm and grip.
-        Contacts or shared errors may be wider than stated, not both.
+        What differs from it is among the compliance of arm and grip. Contacts or shared errors may be wider
+        than stated, not both.
         """
         return tuple(
             Hypothesis(math.log(common * share), compliance, noise, scale)
-            for common, noise, squeezed in MANNERS
+            for common, noise in NOISES
             for share, scale in SCALES
-            if not squeezed and (noise == 1.0 or scale == 1.0)
+            if noise == 1.0 or scale == 1.0
         )
 
 
