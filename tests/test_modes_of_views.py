@@ -256,17 +256,6 @@ def test_a_population_that_misses_the_mode_is_replaced_by_evidence() -> None:
     assert 0 < int((joined["x"] == -3.0).sum()) < 50, "an estimate of 1 beside one of 0.24 keeps its share"
 
 
-def test_particles_that_moves_hardly_displace_are_drawn_again() -> None:
-    torch.manual_seed(0)
-    narrow = weighted_at(torch.full((50,), 1.0).double(), torch.zeros(50).double(), falling_short(2.0))
-    assert second_search.searched(narrow, around(1.0), stuck=False) is narrow
-    drawn = second_search.searched(narrow, around(1.0), stuck=True)["x"]
-    assert int((drawn != 1.0).sum()) > 5
-    # Before a touch there is nothing to draw from.
-    narrow = weighted_at(torch.full((50,), 1.0).double(), torch.zeros(50).double(), falling_short(-math.inf))
-    assert second_search.searched(narrow, around(1.0), stuck=True) is narrow
-
-
 def test_modes_that_particles_exceed_are_searched_for_again() -> None:
     better = falling_short(0.0)
     worse = SimpleNamespace(is_exceeded=lambda _: True, following=lambda _: better)

@@ -70,7 +70,7 @@ SEVERAL = 1800
 # Sweeps are made until the poses are displaced by so many variances, and no more than so many: one displaces
 # them by .3 to 2 where touches tell them, and by .02 to .1 along a bent ridge such as a peg wedged in a hole
 # leaves. There particles die out along it from window to window, and what is left is sure of a part.
-DISPLACED, MOST_SWEEPS = 0.25, 2
+DISPLACED, MOST_SWEEPS = 0.25, 4
 LEAST = 0.03  # of N: where even with so many copies less would be left, the measurement is tempered
 
 
@@ -124,7 +124,7 @@ def guided(
     sweeps: int | Until = 1,
     share: float = 0.5,
     screen: bool = True,
-    search: Callable[[Population, Trace, bool], Population] | None = None,
+    search: Callable[[Population, Trace], Population] | None = None,
 ) -> StepFunction:
     """A step that assimilates a measurement by SMCP3, resamples when needed, and moves the particles.
 
@@ -135,8 +135,8 @@ def guided(
         sweeps: how many of them, or `until(...)`.
         share: particles are resampled below this effective sample size, as a share of N.
         screen: whether a cheap likelihood of what is simulated chooses among copies of the particles.
-        search: given the population after each step, the trace before it, and whether the sweeps have hardly
-            displaced the particles, returns that population or another that takes its place.
+        search: given the population after each step and the trace before it, returns that population or
+            another that takes its place.
     """
 
     def resample(population: Population) -> tuple[Population, Tensor | None]:
@@ -176,8 +176,7 @@ def guided(
 
     def settled(stepped: Stepped, before: Trace) -> Stepped:
         population, info = stepped
-        stuck = isinstance(sweeps, Until) and info.displacement < (sweeps.displacement or 0.0)
-        other = population if search is None else search(population, before, stuck)
+        other = population if search is None else search(population, before)
         if other is population:
             return stepped
         gained = other.log_evidence - population.log_evidence
@@ -342,13 +341,13 @@ def infer(
         again: GaussianApproximation = _given_all(replace(gaussian(scene), near=near), trace, actions)
         return replace(again, near=None)
 
-    def search(population: Population, before: Trace, stuck: bool) -> Population:
+    def search(population: Population, before: Trace) -> Population:
         scene, actions = population.trace.args
         if isinstance(scene.sensor(actions[-1]), FitsPose):
             new = population.trace.since(before)
             if is_refuted(population, new):
                 return searched_by_climbing(population, model.pose, refitted, independent_proposal)
-        return searched(population, independent_proposal, stuck)
+        return searched(population, independent_proposal)
 
     times = sweeps or until(displacement=DISPLACED, of=(model.pose,), most=MOST_SWEEPS)
     step = guided(gaussian, programs, moves, sweeps=times, share=share, screen=screen, search=search)

@@ -9,7 +9,6 @@ it is needed, the evidence is consistent rather than unbiased.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -24,9 +23,7 @@ MISSED = 10.0  # nats by which a mode is better than half of the particles: in s
 COPIES = 20  # draws for each particle: the approximation leaves some per cent of them effective
 
 
-def searched(
-    population: Population, proposal: Callable[[Any], Callable[..., Any]], stuck: bool = False
-) -> Population:
+def searched(population: Population, proposal: Callable[[Any], Callable[..., Any]]) -> Population:
     """The population, or one joined with draws of its approximation where that explains all far better.
 
     So it is where no particle is near a mode that is about as probable: particles that all went to another
@@ -40,17 +37,10 @@ def searched(
         population: weighted for all measurements of its trace. Its approximation has methods `shortfall` and
             `misses_a_mode`.
         proposal: of all latent values, given the approximation.
-        stuck: whether moves hardly displace the particles: those that die out along a ridge are then drawn
-            again.
     """
     population = _followed(population)
     approximation, trace = population.approximation, population.trace
-    shortfall = approximation.shortfall(trace)
-    if (
-        shortfall < MISSED
-        and not (stuck and shortfall > -math.inf)
-        and not approximation.misses_a_mode(trace)
-    ):
+    if approximation.shortfall(trace) < MISSED and not approximation.misses_a_mode(trace):
         return population
     return _followed(joined_with_draws(population, approximation, proposal))
 
