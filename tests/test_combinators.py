@@ -225,6 +225,7 @@ def test_sweeps_until_the_start_is_left_behind_and_no_longer_than_allowed() -> N
     x, y = population.trace["x"], done.trace["x"]
     share = (y - x).square().mean() / y.var(correction=0)
     assert float(displacement(population, done)) == pytest.approx(float(share))
+    assert not len(displacement(population, done, ("elsewhere",))), "what is not named does not count"
     calls.clear()
     tiny = metropolis_hastings(drift("x", (1e-5, 1e-4)))
     moved_by(population, counted(tiny)[0], POSTERIOR, until(displacement=0.5, most=2))

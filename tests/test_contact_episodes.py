@@ -24,7 +24,18 @@ from bcppl.distributions.episodes import ContactEpisodes, Grasp, Hypothesis, Lin
 from bcppl.distributions.episodes.alike import begun_alike, filtered_alike
 from bcppl.distributions.episodes.prior import NOISES, WIDE
 from bcppl.distributions.episodes.row_errors import segments_of
-from bcppl.distributions.episodes.rows import COLUMNS, FELT, FORCE, GIVEN, TIME, WRENCH, new_rows
+from bcppl.distributions.episodes.rows import (
+    COLUMNS,
+    CONTINUES,
+    EPISODE,
+    FELT,
+    FORCE,
+    GIVEN,
+    NOISE as NOISE_COLUMN,
+    TIME,
+    WRENCH,
+    new_rows,
+)
 from bcppl.distributions.manifold import FARTHEST
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.parts import Guess
@@ -97,19 +108,60 @@ def test_it_is_the_dense_gaussian_of_a_stationary_process_an_uncertain_complianc
         assert float((site(pose, 8, **{name: 0.0}).log_prob(MIXED) - expected).abs().max()) > 0.01, name
 
 
-def test_for_all_particles_together_it_is_the_same() -> None:
+def continued(rows: Tensor, cut: int) -> Tensor:
+    """The same, an episode in two from a row on, of one contact."""
+    rows = rows.clone()
+    rows[cut:, EPISODE] += 1.0
+    last = rows[:, EPISODE] == rows[cut, EPISODE]
+    rows[last, CONTINUES] = 1.0
+    return rows
+
+
+def test_what_is_common_to_a_contact_lasts_as_long_as_it() -> None:
+    """A contact over two cells: each may be an outlier by itself, and where it is and yields is common."""
+    pose, one = around(20), (Hypothesis(0.0, 1e-5),)
+    rows, cut = continued(MIXED[4:7], 2), 2
+    distance, force, noise = ledge(pose, rows[:, :7]).distance, rows[:, FORCE], rows[:, NOISE_COLUMN]
+    expected = []
+    for among in itertools.product((True, False), repeat=2):
+        own = [k for k in range(3) if among[int(k >= cut)]]
+        total = torch.zeros(len(pose), dtype=torch.float64)
+        for inside, count in zip(among, (cut, 3 - cut), strict=True):
+            total = total + (
+                math.log1p(-OUTLIER) if inside else math.log(OUTLIER) - count * math.log(FARTHEST)
+            )
+        if own:
+            apart = (rows[own, TIME][:, None] - rows[own, TIME]).abs()
+            together = torch.tensor([[int(a >= cut) == int(b >= cut) for b in own] for a in own])
+            covariance = SHARED**2 + torch.where(together, DRIFT**2 * torch.exp(-apart / LASTING), 0.0)
+            covariance = covariance + (VARYING * 1e-5) ** 2 * force[own][:, None] * force[own]
+            covariance = covariance + torch.diag(noise[own] ** 2 + (ROUGH * 1e-5 * force[own]) ** 2)
+            total = total + MultivariateNormal(-1e-5 * force[own], covariance).log_prob(distance[:, own])
+        expected.append(total)
+    exact = torch.logsumexp(torch.stack(expected), dim=0)
+    off = (site(pose, 3, hypotheses=one).log_prob(rows) - exact).abs()
+    # A mixture of outlier and not, of which the filter keeps the moments, has other tails.
+    assert float(off.median()) < 1e-4 and float(off.max()) < 0.2
+    apart = rows.clone()
+    apart[:, CONTINUES] = 0.0
+    off = (site(pose, 3, hypotheses=one).log_prob(apart) - exact).abs()
+    assert float(off.median()) > 0.05, "as another contact"
+
+
+@pytest.mark.parametrize("cut", [5, 6])
+def test_for_all_particles_together_it_is_the_same(cut: int) -> None:
     """As it is evaluated on a GPU, here on the processor: rows at once, and those after others."""
-    pose = around(30)
+    pose, rows = around(30), continued(MIXED, cut)
     whole = site(pose, 8)
-    prior, distance = whole._prior(0), ledge(pose, MIXED[:, :7]).distance
+    prior, distance = whole._prior(0), ledge(pose, rows[:, :7]).distance
     branches = begun_alike(prior, pose)
-    for rows in (slice(0, 4), slice(4, 8)):
-        segments = segments_of(MIXED[rows], whole._row_errors, whole._every)
-        branches = filtered_alike(branches, prior, segments, distance[:, rows], MIXED[rows, FORCE].numpy())
-    expected = torch.from_numpy(whole.branches(MIXED).log_evidence)
+    for part in itertools.starmap(slice, itertools.pairwise((0, 4, cut, 8))):
+        segments = segments_of(rows[part], whole._row_errors, whole._every)
+        branches = filtered_alike(branches, prior, segments, distance[:, part], rows[part, FORCE].numpy())
+    expected = torch.from_numpy(whole.branches(rows).log_evidence)
     torch.testing.assert_close(branches.log_evidence, expected, rtol=0.0, atol=1e-9)
-    both = branches.on_host, whole.branches(MIXED)
-    squares = [(each.weights[..., None] * each.squared).sum(axis=1) for each in both]
+    both = branches.on_host, whole.branches(rows)
+    squares = [(each.weights[..., None] * each.squared).sum(axis=(1, 2)) for each in both]
     np.testing.assert_allclose(*squares, rtol=1e-9)
 
 

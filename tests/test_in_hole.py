@@ -13,7 +13,7 @@ from bcppl import poses
 from bcppl.distributions.episodes import ContactEpisodes
 from bcppl.distributions.episodes.rows import EPISODE, FELT, FORCE, GIVEN, NOISE, TIME, WRENCH, padded
 from bcppl.geometry.holes import fit_in, hole_of
-from bcppl.inference.approximations.laplace import Normal, quadratic_approximation
+from bcppl.inference.approximations.laplace import Normal, Search, quadratic_approximation
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.sensors.capabilities import Approximated
 from bcppl.sensors.likelihoods.contact_probe import ContactProbe, TouchSettings
@@ -105,3 +105,47 @@ def test_the_mode_in_the_hole_is_reached_and_as_wide_as_the_hole_leaves_it_room(
     own = turned.T @ posterior.covariances[best][:3, :3] @ turned
     assert float(own[:2, :2].diagonal().sqrt().max()) < 2.0 * scene().clearance
     assert float(own[2, 2].sqrt()) > 0.001
+
+
+def leaning(heading: float, lean: float = 0.1) -> Tensor:
+    """A peg (7,) that leans in the hole's mouth, lowered until it touches."""
+    hole, truth = hole_of(scene().part), torch.from_numpy(scene().truth)
+    held = torch.from_numpy(fit_in(hole, scene().peg).hole_from_peg)
+    mouth = poses.compose(truth, torch.from_numpy(hole.part_from_hole))
+    axis = torch.tensor([math.cos(heading), math.sin(heading), 0.0], dtype=torch.float64)
+    tip = poses.identity(200)
+    tip[:, 2] = torch.linspace(0.002, -0.008, 200, dtype=torch.float64)
+    tip = poses.retract(tip, torch.cat([torch.zeros(3, dtype=torch.float64), lean * axis]).expand(200, 6))
+    # The middle of what is inside stands in the middle of the hole.
+    up = poses.rotation_matrix(tip[0])[:, 2]
+    tip[:, :2] += 0.5 * tip[:, 2:3] * up[:2]
+    peg = poses.compose(poses.compose(mouth, tip), held)
+    touching = probe().gap(truth[None], peg).distance[0] < 0.0
+    return peg[int(touching.nonzero()[0])]
+
+
+def test_a_peg_that_is_wedged_in_the_mouth_leads_there() -> None:
+    """The peg may also stand on a part that is lower: only the place of the mouth leads to the truth."""
+    truth, sensor = torch.from_numpy(scene().truth), probe()
+    rows = padded(torch.stack([leaning(heading) for heading in (0.3, 1.6, 2.9, 4.5)]), 4)
+    rows[:, FELT], rows[:, NOISE], rows[:, FORCE], rows[:, GIVEN] = 1.0, 3e-5, 5.0, 0.0
+    rows[:, EPISODE], rows[:, TIME] = torch.arange(4.0).double(), 0.3 * torch.arange(4.0).double()
+    rows[:, WRENCH] = 0.0
+    measured = [Approximated(2, None, rows)]
+    center = poses.retract(truth, torch.tensor([0.003, -0.0035, -0.005, 0.01, -0.02, 0.012]).double())[None]
+    there = poses.local(truth, sensor.at_mouth(measured, center)[0])
+    assert float(there[:3].norm()) < 0.0015 < float(poses.local(truth, center[0])[:3].norm())
+    spread = torch.tensor([0.004] * 3 + [0.02] * 3, dtype=torch.float64)
+    prior = Normal(center, torch.diag(spread**-2)[None])
+
+    def sites(part: Tensor, blur: float) -> list[tuple[ContactEpisodes, Tensor]]:
+        wide = math.hypot(6e-5, blur)
+        return [(ContactEpisodes(sensor.gap, part, len(rows), wide, 1e-5, 2e-5, blur=blur), rows)]
+
+    def nearest(search: Search) -> float:
+        modes = quadratic_approximation(sites, prior, search=search).around
+        return min(float(poses.local(truth, mode)[:3].norm()) for mode in modes)
+
+    assert nearest(Search(everywhere=True)) > 0.002
+    entry = functools.partial(sensor.at_mouth, measured)
+    assert nearest(Search(everywhere=True, entries=(entry,))) < 0.0015

@@ -30,6 +30,7 @@ from bcppl.distributions.episodes import (
     Size,
 )
 from bcppl.distributions.episodes.displaced import lines_at
+from bcppl.distributions.episodes.posterior import moments
 from bcppl.distributions.episodes.row_errors import RowErrors
 from bcppl.distributions.episodes.rows import (
     EARLIER,
@@ -212,7 +213,7 @@ def test_a_row_without_contact_is_positive_given_the_contacts_before() -> None:
     errors = LinearErrors(tuple(certain))
     columns, gaps = measured_columns(ledge, pose, rows, errors), ledge(pose, rows[:, :7]).distance
     after = site(pose, rows, *certain).branches(rows[:2])
-    mean, covariance = torch.from_numpy(after.mean[:, 0]), torch.from_numpy(after.covariance[:, 0])
+    mean, covariance = moments(after)
     own = columns[:, 2]
     variance = float(rows[2, 8]) ** 2 + 1e-10 + 4e-10 + torch.einsum("na,nab,nb->n", own, covariance, own)
     score = (gaps[:, 2] + (own * mean).sum(-1)) / variance.sqrt()

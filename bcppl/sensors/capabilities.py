@@ -130,6 +130,9 @@ class EntersHole(Protocol):
     def in_hole(self, measurements: Sequence[Approximated], part: Tensor) -> InHole:
         """Poses near some (M, 7) that have the hole where the peg would lie deep in the material."""
 
+    def at_mouth(self, measurements: Sequence[Approximated], part: Tensor) -> Tensor:
+        """Poses (K, 7), turned as some (M, 7), whose hole has the tip of the peg in its mouth."""
+
 
 @runtime_checkable
 class Defers(Protocol):

@@ -36,6 +36,8 @@ _REFUTED = 10.0  # nats by which a mode that started at another component of the
 _LEFT = 20
 # Squared standard deviations within which two starts have come together, and lead to the same mode.
 _MET = 0.01
+# Squared prior standard deviations beyond which a hole is not entered: 1e-6 of six degrees of freedom.
+_FARTHEST = 40.0
 _REPLICAS = 16  # of the best mode, for a site whose check draws them
 
 # The sites of the likelihood at poses (S, 7), errors `blur` metres wider, each with its observed value.
@@ -77,12 +79,27 @@ class QuadraticApproximation(NamedTuple):
         )
 
 
+class Search(NamedTuple):
+    """Where to start from.
+
+    Attributes:
+        heading: (3,) the direction of motion at the last contact; None for none.
+        everywhere: whether to search for all modes.
+        entries: each from poses (M, 7) makes others, from which a hole is entered.
+        near: (K, 7) poses to start from as well; None for none.
+    """
+
+    heading: Tensor | None = None
+    everywhere: bool = False
+    entries: tuple[Callable[[Tensor], Tensor], ...] = ()
+    near: Tensor | None = None
+
+
 def quadratic_approximation(
     sites: Sites,
     prior: Normal,
     before: GaussianMixture | None = None,
-    heading: Tensor | None = None,
-    everywhere: bool = False,
+    search: Search | None = None,
     inside: Sequence[InHole] = (),
     nearby: bool = False,
 ) -> QuadraticApproximation:
@@ -95,15 +112,14 @@ def quadratic_approximation(
     Where a part is estimated too near, a peg penetrates it deeply, and would leave a thin wall on the wrong
     side; so it starts from outside as well, the part displaced along the direction of the last contact.
     Errors of millimetres lead all starts to one mode, and which corner or edge was touched may be ambiguous:
-    `everywhere` starts from many places with small errors too, under the prior and around what fewer
-    measurements have left, each of which leads to the nearest mode.
+    `everywhere` starts from many places with small errors too, under the prior, around what fewer
+    measurements have left, and with the peg in the mouth of a hole, each of which leads to the nearest mode.
 
     Args:
         sites: the likelihood.
         prior: of the pose.
         before: the posterior given fewer measurements, M components; None for none.
-        heading: (3,) the direction of motion at the last contact; None for none.
-        everywhere: whether to search for all modes.
+        search: where to start from; around the prior mean and the modes of `before` unless given.
         inside: poses that have the peg in a hole, of which each leads to a mode.
         nearby: whether the modes of `before` hardly move.
     """
@@ -112,30 +128,36 @@ def quadratic_approximation(
         reached, _ = gauss_newton(sites, before.centers, prior, NEAR, len(before.centers))
         modes = _quadratic(sites, reached) if _explains(sites, reached[:1]) else None
     if modes is None:
-        modes = _quadratic(sites, _searched(sites, prior, before, heading, everywhere))
+        modes = _quadratic(sites, _searched(sites, prior, before, search or Search()))
     each = [modes, *(_in_hole(sites, one, prior) for one in inside)]
     return _distinct(_joined(each), prior)
 
 
-def _searched(
-    sites: Sites, prior: Normal, before: GaussianMixture | None, heading: Tensor | None, everywhere: bool
-) -> Tensor:
+def _searched(sites: Sites, prior: Normal, before: GaussianMixture | None, search: Search) -> Tensor:
     """The modes (M, 7) that are reached from all starts."""
     center, precision = prior
     scale = torch.linalg.cholesky(torch.linalg.inv(precision[0]))
     earlier = [] if before is None else [before.centers[:1]]
     starts = [center, poses.exp(center, _STARTS @ scale.T), *earlier]
     reached = [gauss_newton(sites, torch.cat(starts), prior, BLURS)]
-    if heading is not None:
+    if search.heading is not None:
         ahead = torch.cat([center, center if before is None else before.centers[:1]]).repeat_interleave(
             len(_AHEAD), 0
         )
-        ahead[:, :3] += _AHEAD.repeat(2)[:, None] * heading
+        ahead[:, :3] += _AHEAD.repeat(2)[:, None] * search.heading
         reached.append(gauss_newton(sites, ahead, prior, SHARP))
     best, _ = max(reached, key=lambda fit: float(fit[1][0]))
     others = [] if before is None or len(before.centers) == 1 else [before.centers]
-    if everywhere:
-        others.append(poses.exp(center, _PLACES @ scale.T))
+    others += [] if search.near is None else [search.near]
+    if search.everywhere:
+        places = poses.exp(center, _PLACES @ scale.T)
+        entered = torch.cat([places[:0], *(entry(places) for entry in search.entries)])
+        away = poses.log(center, entered)
+        entered = entered[((away @ precision[0]) * away).sum(dim=-1) < _FARTHEST]
+        if len(entered):
+            # By themselves: they begin less probable than others, as a needle does.
+            best = torch.cat([best, gauss_newton(sites, entered, prior, FINE, _MODES)[0]])
+        others.append(places)
         if before is not None:
             of = torch.arange(len(_NEAR)) % len(before.centers)
             away = torch.linalg.cholesky(before.covariances)[of] @ _NEAR[..., None]

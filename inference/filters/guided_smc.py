@@ -39,6 +39,7 @@ from bcppl.inference.filters.tempering import resample_move, tempered
 from bcppl.inference.filters.view_search import is_refuted, searched_by_climbing
 from bcppl.inference.kernels import Kernel, cycle, metropolis_hastings, sequence, surrogate_transition
 from bcppl.inference.kernels.kernel import Move
+from bcppl.inference.kernels.rejuvenation import Until, until
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Program, drift
 from bcppl.inference.proposals.approximated import (
@@ -66,6 +67,10 @@ MOST, ROOM = 40, 40_000
 # Particles and copies where images leave several modes: of 75 particles 20 stay effective, too few for the
 # modes' shares.
 SEVERAL = 1800
+# Sweeps are made until the poses are displaced by so many variances, and no more than so many: one displaces
+# them by .3 to 2 where touches tell them, and by .02 to .1 along a bent ridge such as a peg wedged in a hole
+# leaves. There particles die out along it from window to window, and what is left is sure of a part.
+DISPLACED, MOST_SWEEPS = 0.25, 4
 LEAST = 0.03  # of N: where even with so many copies less would be left, the measurement is tempered
 
 
@@ -116,7 +121,7 @@ def guided(
     programs: Programs,
     moves: Kernel,
     *,
-    sweeps: int = 1,
+    sweeps: int | Until = 1,
     share: float = 0.5,
     screen: bool = True,
     search: Callable[[Population, Trace], Population] | None = None,
@@ -127,7 +132,7 @@ def guided(
         start: the approximation before any measurement, given the program's first argument.
         programs: the kernels and proposals that go with it.
         moves: of every particle after each step.
-        sweeps: how many of them.
+        sweeps: how many of them, or `until(...)`.
         share: particles are resampled below this effective sample size, as a share of N.
         screen: whether a cheap likelihood of what is simulated chooses among copies of the particles.
         search: given the population after each step and the trace before it, returns that population or
@@ -141,7 +146,8 @@ def guided(
         return population.selected(ancestors), ancestors
 
     rejuvenation = resample_move(moves, sweeps, resample, always_move=True)
-    by_tempering = tempered(moves, sweeps=2 * sweeps, resample=resample)
+    doubled = 2 if isinstance(sweeps, Until) else 2 * sweeps
+    by_tempering = tempered(moves, sweeps=doubled, resample=resample)
 
     def step(population: Population, observed: Observed) -> Stepped:
         scene, actions = observed.args
@@ -164,9 +170,9 @@ def guided(
             assimilated = assimilate(population, observed, pair, least)
         if assimilated is None:
             return settled(by_tempering(population, observed), population.trace)
-        moved, ancestors, acceptance, _ = rejuvenation(assimilated.population, POSTERIOR)
-        stepped = Stepped(moved, _info(population, moved, assimilated, acceptance, ancestors))
-        return settled(stepped, population.trace)
+        moved, ancestors, acceptance, displaced = rejuvenation(assimilated.population, POSTERIOR)
+        info = _info(population, moved, assimilated, acceptance, ancestors)._replace(displacement=displaced)
+        return settled(Stepped(moved, info), population.trace)
 
     def settled(stepped: Stepped, before: Trace) -> Stepped:
         population, info = stepped
@@ -292,7 +298,7 @@ def infer(
     *,
     particles: int = 75,
     seed: int = 0,
-    sweeps: int = 1,
+    sweeps: int | None = None,
     share: float = 0.5,
     screen: bool = True,
     scene: Any = None,
@@ -306,7 +312,8 @@ def infer(
         recording: a `bcppl.recordings.Recording`.
         particles: N.
         seed: same seed, same beliefs.
-        sweeps: moves of every particle after each measurement.
+        sweeps: moves of every particle after each measurement; by default until the part's poses have left
+            where they were, by `DISPLACED` variances along each axis, and at most `MOST_SWEEPS`.
         share: particles are resampled below this effective sample size, as a share of N.
         screen: whether a cheap likelihood of what is simulated chooses among copies of the particles and
             decides their moves first (`bcppl.inference.filters.screening`), where the model has one.
@@ -319,7 +326,8 @@ def infer(
             device.
     """
     particles = whole_number("SMC is to run {} particles", particles)
-    sweeps = whole_number("SMC is to make {} sweeps", sweeps)
+    if sweeps is not None:
+        sweeps = whole_number("SMC is to make {} sweeps", sweeps)
     share = number_within("particles are to be resampled below a share of {}", share, least=0.0, most=1.0)
     programs = GaussianPrograms()
 
@@ -341,7 +349,8 @@ def infer(
                 return searched_by_climbing(population, model.pose, refitted, independent_proposal)
         return searched(population, independent_proposal)
 
-    step = guided(gaussian, programs, moves, sweeps=sweeps, share=share, screen=screen, search=search)
+    times = sweeps or until(displacement=DISPLACED, of=(model.pose,), most=MOST_SWEEPS)
+    step = guided(gaussian, programs, moves, sweeps=times, share=share, screen=screen, search=search)
     return smc(
         model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start, device=device
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -41,15 +42,26 @@ class Until:
     distinct: int | None
     displacement: float | None
     most: int
+    of: tuple[str, ...] = ()
 
     def reached(self, start: Population, now: Population) -> bool:
         """Whether the criteria hold for a population that began at `start`."""
         if self.distinct is not None and distinct(now) < min(self.distinct, len(now)):
             return False
-        return self.displacement is None or bool((displacement(start, now) >= self.displacement).all())
+        return self.displacement is None or bool((self.displaced(start, now) >= self.displacement).all())
+
+    def displaced(self, start: Population, now: Population) -> Tensor:
+        """The displacement (K,) on each axis that counts, as of `displacement`."""
+        return displacement(start, now, self.of)
 
 
-def until(*, distinct: int | None = None, displacement: float | None = None, most: int = 50) -> Until:
+def until(
+    *,
+    distinct: int | None = None,
+    displacement: float | None = None,
+    of: Sequence[str] = (),
+    most: int = 50,
+) -> Until:
     """Sweeps until the particles differ, or have left where they began, or both.
 
     A particle that had a stopping time of its own would be biased: a chain that is observed just after it
@@ -65,6 +77,7 @@ def until(*, distinct: int | None = None, displacement: float | None = None, mos
         displacement: the weighted mean squared displacement since the start that every axis of every
             continuous latent value shall reach, as a share of its variance in the population. It is 2 for
             independent particles, and 0.5 where the correlation with the start is about 0.75.
+        of: the addresses of the latent values whose displacement counts; all unless given.
         most: the largest number of sweeps.
 
     Raises:
@@ -77,7 +90,7 @@ def until(*, distinct: int | None = None, displacement: float | None = None, mos
     if displacement is not None:
         what = "until is to wait for a displacement of {} variances"
         displacement = number_within(what, displacement, above=0.0, below=2.0)
-    return Until(distinct, displacement, whole_number("until may make {} sweeps at most", most))
+    return Until(distinct, displacement, whole_number("until may make {} sweeps at most", most), tuple(of))
 
 
 def distinct(population: Population) -> int:
@@ -85,8 +98,10 @@ def distinct(population: Population) -> int:
     return population.distinct
 
 
-def displacement(start: Population, now: Population) -> Tensor:
+def displacement(start: Population, now: Population, of: Collection[str] = ()) -> Tensor:
     """Weighted mean squared displacement (K,) on each axis, as a share of the axis's variance now.
+
+    All latent values count, unless some are named.
 
     Axes are the free axes of poses, in the tangent space at their mean, and the coordinates of other
     continuous latent values. An axis without variance has no displacement: 0.
@@ -94,7 +109,7 @@ def displacement(start: Population, now: Population) -> Tensor:
     weights = normalised(now.log_weights)
     shares = [torch.empty(0, dtype=torch.float64)]
     for address in now.trace.choices:
-        if now.trace.distributions[address].support.is_discrete:
+        if now.trace.distributions[address].support.is_discrete or (of and address not in of):
             continue
         step, place = _coordinates(start, now, address)
         variance = weights @ (place - weights @ place).square()
@@ -140,7 +155,7 @@ def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int
     acceptance = float(torch.cat(shares).mean()) if shares else float("nan")
     if not isinstance(sweeps, Until) or sweeps.displacement is None:
         return Moved(population, acceptance)
-    return Moved(population, acceptance, float(displacement(start, population).min()))
+    return Moved(population, acceptance, float(sweeps.displaced(start, population).min()))
 
 
 def _sweep(population: Population, kernel: Kernel, target: Target) -> tuple[Population, Tensor]:

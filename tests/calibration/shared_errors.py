@@ -25,6 +25,7 @@ from bcppl.distributions.episodes import (
     LinearError,
     LinearErrors,
 )
+from bcppl.distributions.episodes.branches import OF_CONTACT
 from bcppl.distributions.episodes.displaced import lines_at
 from bcppl.distributions.episodes.rows import (
     COLUMNS,
@@ -270,8 +271,11 @@ def rank(bench: Bench, seed: int, profile: BenchProfile = STILL, solids: bool = 
     site = bench.site(pose, rows)
     branches = site.branches(rows)
     pick = torch.multinomial(torch.from_numpy(branches.weights), 1)[:, 0].numpy()
-    mean = torch.from_numpy(branches.mean)[range(DRAWS), pick]
-    values, axes = torch.linalg.eigh(torch.from_numpy(branches.covariance)[range(DRAWS), pick])
+    shared = slice(0, -OF_CONTACT)
+    mean = torch.from_numpy(branches.mean[..., shared])[range(DRAWS), pick]
+    values, axes = torch.linalg.eigh(
+        torch.from_numpy(branches.covariance[..., shared, shared])[range(DRAWS), pick]
+    )
     standard = torch.randn(*mean.shape, 1, dtype=torch.float64)
     own = mean + ((axes * values.clamp(min=0.0).sqrt()[:, None]) @ standard)[..., 0]
     hypotheses = [site._every[k] for k in branches.which[range(DRAWS), pick]]

@@ -26,9 +26,7 @@ _FRICTION = 0.5  # a peg that slides moves across its force by so much more than
 _ASKEW = 0.3  # of an acceleration may be felt in any direction: the tool turns, and its mass lies elsewhere
 _SMOOTH = 0.01  # s to either side of a stamp, over which velocity and acceleration are estimated
 _AMID = 0.05  # s to either side of a stamp without contact, over which its pose is
-# s without contact that end an episode. Where a peg comes to rest or begins to slide another begins, and in
-# each cell: an episode is an outlier as a whole.
-_BREAK = 0.05
+_BREAK = 0.05  # s without contact that end one
 
 
 class Rows(NamedTuple):
@@ -42,6 +40,7 @@ class Rows(NamedTuple):
         force: (R,) N.
         time: (R,) s.
         episode: (R,) the number of the contact, at rest or sliding, within a cell; -1 without contact.
+        continues: (R,) 1 where the contact, at rest or sliding as before, is that of the episode before.
         wrench: (R, 6) on the peg, in its frame, N and N m.
         earlier: (R, K, 7) where the peg was, by each of the extractor's delays before.
     """
@@ -53,6 +52,7 @@ class Rows(NamedTuple):
     force: Array
     time: Array
     episode: Array
+    continues: Array
     wrench: Array
     earlier: Array
 
@@ -71,6 +71,15 @@ class _Stamps(NamedTuple):
     felt: Array
     force: Array
     pace: Array
+
+
+class _Group(NamedTuple):
+    """The stamps of a row."""
+
+    stamps: slice
+    felt: float
+    episode: int = -1
+    continues: bool = False
 
 
 @dataclass
@@ -92,6 +101,7 @@ class EpisodeExtractor:
     _last_contact: float = -math.inf
     _begins: bool = True  # a cell, and so an episode
     _moving: bool = False
+    _continues: bool = False
     _last_free: tuple[float, Array] | None = None
 
     @property
@@ -123,25 +133,25 @@ class EpisodeExtractor:
         felt, speed, pace = self._decided(time, pose, wrench[:, :3])
         size = np.linalg.norm(wrench[:, :3], axis=1)
         seen = _Stamps(time, pose, felt, size, pace)
-        groups: list[tuple[slice, float, int]] = []
+        groups: list[_Group] = []
         begin = int(np.searchsorted(time, self._done, side="right"))
         end = int(np.searchsorted(time, until, side="right"))
         k = begin
         while k < end:
             if felt[k] == 1.0:
                 stop = self._contact_row(k, end, seen)
-                groups.append((slice(k, stop), 1.0, self._episode))
+                groups.append(_Group(slice(k, stop), 1.0, self._episode, self._continues))
                 k = stop
                 continue
             if felt[k] == 0.0 and self._is_new(k, time, pose, felt):
-                groups.append((slice(k, k + 1), 0.0, -1))
+                groups.append(_Group(slice(k, k + 1), 0.0))
                 self._last_free = time[k], pose[k, :3]
             k += 1
         self._done = float(time[end - 1]) if end > begin else self._done
         self._begins = True
         return self._with_free(_rows(groups, time, pose, size, speed, wrench, self.delays), groups, seen)
 
-    def _with_free(self, rows: Rows, groups: list[tuple[slice, float, int]], seen: _Stamps) -> Rows:
+    def _with_free(self, rows: Rows, groups: list[_Group], seen: _Stamps) -> Rows:
         """The rows, those amid free motion by parabolas through the stamps on either side.
 
         There the peg is free before and after: how late the wrench is does not matter.
@@ -150,7 +160,7 @@ class EpisodeExtractor:
         free = np.flatnonzero(rows.felt == 0.0)
         if len(seen.time) < width or not len(free):
             return rows
-        middle = np.array([groups[k][0].start for k in free])
+        middle = np.array([groups[k].stamps.start for k in free])
         first, last = middle - self._amid, middle + self._amid
         inside = (first >= 0) & (last < len(seen.time))
         first, last = np.where(inside, first, 0), np.where(inside, last, 0)
@@ -171,7 +181,6 @@ class EpisodeExtractor:
         broken = now - self._last_contact > max(_BREAK, 1.5 * self.step) or (seen.felt[between] == 0.0).any()
         if broken:
             self._onset = now
-        broken |= self._begins
         longest = min(LONGEST, max(SHORTEST, _GROWTH * (now - self._onset)))
         stop = first + 1
         while stop < end and seen.felt[stop] == 1.0 and seen.time[stop] - now < longest - 1e-6:
@@ -182,8 +191,9 @@ class EpisodeExtractor:
                 break
             stop += 1
         moving = seen.pace[first:stop].mean() > (_RESTING if self._moving else _SLIDING)
-        if broken or moving != self._moving:
-            self._episode += 1
+        other = broken or moving != self._moving
+        if other or self._begins:
+            self._episode, self._continues = self._episode + 1, not other
         self._moving, self._last_contact, self._begins = moving, seen.time[stop - 1], False
         return stop
 
@@ -243,7 +253,7 @@ class EpisodeExtractor:
 
 
 def _rows(
-    groups: list[tuple[slice, float, int]],
+    groups: list[_Group],
     time: Array,
     pose: Array,
     size: Array,
@@ -251,7 +261,7 @@ def _rows(
     wrench: Array,
     delays: tuple[float, ...],
 ) -> Rows:
-    slices = [own for own, _, _ in groups]
+    slices = [group.stamps for group in groups]
 
     def averaged(values: Array) -> Array:
         each = [values[own].mean(axis=0) for own in slices]
@@ -267,12 +277,13 @@ def _rows(
         place[..., 3:] /= np.linalg.norm(place[..., 3:], axis=-1, keepdims=True)
     return Rows(
         mean,
-        np.array([felt for _, felt, _ in groups]),
+        np.array([group.felt for group in groups]),
         np.array([own.stop - own.start for own in slices], dtype=np.float64),
         averaged(speed),
         averaged(size),
         averaged(time),
-        np.array([episode for *_, episode in groups], dtype=np.float64),
+        np.array([group.episode for group in groups], dtype=np.float64),
+        np.array([group.continues for group in groups], dtype=np.float64),
         averaged(wrench),
         earlier,
     )

@@ -1,14 +1,14 @@
 """The filter over a probe's episodes where nothing is learned of shared errors, for all particles by torch.
 
-Without parameters an episode's errors are correlated alike in all particles, and its hypotheses never
-multiply: what the compiled filter (`bcppl.distributions.episodes.switching_filter`) does particle by particle
-is a few operations on all of them. On a GPU it is evaluated so, where the particles are.
+Without these an episode's errors are correlated alike in all particles, and its hypotheses never multiply:
+what the compiled filter (`bcppl.distributions.episodes.switching_filter`) does particle by particle is a few
+operations on all of them. On a GPU it is evaluated so, where the particles are.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,22 +17,25 @@ from torch.special import log_ndtr
 
 from bcppl.arrays import Array, Indices
 from bcppl.devices import beside, numbers
-from bcppl.distributions.episodes.branches import Branches, Prior, Segments
-from bcppl.distributions.episodes.switching_filter import CLEAR, FAINT, RUBBING
+from bcppl.distributions.episodes.branches import OF_CONTACT, Branches, Prior, Segments
+from bcppl.distributions.episodes.switching_filter import BETWEEN, CLEAR, FAINT, RUBBING
 
 _FREE = 64  # rows without contact at a time: they take memory
 
 
 @dataclass(frozen=True, eq=False)
 class AlikeBranches:
-    """The H hypotheses of N particles after some rows, on a device; none has parameters.
+    """The H hypotheses of N particles after some rows, on a device; their parameters are the contact's.
 
     Attributes:
         log_weight: (N, H) unnormalised; -inf for one that is dropped.
+        mean, covariance: (N, H, 2) and (N, H, 2, 2) of the parameters.
         squared: (N, H, E) of each episode so far its squared whitened errors, as predicted.
     """
 
     log_weight: Tensor
+    mean: Tensor
+    covariance: Tensor
     squared: Tensor
 
     @property
@@ -54,8 +57,8 @@ class AlikeBranches:
             number=np.full(particles, hypotheses),
             log_weight=log_weight,
             which=np.broadcast_to(np.arange(hypotheses), log_weight.shape).copy(),
-            mean=np.zeros((particles, hypotheses, 0)),
-            covariance=np.zeros((particles, hypotheses, 0, 0)),
+            mean=numbers(self.mean),
+            covariance=numbers(self.covariance),
             event=np.zeros(squared.shape, np.int64),
             squared=squared,
         )
@@ -64,7 +67,8 @@ class AlikeBranches:
 def begun_alike(prior: Prior, pose: Tensor) -> AlikeBranches:
     """The hypotheses of the particles at poses (N, 7) before the first row."""
     log_weight = beside(np.asarray(prior.log_weight), pose).expand(len(pose), -1)
-    return AlikeBranches(log_weight, log_weight.new_zeros(*log_weight.shape, 0))
+    shape, sizes = log_weight.shape, (OF_CONTACT, (OF_CONTACT, OF_CONTACT), 0)
+    return AlikeBranches(log_weight, *(log_weight.new_zeros(*shape, *np.atleast_1d(each)) for each in sizes))
 
 
 def filtered_alike(
@@ -80,6 +84,7 @@ def filtered_alike(
         force: (R,) N.
     """
     log_weight, squared = before.log_weight, [before.squared]
+    mean, covariance = before.mean, before.covariance
     free: list[int] = []
 
     def put(values: Array | Indices) -> Tensor:
@@ -97,19 +102,33 @@ def filtered_alike(
             continue
         log_weight = log_weight + _of_free(distance, free, own, log_in, log_out)[:, of_each]
         free, rows = [], last - first
-        error = distance[:, None, first:last] + sunk[:, first:last]
+        if segments.begins[s]:
+            mean = torch.zeros_like(mean)
+            covariance = torch.diag_embed(put(segments.common)).expand_as(covariance)
+        by = put(np.stack([np.ones(rows), force[first:last]]))
+        error = distance[:, None, first:last] + sunk[:, first:last] + mean @ by
         factor = _lower(segments.factor[:, first:last, :rows])
         white = torch.einsum("hij,nhj->nhi", put(factor), error)
-        square = white.square().sum(dim=2)
-        size = put(segments.log_determinant[:, s] + rows * math.log(2.0 * math.pi))
+        ratio = covariance @ put(segments.known[:, s]) + put(np.eye(OF_CONTACT))
+        later = torch.linalg.solve(ratio, covariance)
+        pull = torch.einsum("hra,nhr->nha", put(segments.white[:, first:last]), white)
+        step = (later @ pull[..., None])[..., 0]
+        square = white.square().sum(dim=2) - (pull * step).sum(dim=2)
+        size = put(segments.log_determinant[:, s] + rows * math.log(2.0 * math.pi)) + ratio.logdet()
         inlier = log_in - 0.5 * (square + size)
         stray = torch.full_like(inlier, log_out - rows * math.log(prior.farthest))
-        log_weight = log_weight + torch.logaddexp(inlier, stray)
+        either = torch.logaddexp(inlier, stray)
+        inside = (inlier - either).exp()[..., None]
+        mean = mean - inside * step
+        inside = inside[..., None]
+        covariance = inside * later + (1.0 - inside) * covariance
+        covariance = covariance + inside * (1.0 - inside) * step[..., None] * step[..., None, :]
+        log_weight = log_weight + either
         faint = log_weight < log_weight.amax(dim=1, keepdim=True) - FAINT
         log_weight = log_weight.masked_fill(faint, -torch.inf)
         squared.append(square[..., None])
     log_weight = log_weight + _of_free(distance, free, own, log_in, log_out)[:, of_each]
-    return replace(before, log_weight=log_weight, squared=torch.cat(squared, dim=2))
+    return AlikeBranches(log_weight, mean, covariance, torch.cat(squared, dim=2))
 
 
 def _of_free(distance: Tensor, rows: list[int], own: Tensor, log_in: float, log_out: float) -> Tensor:
@@ -120,7 +139,7 @@ def _of_free(distance: Tensor, rows: list[int], own: Tensor, log_in: float, log_
         if which.stop - which.start != len(rows[first : first + _FREE]):
             raise AssertionError("rows without contact between two episodes follow one another")
         gap = distance[:, which]
-        score = gap[:, None] / own[:, which]
+        score = gap[:, None] / own[:, which] + BETWEEN
         log_density = -0.5 * score.square() - 0.5 * math.log(2.0 * math.pi)
         positive = torch.logaddexp(log_ndtr(score), math.log(RUBBING) + log_density).clamp(max=0.0)
         either = torch.logaddexp(log_in + positive, torch.full_like(score, log_out))

@@ -9,6 +9,9 @@ import numpy as np
 from bcppl.arrays import Array, Indices
 
 KEPT = 8  # hypotheses of a particle
+# Parameters of the present contact, after those that all touches share: where it is, and by how much its
+# compliance differs. Another contact has others.
+OF_CONTACT = 2
 INLIER, OUTLIER = 0, 1  # what an episode is; plus twice the number of the change before or in it
 
 
@@ -18,20 +21,29 @@ class Segments(NamedTuple):
     Attributes:
         first, last: (S,) the index of a segment's first row, and that after its last.
         contact: (S,) 1 for an episode.
+        begins: (S,) 1 for an episode whose contact is not that of the episode before.
         own: (H, R) of each hypothesis, variances of the errors of rows without contact, m^2.
-        errors: (H, R, E) covariances of a row's error with those of its episode up to it, m^2.
+        common: (H, 2) variances of the parameters of a contact that begins, m^2 and (m/N)^2.
+        errors: (H, R, E) covariances of a row's error with those of its episode up to it, m^2, but for what
+            the parameters of its contact add.
         factor: (H, R, E) their Cholesky factors, with inverted diagonals.
         log_determinant: (H, S) of an episode's covariance.
+        white: (H, R, 2) the gaps' derivatives by the contact's parameters, whitened by the factor.
+        known: (H, S, 2, 2) the information on these in an episode.
         loaded: (R,) by a row of an episode, the share of a change's variances that has come.
     """
 
     first: Indices
     last: Indices
     contact: Indices
+    begins: Indices
     own: Array
+    common: Array
     errors: Array
     factor: Array
     log_determinant: Array
+    white: Array
+    known: Array
     loaded: Array
 
 
@@ -42,7 +54,7 @@ class Prior(NamedTuple):
         log_weight, compliance, scale: (H,) of each hypothesis: its log-probability, the compliance of a
             contact in m/N, and the factor of the shared errors' standard deviations.
         delay: (H,) the place of its delay among those for which gaps are given.
-        mean, variance: (M,) of the parameters.
+        mean, variance: (M,) of the parameters; the last two are those of a contact.
         change_log_probability: (C,) of each change, at an episode: none, then jumps of one or more errors.
         change_variance: (C, M) by each.
         outlier: the probability that an episode, or a row without contact, is one.
@@ -68,7 +80,7 @@ class Branches(NamedTuple):
         number: (N,) how many there are; others are not used.
         log_weight: (N, B) unnormalised: their sum is the likelihood of the rows so far.
         which: (N, B) the hypothesis of the prior.
-        mean: (N, B, M) of the parameters.
+        mean: (N, B, M) of the parameters, those of the present contact last.
         covariance: (N, B, M, M).
         event: (N, B, E) of each episode so far: twice the number of a change, and one more for an outlier.
         squared: (N, B, E) its squared whitened errors, as predicted.

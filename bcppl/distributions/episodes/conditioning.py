@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from bcppl.arrays import Array
-from bcppl.compiled import summed
+from bcppl.compiled import compiled, summed
 
 
 @summed
@@ -27,6 +27,35 @@ def squared_by(covariance: Array, column: Array, product: Array) -> float:
         product[a] = dot(covariance[a], column)
         square += column[a] * product[a]
     return square
+
+
+@compiled
+def begin_contact(mean: Array, covariance: Array, variances: Array) -> None:
+    """Set the last parameters, those of a contact, to ones of which nothing is known but their variances."""
+    for k in range(len(variances)):
+        a = len(mean) - len(variances) + k
+        mean[a] = 0.0
+        covariance[a, :] = 0.0
+        covariance[:, a] = 0.0
+        covariance[a, a] = variances[k]
+
+
+@compiled
+def informed(covariance: Array, known: Array, after: Array) -> float:
+    """Set `after` (2, 2) to the covariance of two parameters when information (2, 2) on them has come.
+
+    Returns:
+        the logarithm of the determinant of the covariance by that of `after`.
+    """
+    a = 1.0 + covariance[0, 0] * known[0, 0] + covariance[0, 1] * known[1, 0]
+    b = covariance[0, 0] * known[0, 1] + covariance[0, 1] * known[1, 1]
+    c = covariance[1, 0] * known[0, 0] + covariance[1, 1] * known[1, 0]
+    d = 1.0 + covariance[1, 0] * known[0, 1] + covariance[1, 1] * known[1, 1]
+    determinant = a * d - b * c
+    for k in range(2):
+        after[0, k] = (d * covariance[0, k] - b * covariance[1, k]) / determinant
+        after[1, k] = (a * covariance[1, k] - c * covariance[0, k]) / determinant
+    return math.log(determinant)
 
 
 @summed

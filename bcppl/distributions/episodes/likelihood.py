@@ -41,32 +41,35 @@ class ContactEpisodes(FilteredEpisodes):
     """Where a held peg was measured to be, and whether it felt the part, over the rows of a window.
 
     A row is the mean of stamps that hardly differ, or one stamp. In an episode, which is an uninterrupted
-    contact, the gap at row i of force F_i is normal with mean -c F_i, and its errors have the covariance
+    contact or, of a longer one, what is in half a second of a probe, the gap at row i of force F_i is normal
+    with mean -c F_i, and its errors have the covariance
 
         (noise_i^2 + (0.2 c F_i)^2) [i = j] + drift^2 exp(-|t_i - t_j| / lasting) + shared^2
         + (varying c)^2 F_i F_j:
 
     noise of the rows, a stationary Ornstein-Uhlenbeck process in time, the unknown geometry, and a compliance
-    that differs from contact to contact by a factor. The compliance c of part and peg is common to a
-    recording and log-normal; all errors but those in c are wider by a common factor with some probability
-    (`prior.NOISES`); both are integrated out by a sum over nodes. So a row adds what it adds whatever
-    the rate, and the product of the windows' likelihoods does not depend on how a probe is cut into them: a
-    row that an earlier window has used is in the value again, marked as given, and the log-likelihood is that
-    of all rows minus that of the given ones.
+    that differs from contact to contact by a factor. The last two are the same in all episodes of a contact.
+    The compliance c of part and peg is common to a recording and log-normal; all errors but those in c are
+    wider by a common factor with some probability (`prior.NOISES`); both are integrated out by a sum over
+    nodes. So a row adds what it adds whatever the rate, and the product of the windows' likelihoods does not
+    depend on how a probe is cut into them: a row that an earlier window has used is in the value again,
+    marked as given, and the log-likelihood is that of all rows minus that of the given ones.
 
     What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap and
     is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear over what that may
     be (`bcppl.distributions.episodes.regressed`), given the rows until a few before (`rows.last_end`).
 
     A row without contact has the probability that a gap about d is positive, as in `ContactManifold`, or
-    about zero: a peg may rub along the part with a force that is not felt. An episode is an outlier as a
-    whole. Where a torque is one that no single contact exerts, an episode has besides the probability that
-    the peg is not free to turn against it (`bcppl.distributions.episodes.couples`).
+    about zero: a peg may rub along the part with a force that is not felt. Between two walls the gap seems
+    less than it is, which the probability allows for. An episode is an outlier as a whole. Where a torque is
+    one that no single contact exerts, an episode has besides the probability that the peg is not free to turn
+    against it (`bcppl.distributions.episodes.couples`).
 
     The event is (T, COLUMNS): world_from_peg; 1 with contact, 0 without, NaN for a row that is not used;
     noise (m) of the row; force (N); time (s); the number of the episode; 1 for a given row; the wrench on the
     peg (N and N m, in its frame); the rotation vector (rad, there) that contacts prevent (`rows.TURN`),
-    0 for none; twists (m and rad, in its frame) to where it was a little earlier (`rows.EARLIER`). Where
+    0 for none; 1 for an episode whose contact is that of the episode before (`rows.CONTINUES`); twists (m and
+    rad, in its frame) to where it was a little earlier (`rows.EARLIER`). Where
     `motion` predicts the rows there are no forces and times: these are NaN, and the rows are distributed as
     in `ContactManifold`.
 
@@ -240,7 +243,8 @@ class ContactEpisodes(FilteredEpisodes):
         delay = torch.from_numpy(self._prior(0).delay[branches.which])  # (N, B)
         particle = torch.arange(len(delay))[:, None]
         each = moved[particle, delay]
-        each = each + torch.einsum("nbrm,nbm->nbr", columns[particle, delay], torch.from_numpy(branches.mean))
+        shared = torch.from_numpy(branches.mean[..., : columns.shape[-1]])
+        each = each + torch.einsum("nbrm,nbm->nbr", columns[particle, delay], shared)
         return (torch.from_numpy(branches.weights)[..., None] * each).sum(dim=1)
 
     def _quadratic_of(self, rows: Tensor) -> Quadratic:

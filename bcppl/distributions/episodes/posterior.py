@@ -8,18 +8,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bcppl.distributions.episodes.branches import Branches
+from bcppl.distributions.episodes.branches import OF_CONTACT, Branches
 from bcppl.distributions.episodes.linear_errors import LinearErrors
 
 
 def drawn(branches: Branches, draws: int) -> Tensor:
-    """Parameters (N, draws, M) from their posterior, the same at each call."""
+    """Parameters (N, draws, M) that all touches share from their posterior, the same at each call."""
     generator = torch.Generator().manual_seed(0)
     weights = torch.from_numpy(branches.weights)
     which = torch.multinomial(weights, draws, replacement=True, generator=generator)
     particle = torch.arange(len(weights))[:, None]
-    mean = torch.from_numpy(branches.mean)[particle, which]
-    variances, axes = torch.linalg.eigh(torch.from_numpy(branches.covariance)[particle, which])
+    shared = slice(0, -OF_CONTACT)
+    mean = torch.from_numpy(branches.mean[..., shared])[particle, which]
+    covariance = torch.from_numpy(branches.covariance[..., shared, shared])[particle, which]
+    variances, axes = torch.linalg.eigh(covariance)
     standard = torch.randn(*mean.shape, 1, generator=generator, dtype=torch.float64)
     # The symmetric root: that of the axes alone would depend on their signs, which are those of rounding.
     root = (axes * variances.clamp(min=0.0).sqrt()[..., None, :]) @ axes.transpose(-1, -2)
@@ -27,9 +29,10 @@ def drawn(branches: Branches, draws: int) -> Tensor:
 
 
 def moments(branches: Branches) -> tuple[Tensor, Tensor]:
-    """Mean (N, M) and covariance (N, M, M) of the parameters."""
-    weights, means = torch.from_numpy(branches.weights)[:, None], torch.from_numpy(branches.mean)
-    covariances = torch.from_numpy(branches.covariance)
+    """Mean (N, M) and covariance (N, M, M) of the parameters that all touches share."""
+    shared = slice(0, -OF_CONTACT)
+    weights, means = torch.from_numpy(branches.weights)[:, None], torch.from_numpy(branches.mean[..., shared])
+    covariances = torch.from_numpy(branches.covariance[..., shared, shared])
     mean = weights @ means  # (N, 1, M)
     away = weights.transpose(1, 2).sqrt() * (means - mean)
     within = (weights @ covariances.flatten(2)).view_as(covariances[:, 0])

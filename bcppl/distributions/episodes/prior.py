@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from bcppl.distributions.episodes.branches import Prior
+from bcppl.distributions.episodes.branches import OF_CONTACT, Prior
 from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.episodes.row_errors import Hypothesis
 from bcppl.distributions.manifold import FARTHEST
@@ -52,16 +52,16 @@ def with_delays(hypotheses: tuple[Hypothesis, ...], bench: LinearErrors) -> tupl
 @lru_cache(maxsize=64)
 def prior_of(bench: LinearErrors, hypotheses: tuple[Hypothesis, ...], outlier: float, pose: int) -> Prior:
     """The prior of hypotheses with delays, with so many parameters of the pose before the shared errors'."""
-    own, changes = np.zeros(pose), bench.changes
+    own, none, changes = np.zeros(pose), np.zeros(OF_CONTACT), bench.changes
     log_weight, compliance, _, scale, delay = np.array(hypotheses).T.copy()
-    changed = np.array([np.concatenate([own, c.variances.numpy()]) for c in changes])
+    changed = np.array([np.concatenate([own, c.variances.numpy(), none]) for c in changes])
     return Prior(
         log_weight=log_weight,
         compliance=compliance,
         scale=scale,
         delay=np.searchsorted(list(bench.delays), delay),
-        mean=np.concatenate([own, bench.means.numpy()]),
-        variance=np.concatenate([WIDE.numpy()[:pose] ** 2, bench.variances.numpy()]),
+        mean=np.concatenate([own, bench.means.numpy(), none]),
+        variance=np.concatenate([WIDE.numpy()[:pose] ** 2, bench.variances.numpy(), none]),
         change_log_probability=np.array([math.log(c.probability) for c in changes]),
         change_variance=changed,
         outlier=outlier,

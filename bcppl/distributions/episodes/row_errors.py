@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bcppl.arrays import Array, Indices
+from bcppl.arrays import Array
 from bcppl.compiled import compiled
 from bcppl.devices import on_host
-from bcppl.distributions.episodes.branches import Segments
-from bcppl.distributions.episodes.conditioning import factorise
-from bcppl.distributions.episodes.rows import EPISODE, FELT, FORCE, NOISE, TIME
+from bcppl.distributions.episodes.branches import OF_CONTACT, Segments
+from bcppl.distributions.episodes.conditioning import dot, factorise, whiten
+from bcppl.distributions.episodes.rows import CONTINUES, EPISODE, FELT, FORCE, NOISE, TIME
 
 
 class Hypothesis(NamedTuple):
@@ -48,15 +48,15 @@ class RowErrors(NamedTuple):
 
 def segments_of(rows: Tensor, errors: RowErrors, hypotheses: tuple[Hypothesis, ...]) -> Segments:
     """The segments of rows (R, COLUMNS), with their errors under each hypothesis."""
-    columns = rows[:, [FELT, NOISE, FORCE, TIME, EPISODE]].contiguous()
+    columns = rows[:, [FELT, NOISE, FORCE, TIME, EPISODE, CONTINUES]].contiguous()
     with on_host():
         return _segments(columns.numpy().tobytes(), errors, hypotheses)
 
 
 @lru_cache(maxsize=64)
 def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, ...]) -> Segments:
-    felt, noise, force, time, episode = (
-        torch.frombuffer(bytearray(columns), dtype=torch.float64).view(-1, 5).T
+    felt, noise, force, time, episode, continues = (
+        torch.frombuffer(bytearray(columns), dtype=torch.float64).view(-1, 6).T
     )
     contact = felt == 1.0
     begins = torch.ones(len(felt), dtype=torch.bool)
@@ -77,30 +77,46 @@ def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, .
             most = force[begin:end].clamp(min=1e-3).cummax(dim=0).values
             loaded[begin:end] = most / most[-1]
             apart = (time[begin:end, None] - time[begin:end]).abs()
-            lasting = errors.shared**2 + errors.drift**2 * torch.exp(-apart / errors.lasting)
-            both = errors.varying**2 * sunk[:, begin:end, None] * sunk[:, None, begin:end]
-            both = both + scale[:, None, None] ** 2 * lasting + torch.diag_embed(own[:, begin:end])
+            lasting = errors.drift**2 * torch.exp(-apart / errors.lasting)
+            both = scale[:, None, None] ** 2 * lasting + torch.diag_embed(own[:, begin:end])
             joint[:, begin:end, : end - begin] = both
-    arrays = (first, last, contact[first].to(torch.int64), alone, joint, loaded)
-    return _with_factors(*(np.ascontiguousarray(each.numpy()) for each in arrays))
-
-
-def _with_factors(
-    first: Indices, last: Indices, contact: Indices, own: Array, errors: Array, loaded: Array
-) -> Segments:
-    factor, log_determinant = np.zeros_like(errors), np.zeros((len(errors), len(first)))
-    set_factors(first, last, contact, errors, factor, log_determinant)
-    return Segments(first, last, contact, own, errors, factor, log_determinant, loaded)
+    common = torch.stack([(scale * errors.shared) ** 2, (errors.varying * compliance) ** 2], dim=1)
+    begins = contact[first] & (continues[first] != 1.0)
+    segments = Segments(
+        first=first.numpy(),
+        last=last.numpy(),
+        contact=contact[first].to(torch.int64).numpy(),
+        begins=begins.to(torch.int64).numpy(),
+        own=np.ascontiguousarray(alone.numpy()),
+        common=np.ascontiguousarray(common.numpy()),
+        errors=joint.numpy(),
+        factor=np.zeros(joint.shape),
+        log_determinant=np.zeros((len(joint), len(first))),
+        white=np.zeros((*joint.shape[:2], OF_CONTACT)),
+        known=np.zeros((len(joint), len(first), OF_CONTACT, OF_CONTACT)),
+        loaded=loaded.numpy(),
+    )
+    _set_factors(segments, force.numpy().copy())
+    return segments
 
 
 @compiled
-def set_factors(
-    first: Indices, last: Indices, contact: Indices, errors: Array, factor: Array, log_determinant: Array
-) -> None:
-    """Set the factors (H, R, E) of episodes' covariances, as of `factorise`, and log-determinants (H, S)."""
-    none, never = np.zeros((errors.shape[2], 0)), np.zeros(0)
-    for h in range(len(errors)):
-        for s in range(len(first)):
-            if contact[s]:
-                own, to = errors[h, first[s] : last[s]], factor[h, first[s] : last[s]]
-                log_determinant[h, s] = factorise(own, none, never, never, to)
+def _set_factors(segments: Segments, force: Array) -> None:
+    """Set the factors of episodes' covariances, as of `factorise`, and what these make of the contact's."""
+    rows = segments.errors.shape[2]
+    none, never = np.zeros((rows, 0)), np.zeros(0)
+    white = np.zeros((OF_CONTACT, rows))
+    for h in range(len(segments.errors)):
+        for s in range(len(segments.first)):
+            if not segments.contact[s]:
+                continue
+            first, last = segments.first[s], segments.last[s]
+            factor, count = segments.factor[h, first:last], last - first
+            own = segments.errors[h, first:last]
+            segments.log_determinant[h, s] = factorise(own, none, never, never, factor)
+            whiten(factor, np.ones(count), white[0, :count])
+            whiten(factor, force[first:last], white[1, :count])
+            for a in range(OF_CONTACT):
+                segments.white[h, first:last, a] = white[a, :count]
+                for b in range(OF_CONTACT):
+                    segments.known[h, s, a, b] = dot(white[a, :count], white[b, :count])

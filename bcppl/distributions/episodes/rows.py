@@ -10,10 +10,12 @@ from torch import Tensor
 # that lead to where the peg was so many SECONDS before, m and rad: the wrench may be late by as much. WITHIN
 # is the twist by which that differs within an interval of the delay (`late`), 0 for none. TURN is the
 # rotation vector (rad, in its frame) that a torque which no single contact exerts stands against, 0 for none.
+# CONTINUES is 1 for rows of an episode whose contact is that of the episode before.
 FELT, NOISE, FORCE, TIME, EPISODE, GIVEN = range(7, 13)
 WRENCH, WITHIN, TURN = slice(13, 19), slice(19, 25), slice(25, 28)
+CONTINUES = 28
 SECONDS = (0.006, 0.024, 0.048, 0.096)  # clocks that agree are common
-EARLIER = slice(28, 28 + 6 * len(SECONDS))
+EARLIER = slice(29, 29 + 6 * len(SECONDS))
 COLUMNS = EARLIER.stop
 _TOGETHER = 4  # rows of which the gaps are linear over the same
 

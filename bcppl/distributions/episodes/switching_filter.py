@@ -1,7 +1,8 @@
 """A Rao-Blackwellised filter over the episodes of a probe: Gaussian errors that all touches share, and jumps.
 
 The gap at a row is the measured one plus a linear function of M parameters, which are normal a priori, plus
-the row's own errors, which are normal and correlated within an episode. So given what is discrete the
+the row's own errors, which are normal and correlated within an episode. Two of the parameters are of the
+present contact and begin again with another: an offset, and its compliance. So given what is discrete the
 parameters are normal at any time and are integrated out by a Kalman filter, one for each hypothesis: of the
 contact's compliance and the noise's scale from the beginning, of a change of some parameters in an episode,
 or of an outlier, where an episode surprises. A change is a Wiener process that runs while a contact is loaded
@@ -26,8 +27,25 @@ from torch import Tensor
 from bcppl.arrays import Array
 from bcppl.compiled import compiled, summed
 from bcppl.devices import numbers
-from bcppl.distributions.episodes.branches import INLIER, KEPT, OUTLIER, Branches, Prior, Segments
-from bcppl.distributions.episodes.conditioning import condition, dot, factorise, set_joint, squared_by, whiten
+from bcppl.distributions.episodes.branches import (
+    INLIER,
+    KEPT,
+    OF_CONTACT,
+    OUTLIER,
+    Branches,
+    Prior,
+    Segments,
+)
+from bcppl.distributions.episodes.conditioning import (
+    begin_contact,
+    condition,
+    dot,
+    factorise,
+    informed,
+    set_joint,
+    squared_by,
+    whiten,
+)
 from bcppl.distributions.episodes.displaced import Lines
 from bcppl.threads import parallel_sum, thread_count
 
@@ -35,6 +53,9 @@ from bcppl.threads import parallel_sum, thread_count
 # delay of the wrench was 12 below another, and in the end 46 above it.
 FAINT = 25.0
 _UNLIKELY = 10.0  # the same before an episode, of a hypothesis with a change
+# Standard deviations by which the gap of a peg between two walls seems less: it is the least of two that err
+# in opposite directions, so by the mean size of a normal error.
+BETWEEN = math.sqrt(2.0 / math.pi)
 RUBBING = 1.0  # standard deviations of the gap by which a command may be blocked without being felt
 CLEAR = 0.02  # m: farther from the part than this a peg without contact says nothing
 _LOG_TWO_PI = math.log(2.0 * math.pi)
@@ -121,7 +142,8 @@ def _log_ndtr(z: float) -> float:
 def _log_free(score: float) -> float:
     """Log-probability of a row without contact whose gap is so many standard deviations.
 
-    A peg may rub along the part with a force that is not felt, and is then at its surface.
+    A peg may rub along the part with a force that is not felt, and is then at its surface. The score is that
+    of a peg between two walls: `BETWEEN` is added.
     """
     log_density = -0.5 * score * score - 0.5 * _LOG_TWO_PI
     return min(0.0, _log_sum(_log_ndtr(score), math.log(RUBBING) + log_density))
@@ -135,8 +157,12 @@ def _log_sum(a: float, b: float) -> float:
 
 @summed
 def _line(gaps: _Gaps, n: int, delay: int, row: int, column: Array) -> float:
-    """Set `column` (P + M,) to the derivatives of a gap; returns it without errors, with a delay."""
+    """Set `column` (P + M + 2,) to the derivatives of a gap; returns it without errors, with a delay.
+
+    Those by the parameters of a contact are 0.
+    """
     distance, own = gaps.distance[n, row], gaps.gradient.shape[2]
+    column[own + gaps.offset.shape[2] :] = 0.0
     for a in range(own):
         column[a] = gaps.gradient[n, row, a]
     for m in range(gaps.offset.shape[2]):
@@ -180,8 +206,10 @@ def _filter(
     delays = len(gaps.late)
     distance, columns = np.empty((delays, longest)), np.empty((delays, longest, parameters))
     filled = np.empty(delays, np.bool_)
-    # Without parameters an episode's errors are correlated alike in all particles.
-    alike = parameters == 0 and gaps.residual.shape[2] == 0
+    # Without shared errors an episode's errors are correlated alike in all particles.
+    alike = parameters == OF_CONTACT and gaps.residual.shape[2] == 0
+    later_mean, later_covariance = np.empty((size, OF_CONTACT)), np.empty((size, OF_CONTACT, OF_CONTACT))
+    moved = np.empty(OF_CONTACT)
     pull, gain, changed = np.empty(parameters), np.empty((longest, parameters)), np.empty(parameters)
     old_which, old_event, old_squared = which[0].copy(), event[0].copy(), squared[0].copy()
     old_mean, old_covariance = mean[0].copy(), covariance[0].copy()
@@ -212,13 +240,13 @@ def _filter(
                     variance += dot(gaps.residual[n, first], gaps.residual[n, first])
                     root = math.sqrt(variance)
                     # Hypotheses that differ in the compliance alone are the same without contact.
-                    if gap / root != score:
-                        score = gap / root
+                    if gap / root + BETWEEN != score:
+                        score = gap / root + BETWEEN
                         positive = _log_free(score)
                         either = _log_sum(log_in + positive, log_out)
                     inside = log_in + positive
                     log_weight[n, b] += either
-                    if parameters and inside > log_out and positive < 0.0:
+                    if not alike and inside > log_out and positive < 0.0:
                         density = math.exp(-0.5 * score**2 - 0.5 * _LOG_TWO_PI - positive)
                         hazard = density * (1.0 - RUBBING * score)
                         bend = density * (score + RUBBING - RUBBING * score**2) + hazard**2
@@ -237,12 +265,15 @@ def _filter(
             for b in range(number[n]):
                 h = which[n, b]
                 delay = prior.delay[h]
+                if segments.begins[s] == 1:
+                    begin_contact(mean[n, b], covariance[n, b], segments.common[h])
                 slope, own_pull, joint = columns[delay, :rows], pulls[b, :rows], joints[b]
                 for i in range(rows):
                     share = gaps.trust[n, delay, first + i] if gaps.trust.size else 1.0
                     if not filled[delay]:
                         distance[delay, i] = _line(gaps, n, delay, first + i, slope[i])
                         slope[i] *= share
+                        slope[i, parameters - 2], slope[i, parameters - 1] = 1.0, gaps.force[first + i]
                     error[b, i] = dot(slope[i], mean[n, b]) + share * (
                         distance[delay, i] + prior.compliance[h] * gaps.force[first + i]
                     )
@@ -258,6 +289,11 @@ def _filter(
                     if alike:
                         log_determinant = segments.log_determinant[h, s]
                         square[found] = whiten(segments.factor[h, first:last], error[b, :rows], white)
+                        later = later_covariance[b]
+                        log_determinant += informed(covariance[n, b], segments.known[h, s], later)
+                        for a in range(OF_CONTACT):
+                            pull[a] = dot(segments.white[h, first:last, a], white[:rows])
+                        square[found] -= squared_by(later, pull, moved)
                     else:
                         log_determinant = factorise(joint[:rows], slope, changed, loaded, factor)
                         square[found] = whiten(factor, error[b, :rows], white)
@@ -266,8 +302,20 @@ def _filter(
                     outlier = log_weight[n, b] + stray
                     source[found], source[found + 1] = b, b
                     kind[found], kind[found + 1] = 2 * change + INLIER, 2 * change + OUTLIER
+                    if alike:
+                        # Nothing differs between the two but the contact's parameters: their moments.
+                        weight[found] = _log_sum(inlier, outlier)
+                        inside = math.exp(inlier - weight[found])
+                        for a in range(OF_CONTACT):
+                            later_mean[b, a] = mean[n, b, a] - inside * moved[a]
+                            for c in range(OF_CONTACT):
+                                spread = inside * (1.0 - inside) * moved[a] * moved[c]
+                                within = inside * later[a, c] + (1.0 - inside) * covariance[n, b, a, c]
+                                later[a, c] = within + spread
+                        found += 1
+                        break
                     surprise = square[found] - rows > _SURPRISING * math.sqrt(2.0 * rows) + 1.0
-                    if change == 0 and (parameters == 0 or not surprise):
+                    if change == 0 and not surprise:
                         # Nothing differs between the two but a state that is hardly ever the outlier's.
                         weight[found] = _log_sum(inlier, outlier)
                         found += 1
@@ -306,7 +354,9 @@ def _filter(
                     changed[a] = prior.change_variance[change, a] * prior.scale[h] ** 2
                 log_weight[n, left], which[n, left] = weight[c], h
                 mean[n, left], covariance[n, left] = old_mean[b], old_covariance[b]
-                if parameters and kind[c] % 2 == INLIER:
+                if alike:
+                    mean[n, left], covariance[n, left] = later_mean[b], later_covariance[b]
+                elif kind[c] % 2 == INLIER:
                     slope = columns[prior.delay[h], :rows]
                     factorise(joints[b, :rows], slope, changed, loaded, factor)
                     whiten(factor, error[b, :rows], white)

@@ -19,18 +19,19 @@ from bcppl.distributions.episodes import ContactEpisodes, Hypothesis, LinearErro
 from bcppl.distributions.episodes.branches import begun
 from bcppl.distributions.episodes.posterior import moments
 from bcppl.distributions.episodes.prior import prior_of, with_delays
-from bcppl.distributions.episodes.rows import EPISODE, FELT, TIME, WRENCH, new_rows
+from bcppl.distributions.episodes.rows import EPISODE, FELT, FORCE, TIME, WRENCH, new_rows
 from bcppl.distributions.manifold import MeasuresGap
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE, PROBABILITY, check_parameters, within
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
-from bcppl.geometry.holes import Fit, Hole, fit_in, hole_of
+from bcppl.geometry.holes import hole_of
 from bcppl.geometry.parts import Part, with_tip_at
 from bcppl.geometry.turns import turns_freely
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.capabilities import Approximated, InHole, PegRows
 from bcppl.sensors.likelihoods.bench_profiles import BenchProfile, profile_named
+from bcppl.sensors.likelihoods.hole_entry import HoleEntry
 from bcppl.sensors.likelihoods.probe_rows import (
     ProbeRows,
     RememberedGaps,
@@ -48,7 +49,6 @@ PRESSED = 4.0  # N: of such a probe's contacts
 GEOMETRY = 0.00001  # m: by which part and peg differ from their models where they touch
 _NEAR = 0.02  # m: a window in which the peg stays farther away carries no information
 _MOVED = 0.001  # m: a shorter displacement has no direction
-_DEEP = 0.001  # m: a peg does not lie deeper in the material
 
 
 @dataclass(frozen=True)
@@ -270,47 +270,28 @@ class ContactProbe:
         return way / way.norm() if float(way.norm()) > _MOVED else None
 
     @cached_property
-    def _hole(self) -> tuple[Hole, Fit] | None:
-        """The part's hole, and how the peg fits; None without one, with several, or for another peg."""
+    def _entry(self) -> HoleEntry | None:
+        """How the peg goes into the part's hole; None without one, with several, or for another peg."""
         try:
-            hole = hole_of(self.gap.part)
-            return hole, fit_in(hole, self.peg)
+            return HoleEntry(self.gap, self.peg, hole_of(self.gap.part))
         except InputError:
             return None
 
     def in_hole(self, measurements: Sequence[Approximated], part: Tensor) -> InHole:
-        """Poses near some (M, 7) that have the hole where the peg would lie deep in the material.
-
-        A hole with a tenth of a millimetre to spare is a needle: nothing leads to it from millimetres away.
-        """
+        """Poses near some (M, 7) that have the hole where the peg would lie deep in the material."""
         rows = torch.cat([new_rows(value) for _, _, value in measurements])
         rows = rows[rows[:, FELT] == 0.0]  # the peg is upright before it is pressed
-        if self._hole is None or not len(rows):
+        if self._entry is None or not len(rows):
             return InHole(part[:0], part.new_zeros(0, 6, 6))
-        hole, fit = self._hole
-        least = self.gap(part, rows[:, :7]).distance.min(dim=1)
-        deep = least.values < -_DEEP
-        part, peg = part[deep], rows[least.indices[deep], :7]
-        turn, along = poses.rotation_matrix(part), poses.rotation_matrix(peg)[..., 2]
-        across = torch.linalg.cross(turn[..., 2], along)
-        sine, cosine = across.norm(dim=1, keepdim=True), (turn[..., 2] * along).sum(dim=1, keepdim=True)
-        leans = torch.atan2(sine, cosine) * across / sine.clamp(min=1e-12)
-        own = (turn.transpose(-1, -2) @ leans[..., None])[..., 0]
-        upright = poses.retract(part, torch.cat([torch.zeros_like(own), own], dim=1))
-        tip = torch.tensor([[0.0, 0.0, float(self.peg.vertices[:, 2].min())]], dtype=torch.float64)
-        mouth = torch.from_numpy(hole.part_from_hole[None, :3])
-        tip_at = poses.transform(peg, tip)
-        off = (tip_at - poses.transform(upright, mouth))[:, 0]
-        upright[:, :3] += off - (off * along).sum(dim=1, keepdim=True) * along
-        # Mouth and tip are anywhere between the walls.
-        at = torch.cat([mouth.expand(len(peg), 1, 3), poses.transform(poses.inverse(upright), tip_at)], dim=1)
-        beside = torch.eye(3, dtype=torch.float64) - along[:, :, None] * along[:, None]
-        turned = poses.rotation_matrix(upright)[:, None] @ _cross(at)
-        moved = beside[:, None] @ torch.cat(
-            [torch.eye(3, dtype=torch.float64).expand_as(turned), -turned], dim=-1
-        )
-        spread = fit.clearance / math.sqrt(12.0)
-        return InHole(upright, (moved.transpose(-1, -2) @ moved).sum(dim=1) / spread**2)
+        return self._entry.deep(part, rows[:, :7])
+
+    def at_mouth(self, measurements: Sequence[Approximated], part: Tensor) -> Tensor:
+        """Poses (K, 7), turned as some (M, 7), whose hole has the tip of the peg in its mouth."""
+        pressed = [rows[rows[:, FELT] == 1.0] for rows in (new_rows(value) for _, _, value in measurements)]
+        pressed = [rows for rows in pressed if len(rows)]
+        if self._entry is None or not pressed:
+            return part[:0]
+        return self._entry.wedged(part, pressed[-1][pressed[-1][:, FORCE].argmax(), :7])
 
     @cached_property
     def shared_prior(self) -> tuple[Tensor, Tensor]:
@@ -331,9 +312,3 @@ class ContactProbe:
         rows = torch.cat([new_rows(value) for _, _, value in measurements])
         force = (poses.rotation_matrix(rows[:, :7]) @ rows[:, WRENCH][:, :3, None])[..., 0]
         return PegRows(rows[:, TIME], rows[:, FELT] == 1.0, rows[:, EPISODE].long(), rows[:, :7], force)
-
-
-def _cross(points: Tensor) -> Tensor:
-    """Matrices (..., 3, 3) whose product with a vector is the cross product of points (..., 3) with it."""
-    axes = torch.eye(3, dtype=torch.float64).expand(*points.shape[:-1], 3, 3)
-    return torch.linalg.cross(points[..., None, :].expand_as(axes), axes, dim=-1).transpose(-1, -2)

@@ -209,6 +209,6 @@ class ProbeRows:
             own = np.flatnonzero(rows.episode == episode)
             hardest = own[[rows.force[own].argmax()]]
             turn[hardest] = turn_against(rows.wrench[hardest], self.sensing.peg)
-        columns += [rows.wrench, np.zeros((len(noise), 6)), turn, twists]
+        columns += [rows.wrench, np.zeros((len(noise), 6)), turn, rows.continues, twists]
         every = padded(torch.from_numpy(np.column_stack([rows.world_from_peg, *columns])), len(noise))
         return every if settings.free_space else every[every[:, FELT] == 1.0]

@@ -112,6 +112,10 @@ class ScreenedProbe(SimulatedProbe):
         """Poses near some (M, 7) that have the hole where the peg would lie deep in the material."""
         return self.geometry.in_hole(self._in_rows(measurements), part)
 
+    def at_mouth(self, measurements: Sequence[Approximated], part: Tensor) -> Tensor:
+        """Poses (K, 7), turned as some (M, 7), whose hole has the tip of the peg in its mouth."""
+        return self.geometry.at_mouth(self._in_rows(measurements), part)
+
     def _in_rows(self, measurements: Sequence[Approximated]) -> list[Approximated]:
         return [each._replace(value=self._rows_of(each.value)) for each in measurements]
 
