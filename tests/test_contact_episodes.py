@@ -96,7 +96,7 @@ def test_it_is_the_dense_gaussian_of_a_stationary_process_an_uncertain_complianc
             total = total + torch.logaddexp(inlier + math.log1p(-OUTLIER), stray)
         for k in (3, 7):
             spread = scale * math.sqrt(float(MIXED[k, 8]) ** 2 + DRIFT**2 + SHARED**2)
-            score = distance[:, k] / spread
+            score = distance[:, k] / spread + math.sqrt(2.0 / math.pi)  # as between two walls
             rubbing = torch.exp(-0.5 * score**2) / math.sqrt(2.0 * math.pi)
             free = (torch.special.ndtr(score) + rubbing).clamp(max=1.0)
             total = total + torch.log((1 - OUTLIER) * free + OUTLIER)

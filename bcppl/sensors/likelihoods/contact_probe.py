@@ -291,7 +291,9 @@ class ContactProbe:
         pressed = [rows for rows in pressed if len(rows)]
         if self._entry is None or not pressed:
             return part[:0]
-        return self._entry.wedged(part, pressed[-1][pressed[-1][:, FORCE].argmax(), :7])
+        hardest = pressed[-1][pressed[-1][:, FORCE].argmax()]
+        together = pressed[-1][pressed[-1][:, EPISODE] == hardest[EPISODE], :7]
+        return self._entry.wedged(part, hardest[:7]) if self._entry.stays(together) else part[:0]
 
     @cached_property
     def shared_prior(self) -> tuple[Tensor, Tensor]:

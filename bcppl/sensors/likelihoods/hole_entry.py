@@ -18,6 +18,7 @@ from bcppl.geometry.parts import Part
 from bcppl.sensors.capabilities import InHole
 
 _DEEP = 0.001  # m: a peg does not lie deeper in the material
+_STAYS = 0.004  # m by which the tip of a wedged peg moves in half a second, at most
 _LEAST_LEAN = 0.03  # rad: a peg that leans less may be as deep as with it
 _LEVEL = 1e-5  # m: vertices of the peg closer in height than this are of its tip
 
@@ -66,6 +67,11 @@ class HoleEntry:
         )
         spread = self._clearance / math.sqrt(12.0)
         return InHole(upright, (moved.transpose(-1, -2) @ moved).sum(dim=1) / spread**2)
+
+    def stays(self, peg: Tensor) -> bool:
+        """Whether the tip of pegs (R, 7), of one contact, stays where a hole may hold it."""
+        tip = poses.transform(peg, self._tip)[:, 0]
+        return float((tip - tip[0]).norm(dim=1).max()) < _STAYS
 
     def wedged(self, part: Tensor, peg: Tensor) -> Tensor:
         """Poses (M, 7), turned as some are, whose hole has the tip of a peg (7,) that leans wedged in it.
