@@ -20,7 +20,12 @@ from bcppl.distributions.poses import UniformPose
 from bcppl.geometry.extrusion import box_peg
 from bcppl.geometry.parts import Guess, Part
 from bcppl.inference.approximations.gaussian import GaussianApproximation
-from bcppl.inference.approximations.laplace import Normal, QuadraticApproximation, quadratic_approximation
+from bcppl.inference.approximations.laplace import (
+    Normal,
+    QuadraticApproximation,
+    Search,
+    quadratic_approximation,
+)
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.proposals.approximated import component_transitions
 from bcppl.models import look_and_touch
@@ -91,7 +96,7 @@ def approximated(
     center = torch.from_numpy(recording.guess.world_from_part)[None]
     prior = Normal(center, torch.diag(spread**-2)[None])
     sites, heading = partial(sensor.sites, [window]), sensor.heading([window])
-    return prior, quadratic_approximation(sites, prior, before, heading, everywhere, nearby=nearby)
+    return prior, quadratic_approximation(sites, prior, before, Search(heading, everywhere), nearby=nearby)
 
 
 def test_the_world_is_sound_and_both_places_explain_the_touch_alike() -> None:
