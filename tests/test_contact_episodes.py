@@ -146,6 +146,9 @@ def test_what_is_common_to_a_contact_lasts_as_long_as_it() -> None:
     apart[:, CONTINUES] = 0.0
     off = (site(pose, 3, hypotheses=one).log_prob(apart) - exact).abs()
     assert float(off.median()) > 0.05, "as another contact"
+    # Where the rows before are left out, it is as another.
+    cuts = [site(pose, 1, hypotheses=one).log_prob(each[cut:]) for each in (rows, apart)]
+    torch.testing.assert_close(*cuts)
 
 
 @pytest.mark.parametrize("cut", [5, 6])

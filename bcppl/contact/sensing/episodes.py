@@ -26,7 +26,7 @@ _FRICTION = 0.5  # a peg that slides moves across its force by so much more than
 _ASKEW = 0.3  # of an acceleration may be felt in any direction: the tool turns, and its mass lies elsewhere
 _SMOOTH = 0.01  # s to either side of a stamp, over which velocity and acceleration are estimated
 _AMID = 0.05  # s to either side of a stamp without contact, over which its pose is
-_BREAK = 0.05  # s without contact that end one
+_BREAK = 0.05  # s in which contact is not felt, by which it ends
 
 
 class Rows(NamedTuple):

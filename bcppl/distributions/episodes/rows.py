@@ -66,6 +66,7 @@ def given_and_all(value: Tensor) -> tuple[Tensor, Tensor]:
     rows = rows[~np.isnan(rows[:, FELT])]
     count = int((rows[:, GIVEN] == 1.0).sum())
     rows[:, GIVEN] = 0.0
+    rows[:1, CONTINUES] = 0.0  # what was before the first of all is not known
     return torch.from_numpy(rows[:count]), torch.from_numpy(rows)
 
 

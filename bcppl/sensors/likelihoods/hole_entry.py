@@ -41,7 +41,7 @@ class HoleEntry:
         low = float(peg.vertices[:, 2].min())
         self._tip = torch.tensor([[0.0, 0.0, low]], dtype=torch.float64)
         foot = peg.vertices[peg.vertices[:, 2] < low + _LEVEL, :2]
-        self._width = 2.0 * float(np.linalg.norm(foot, axis=1).min())
+        self._width = float(np.ptp(foot, axis=0).min())
 
     def deep(self, part: Tensor, peg: Tensor) -> InHole:
         """Poses near some (M, 7) that have the hole where pegs (R, 7) would lie deep in the material."""
