@@ -16,12 +16,13 @@ INLIER, OUTLIER = 0, 1  # what an episode is; plus twice the number of the chang
 
 
 class Segments(NamedTuple):
-    """S segments of consecutive rows: an episode of contact, or one row without contact.
+    """S segments of consecutive rows: a piece of an episode of contact, or one row without contact.
 
     Attributes:
         first, last: (S,) the index of a segment's first row, and that after its last.
-        contact: (S,) 1 for an episode.
-        begins: (S,) 1 for an episode whose contact is not that of the episode before.
+        contact: (S,) 1 for a piece of an episode.
+        begins: (S,) 1 for one whose contact is not that of the piece before.
+        slips: (S,) 1 for one in which what is held by friction may slip: it is loaded more than before.
         own: (H, R) of each hypothesis, variances of the errors of rows without contact, m^2.
         common: (H, 2) variances of the parameters of a contact that begins, m^2 and (m/N)^2.
         errors: (H, R, E) covariances of a row's error with those of its episode up to it, m^2, but for what
@@ -37,6 +38,7 @@ class Segments(NamedTuple):
     last: Indices
     contact: Indices
     begins: Indices
+    slips: Indices
     own: Array
     common: Array
     errors: Array

@@ -17,6 +17,12 @@ from bcppl.distributions.episodes.conditioning import dot, factorise, whiten
 from bcppl.distributions.episodes.rows import CONTINUES, EPISODE, FELT, FORCE, NOISE, TIME
 
 
+# Rows of a piece of an episode and the seconds between its first and the next one's, at least: it is an
+# outlier as a whole, and a contact that is not one is felt amid others.
+_PIECE, _LASTING = 4, 0.1
+_MORE = 1.1  # times the load before, by which what is held slips in a later piece of an episode
+
+
 class Hypothesis(NamedTuple):
     """What may hold for all of a recording's touches.
 
@@ -46,6 +52,16 @@ class RowErrors(NamedTuple):
     rough: float
 
 
+def _first(same: list[bool], time: list[float]) -> list[int]:
+    """The index of each segment's first row, of rows that may go on with the episode of the one before."""
+    first: list[int] = []
+    for k, at in enumerate(time):
+        if k and same[k - 1] and (k - first[-1] < _PIECE or at - time[first[-1]] < _LASTING):
+            continue
+        first.append(k)
+    return first
+
+
 def segments_of(rows: Tensor, errors: RowErrors, hypotheses: tuple[Hypothesis, ...]) -> Segments:
     """The segments of rows (R, COLUMNS), with their errors under each hypothesis."""
     columns = rows[:, [FELT, NOISE, FORCE, TIME, EPISODE, CONTINUES]].contiguous()
@@ -59,9 +75,8 @@ def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, .
         torch.frombuffer(bytearray(columns), dtype=torch.float64).view(-1, 6).T
     )
     contact = felt == 1.0
-    begins = torch.ones(len(felt), dtype=torch.bool)
-    begins[1:] = ~(contact[1:] & contact[:-1] & (episode[1:] == episode[:-1]))
-    first = begins.nonzero()[:, 0]
+    same = contact[1:] & contact[:-1] & (episode[1:] == episode[:-1])
+    first = torch.tensor(_first(same.tolist(), time.tolist()), dtype=torch.int64)
     last = torch.cat([first[1:], torch.tensor([len(felt)])])
     compliance = torch.tensor([h.compliance for h in hypotheses], dtype=torch.float64)
     scale = torch.tensor([h.noise for h in hypotheses], dtype=torch.float64)
@@ -70,23 +85,28 @@ def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, .
     alone = scale[:, None] ** 2 * (own + errors.shared**2 + errors.drift**2)
     own = scale[:, None] ** 2 * own + (errors.rough * sunk) ** 2
     joint = torch.zeros(len(hypotheses), len(felt), int((last - first).max()), dtype=torch.float64)
-    loaded = torch.zeros_like(time)
-    for begin, end in zip(first.tolist(), last.tolist(), strict=True):
+    loaded, slips = torch.zeros_like(time), contact[first].clone()
+    within = torch.cat([torch.tensor([False]), same])[first]
+    most = torch.zeros(1, dtype=torch.float64)
+    for s, (begin, end) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
         if contact[begin]:
             # What is held by friction slips when it is loaded more than it was.
-            most = force[begin:end].clamp(min=1e-3).cummax(dim=0).values
-            loaded[begin:end] = most / most[-1]
+            before = most[-1] if within[s] else torch.zeros(())
+            most = torch.maximum(force[begin:end].clamp(min=1e-3).cummax(dim=0).values, before)
+            slips[s] = most[-1] > _MORE * before
+            loaded[begin:end] = (most - before) / (most[-1] - before).clamp(min=1e-9)
             apart = (time[begin:end, None] - time[begin:end]).abs()
             lasting = errors.drift**2 * torch.exp(-apart / errors.lasting)
             both = scale[:, None, None] ** 2 * lasting + torch.diag_embed(own[:, begin:end])
             joint[:, begin:end, : end - begin] = both
     common = torch.stack([(scale * errors.shared) ** 2, (errors.varying * compliance) ** 2], dim=1)
-    begins = contact[first] & (continues[first] != 1.0)
+    begins = contact[first] & ~within & (continues[first] != 1.0)
     segments = Segments(
         first=first.numpy(),
         last=last.numpy(),
         contact=contact[first].to(torch.int64).numpy(),
         begins=begins.to(torch.int64).numpy(),
+        slips=slips.to(torch.int64).numpy(),
         own=np.ascontiguousarray(alone.numpy()),
         common=np.ascontiguousarray(common.numpy()),
         errors=joint.numpy(),

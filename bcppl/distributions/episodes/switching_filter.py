@@ -281,7 +281,7 @@ def _filter(
                 if not alike:
                     np.dot(slope, covariance[n, b], own_pull)
                     set_joint(slope, own_pull, segments.errors[h, first:last], left_over, joint[:rows])
-                for change in range(changes):
+                for change in range(changes if segments.slips[s] else 1):
                     if change and log_weight[n, b] + prior.change_log_probability[change] < likely:
                         continue
                     for a in range(parameters):
@@ -320,8 +320,8 @@ def _filter(
                         weight[found] = _log_sum(inlier, outlier)
                         found += 1
                         break
-                    weight[found] = inlier + prior.change_log_probability[change]
-                    weight[found + 1] = outlier + prior.change_log_probability[change]
+                    chance = prior.change_log_probability[change] if segments.slips[s] else 0.0
+                    weight[found], weight[found + 1] = inlier + chance, outlier + chance
                     square[found + 1] = square[found]
                     found += 2
             best, left, known_branches = weight[:found].max(), 0, number[n]
