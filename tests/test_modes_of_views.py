@@ -220,7 +220,9 @@ def around(center: float) -> object:
 
 def falling_short(nats: float, misses: bool = False) -> SimpleNamespace:
     """An approximation whose best mode is so much better than half of the particles."""
-    return SimpleNamespace(shortfall=lambda _: nats, misses_a_mode=lambda _: misses)
+    return SimpleNamespace(
+        shortfall=lambda _: nats, misses_a_mode=lambda _: misses, is_exceeded=lambda _: False
+    )
 
 
 def test_a_population_that_misses_the_mode_is_replaced_by_evidence() -> None:
@@ -252,6 +254,14 @@ def test_a_population_that_misses_the_mode_is_replaced_by_evidence() -> None:
     elsewhere = falling_short(2.0, misses=True)
     joined = second_search.searched(weighted_at(astray, torch.zeros(50).double(), elsewhere), around(1.0))
     assert 0 < int((joined["x"] == -3.0).sum()) < 50, "an estimate of 1 beside one of 0.24 keeps its share"
+
+
+def test_modes_that_particles_exceed_are_searched_for_again() -> None:
+    better = falling_short(0.0)
+    worse = SimpleNamespace(is_exceeded=lambda _: True, following=lambda _: better)
+    population = weighted_at(torch.full((50,), 1.0).double(), torch.zeros(50).double(), worse)
+    after = second_search.searched(population, around(1.0))
+    assert after.approximation is better and torch.equal(after["x"], population["x"])
 
 
 def test_a_mode_without_particles_is_missed_if_it_weighs() -> None:

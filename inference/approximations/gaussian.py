@@ -49,6 +49,8 @@ _MODES, _FAINT = 8, 10.0  # that views leave: at most so many, within so many na
 # A mode that particles miss: of at least this share of all modes' weight, at most so many nats less probable
 # than the best particle, and no particle within so many squared standard deviations.
 _SHARE, _LESS, _APART = 0.05, 5.0, 50.0
+_BETTER = 3.0  # nats by which a particle is more probable than all modes, which have been lost
+_FOLLOWED = 32  # particles from which modes are searched for
 UNSURE = 0.0005  # m: beyond this standard deviation the contact may be with another place of the part
 
 
@@ -146,14 +148,16 @@ class GaussianApproximation:
         first = self.quadratic is None
         ambiguous = any(sensor.new_contact(own, newest=not first) for sensor, own in contacts)
         # No contact has begun, which could have been with several places: the modes hardly move.
-        nearby = not (first or ambiguous) and len(contacts) == len(by_sensor)
+        again = self.near is not None
+        nearby = not (first or ambiguous or again) and len(contacts) == len(by_sensor)
         headings = [sensor.heading(own) for sensor, own in contacts]
 
         def sites(pose: Tensor, blur: float) -> Iterator[tuple[Any, Tensor]]:
             for sensor, own in by_sensor:
                 yield from sensor.sites(own, pose, blur)
 
-        known, everywhere = self.prior, self.thorough and ambiguous and self._is_unsure()
+        known = self.prior
+        everywhere = self.thorough and (again or (ambiguous and self._is_unsure()))
         before = None if self.quadratic is None else self.mixture
         own = torch.zeros(0) if before is None else known.component(before.centers)
         heading = next((heading for heading in headings if heading is not None), None)
@@ -168,7 +172,7 @@ class GaussianApproximation:
             inside = [sensor.in_hole(c, near) for sensor, c in entering]
             inside = [places for places in inside if len(places.part)]
             entries = tuple(partial(s.at_mouth, c) for s, c in entering)
-            search = Search(heading, everywhere, entries)
+            search = Search(heading, everywhere, entries, self.near)
             each.append(quadratic_approximation(sites, normal, mine, search, inside, nearby))
         quadratic = each[0] if len(each) == 1 else together(each, known)
         return replace(self, quadratic=quadratic, relevant=relevant, stale=False)
@@ -269,6 +273,21 @@ class GaussianApproximation:
         here = self.here
         best, reached = here._at_modes(), here._at_particles(trace)
         return float(best.max() - reached.median())
+
+    def is_exceeded(self, trace: Any) -> bool:
+        """Whether some particle explains all measurements far better than all modes do."""
+        if self.quadratic is None:
+            return False
+        here = self.here
+        return bool(here._at_particles(trace).max() > here._at_modes().max() + _BETTER)
+
+    @on_host()
+    def following(self, trace: Any) -> GaussianApproximation:
+        """The same with modes that are searched for again: from particles, and from many places."""
+        count = len(trace[self.pose])
+        some = torch.linspace(0, count - 1, min(count, _FOLLOWED)).long()
+        near = moved(trace[self.pose], HOST)[some]
+        return replace(replace(self, near=near, stale=True).updated(), near=None)
 
     def misses_a_mode(self, trace: Any) -> bool:
         """Whether some mode has no particle near it, and is about as probable as the best particle."""

@@ -86,11 +86,13 @@ class Search(NamedTuple):
         heading: (3,) the direction of motion at the last contact; None for none.
         everywhere: whether to search for all modes.
         entries: each from poses (M, 7) makes others, from which a hole is entered.
+        near: (K, 7) poses to start from as well; None for none.
     """
 
     heading: Tensor | None = None
     everywhere: bool = False
     entries: tuple[Callable[[Tensor], Tensor], ...] = ()
+    near: Tensor | None = None
 
 
 def quadratic_approximation(
@@ -146,6 +148,7 @@ def _searched(sites: Sites, prior: Normal, before: GaussianMixture | None, searc
         reached.append(gauss_newton(sites, ahead, prior, SHARP))
     best, _ = max(reached, key=lambda fit: float(fit[1][0]))
     others = [] if before is None or len(before.centers) == 1 else [before.centers]
+    others += [] if search.near is None else [search.near]
     if search.everywhere:
         places = poses.exp(center, _PLACES @ scale.T)
         entered = torch.cat([places[:0], *(entry(places) for entry in search.entries)])

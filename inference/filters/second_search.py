@@ -27,18 +27,30 @@ def searched(population: Population, proposal: Callable[[Any], Callable[..., Any
     """The population, or one joined with draws of its approximation where that explains all far better.
 
     So it is where no particle is near a mode that is about as probable: particles that all went to another
-    one, which seemed better when less was measured, do not come back by themselves. It costs nothing where
-    particles are near all modes, and `COPIES` evaluations of all measurements for each particle elsewhere.
+    one, which seemed better when less was measured, do not come back by themselves. Where a particle explains
+    all far better than the modes of the approximation do, these are searched for again first, from particles
+    and from many places: the next measurement would move all to where it is known to be worse. It costs
+    nothing where particles are near all modes, and `COPIES` evaluations of all measurements for each particle
+    elsewhere.
 
     Args:
         population: weighted for all measurements of its trace. Its approximation has methods `shortfall` and
             `misses_a_mode`.
         proposal: of all latent values, given the approximation.
     """
+    population = _followed(population)
     approximation, trace = population.approximation, population.trace
     if approximation.shortfall(trace) < MISSED and not approximation.misses_a_mode(trace):
         return population
-    return joined_with_draws(population, approximation, proposal)
+    return _followed(joined_with_draws(population, approximation, proposal))
+
+
+def _followed(population: Population) -> Population:
+    """The population whose approximation is, where some particle is far better, searched for again."""
+    approximation, trace = population.approximation, population.trace
+    if not approximation.is_exceeded(trace):
+        return population
+    return population.with_approximation(approximation.following(trace))
 
 
 def joined_with_draws(
