@@ -16,7 +16,6 @@ from bcppl.distributions.episodes.branches import OF_CONTACT, Segments
 from bcppl.distributions.episodes.conditioning import dot, factorise, whiten
 from bcppl.distributions.episodes.rows import CONTINUES, EPISODE, FELT, FORCE, NOISE, TIME
 
-
 # Rows of a piece of an episode and the seconds between its first and the next one's, at least: it is an
 # outlier as a whole, and a contact that is not one is felt amid others.
 _PIECE, _LASTING = 4, 0.1
