@@ -20,6 +20,7 @@ from bcppl.inference.ancestry import inherited
 from bcppl.poses import FREE
 from bcppl.traces import Trace
 from bcppl.traces.indexing import Index, particles_at
+from bcppl.traces.verbs import at_device
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +118,13 @@ class Population:
             if computed in self.__dict__:
                 later.__dict__[computed] = self.__dict__[computed]
         return later
+
+    def on(self, device: torch.device) -> Population:
+        """The same particles on a device; their approximation is on the host wherever they are."""
+        own = {name: self.__dict__[name] for name in ("log_weights", "founders", "families", "sides")}
+        if self.log_weights.device == device:
+            return self
+        return self._with(trace=at_device(self.trace, device), **moved(own, device))
 
     def with_approximation(self, approximation: Any) -> Population:
         """The same particles with another approximation of their posterior."""

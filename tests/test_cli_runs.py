@@ -183,6 +183,7 @@ def test_what_cannot_be_run_or_simulated_is_refused(bcppl: Callable[..., Ran]) -
         assert ran.code == 2 and "help(bcppl.models.arm_in_view)" in ran.err, ran.err
         assert len(ran.err.strip().splitlines()) == 1
     assert "no model 'arm'" in bcppl("run", SHIPPED, "--model", "arm").err
+    assert "names no device" in bcppl("run", SHIPPED, "--device", "abacus").err
 
 
 def test_the_bar_names_the_measurement_in_progress() -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +19,8 @@ from bcppl.errors import InputError
 from bcppl.inference import guided_smc
 from bcppl.models import load_recording
 from bcppl.models.look_and_touch import model
+from bcppl.recordings import save
+from tests.command_line import Ran
 
 if not find_spec("warp"):  # an optional group
     pytest.skip("Warp is not installed", allow_module_level=True)
@@ -101,6 +106,36 @@ def test_the_likelihood_of_an_image_is_that_of_the_processor(
     apart = (found - expected).abs()
     assert float(apart.median()) < 0.01 and float(apart.max()) < 2.0
     assert float(expected.std()) > 10.0
+
+
+def test_the_command_runs_on_the_device_and_keeps_which(
+    bcppl: Callable[..., Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("--particles", 8, "--set", "profile=perfect", "--device", "cuda", "--out", "run")
+    recording = load_recording("peg_probe")
+    save(replace(recording, measurements=recording.measurements[:2]), tmp_path / "short.h5")
+    with stand_in(monkeypatch):
+        ran = bcppl("run", "short.h5", *words)
+    assert ran.code == 0, ran.err
+    record = json.loads((tmp_path / "run/run.json").read_text())
+    assert record["device"] == "cuda" and record["complete"]
+
+
+def test_a_run_goes_on_with_particles_that_were_kept_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording, program = load_recording("peg_probe"), model.with_settings(profile="perfect")
+
+    def run(start: Any = None) -> Any:
+        return guided_smc.infer(program, recording, particles=8, seed=1, device="cuda", start=start)
+
+    with stand_in(monkeypatch):
+        _, first, second = islice(run(), 3)
+        kept = first.population.on(devices.HOST)
+        assert not isinstance(kept.trace["part"], There)
+        again = next(run(replace(first, population=kept)))
+        assert isinstance(again.population.trace["part"], There)
+    assert again.info.label == second.info.label
+    assert torch.equal(again.belief.world_from_part, second.belief.world_from_part)
+    assert torch.equal(again.belief.log_weights, second.belief.log_weights)
 
 
 def test_a_device_that_is_not_there_is_refused() -> None:

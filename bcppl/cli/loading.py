@@ -102,15 +102,12 @@ def inference(given: str | None, chosen: Model, named: str = "", by: str = "the 
     return given, infer
 
 
-def resuming(infer: Infer, name: str) -> Infer:
-    """An inference program that goes on from a step; InputError where it does not."""
+def check_takes(infer: Infer, option: str, refusal: str, cure: str) -> None:
+    """InputError, which says what is refused and the cure, where an inference program lacks an option."""
     try:
-        inspect.signature(infer).bind(None, None, particles=2, seed=0, scene=None, start=None)
+        inspect.signature(infer).bind(None, None, particles=2, seed=0, scene=None, **{option: None})
     except TypeError as error:
-        raise InputError(
-            f"{name} cannot go on with a run, its `infer` takes no `start`; run the recording again."
-        ) from error
-    return infer
+        raise InputError(f"{refusal}, its `infer` takes no `{option}`; {cure}.") from error
 
 
 def simulating() -> list[str]:

@@ -33,14 +33,14 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import whole_number
-from bcppl.devices import on_host
+from bcppl.devices import HOST, on_host
 from bcppl.distributions.checks import THRESHOLD, Check, Checked, chi_square
 from bcppl.distributions.poses import NormalPose
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded, systematic
 from bcppl.traces import Trace
 from bcppl.traces.series import SeriesTrace
-from bcppl.traces.verbs import on_host_of
+from bcppl.traces.verbs import at_device
 
 __all__ = ["THRESHOLD", "Check", "surprise"]
 
@@ -95,7 +95,7 @@ def surprise(
     with seeded(seed), torch.no_grad():
         chosen = systematic(population.log_weights, particles)
         # They are few: on the host, wherever the particles are.
-        few = on_host_of(trace.chosen(chosen))
+        few = at_device(trace.chosen(chosen), HOST)
         copies: list[Trace] = []
 
         def replicated(address: str) -> Any:

@@ -218,7 +218,11 @@ def _steps(
             raise InputError(
                 f"a run is to be resumed on {device}, and was begun elsewhere; resume it on the same device."
             )
-        state, population, particles = [start.random_state], start.population, len(start.population)
+        state, population, particles = (
+            [start.random_state],
+            start.population.on(device),
+            len(start.population),
+        )
         truth = _Truth(model, moved(scene, HOST), recording, population, seed)
         for observed in observations_of(model, scene, measurements[: start.taken]):
             truth.assimilate(observed)

@@ -12,6 +12,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import normalised
+from bcppl.devices import beside
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.kernels.halving import halved, halves
@@ -107,7 +108,7 @@ def displacement(start: Population, now: Population, of: Collection[str] = ()) -
     continuous latent values. An axis without variance has no displacement: 0.
     """
     weights = normalised(now.log_weights)
-    shares = [torch.empty(0, dtype=torch.float64)]
+    shares = [weights.new_empty(0)]
     for address in now.trace.choices:
         if now.trace.distributions[address].support.is_discrete or (of and address not in of):
             continue
@@ -125,7 +126,7 @@ def _coordinates(start: Population, now: Population, address: str) -> tuple[Tens
     if freedom is None or old.ndim != 2:
         old, new = (v.reshape(len(now), -1).to(torch.float64) for v in (old, new))
         return new - old, new
-    mean = now.belief(address).mean
+    mean = beside(now.belief(address).mean, new)
     before, after = (freedom.coordinates(poses.local(mean, pose)) for pose in (old, new))
     return after - before, after
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,7 +17,8 @@ if TYPE_CHECKING:
     from bcppl.recordings import Recording
 
 FEWEST = 20  # particles, below which a run warns
-OF_THE_RUN = ("particles", "seed", "out", "set_")  # what a run that is resumed has from its folder
+HERE = "cpu"
+OF_THE_RUN = ("particles", "seed", "device", "out", "set_")  # what a run that is resumed has from its folder
 
 
 def run(
@@ -35,6 +37,7 @@ def run(
     seed: Annotated[
         int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same belief, bit for bit.")
     ] = 0,
+    device: Annotated[str, typer.Option(help="Where the particles are: cpu, or cuda for a GPU.")] = HERE,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -62,6 +65,7 @@ def run(
     from bcppl.cli.predictive_checks import PredictiveChecks
     from bcppl.cli.report import Report
     from bcppl.cli.run_folder import PAGE, STEP, RunFolder, beside, read_record
+    from bcppl.devices import HOST, device_named
     from bcppl.inference.progress import sole_bar
     from bcppl.inference.saved import load_step
     from bcppl.sensors.plausibility import doubts
@@ -76,6 +80,7 @@ def run(
                 f"--{option} is that of the run in {resume}; leave it out, or begin another run."
             )
         recording, particles, seed = recording or record["recording"], record["particles"], record["seed"]
+        device = record.get("device", HERE)
     if recording is None:
         raise InputError("there is nothing to run; give a recording, or the folder of a run by --resume.")
     measured = loading.recording(recording)
@@ -96,12 +101,13 @@ def run(
     doubted = [str(doubt) for doubt in kept] if isinstance(kept, list) else doubts(measured)
     for doubt in doubted:
         console.print(f"doubt: {visible(doubt)}", style="yellow", markup=False)
-    report, options = (
-        Report(console, measured, chosen),
-        {"particles": particles, "seed": seed, "scene": scene},
-    )
+    report = Report(console, measured, chosen)
+    options: dict[str, Any] = {"particles": particles, "seed": seed, "scene": scene}
+    if device != HERE:
+        loading.check_takes(infer, "device", f"{inference} runs on the processor only", "leave out --device")
+        options["device"] = device_named(device)
     if resume is not None and (resume / STEP).exists():
-        infer = loading.resuming(infer, inference)
+        loading.check_takes(infer, "start", f"{inference} cannot go on with a run", "run the recording again")
         start = options["start"] = load_step(resume / STEP, chosen, measured, scene)
         folder = RunFolder.resumed(resume, record, measured, start.taken)
         sites = start.population.trace.addresses
@@ -118,6 +124,7 @@ def run(
                 "inference": inference,
                 "particles": particles,
                 "seed": seed,
+                "device": device,
                 "settings": settings,
                 "doubts": doubted,
             },
@@ -126,7 +133,8 @@ def run(
         with sole_bar(console) as progress:
             total = len(measured.measurements)
             task = progress.add_task(next_label(measured, report.rows), total=total, completed=report.rows)
-            for step in infer(chosen, measured, **options):
+            for made in infer(chosen, measured, **options):
+                step = made if device == HERE else replace(made, population=made.population.on(HOST))
                 folder.add(step, report.row(step), report.checks.labels)
                 progress.update(
                     task, completed=report.rows - 1, description=next_label(measured, report.rows)
