@@ -15,7 +15,7 @@ from bcppl.geometry.holes import hole_of
 from bcppl.models import load_recording
 from tests.command_line import short
 from tests.made_recordings import assert_one_sentence
-from tests.test_contact_episodes import probed
+from tests.test_probe_rows import probed
 
 TRUTH = torch.as_tensor(short(1).truth, dtype=torch.float64)
 

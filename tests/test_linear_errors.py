@@ -59,8 +59,9 @@ from bcppl.sensors.likelihoods.bench_profiles import PROFILES, BenchProfile
 from bcppl.sensors.measurements import Measurement, Recording
 from tests.episode_errors import factors
 from tests.made_recordings import assert_one_sentence
-from tests.test_contact_episodes import MIXED, cut, probed, values_of
+from tests.test_contact_episodes import MIXED
 from tests.test_manifold import around, ledge
+from tests.test_probe_rows import cut, probed, values_of
 
 ONE = (Hypothesis(0.0, 5e-6),)
 SHARED = (Grasp(slips=0.0), ArmCompliance(), KinematicError(center=(0.01, 0.0, 0.0)), Delay(), Size(0.001))

@@ -22,9 +22,9 @@ from bcppl.geometry.gap import PegGap
 from bcppl.models import look_and_touch
 from bcppl.models.worlds.bench.parts import bench_part
 from tests.episode_errors import factors
-from tests.test_contact_episodes import probed, values_of
 from tests.test_linear_errors import ONE, OUTLIER, rows_with_wrenches
 from tests.test_manifold import ledge
+from tests.test_probe_rows import probed, values_of
 
 STEPS = 4001
 PLACES = torch.tensor([[0, 0, -0.003], [0.006, 0, 0], [0.012, 0.004, 0]]).double()  # m, in the hole's frame
