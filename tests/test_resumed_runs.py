@@ -41,6 +41,7 @@ PARTICLES = 6
 pytestmark = pytest.mark.filterwarnings("ignore:.*leaves out stamps")
 
 FIRST, SECOND = 0, 1  # views of the bench
+START = 2  # the window by which a probe's wrench is tared
 TOP, LATER, ON = 8, 10, 11  # windows in which the peg feels the top, again farther on, and stays on it
 
 
@@ -110,16 +111,16 @@ RUNS: dict[str, tuple[Callable[..., Any], Model, Callable[[], Recording], tuple[
     "guided, views and a touch": (
         guided_smc.infer,
         look_and_touch.model,
-        lambda: bench(FIRST, SECOND, TOP),
+        lambda: bench(FIRST, SECOND, START, TOP),
         (1,),
     ),
     "guided, touches around a view": (
         guided_smc.infer,
         look_and_touch.model,
-        lambda: bench(TOP, FIRST, LATER),
-        (2,),
+        lambda: bench(START, TOP, FIRST, LATER),
+        (3,),
     ),
-    "tempered, touches": (FEW_MOVES, look_and_touch.model, lambda: precisely_known(LATER, ON), (1,)),
+    "tempered, touches": (FEW_MOVES, look_and_touch.model, lambda: precisely_known(START, LATER, ON), (2,)),
     "tempered, a view and windows": (
         FEW_MOVES,
         peg_in_hole.model,
@@ -211,7 +212,7 @@ def test_a_model_that_writes_into_its_scene_is_seen(write: Callable[[Any], None]
         look_and_touch.look_and_touch(scene, actions)
         write(scene)
 
-    recording = copy.deepcopy(bench(FIRST, TOP))
+    recording = copy.deepcopy(bench(FIRST, START, TOP))
     scene = look_and_touch.prepare(recording)
     before, actions = contents(scene), [m.action for m in recording.measurements]
     generate(look_and_touch.look_and_touch, (scene, actions), {}, 2)
@@ -269,10 +270,10 @@ def alone(*which: int) -> list[Step]:
 @pytest.mark.parametrize(("one", "other"), [(TOP, LATER), (SECOND, TOP), (TOP, SECOND)])
 def test_two_branches_from_one_step_do_not_influence_each_other(one: int, other: int) -> None:
     """After a view: two windows, a view and a window, and a window and a view."""
-    *_, start = guided(bench(FIRST), fresh())
+    *_, start = guided(bench(FIRST, START), fresh())
     scene = start.population.trace.args[0]
-    guided(bench(FIRST, one), scene, start)
-    assert_same(alone(FIRST, other)[2:], guided(bench(FIRST, other), scene, start))
+    guided(bench(FIRST, START, one), scene, start)
+    assert_same(alone(FIRST, START, other)[3:], guided(bench(FIRST, START, other), scene, start))
 
 
 def test_another_image_with_the_same_number_is_fitted() -> None:
@@ -283,16 +284,16 @@ def test_another_image_with_the_same_number_is_fitted() -> None:
 
 def test_a_run_in_another_order_on_the_same_scene_has_no_influence() -> None:
     scene = fresh()
-    guided(bench(TOP, FIRST), scene)
-    assert_same(alone(FIRST, TOP), guided(bench(FIRST, TOP), scene))
+    guided(bench(START, TOP, FIRST), scene)
+    assert_same(alone(FIRST, START, TOP), guided(bench(FIRST, START, TOP), scene))
 
 
 def test_a_run_by_another_inference_program_on_the_same_scene_has_no_influence() -> None:
     """Guided runs fit images, tempered ones do not."""
-    scene, recording = fresh(), bench(FIRST, TOP)
+    scene, recording = fresh(), bench(FIRST, START, TOP)
     other = tempered_smc.infer(look_and_touch.model, recording, particles=PARTICLES, sweeps=1, scene=scene)
-    assert [step.taken for step in other] == [0, 1, 2]
-    assert_same(alone(FIRST, TOP), guided(recording, scene))
+    assert [step.taken for step in other] == [0, 1, 2, 3]
+    assert_same(alone(FIRST, START, TOP), guided(recording, scene))
 
 
 def test_a_guided_run_is_resumed_from_a_tempered_one_with_the_same_approximation() -> None:
@@ -302,12 +303,12 @@ def test_a_guided_run_is_resumed_from_a_tempered_one_with_the_same_approximation
     assert start.population.approximation is None
     one, other = (
         run[-1].population.approximation
-        for run in (guided(bench(FIRST, TOP), scene, start), alone(FIRST, TOP))
+        for run in (guided(bench(FIRST, START, TOP), scene, start), alone(FIRST, START, TOP))
     )
     for mine, theirs in zip(one.mixture, other.mixture, strict=True):
         assert torch.equal(mine, theirs)
 
 
 def test_a_second_run_on_the_same_scene_is_the_first() -> None:
-    first = alone(FIRST, TOP)
-    assert_same(first, guided(bench(FIRST, TOP), first[0].population.trace.args[0]))
+    first = alone(FIRST, START, TOP)
+    assert_same(first, guided(bench(FIRST, START, TOP), first[0].population.trace.args[0]))

@@ -205,8 +205,8 @@ def _window(where: str, window: ProbeWindow, touch: Touch, end: int) -> Iterator
         yield f"{span} begins before an earlier window ended, at {end}; give them in order, without overlap."
     if first > end:
         yield (
-            f"{span} leaves out stamps {end} to {first}; keep every window from the probe's start, "
-            "for the sensor's zero is estimated from the first ones."
+            f"{span} leaves out stamps {end} to {first}; keep every window from the probe's start, for the "
+            "sensor's zero is that of the first stamps: without them the touches say nothing."
         )
     if touch.times.shape != (last - first,):
         yield f"{span} holds {touch.times.size} wrench times, not {last - first}; read them at the stamps."

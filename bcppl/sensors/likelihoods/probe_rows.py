@@ -142,7 +142,7 @@ class Measured(NamedTuple):
 class ProbeRows:
     """One probe, as far as it is measured.
 
-    The wrench may be late by times in the first intervals of `rows.SECONDS`, so many as `intervals`.
+    A probe of which the beginning was not measured, by which the wrench is tared, has no rows. The wrench may be late by times in the first intervals of `rows.SECONDS`, so many as `intervals`.
 
     Attributes:
         windows: so far.
@@ -177,7 +177,10 @@ class ProbeRows:
         self.windows.append(measurement)
         ends = cells_of(window)
         if len(ends):
-            self.rows[len(self.windows) - 1] = torch.cat([self._rows(int(end)) for end in ends])
+            rows = torch.cat([self._rows(int(end)) for end in ends])
+            # A wrench that is tared amid a probe may be so in contact: then it is felt where the peg is free.
+            is_tared = not self.sensing.tare or self._number[0] < self.sensing.tare
+            self.rows[len(self.windows) - 1] = rows if is_tared else rows[:0]
 
     def _tip(self, pose: Array) -> Array:
         """Positions (T, 3) of the peg's farthest vertex."""
