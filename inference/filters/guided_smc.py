@@ -60,9 +60,9 @@ CERTAIN = 0.01  # nats: a log-likelihood as small for all particles carries no i
 ASKED = 4  # particles that are evaluated first for that
 FEW = 0.2  # the effective sample size that SMCP3 is to leave, as a share of N
 AMPLE = 30.0  # the same, enough for any N
-# Where it does not, it is run again with more copies of each particle, as many as seem needed; at most so many
-# of each and in all: memory and time grow with them. N of all are kept. Where even these leave less, the
-# measurement is tempered: of 75 particles 3 were left along a bent ridge, and a belief was sure of a part of it.
+# Where it does not, it is run again with more copies of each particle, as many as seem needed; at most so
+# many of each and in all: memory and time grow with them. N of all are kept. Where even these leave less,
+# the measurement is tempered: of 75 particles 3 were left along a bent ridge, sure of a part of it.
 MOST, ROOM = 40, 40_000
 # Particles and copies where images leave several modes: of 75 particles 20 stay effective, too few for the
 # modes' shares.

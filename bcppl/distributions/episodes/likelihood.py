@@ -63,8 +63,8 @@ class ContactEpisodes(FilteredEpisodes):
     about zero: a peg may rub along the part with a force that is not felt. Between two walls the gap seems
     less than it is, which the probability allows for. Of an episode each piece of a tenth of a second, or of
     four rows, may be an outlier by itself (`bcppl.distributions.episodes.row_errors`), and the errors that
-    last are its own. Where a torque is one that no single contact exerts, an episode has besides the probability that the peg is not free to turn
-    against it (`bcppl.distributions.episodes.couples`).
+    last are its own. Where a torque is one that no single contact exerts, an episode has besides the
+    probability that the peg is not free to turn against it (`bcppl.distributions.episodes.couples`).
 
     The event is (T, COLUMNS): world_from_peg; 1 with contact, 0 without, NaN for a row that is not used;
     noise (m) of the row; force (N); time (s); the number of the episode; 1 for a given row; the wrench on the

@@ -1,11 +1,11 @@
 """A Rao-Blackwellised filter over the episodes of a probe: Gaussian errors that all touches share, and jumps.
 
 The gap at a row is the measured one plus a linear function of M parameters, which are normal a priori, plus
-the row's own errors, which are normal and correlated within a piece of an episode. Two of the parameters are of the
-present contact and begin again with another: an offset, and its compliance. So given what is discrete the
-parameters are normal at any time and are integrated out by a Kalman filter, one for each hypothesis: of the
-contact's compliance and the noise's scale from the beginning, of a change of some parameters in a piece, or
-of an outlier, where a piece surprises. A change is a Wiener process that runs while a contact is loaded
+the row's own errors, which are normal and correlated within a piece of an episode. Two of the parameters are
+of the present contact and begin again with another: an offset, and its compliance. So given what is discrete
+the parameters are normal at any time and are integrated out by a Kalman filter, one for each hypothesis: of
+the contact's compliance and the noise's scale from the beginning, of a change of some parameters in a piece,
+or of an outlier, where a piece surprises. A change is a Wiener process that runs while a contact is loaded
 more than it was: what is held by friction slips then, at once or slowly, and not under a steady force.
 Hypotheses multiply there, and the most probable ones are kept (a Gaussian mixture filter: Alspach and
 Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, IEEE TAC 17, 1972). Each row's

@@ -142,7 +142,8 @@ class Measured(NamedTuple):
 class ProbeRows:
     """One probe, as far as it is measured.
 
-    A probe of which the beginning was not measured, by which the wrench is tared, has no rows. The wrench may be late by times in the first intervals of `rows.SECONDS`, so many as `intervals`.
+    A probe of which the beginning was not measured, by which the wrench is tared, has no rows. The wrench may
+    be late by times in the first intervals of `rows.SECONDS`, so many as `intervals`.
 
     Attributes:
         windows: so far.
