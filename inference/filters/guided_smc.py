@@ -20,20 +20,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.devices import HOST, moved, same_random_state
-from bcppl.errors import NoWeightError
 from bcppl.inference.approximations.approximation import Approximation
 from bcppl.inference.approximations.gaussian import GaussianApproximation
-from bcppl.inference.filters.screening import approximated, by_mode, screened
+from bcppl.inference.filters.assimilation import Assimilated, assimilate, assimilate_screened
+from bcppl.inference.filters.screening import approximated, by_mode
 from bcppl.inference.filters.second_search import searched
 from bcppl.inference.filters.smc import Step, smc
-from bcppl.inference.filters.smcp3 import Pair, moved as moved_by_pair
+from bcppl.inference.filters.smcp3 import Pair
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
 from bcppl.inference.filters.tempering import resample_move, tempered
 from bcppl.inference.filters.view_search import is_refuted, searched_by_climbing
@@ -50,7 +50,6 @@ from bcppl.inference.proposals.approximated import (
     joint_random_walk,
 )
 from bcppl.inference.proposals.coordinates import continuous_addresses
-from bcppl.inference.sizing import replicate
 from bcppl.inference.targets import POSTERIOR, runs_physics
 from bcppl.sensors.capabilities import Defers, FitsPose
 from bcppl.traces import Model, Trace, extend
@@ -58,12 +57,6 @@ from bcppl.traces import Model, Trace, extend
 WALK = (0.2, 2.0)  # scales of the random walks
 CERTAIN = 0.01  # nats: a log-likelihood as small for all particles carries no information
 ASKED = 4  # particles that are evaluated first for that
-FEW = 0.2  # the effective sample size that SMCP3 is to leave, as a share of N
-AMPLE = 30.0  # the same, enough for any N
-# Where it does not, it is run again with more copies of each particle, as many as seem needed; at most so
-# many of each and in all: memory and time grow with them. N of all are kept. Where even these leave less,
-# the measurement is tempered: of 75 particles 3 were left along a bent ridge, sure of a part of it.
-MOST, ROOM = 40, 40_000
 # Particles and copies where images leave several modes: of 75 particles 20 stay effective, too few for the
 # modes' shares.
 SEVERAL = 1800
@@ -71,7 +64,6 @@ SEVERAL = 1800
 # them by .3 to 2 where touches tell them, and by .02 to .1 along a bent ridge such as a peg wedged in a hole
 # leaves. There particles die out along it from window to window, and what is left is sure of a part.
 DISPLACED, MOST_SWEEPS = 0.25, 4
-LEAST = 0.03  # of N: where the screening of copies leaves less, the measurement is tempered
 
 
 class Programs(Protocol):
@@ -187,57 +179,6 @@ def guided(
         )
 
     return step
-
-
-class Assimilated(NamedTuple):
-    """A population given one more measurement."""
-
-    population: Population  # of N particles
-    effective: float  # the effective sample size of all copies
-    origin: Tensor | None  # (N,) the particle that each copy was made of; None where each is its own
-
-
-def assimilate(population: Population, observed: Observed, pair: Pair, least: int = 1) -> Assimilated | None:
-    """The particles moved and weighted by a pair of kernels; None where too few keep weight.
-
-    `least` is how many copies of each are made at least.
-    """
-    count = len(population)
-
-    def weighted(population: Population) -> Population | None:
-        try:
-            return moved_by_pair(population, pair, observed)
-        except NoWeightError:
-            return None
-
-    goal, allowed = min(FEW * count, AMPLE), max(1, min(MOST, ROOM // count))
-    times = min(least, allowed)
-    reached = weighted(population if times == 1 else replicate(population, times))
-    while times < allowed and (reached is None or reached.effective_sample_size < goal):
-        before = 0.0 if reached is None else reached.effective_sample_size
-        # The estimate is often too large: ask for more copies than would just do.
-        times = min(allowed, max(2 * times, math.ceil(1.5 * goal * times / max(before, goal * times / MOST))))
-        reached = weighted(replicate(population, times))
-        if before and (reached is None or reached.effective_sample_size < before):
-            return None  # more copies find what the proposal had missed
-    if reached is None or reached.effective_sample_size < goal:
-        return None
-    effective = reached.effective_sample_size
-    if times == 1:
-        return Assimilated(reached, effective, None)
-    chosen = by_mode(reached, count)
-    return Assimilated(reached.selected(chosen), effective, chosen // times)
-
-
-def assimilate_screened(
-    population: Population, before: Approximation, observed: Observed, pair: Pair
-) -> Assimilated | None:
-    """The same where a cheap likelihood chooses among copies, and the others are simulated."""
-    reached = screened(population, before, observed, pair)
-    if reached is None or reached[0].effective_sample_size < LEAST * len(population):
-        return None
-    few, origin = reached
-    return Assimilated(few, few.effective_sample_size, origin)
 
 
 def _given_all(approximation: Any, trace: Trace, actions: Sequence[Any]) -> Any:

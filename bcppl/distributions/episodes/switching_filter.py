@@ -208,6 +208,7 @@ def _filter(
     filled = np.empty(delays, np.bool_)
     # Without shared errors an episode's errors are correlated alike in all particles.
     alike = parameters == OF_CONTACT and gaps.residual.shape[2] == 0
+    of_contact = parameters - OF_CONTACT
     later_mean, later_covariance = np.empty((size, OF_CONTACT)), np.empty((size, OF_CONTACT, OF_CONTACT))
     moved = np.empty(OF_CONTACT)
     pull, gain, changed = np.empty(parameters), np.empty((longest, parameters)), np.empty(parameters)
@@ -273,7 +274,7 @@ def _filter(
                     if not filled[delay]:
                         distance[delay, i] = _line(gaps, n, delay, first + i, slope[i])
                         slope[i] *= share
-                        slope[i, parameters - 2], slope[i, parameters - 1] = 1.0, gaps.force[first + i]
+                        slope[i, of_contact], slope[i, of_contact + 1] = 1.0, gaps.force[first + i]
                     error[b, i] = dot(slope[i], mean[n, b]) + share * (
                         distance[delay, i] + prior.compliance[h] * gaps.force[first + i]
                     )
