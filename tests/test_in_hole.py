@@ -149,3 +149,15 @@ def test_a_peg_that_is_wedged_in_the_mouth_leads_there() -> None:
     assert nearest(Search(everywhere=True)) > 0.002
     entry = functools.partial(sensor.at_mouth, measured)
     assert nearest(Search(everywhere=True, entries=(entry,))) < 0.0015
+
+
+def test_a_peg_whose_tip_travels_in_contact_is_in_no_mouth() -> None:
+    """It slides on the part, or its contact is false."""
+    center, sensor = torch.from_numpy(scene().truth)[None], probe()
+    rows = padded(leaning(0.3)[None].repeat(4, 1), 4)
+    rows[:, FELT], rows[:, NOISE], rows[:, FORCE], rows[:, EPISODE], rows[:, GIVEN] = 1.0, 3e-5, 5.0, 0.0, 0.0
+    rows[:, TIME], rows[:, WRENCH] = 0.1 * torch.arange(4.0).double(), 0.0
+    for travel, starts in ((0.001, 1), (0.003, 0)):
+        moved = rows.clone()
+        moved[:, 0] += travel * torch.arange(4.0).double()
+        assert len(sensor.at_mouth([Approximated(2, None, moved)], center)) == starts
