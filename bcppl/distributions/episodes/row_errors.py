@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from bcppl.arrays import Array
 from bcppl.compiled import compiled
-from bcppl.devices import on_host
 from bcppl.distributions.episodes.branches import OF_CONTACT, Segments
 from bcppl.distributions.episodes.conditioning import dot, factorise, whiten
 from bcppl.distributions.episodes.rows import CONTINUES, EPISODE, FELT, FORCE, NOISE, TIME
@@ -64,59 +63,65 @@ def _first(same: list[bool], time: list[float]) -> list[int]:
 def segments_of(rows: Tensor, errors: RowErrors, hypotheses: tuple[Hypothesis, ...]) -> Segments:
     """The segments of rows (R, COLUMNS), with their errors under each hypothesis."""
     columns = rows[:, [FELT, NOISE, FORCE, TIME, EPISODE, CONTINUES]].contiguous()
-    with on_host():
-        return _segments(columns.numpy().tobytes(), errors, hypotheses)
+    return _segments(columns.numpy().tobytes(), errors, hypotheses)
 
 
 @lru_cache(maxsize=64)
 def _segments(columns: bytes, errors: RowErrors, hypotheses: tuple[Hypothesis, ...]) -> Segments:
-    felt, noise, force, time, episode, continues = (
-        torch.frombuffer(bytearray(columns), dtype=torch.float64).view(-1, 6).T
-    )
+    felt, noise, force, time, episode, continues = np.frombuffer(columns).reshape(-1, 6).T.copy()
     contact = felt == 1.0
     same = contact[1:] & contact[:-1] & (episode[1:] == episode[:-1])
-    first = torch.tensor(_first(same.tolist(), time.tolist()), dtype=torch.int64)
-    last = torch.cat([first[1:], torch.tensor([len(felt)])])
-    compliance = torch.tensor([h.compliance for h in hypotheses], dtype=torch.float64)
-    scale = torch.tensor([h.noise for h in hypotheses], dtype=torch.float64)
-    sunk = compliance[:, None] * torch.where(contact, force, 0.0)
+    first = np.array(_first(same.tolist(), time.tolist()))
+    last = np.append(first[1:], len(felt))
+    within = np.append(False, same)[first]
+    compliance, scale = np.array([(h.compliance, h.noise) for h in hypotheses]).T
     own = noise**2 + errors.blur**2
     alone = scale[:, None] ** 2 * (own + errors.shared**2 + errors.drift**2)
-    own = scale[:, None] ** 2 * own + (errors.rough * sunk) ** 2
-    joint = torch.zeros(len(hypotheses), len(felt), int((last - first).max()), dtype=torch.float64)
-    loaded, slips = torch.zeros_like(time), contact[first].clone()
-    within = torch.cat([torch.tensor([False]), same])[first]
-    most = torch.zeros(1, dtype=torch.float64)
-    for s, (begin, end) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
-        if contact[begin]:
-            # What is held by friction slips when it is loaded more than it was.
-            before = most[-1] if within[s] else torch.zeros(())
-            most = torch.maximum(force[begin:end].clamp(min=1e-3).cummax(dim=0).values, before)
-            slips[s] = most[-1] > _MORE * before
-            loaded[begin:end] = (most - before) / (most[-1] - before).clamp(min=1e-9)
-            apart = (time[begin:end, None] - time[begin:end]).abs()
-            lasting = errors.drift**2 * torch.exp(-apart / errors.lasting)
-            both = scale[:, None, None] ** 2 * lasting + torch.diag_embed(own[:, begin:end])
-            joint[:, begin:end, : end - begin] = both
-    common = torch.stack([(scale * errors.shared) ** 2, (errors.varying * compliance) ** 2], dim=1)
-    begins = contact[first] & ~within & (continues[first] != 1.0)
+    own = scale[:, None] ** 2 * own + (errors.rough * compliance[:, None] * force * contact) ** 2
+    count, shape = len(hypotheses), (len(hypotheses), len(felt), int((last - first).max()))
     segments = Segments(
-        first=first.numpy(),
-        last=last.numpy(),
-        contact=contact[first].to(torch.int64).numpy(),
-        begins=begins.to(torch.int64).numpy(),
-        slips=slips.to(torch.int64).numpy(),
-        own=np.ascontiguousarray(alone.numpy()),
-        common=np.ascontiguousarray(common.numpy()),
-        errors=joint.numpy(),
-        factor=np.zeros(joint.shape),
-        log_determinant=np.zeros((len(joint), len(first))),
-        white=np.zeros((*joint.shape[:2], OF_CONTACT)),
-        known=np.zeros((len(joint), len(first), OF_CONTACT, OF_CONTACT)),
-        loaded=loaded.numpy(),
+        first=first,
+        last=last,
+        contact=contact[first].astype(np.int64),
+        begins=(contact[first] & ~within & (continues[first] != 1.0)).astype(np.int64),
+        slips=np.zeros(len(first), np.int64),
+        own=alone,
+        common=np.stack([(scale * errors.shared) ** 2, (errors.varying * compliance) ** 2], axis=1),
+        errors=np.zeros(shape),
+        factor=np.zeros(shape),
+        log_determinant=np.zeros((count, len(first))),
+        white=np.zeros((*shape[:2], OF_CONTACT)),
+        known=np.zeros((count, len(first), OF_CONTACT, OF_CONTACT)),
+        loaded=np.zeros(len(felt)),
     )
-    _set_factors(segments, force.numpy().copy())
+    _set_errors(segments, within, time, force, own, (scale * errors.drift) ** 2, errors.lasting)
+    _set_factors(segments, force)
     return segments
+
+
+@compiled
+def _set_errors(
+    segments: Segments, within: Array, time: Array, force: Array, own: Array, drift: Array, lasting: float
+) -> None:
+    """Set the covariances of the rows' errors, of `own` (H, R) and lasting ones, and where contacts slip."""
+    most = 0.0
+    for s in range(len(segments.first)):
+        if not segments.contact[s]:
+            continue
+        first, last = segments.first[s], segments.last[s]
+        # What is held by friction slips when it is loaded more than it was.
+        before = most if within[s] else 0.0
+        most = before
+        for i in range(first, last):
+            most = max(most, force[i], 1e-3)
+            segments.loaded[i] = most - before
+            for h in range(len(drift)):
+                for j in range(first, last):
+                    apart = abs(time[i] - time[j])
+                    segments.errors[h, i, j - first] = drift[h] * math.exp(-apart / lasting)
+                segments.errors[h, i, i - first] += own[h, i]
+        segments.loaded[first:last] /= max(most - before, 1e-9)
+        segments.slips[s] = int(most > _MORE * before)
 
 
 @compiled
