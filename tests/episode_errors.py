@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bcppl.distributions.episodes.row_errors import Hypothesis, RowErrors
+from bcppl.distributions.episodes.filter.row_errors import Hypothesis, RowErrors
 from bcppl.distributions.episodes.rows import EPISODE, FORCE, NOISE, TIME
 
 

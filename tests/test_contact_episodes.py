@@ -15,9 +15,9 @@ from torch.distributions import MultivariateNormal
 
 from bcppl import poses
 from bcppl.distributions.episodes import ContactEpisodes, Grasp, Hypothesis, LinearErrors
-from bcppl.distributions.episodes.alike import begun_alike, filtered_alike
+from bcppl.distributions.episodes.filter.alike import begun_alike, filtered_alike
+from bcppl.distributions.episodes.filter.row_errors import segments_of
 from bcppl.distributions.episodes.prior import NOISES, WIDE
-from bcppl.distributions.episodes.row_errors import segments_of
 from bcppl.distributions.episodes.rows import (
     COLUMNS,
     CONTINUES,

@@ -30,8 +30,8 @@ from bcppl.distributions.episodes import (
     Size,
 )
 from bcppl.distributions.episodes.displaced import lines_at
-from bcppl.distributions.episodes.posterior import moments
-from bcppl.distributions.episodes.row_errors import RowErrors
+from bcppl.distributions.episodes.filter.posterior import moments
+from bcppl.distributions.episodes.filter.row_errors import RowErrors
 from bcppl.distributions.episodes.rows import (
     EARLIER,
     FELT,

@@ -12,10 +12,10 @@ from torch.distributions import MultivariateNormal
 
 from bcppl import poses
 from bcppl.distributions.episodes import ContactEpisodes, Grasp, LinearErrors, Size
-from bcppl.distributions.episodes.branches import begun
 from bcppl.distributions.episodes.displaced import lines_at
+from bcppl.distributions.episodes.filter.branches import begun
+from bcppl.distributions.episodes.filter.row_errors import RowErrors
 from bcppl.distributions.episodes.regressed import Spread, regressed
-from bcppl.distributions.episodes.row_errors import RowErrors
 from bcppl.distributions.episodes.rows import EARLIER, FORCE
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.gap import PegGap

@@ -25,8 +25,8 @@ from bcppl.distributions.episodes import (
     LinearError,
     LinearErrors,
 )
-from bcppl.distributions.episodes.branches import OF_CONTACT
 from bcppl.distributions.episodes.displaced import lines_at
+from bcppl.distributions.episodes.filter.branches import OF_CONTACT
 from bcppl.distributions.episodes.rows import (
     COLUMNS,
     EARLIER,

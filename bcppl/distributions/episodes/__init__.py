@@ -1,5 +1,6 @@
 """Likelihood of a held peg's touches by episodes of contact."""
 
+from bcppl.distributions.episodes.filter.row_errors import Hypothesis
 from bcppl.distributions.episodes.likelihood import ContactEpisodes
 from bcppl.distributions.episodes.linear_errors import LinearError, LinearErrors
 from bcppl.distributions.episodes.nuisances import (
@@ -10,7 +11,6 @@ from bcppl.distributions.episodes.nuisances import (
     PartSlides,
     Size,
 )
-from bcppl.distributions.episodes.row_errors import Hypothesis
 
 __all__ = [
     "ArmCompliance",

@@ -10,18 +10,18 @@ import torch
 from torch import Tensor
 
 from bcppl.devices import beside, is_on_host
-from bcppl.distributions.episodes.alike import AlikeBranches, begun_alike, filtered_alike
-from bcppl.distributions.episodes.branches import Branches, Prior, begun
 from bcppl.distributions.episodes.couples import MeasuresWitness
 from bcppl.distributions.episodes.displaced import Lines, lines_at
+from bcppl.distributions.episodes.filter.alike import AlikeBranches, begun_alike, filtered_alike
+from bcppl.distributions.episodes.filter.branches import Branches, Prior, begun
+from bcppl.distributions.episodes.filter.posterior import moments
+from bcppl.distributions.episodes.filter.row_errors import Hypothesis, RowErrors, segments_of
+from bcppl.distributions.episodes.filter.switching_filter import filtered
 from bcppl.distributions.episodes.linear_errors import LinearErrors
-from bcppl.distributions.episodes.posterior import moments
 from bcppl.distributions.episodes.predicted import PredictedEpisodes
 from bcppl.distributions.episodes.prior import nodes_of, prior_of, with_delays
 from bcppl.distributions.episodes.regressed import Spread, regressed
-from bcppl.distributions.episodes.row_errors import Hypothesis, RowErrors, segments_of
 from bcppl.distributions.episodes.rows import COLUMNS, EPISODE, FORCE, NOISE, is_cut, last_end
-from bcppl.distributions.episodes.switching_filter import filtered
 from bcppl.distributions.manifold import FARTHEST, ContactManifold
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 

@@ -14,13 +14,13 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.devices import beside, numbers
 from bcppl.distributions.checks import Check, chi_square
-from bcppl.distributions.episodes.branches import Branches, begun
 from bcppl.distributions.episodes.couples import coupled, log_blocked
 from bcppl.distributions.episodes.displaced import lines_at
+from bcppl.distributions.episodes.filter.branches import Branches, begun
+from bcppl.distributions.episodes.filter.posterior import drawn, moments, probable_jumps
+from bcppl.distributions.episodes.filter.row_errors import segments_of
 from bcppl.distributions.episodes.filtered import FilteredEpisodes
-from bcppl.distributions.episodes.posterior import drawn, moments, probable_jumps
 from bcppl.distributions.episodes.prior import WIDE
-from bcppl.distributions.episodes.row_errors import segments_of
 from bcppl.distributions.episodes.rows import (
     COLUMNS,
     FELT,
@@ -56,14 +56,15 @@ class ContactEpisodes(FilteredEpisodes):
     marked as given, and the log-likelihood is that of all rows minus that of the given ones.
 
     What all touches share (`bench`: the peg's pose in the hand, the arm's compliance, ...) moves the gap and
-    is integrated out (`bcppl.distributions.episodes.switching_filter`). The gap is linear over what that may
-    be (`bcppl.distributions.episodes.regressed`), given the rows until a few before (`rows.last_end`).
+    is integrated out (`bcppl.distributions.episodes.filter.switching_filter`). The gap is linear over what
+    that may be (`bcppl.distributions.episodes.regressed`), given the rows until a few before
+    (`rows.last_end`).
 
     A row without contact has the probability that a gap about d is positive, as in `ContactManifold`, or
     about zero: a peg may rub along the part with a force that is not felt. Between two walls the gap seems
     less than it is, which the probability allows for. Of an episode each piece of a tenth of a second, or of
-    four rows, may be an outlier by itself (`bcppl.distributions.episodes.row_errors`), and the errors that
-    last are its own. Where a torque is one that no single contact exerts, an episode has besides the
+    four rows, may be an outlier by itself (`bcppl.distributions.episodes.filter.row_errors`), and the errors
+    that last are its own. Where a torque is one that no single contact exerts, an episode has besides the
     probability that the peg is not free to turn against it (`bcppl.distributions.episodes.couples`).
 
     The event is (T, COLUMNS): world_from_peg; 1 with contact, 0 without, NaN for a row that is not used;

@@ -8,9 +8,9 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from bcppl.distributions.episodes.branches import OF_CONTACT, Prior
+from bcppl.distributions.episodes.filter.branches import OF_CONTACT, Prior
+from bcppl.distributions.episodes.filter.row_errors import Hypothesis
 from bcppl.distributions.episodes.linear_errors import LinearErrors
-from bcppl.distributions.episodes.row_errors import Hypothesis
 from bcppl.distributions.manifold import FARTHEST
 
 # Factors of the rows' own errors, after their probabilities: a peg that bounces off an edge or sinks into it

@@ -16,8 +16,8 @@ from bcppl.contact.quasi_static import QuasiStaticMotion, WindowMotion
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.location import ContactSensing
 from bcppl.distributions.episodes import ContactEpisodes, Hypothesis, LinearError, LinearErrors
-from bcppl.distributions.episodes.branches import begun
-from bcppl.distributions.episodes.posterior import moments
+from bcppl.distributions.episodes.filter.branches import begun
+from bcppl.distributions.episodes.filter.posterior import moments
 from bcppl.distributions.episodes.prior import prior_of, with_delays
 from bcppl.distributions.episodes.rows import EPISODE, FELT, FORCE, TIME, WRENCH, new_rows
 from bcppl.distributions.manifold import MeasuresGap

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from bcppl.arrays import Array
 from bcppl.compiled import compiled
-from bcppl.distributions.episodes.branches import OF_CONTACT, Segments
-from bcppl.distributions.episodes.conditioning import dot, factorise, whiten
+from bcppl.distributions.episodes.filter.branches import OF_CONTACT, Segments
+from bcppl.distributions.episodes.filter.conditioning import dot, factorise, whiten
 from bcppl.distributions.episodes.rows import CONTINUES, EPISODE, FELT, FORCE, NOISE, TIME
 
 # Rows of a piece of an episode and the seconds between its first and the next one's, at least: it is an

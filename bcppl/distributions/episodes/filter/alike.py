@@ -1,8 +1,8 @@
 """The filter over a probe's episodes where nothing is learned of shared errors, for all particles by torch.
 
 Without these an episode's errors are correlated alike in all particles, and its hypotheses never multiply:
-what the compiled filter (`bcppl.distributions.episodes.switching_filter`) does particle by particle is a few
-operations on all of them. On a GPU it is evaluated so, where the particles are.
+what the compiled filter (`bcppl.distributions.episodes.filter.switching_filter`) does particle by particle is
+a few operations on all of them. On a GPU it is evaluated so, where the particles are.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from torch.special import log_ndtr
 
 from bcppl.arrays import Array, Indices
 from bcppl.devices import beside, numbers
-from bcppl.distributions.episodes.branches import OF_CONTACT, Branches, Prior, Segments
-from bcppl.distributions.episodes.switching_filter import BETWEEN, CLEAR, FAINT, RUBBING
+from bcppl.distributions.episodes.filter.branches import OF_CONTACT, Branches, Prior, Segments
+from bcppl.distributions.episodes.filter.switching_filter import BETWEEN, CLEAR, FAINT, RUBBING
 
 _FREE = 64  # rows without contact at a time: they take memory
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bcppl.distributions.episodes.branches import OF_CONTACT, Branches
+from bcppl.distributions.episodes.filter.branches import OF_CONTACT, Branches
 from bcppl.distributions.episodes.linear_errors import LinearErrors
 
 

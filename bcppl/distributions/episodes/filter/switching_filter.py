@@ -27,7 +27,8 @@ from torch import Tensor
 from bcppl.arrays import Array
 from bcppl.compiled import compiled, summed
 from bcppl.devices import numbers
-from bcppl.distributions.episodes.branches import (
+from bcppl.distributions.episodes.displaced import Lines
+from bcppl.distributions.episodes.filter.branches import (
     INLIER,
     KEPT,
     OF_CONTACT,
@@ -36,7 +37,7 @@ from bcppl.distributions.episodes.branches import (
     Prior,
     Segments,
 )
-from bcppl.distributions.episodes.conditioning import (
+from bcppl.distributions.episodes.filter.conditioning import (
     begin_contact,
     condition,
     dot,
@@ -46,7 +47,6 @@ from bcppl.distributions.episodes.conditioning import (
     squared_by,
     whiten,
 )
-from bcppl.distributions.episodes.displaced import Lines
 from bcppl.threads import parallel_sum, thread_count
 
 # Nats below the most probable hypothesis, from which on one is dropped: at the release of a touch the right

@@ -1,0 +1,1 @@
+"""A filter over the episodes of a probe: hypotheses of what holds for all touches, and their parameters."""
