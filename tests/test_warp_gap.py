@@ -65,7 +65,7 @@ def test_a_recording_ends_at_the_same_belief() -> None:
     recording = load_recording("peg_probe")
     ends = []
     for gap in (PegGap, WarpGap):
-        *_, last = guided_smc.infer(model.with_settings(gap=gap, profile="perfect"), recording, particles=30)
+        *_, last = guided_smc.infer(model.with_settings(gap=gap, profile="perfect"), recording)
         ends.append(last.belief)
     mean, spread = ends[0].mean, ends[0].covariance.diagonal().sqrt()
     assert bool((poses.local(mean, ends[1].mean).abs() < spread).all())

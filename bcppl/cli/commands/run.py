@@ -104,8 +104,8 @@ def run(
     report = Report(console, measured, chosen)
     options: dict[str, Any] = {"particles": particles, "seed": seed, "scene": scene}
     if device != HERE:
-        loading.check_takes(infer, "device", f"{inference} runs on the processor only", "leave out --device")
         options["device"] = device_named(device)
+        loading.check_takes(infer, "device", f"{inference} runs on the processor only", "leave out --device")
     if resume is not None and (resume / STEP).exists():
         loading.check_takes(infer, "start", f"{inference} cannot go on with a run", "run the recording again")
         start = options["start"] = load_step(resume / STEP, chosen, measured, scene)
