@@ -175,7 +175,9 @@ def read_record(path: Path) -> dict[str, Any]:
         raise InputError(f"there is no run in {path}: it has no {RECORD}; give the folder of a run.")
     record = strict_json.read(path / RECORD, "run the recording again", finite=False)
     kinds = {"recording": str, "model": str, "inference": str, "particles": int, "seed": int}
-    kinds |= {"settings": dict, "rows": list, "checked": dict}
+    kinds |= {"device": str, "settings": dict, "rows": list, "checked": dict}
+    if isinstance(record, dict):
+        record.setdefault("device", "cpu")  # of versions that had no other
     wrong = [] if isinstance(record, dict) else ["recording"]
     wrong = wrong or [name for name, kind in kinds.items() if not isinstance(record.get(name), kind)]
     if wrong:

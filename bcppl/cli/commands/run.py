@@ -80,7 +80,7 @@ def run(
                 f"--{option} is that of the run in {resume}; leave it out, or begin another run."
             )
         recording, particles, seed = recording or record["recording"], record["particles"], record["seed"]
-        device = record.get("device", HERE)
+        device = record["device"]
     if recording is None:
         raise InputError("there is nothing to run; give a recording, or the folder of a run by --resume.")
     measured = loading.recording(recording)
