@@ -35,6 +35,7 @@ from bcppl.distributions.pose_normals import (
 from bcppl.distributions.poses import MixturePose
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
+from bcppl.inference.approximations.adaptive import adapted
 from bcppl.inference.approximations.laplace import (
     Normal,
     QuadraticApproximation,
@@ -71,6 +72,7 @@ class GaussianApproximation:
     fits: Mapping[str, Fitted] = field(default_factory=dict)  # by viewpoint
     contacts: tuple[Approximated, ...] = ()  # measurements with a quadratic approximation
     quadratic: QuadraticApproximation | None = None  # of the contacts' likelihood; None before the first
+    adapted: QuadraticApproximation | None = None  # the same by importance sampling, for proposals
     # by number of the measurement, whether it is informative near the fits' estimate
     relevant: Mapping[int, bool] = field(default_factory=dict)
     stale: bool = False  # whether contacts were added after `quadratic` was computed
@@ -104,10 +106,18 @@ class GaussianApproximation:
         if device == HOST:
             return self
         fits = {name: replace(each, fit=moved(each.fit, device)) for name, each in self.fits.items()}
-        scene, quadratic = moved(self.scene, device), moved(self.quadratic, device)
-        there = replace(self, scene=scene, fits=fits, quadratic=quadratic)
+        there = replace(
+            self,
+            scene=moved(self.scene, device),
+            fits=fits,
+            quadratic=moved(self.quadratic, device),
+            adapted=moved(self.adapted, device),
+        )
         there.__dict__.update(
-            here=there, prior=moved(self.prior, device), mixture=moved(self.mixture, device)
+            here=there,
+            prior=moved(self.prior, device),
+            modes=moved(self.modes, device),
+            mixture=moved(self.mixture, device),
         )
         return there
 
@@ -158,24 +168,25 @@ class GaussianApproximation:
 
         known = self.prior
         everywhere = self.thorough and (again or (ambiguous and self._is_unsure()))
-        before = None if self.quadratic is None else self.mixture
-        own = torch.zeros(0) if before is None else known.component(before.centers)
+        before = None if self.quadratic is None else self.modes
+        wider = None if self.quadratic is None else self.mixture
         heading = next((heading for heading in headings if heading is not None), None)
         entering = [(sensor, c) for sensor, c in by_sensor if isinstance(sensor, EntersHole)]
         each = []
         for k, (center, covariance) in enumerate(zip(known.centers, known.covariances, strict=True)):
-            mine = None
-            if before is not None and bool((own == k).any()):
-                mine = GaussianMixture(*(values[own == k] for values in before))
+            mine, moments = (_within(known, k, mixture) for mixture in (before, wider))
             normal = Normal(center[None], torch.linalg.inv(covariance)[None])
             near = center[None] if mine is None else torch.cat([center[None], mine.centers])
             inside = [sensor.in_hole(c, near) for sensor, c in entering]
             inside = [places for places in inside if len(places.part)]
             entries = tuple(partial(s.at_mouth, c) for s, c in entering)
             search = Search(heading, everywhere, entries, self.near)
-            each.append(quadratic_approximation(sites, normal, mine, search, inside, nearby))
-        quadratic = each[0] if len(each) == 1 else together(each, known)
-        return replace(self, quadratic=quadratic, relevant=relevant, stale=False)
+            modes = quadratic_approximation(sites, normal, mine, search, inside, nearby)
+            each.append((modes, adapted(sites, normal, modes, moments)))
+        quadratic, spread = each[0]
+        if len(each) > 1:
+            quadratic, spread = (together(list(them), known) for them in zip(*each, strict=True))
+        return replace(self, quadratic=quadratic, adapted=spread, relevant=relevant, stale=False)
 
     def _by_sensor(self, contacts: tuple[Approximated, ...]) -> Iterator[tuple[Any, list[Approximated]]]:
         groups: dict[int, tuple[Any, list[Approximated]]] = {}
@@ -229,9 +240,18 @@ class GaussianApproximation:
 
     @cached_property
     @on_host()
+    def modes(self) -> GaussianMixture:
+        """The posterior by its modes and its curvature there (Laplace's method)."""
+        return self._posterior(self.quadratic)
+
+    @cached_property
+    @on_host()
     def mixture(self) -> GaussianMixture:
         """The posterior of the part's pose, the nuisance parameters integrated out."""
-        prior, quadratic = self.prior, self.quadratic
+        return self._posterior(self.adapted)
+
+    def _posterior(self, quadratic: QuadraticApproximation | None) -> GaussianMixture:
+        prior = self.prior
         if quadratic is None:
             return prior
         own = prior.component(quadratic.around)
@@ -293,7 +313,7 @@ class GaussianApproximation:
         """Whether some mode has no particle near it, and is about as probable as the best particle."""
         if self.quadratic is None:
             return False
-        here, mixture = self.here, self.here.mixture
+        here, mixture = self.here, self.here.modes
         away = poses.log(mixture.centers, trace[self.pose][:, None])
         squared = torch.einsum("nmi,mij,nmj->nm", away, torch.linalg.inv(mixture.covariances), away)
         alone = (squared > _APART).all(dim=0) & (mixture.log_weights.softmax(dim=0) > _SHARE)
@@ -348,7 +368,7 @@ class GaussianApproximation:
         ]
         prior = self.scene.prior
         given = product_of_factors(prior, factors) if factors else None
-        if self.quadratic is None:
+        if self.adapted is None:
             return prior if given is None else truncated(prior, given)
         if given is None:
             expected = normal_like(prior)
@@ -357,7 +377,7 @@ class GaussianApproximation:
         else:
             given = moments_within(prior, given)
             center, precision = given.center, torch.linalg.inv(given.covariance)
-        return widened_mixture(self.quadratic.posterior(center, precision))
+        return widened_mixture(self.adapted.posterior(center, precision))
 
     def predicted(self, trace: Any) -> Any:
         """The Gaussian with the moments of `conditional`; None where no measurement is included yet."""
@@ -365,3 +385,13 @@ class GaussianApproximation:
         if before is self.scene.prior:
             return None
         return matched(before) if isinstance(before, MixturePose) else before
+
+
+def _within(
+    prior: GaussianMixture, component: int, mixture: GaussianMixture | None
+) -> GaussianMixture | None:
+    """Those of a mixture's components that are within one of a prior's; None for none."""
+    if mixture is None:
+        return None
+    own = prior.component(mixture.centers) == component
+    return GaussianMixture(*(values[own] for values in mixture)) if bool(own.any()) else None

@@ -47,6 +47,7 @@ from bcppl.inference.proposals.approximated import (
     conditional_proposal,
     forward_kernel,
     independent_proposal,
+    joint_proposal,
     joint_random_walk,
 )
 from bcppl.inference.proposals.coordinates import continuous_addresses
@@ -83,7 +84,11 @@ class GaussianPrograms:
         return Pair(forward_kernel(before, after, action), backward_kernel(before, after, action))
 
     def proposals(self, approximation: Any) -> Sequence[Program]:  # noqa: D102
-        return conditional_proposal(approximation), joint_random_walk(approximation)
+        return (
+            conditional_proposal(approximation),
+            joint_proposal(approximation),
+            joint_random_walk(approximation),
+        )
 
 
 def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: bool = True) -> Kernel:
@@ -97,8 +102,7 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
     def moved(population: Population) -> Move:
         others = [address for address in continuous_addresses(population.trace) if address != pose]
         walks = [metropolis_hastings(drift(other, WALK)) for other in others]
-        of_pose: list[Any] = [*proposals(population.approximation), drift(pose, WALK)]
-        guided = [metropolis_hastings(proposal) for proposal in of_pose]
+        guided = [metropolis_hastings(proposal) for proposal in proposals(population.approximation)]
         if screen and runs_physics(population.trace):
             guided = [surrogate_transition(cycle(guided), approximated)]
         # One for all: chosen for each particle, every walk would have to run.

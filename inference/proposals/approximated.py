@@ -88,6 +88,16 @@ def conditional_proposal(given: GaussianApproximation) -> Program:
     return program
 
 
+def joint_proposal(given: GaussianApproximation) -> Program:
+    """An independence proposal of the part's pose; the nuisance parameters of its instruments follow it."""
+
+    def program(trace: Trace) -> None:
+        approximation = given.here
+        _follow(trace, approximation, widened_mixture(approximation.mixture), WALKING)
+
+    return program
+
+
 def joint_random_walk(given: GaussianApproximation) -> Program:
     """A random walk of the part's pose with the approximate covariance; nuisance parameters follow it."""
 

@@ -38,6 +38,7 @@ def approximation_content(approximation: Any) -> Content | None:
         "fits": list(approximation.fits),
         "contacts": [contact.number for contact in approximation.contacts],
         "quadratic": None if approximation.quadratic is None else list(approximation.quadratic),
+        "adapted": None if approximation.adapted is None else list(approximation.adapted),
         "relevant": [list(relevant), list(relevant.values())],
         "stale": approximation.stale,
     }
@@ -61,11 +62,13 @@ def approximation_of(content: Content | None, trace: Trace) -> GaussianApproxima
             "give the scene and the actions that it was saved with."
         ) from error
     quadratic = content["quadratic"]
+    adapted = content.get("adapted", quadratic)  # files of before it was computed have none
     return replace(
         GaussianApproximation(content["pose"], scene),
         fits=fits,
         contacts=contacts,
         quadratic=None if quadratic is None else QuadraticApproximation(*quadratic),
+        adapted=None if adapted is None else QuadraticApproximation(*adapted),
         relevant=dict(zip(*content["relevant"], strict=True)),
         stale=content["stale"],
     )
