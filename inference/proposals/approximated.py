@@ -25,8 +25,8 @@ from bcppl.sensors.capabilities import FitsPose
 from bcppl.traces import Trace
 
 # Correlations of standardised deviations before and after a proposal: of the part, of nuisance parameters
-# when a measurement is assimilated, and of those in a random walk.
-MOVED, ASSIMILATING, WALKING = 0.9, 0.98, 0.9
+# that follow it to anywhere, and of those in a random walk.
+MOVED, FOLLOWING, WALKING = 0.9, 0.98, 0.9
 SCALES = torch.tensor([0.1, 1.5], dtype=torch.float64).log()  # of a random walk
 _SAME = 25.0  # squared standard deviations: components that are nearer are the same before and after
 _KNOWN = 1e-14  # variance (m^2, rad^2) of a pose that is given
@@ -40,7 +40,7 @@ def forward_kernel(source: GaussianApproximation, target: GaussianApproximation,
         before, after = source.here, target.here
         sensor = after.scene.sensor(action)
         if not isinstance(sensor, FitsPose):
-            _follow(trace, after, _transported(trace, before, after), ASSIMILATING)
+            _follow(trace, after, _transported(trace, before, after), FOLLOWING)
             return
         values = {}
         if sensor.brings_nuisances(action, trace):
@@ -59,7 +59,7 @@ def backward_kernel(source: GaussianApproximation, target: GaussianApproximation
         if isinstance(after.scene.sensor(action), FitsPose):
             pyro.sample(before.pose, before.conditional(trace))
         else:
-            _follow(trace, before, _transported(trace, after, before), ASSIMILATING)
+            _follow(trace, before, _transported(trace, after, before), FOLLOWING)
 
     return program
 
@@ -93,7 +93,7 @@ def joint_proposal(given: GaussianApproximation) -> Program:
 
     def program(trace: Trace) -> None:
         approximation = given.here
-        _follow(trace, approximation, widened_mixture(approximation.mixture), WALKING)
+        _follow(trace, approximation, widened_mixture(approximation.mixture), FOLLOWING)
 
     return program
 
