@@ -62,9 +62,9 @@ ASKED = 4  # particles that are evaluated first for that
 # modes' shares.
 SEVERAL = 1800
 # Sweeps are made until the poses are displaced by so many variances, and no more than so many: one displaces
-# them by .3 to 2 where touches tell them, and by .02 to .1 along a bent ridge such as a peg wedged in a hole
-# leaves. There particles die out along it from window to window, and what is left is sure of a part.
-DISPLACED, MOST_SWEEPS = 0.25, 4
+# them by .2 to 1 where touches tell them, and by less along a bent ridge such as a peg wedged in a hole
+# leaves. There particles died out along it from window to window, and what was left was sure of a part.
+DISPLACED, MOST_SWEEPS = 0.5, 6
 
 
 class Programs(Protocol):
@@ -74,7 +74,7 @@ class Programs(Protocol):
         """Forward and backward kernels of one measurement."""
 
     def proposals(self, approximation: Any) -> Sequence[Program]:
-        """Proposals of Metropolis-Hastings moves."""
+        """Proposals of Metropolis-Hastings moves: one that is made in every sweep, then others."""
 
 
 class GaussianPrograms:
@@ -85,16 +85,17 @@ class GaussianPrograms:
 
     def proposals(self, approximation: Any) -> Sequence[Program]:  # noqa: D102
         return (
-            conditional_proposal(approximation),
             joint_proposal(approximation),
+            conditional_proposal(approximation),
             joint_random_walk(approximation),
         )
 
 
 def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: bool = True) -> Kernel:
-    """A random walk of one other latent value, the approximation's proposals, and a random walk of the pose.
+    """A random walk of one other latent value, and two of the approximation's proposals.
 
-    `proposals` are those that go with the approximation that the population carries. Where the program runs
+    `proposals` are those that go with the approximation that the population carries: the first is made in
+    every sweep, and one of the others. Where the program runs
     physics and these are to `screen`, they move by what is approximated (`approximated`), and physics decides
     once about where they have led.
     """
@@ -102,14 +103,18 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
     def moved(population: Population) -> Move:
         others = [address for address in continuous_addresses(population.trace) if address != pose]
         walks = [metropolis_hastings(drift(other, WALK)) for other in others]
-        guided = [metropolis_hastings(proposal) for proposal in proposals(population.approximation)]
+        first, *further = (metropolis_hastings(p) for p in proposals(population.approximation))
+        guided = [first, *_one_of(further)]
         if screen and runs_physics(population.trace):
             guided = [surrogate_transition(cycle(guided), approximated)]
-        # One for all: chosen for each particle, every walk would have to run.
-        chosen = [walks[int(torch.randint(len(walks), ()))]] if walks else []
-        return sequence([*chosen, *guided])(population)
+        return sequence([*_one_of(walks), *guided])(population)
 
     return moved
+
+
+def _one_of(kernels: Sequence[Kernel]) -> list[Kernel]:
+    """One for all particles: chosen for each, every one would have to run."""
+    return [kernels[int(torch.randint(len(kernels), ()))]] if kernels else []
 
 
 def guided(
