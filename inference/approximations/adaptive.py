@@ -23,7 +23,9 @@ from bcppl.distributions.poses import MixturePose, NormalTwist
 from bcppl.inference.approximations.laplace import Normal, QuadraticApproximation, Sites
 
 FIRST, MORE, ROUNDS = 64, 256, 6  # draws of the first round and of each further one; rounds at most
-GOOD = 0.3  # the share of effective draws in the first round with which the curvature is good enough
+# The curvature is good enough if this share of the first round's draws is effective, and these are no further
+# from the modes than so many squared standard deviations on average (six for a Gaussian).
+GOOD, FAR = 0.2, 9.0
 ENOUGH = 100.0  # effective draws that moments of six axes are taken from
 _OLD = 6.0  # draws that the covariance of the round before counts for
 _MOST, _LEAST = 4, 0.01  # components that are kept: at most so many, of at least this share
@@ -38,8 +40,8 @@ def adapted(
     wider. It is around the components' means; the modes as they are where their curvature is good enough.
     """
     alone = NormalTwist(prior.center[0], torch.linalg.inv(prior.precision[0]))
-    mixture = modes.posterior(*prior)
-    mixture = GaussianMixture(*(values[0] for values in mixture))
+    curved = GaussianMixture(*(values[0] for values in modes.posterior(*prior)))
+    mixture = curved if before is None else _both(curved, before)
     drawn, target, proposals = list[Tensor](), list[Tensor](), list[MixturePose]()
     with same_random_state():
         torch.manual_seed(0)
@@ -56,10 +58,8 @@ def adapted(
             log_weights = torch.cat(target) - (density + shares).logsumexp(dim=1)
             weights = log_weights.softmax(dim=0)
             effective = float(1.0 / weights.square().sum())
-            if number == 0 and effective > GOOD * FIRST:
+            if number == 0 and effective > GOOD * FIRST and float(weights @ _away(curved, pose)) < FAR:
                 return modes
-            if number == 0 and before is not None:
-                mixture = _both(mixture, before)
             log_evidence = float(log_weights.logsumexp(dim=0)) - math.log(len(pose))
             mixture = _moments(mixture, pose, weights, log_evidence)
             if effective > ENOUGH:
@@ -84,6 +84,12 @@ def _moments(mixture: GaussianMixture, pose: Tensor, weights: Tensor, log_eviden
     spread = torch.einsum("sm,smi,smj->mij", within, away, away)
     covariances = (effective * spread + _OLD * mixture.covariances) / (effective + _OLD)
     return GaussianMixture(centers, covariances, mass.log() + log_evidence)
+
+
+def _away(mixture: GaussianMixture, pose: Tensor) -> Tensor:
+    """The squared standard deviations (S,) of poses (S, 7) from the nearest component."""
+    away = poses.log(mixture.centers, pose[:, None])
+    return torch.einsum("smi,mij,smj->sm", away, torch.linalg.inv(mixture.covariances), away).amin(dim=1)
 
 
 def _both(one: GaussianMixture, other: GaussianMixture) -> GaussianMixture:

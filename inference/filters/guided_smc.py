@@ -95,7 +95,7 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
     """A random walk of one other latent value, and two of the approximation's proposals.
 
     `proposals` are those that go with the approximation that the population carries: the first is made in
-    every sweep, and one of the others. Where the program runs
+    every sweep, and one of the others; a random walk of the pose where there are none. Where the program runs
     physics and these are to `screen`, they move by what is approximated (`approximated`), and physics decides
     once about where they have led.
     """
@@ -103,7 +103,8 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
     def moved(population: Population) -> Move:
         others = [address for address in continuous_addresses(population.trace) if address != pose]
         walks = [metropolis_hastings(drift(other, WALK)) for other in others]
-        first, *further = (metropolis_hastings(p) for p in proposals(population.approximation))
+        of_pose = [*proposals(population.approximation)] or [drift(pose, WALK)]
+        first, *further = (metropolis_hastings(proposal) for proposal in of_pose)
         guided = [first, *_one_of(further)]
         if screen and runs_physics(population.trace):
             guided = [surrogate_transition(cycle(guided), approximated)]
