@@ -103,7 +103,7 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
     def moved(population: Population) -> Move:
         others = [address for address in continuous_addresses(population.trace) if address != pose]
         walks = [metropolis_hastings(drift(other, WALK)) for other in others]
-        of_pose = [*proposals(population.approximation)] or [drift(pose, WALK)]
+        of_pose: list[Any] = [*proposals(population.approximation)] or [drift(pose, WALK)]
         first, *further = (metropolis_hastings(proposal) for proposal in of_pose)
         guided = [first, *_one_of(further)]
         if screen and runs_physics(population.trace):

@@ -14,14 +14,14 @@ from bcppl.arguments import number_within
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import log_scales, spread_of, weighted_places
+from bcppl.inference.proposals.spread import spread_of, weighted_places
 from bcppl.traces import Trace
 
 DIFFERENCES = 200  # drawn when it is fitted
 
 
 def differential_evolution(
-    address: str, *, scales: tuple[float, float] = (1.0, 1.0), jumps: float = 0.1, noise: float = 0.05
+    address: str, *, scale: float | None = None, jumps: float = 0.1, noise: float = 0.05
 ) -> Fitted:
     """A proposal that steps along plus or minus the difference of two other particles, with noise.
 
@@ -32,16 +32,16 @@ def differential_evolution(
 
     Args:
         address: of the latent value.
-        scales: the factor of the differences is log-uniform between these, times ter Braak's
-            2.38 / sqrt(2 d). Along a bent ridge no single one is right.
+        scale: factor of the differences; by default ter Braak's 2.38 / sqrt(2 d).
         jumps: the probability of a whole difference.
         noise: standard deviation of the noise, in the particles' standard deviations.
 
     Raises:
-        InputError: the scales are not two positive numbers, the smaller first, the noise is not positive, or
-            the jumps are no probability; when it is fitted: the address is not latent, or is discrete.
+        InputError: the scale or the noise is not positive, or the jumps are no probability; when it is
+            fitted: the address is not latent, or is discrete.
     """
-    smallest, largest = log_scales("differential_evolution", scales)
+    if scale is not None:
+        scale = number_within("differential_evolution is given the scale {}", scale, above=0.0)
     jumps = number_within("differential_evolution is given the jumps {}", jumps, least=0.0, most=1.0)
     noise = number_within("differential_evolution is given the noise {}", noise, above=0.0)
     spread = spread_of(address)
@@ -50,16 +50,15 @@ def differential_evolution(
         covariance = noise**2 * spread(population)
         known, places, weights, *_ = weighted_places(population, address)
         drawn = _differences(known, places, weights)
-        usual = 2.38 / math.sqrt(2.0 * known.dimension)
+        usual = 2.38 / math.sqrt(2.0 * known.dimension) if scale is None else scale
+        sizes = torch.tensor([usual, 1.0], dtype=torch.float64)
 
         def along(trace: Trace) -> None:
             coordinates = known.of(trace)
             # A categorical one would be given the chances of all for each particle.
             which = pyro.sample("difference", dist.Uniform(drawn.new_zeros(()), float(len(drawn)))).long()
             whole = pyro.sample("whole", dist.Bernoulli(torch.tensor(jumps, dtype=torch.float64)))
-            share = pyro.sample("difference scale", dist.Uniform(drawn.new_zeros(()), 1.0))
-            size = usual * torch.exp(torch.lerp(smallest, largest, share))
-            step = torch.where(whole > 0.0, 1.0, size)[:, None] * drawn[which]
+            step = sizes[whole.long()][:, None] * drawn[which]
             place = coordinates.places(trace[address])
             ends = coordinates.stepped(place[:, None], torch.stack([step, -step], dim=1))
             pyro.sample(

@@ -9,9 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bcppl.arguments import number_within
 from bcppl.beliefs import normalised
-from bcppl.errors import InferenceError, InputError
+from bcppl.errors import InferenceError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
 from bcppl.inference.summaries import weighted_covariance
@@ -125,13 +124,3 @@ def conditioned(covariance: Tensor, count: float) -> Tensor:
     """
     share = 0.1 * min(1.0, (len(covariance) / count) ** 2)
     return (1.0 - share) * covariance + share * torch.diag(covariance.diagonal())
-
-
-def log_scales(proposal: str, scales: tuple[float, float]) -> Tensor:
-    """The logarithms (2,) of a proposal's smallest and largest scale."""
-    smallest, largest = (number_within(f"{proposal} is given the scale {{}}", s, above=0.0) for s in scales)
-    if smallest > largest:
-        raise InputError(
-            f"{proposal} is given the scales {(smallest, largest)}; give the smaller one first, (0.05, 1.0)."
-        )
-    return torch.tensor([math.log(smallest), math.log(largest)], dtype=torch.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -10,11 +11,12 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
+from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
 from bcppl.inference.proposals.proposal import Fitted
-from bcppl.inference.proposals.spread import conditioned, log_scales, spread_of, weighted_places
+from bcppl.inference.proposals.spread import conditioned, spread_of, weighted_places
 from bcppl.inference.summaries import weighted_covariance
 from bcppl.traces import Trace
 
@@ -35,7 +37,7 @@ def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fitted:
         InputError: the scales are not two positive numbers, the smaller first; when it is fitted: the address
             is not latent, or is discrete.
     """
-    sizes = log_scales("drift", scales)
+    log_scales = _log_scales(scales)
     spread = spread_of(address)
 
     def fit(population: Population) -> Callable[[Trace], None]:
@@ -44,7 +46,7 @@ def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fitted:
 
         def random_walk(trace: Trace) -> None:
             coordinates = known.of(trace)
-            size = torch.exp(pyro.sample("drift scale", dist.Uniform(*sizes)))
+            size = torch.exp(pyro.sample("drift scale", dist.Uniform(*log_scales)))
             place = coordinates.places(trace[address])
             pyro.sample(address, coordinates.normal(place, covariance, size))
 
@@ -73,13 +75,13 @@ def joint_drift(*addresses: str, scales: tuple[float, float] = (0.05, 1.0)) -> F
             f"joint_drift is given the addresses {addresses!r}; give two or more, each once; "
             "use drift for one."
         )
-    sizes = log_scales("drift", scales)
+    log_scales = _log_scales(scales)
 
     def fit(population: Population) -> Callable[[Trace], None]:
         links = _links(population, addresses)
 
         def random_walk(trace: Trace) -> None:
-            size = torch.exp(pyro.sample("drift scale", dist.Uniform(*sizes)))
+            size = torch.exp(pyro.sample("drift scale", dist.Uniform(*log_scales)))
             taken = torch.zeros(len(trace), 0, dtype=torch.float64)
             for link in links:
                 coordinates = link.coordinates.of(trace)
@@ -132,3 +134,13 @@ def _links(population: Population, addresses: tuple[str, ...]) -> list[_Link]:
         links.append(_Link(address, coordinates, gain, 0.5 * (left + left.T)))
         end += coordinates.dimension
     return links
+
+
+def _log_scales(scales: tuple[float, float]) -> Tensor:
+    """The logarithms (2,) of the smallest and the largest scale."""
+    smallest, largest = (number_within("drift is given the scale {}", s, above=0.0) for s in scales)
+    if smallest > largest:
+        raise InputError(
+            f"drift is given the scales {(smallest, largest)}; give the smaller one first, (0.05, 1.0)."
+        )
+    return torch.tensor([math.log(smallest), math.log(largest)], dtype=torch.float64)
