@@ -40,6 +40,7 @@ from bcppl.inference.approximations.laplace import (
     Normal,
     QuadraticApproximation,
     Search,
+    joined,
     quadratic_approximation,
     together,
 )
@@ -143,9 +144,21 @@ class GaussianApproximation:
 
     @on_host()
     def updated(self) -> GaussianApproximation:
-        """The same with the quadratic approximation of all contacts."""
+        """The same with the quadratic approximation of all contacts, adapted to the posterior."""
         if not self.stale:
             return self
+        found, known = self.searched(), self.prior
+        assert found.quadratic is not None
+        wider = None if self.quadratic is None else self.mixture
+        own, each = known.component(found.quadratic.around), []
+        for k in own.unique().tolist():
+            modes = QuadraticApproximation(*(values[own == k] for values in found.quadratic))
+            each.append(adapted(found._sites, _normal(known, k), modes, _within(known, k, wider)))
+        return replace(found, adapted=joined(each))
+
+    @on_host()
+    def searched(self) -> GaussianApproximation:
+        """The same with the quadratic approximation of all contacts, by its curvature at the modes."""
         relevant = dict(self.relevant)
         for contact in self.contacts:
             sensor = self.scene.sensor(contact.action)
@@ -153,7 +166,8 @@ class GaussianApproximation:
                 relevant[contact.number] = not isinstance(sensor, Contacts) or sensor.is_informative(
                     contact.action, contact.value, self.prior.centers
                 )
-        by_sensor = list(self._by_sensor(tuple(c for c in self.contacts if relevant[c.number])))
+        given = replace(self, relevant=relevant)
+        by_sensor = list(self._by_sensor(given._informative))
         contacts = [(sensor, own) for sensor, own in by_sensor if isinstance(sensor, Contacts)]
         first = self.quadratic is None
         ambiguous = any(sensor.new_contact(own, newest=not first) for sensor, own in contacts)
@@ -161,32 +175,27 @@ class GaussianApproximation:
         again = self.near is not None
         nearby = not (first or ambiguous or again) and len(contacts) == len(by_sensor)
         headings = [sensor.heading(own) for sensor, own in contacts]
-
-        def sites(pose: Tensor, blur: float) -> Iterator[tuple[Any, Tensor]]:
-            for sensor, own in by_sensor:
-                yield from sensor.sites(own, pose, blur)
-
         known = self.prior
         everywhere = self.thorough and (again or (ambiguous and self._is_unsure()))
         before = None if self.quadratic is None else self.modes
-        wider = None if self.quadratic is None else self.mixture
         heading = next((heading for heading in headings if heading is not None), None)
         entering = [(sensor, c) for sensor, c in by_sensor if isinstance(sensor, EntersHole)]
         each = []
-        for k, (center, covariance) in enumerate(zip(known.centers, known.covariances, strict=True)):
-            mine, moments = (_within(known, k, mixture) for mixture in (before, wider))
-            normal = Normal(center[None], torch.linalg.inv(covariance)[None])
-            near = center[None] if mine is None else torch.cat([center[None], mine.centers])
+        for k in range(len(known.centers)):
+            mine, normal = _within(known, k, before), _normal(known, k)
+            near = normal.center if mine is None else torch.cat([normal.center, mine.centers])
             inside = [sensor.in_hole(c, near) for sensor, c in entering]
             inside = [places for places in inside if len(places.part)]
             entries = tuple(partial(s.at_mouth, c) for s, c in entering)
             search = Search(heading, everywhere, entries, self.near)
-            modes = quadratic_approximation(sites, normal, mine, search, inside, nearby)
-            each.append((modes, adapted(sites, normal, modes, moments)))
-        quadratic, spread = each[0]
-        if len(each) > 1:
-            quadratic, spread = (together(list(them), known) for them in zip(*each, strict=True))
-        return replace(self, quadratic=quadratic, adapted=spread, relevant=relevant, stale=False)
+            each.append(quadratic_approximation(given._sites, normal, mine, search, inside, nearby))
+        quadratic = each[0] if len(each) == 1 else together(each, known)
+        return replace(given, quadratic=quadratic, adapted=quadratic, stale=False)
+
+    def _sites(self, pose: Tensor, blur: float) -> Iterator[tuple[Any, Tensor]]:
+        """The likelihood of the contacts at poses (S, 7), as `laplace.Sites`."""
+        for sensor, own in self._by_sensor(self._informative):
+            yield from sensor.sites(own, pose, blur)
 
     def _by_sensor(self, contacts: tuple[Approximated, ...]) -> Iterator[tuple[Any, list[Approximated]]]:
         groups: dict[int, tuple[Any, list[Approximated]]] = {}
@@ -385,6 +394,11 @@ class GaussianApproximation:
         if before is self.scene.prior:
             return None
         return matched(before) if isinstance(before, MixturePose) else before
+
+
+def _normal(prior: GaussianMixture, component: int) -> Normal:
+    """One of a prior's components."""
+    return Normal(prior.centers[component, None], torch.linalg.inv(prior.covariances[component])[None])
 
 
 def _within(

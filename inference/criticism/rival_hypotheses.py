@@ -170,7 +170,7 @@ def _with_contacts(
         quadratic=None,
         stale=True,
         thorough=thorough,
-    ).updated()
+    ).searched()
 
 
 def _forces(approximation: GaussianApproximation) -> Iterator[tuple[FeelsForces, list[Approximated]]]:
