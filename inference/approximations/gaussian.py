@@ -23,7 +23,6 @@ from bcppl.devices import HOST, current_device, moved, on_host
 from bcppl.distributions.pose_normals import (
     GaussianMixture,
     PoseFactor,
-    log_overlap,
     matched,
     mixture_of,
     moments_within,
@@ -36,6 +35,7 @@ from bcppl.distributions.poses import MixturePose
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.approximations.adaptive import adapted
+from bcppl.inference.approximations.fits import Fitted, by_instrument, given_fits
 from bcppl.inference.approximations.laplace import (
     Normal,
     QuadraticApproximation,
@@ -47,21 +47,12 @@ from bcppl.inference.approximations.laplace import (
 from bcppl.inference.targets import PHYSICS, cost_of
 from bcppl.sensors.capabilities import Approximated, Contacts, EntersHole, FitsPose, Linearised, Screens
 
-_MODES, _FAINT = 8, 10.0  # that views leave: at most so many, within so many nats of the most probable
 # A mode that particles miss: of at least this share of all modes' weight, at most so many nats less probable
 # than the best particle, and no particle within so many squared standard deviations.
 _SHARE, _LESS, _APART = 0.05, 5.0, 50.0
 _BETTER = 3.0  # nats by which a particle is more probable than all modes, which have been lost
 _FOLLOWED = 32  # particles from which modes are searched for
 UNSURE = 0.0005  # m: beyond this standard deviation the contact may be with another place of the part
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """The action of a viewpoint's first measurement, and the Gaussian fitted to that."""
-
-    action: Any
-    fit: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,13 +195,6 @@ class GaussianApproximation:
             groups.setdefault(id(sensor), (sensor, []))[1].append(contact)
         yield from groups.values()
 
-    def _by_instrument(self) -> list[list[int]]:
-        """The places of each instrument's own among the fits."""
-        groups: dict[str, list[int]] = {}
-        for k, each in enumerate(self.fits.values()):
-            groups.setdefault(self.scene.sensor(each.action).instrument(each.action), []).append(k)
-        return list(groups.values())
-
     def _is_unsure(self) -> bool:
         """Whether the part may be at several places so far, or at one that is not known well."""
         covariances = self.mixture.covariances
@@ -221,31 +205,7 @@ class GaussianApproximation:
     @on_host()
     def prior(self) -> GaussianMixture:
         """The pose given the instruments' fits; the model's prior where there is none."""
-        prior, fits = self.scene.prior, list(self.fits.values())
-        if not fits:
-            normal = normal_like(prior)
-            alone = torch.zeros(1, dtype=torch.float64)
-            return GaussianMixture(normal.center[None], normal.covariance[None], alone)
-        # One component for each combination of the instruments' own, as far as they agree.
-        each = torch.cartesian_prod(*(torch.arange(len(f.fit.log_weights)) for f in fits)).reshape(
-            -1, len(fits)
-        )
-        chosen = [f.fit.chosen(index) for f, index in zip(fits, each.T, strict=True)]
-        factors = []
-        for own in self._by_instrument():
-            actions, sensor = [fits[k].action for k in own], self.scene.sensor(fits[own[0]].action)
-            factors.append(sensor.marginal_factor(actions, [chosen[k] for k in own]))
-        normal = product_of_factors(prior, factors)
-        log_weights = torch.stack([fit.log_weights for fit in chosen]).sum(dim=0)
-        kept = torch.zeros(1, dtype=torch.int64)
-        if len(each) > 1:
-            log_weights = log_weights + log_overlap(normal, factors)
-            order = log_weights.argsort(descending=True)[:_MODES]
-            kept = order[log_weights[order] > log_weights[order[0]] - _FAINT]
-        whole = moments_within(prior, normal)
-        return GaussianMixture(
-            whole.center[kept], whole.covariance[kept], log_weights[kept].log_softmax(dim=0)
-        )
+        return given_fits(self.scene, list(self.fits.values()))
 
     @cached_property
     @on_host()
@@ -373,7 +333,7 @@ class GaussianApproximation:
         fits = list(self.fits.values())
         factors: list[PoseFactor] = [
             self.scene.sensor(fits[own[0]].action).factor([fits[k].action for k in own], looked_up)
-            for own in self._by_instrument()
+            for own in by_instrument(self.scene, fits)
         ]
         prior = self.scene.prior
         given = product_of_factors(prior, factors) if factors else None

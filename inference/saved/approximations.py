@@ -11,7 +11,8 @@ from dataclasses import replace
 from typing import Any
 
 from bcppl.errors import InputError
-from bcppl.inference.approximations.gaussian import Fitted, GaussianApproximation
+from bcppl.inference.approximations.fits import Fitted
+from bcppl.inference.approximations.gaussian import GaussianApproximation
 from bcppl.inference.approximations.laplace import QuadraticApproximation
 from bcppl.sensors.capabilities import Approximated, FitsPose
 from bcppl.traces import Trace

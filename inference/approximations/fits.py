@@ -1,0 +1,62 @@
+"""The pose of a part given what is fitted to the images of several instruments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from bcppl.distributions.pose_normals import (
+    GaussianMixture,
+    log_overlap,
+    moments_within,
+    normal_like,
+    product_of_factors,
+)
+
+_MODES, _FAINT = 8, 10.0  # that views leave: at most so many, within so many nats of the most probable
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """The action of a viewpoint's first measurement, and the Gaussian fitted to that."""
+
+    action: Any
+    fit: Any
+
+
+def by_instrument(scene: Any, fits: Sequence[Fitted]) -> list[list[int]]:
+    """The places of each instrument's own among the fits."""
+    groups: dict[str, list[int]] = {}
+    for k, each in enumerate(fits):
+        groups.setdefault(scene.sensor(each.action).instrument(each.action), []).append(k)
+    return list(groups.values())
+
+
+def given_fits(scene: Any, fits: Sequence[Fitted]) -> GaussianMixture:
+    """The part's pose given the fits, the nuisance parameters integrated out; the prior where there is none.
+
+    It has one component for each combination of the instruments' own, as far as they agree.
+    """
+    prior = scene.prior
+    if not fits:
+        normal = normal_like(prior)
+        alone = torch.zeros(1, dtype=torch.float64)
+        return GaussianMixture(normal.center[None], normal.covariance[None], alone)
+    each = torch.cartesian_prod(*(torch.arange(len(f.fit.log_weights)) for f in fits)).reshape(-1, len(fits))
+    chosen = [f.fit.chosen(index) for f, index in zip(fits, each.T, strict=True)]
+    factors = []
+    for own in by_instrument(scene, fits):
+        actions, sensor = [fits[k].action for k in own], scene.sensor(fits[own[0]].action)
+        factors.append(sensor.marginal_factor(actions, [chosen[k] for k in own]))
+    normal = product_of_factors(prior, factors)
+    log_weights = torch.stack([fit.log_weights for fit in chosen]).sum(dim=0)
+    kept = torch.zeros(1, dtype=torch.int64)
+    if len(each) > 1:
+        log_weights = log_weights + log_overlap(normal, factors)
+        order = log_weights.argsort(descending=True)[:_MODES]
+        kept = order[log_weights[order] > log_weights[order[0]] - _FAINT]
+    whole = moments_within(prior, normal)
+    return GaussianMixture(whole.center[kept], whole.covariance[kept], log_weights[kept].log_softmax(dim=0))
