@@ -121,6 +121,18 @@ def test_the_posterior_before_is_where_draws_begin_too() -> None:
         assert (share == pytest.approx(expected / (1.0 + expected), abs=0.06)) is found
 
 
+def test_modes_stay_where_no_draw_has_weight() -> None:
+    @dataclass(frozen=True)
+    class Nowhere:
+        pose: Tensor
+
+        def log_prob(self, value: Tensor) -> Tensor:
+            return torch.full((len(self.pose),), -torch.inf, dtype=torch.float64)
+
+    modes = at_mode(NARROW)
+    assert adapted(lambda pose, blur: [(Nowhere(pose), torch.zeros(()))], PRIOR, modes) is modes
+
+
 def test_components_are_a_likelihood_that_leaves_them() -> None:
     spread = torch.diag(torch.tensor([1e-4, 5e-4, 2e-3, 0.01, 0.03, 0.02], dtype=torch.float64) ** 2)
     away = torch.tensor([[1e-3, 0, 0, 0.02, 0, 0], [0, -2e-3, 0, 0, 0, 0.03]], dtype=torch.float64)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.devices import same_random_state
+from bcppl.devices import same_random_state, seed_here
 from bcppl.distributions.pose_normals import GaussianMixture, widened_mixture
 from bcppl.distributions.poses import MixturePose, NormalTwist
 from bcppl.inference.approximations.laplace import Normal, QuadraticApproximation, Sites
@@ -44,7 +44,7 @@ def adapted(
     mixture = curved if before is None else _both(curved, before)
     drawn, target, proposals = list[Tensor](), list[Tensor](), list[MixturePose]()
     with same_random_state():
-        torch.manual_seed(0)
+        seed_here(0)
         for number in range(ROUNDS):
             proposals.append(widened_mixture(mixture))
             drawn.append(proposals[-1].sample((MORE if number else FIRST,)))
@@ -58,6 +58,8 @@ def adapted(
             log_weights = torch.cat(target) - (density + shares).logsumexp(dim=1)
             weights = log_weights.softmax(dim=0)
             effective = float(1.0 / weights.square().sum())
+            if not math.isfinite(effective):
+                return modes  # no draw has any weight
             if number == 0 and effective > GOOD * FIRST and float(weights @ _away(curved, pose)) < FAR:
                 return modes
             log_evidence = float(log_weights.logsumexp(dim=0)) - math.log(len(pose))
