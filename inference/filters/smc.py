@@ -247,7 +247,8 @@ def _steps(
         truth.assimilate(observed)
         gap = truth.gap(population)
         evidence, distinct = population.log_evidence, belief.distinct
-        info = Info(label, _time(measurement), evidence, distinct, gap, elapsed, spent, happened)
+        record = moved(happened, HOST)
+        info = Info(label, _time(measurement), evidence, distinct, gap, elapsed, spent, record)
         start = Step(belief, info, population, state[0], count)
         yield start
 
