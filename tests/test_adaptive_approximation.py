@@ -72,7 +72,7 @@ def moments(quadratic: QuadraticApproximation) -> GaussianMixture:
     return GaussianMixture(*(values[0] for values in quadratic.posterior(*PRIOR)))
 
 
-def test_moments_and_evidence_where_curvature_says_a_tenth_of_the_width() -> None:
+def test_moments_and_evidence_where_curvature_says_a_fifth_of_the_width() -> None:
     modes = at_mode(NARROW)
     posterior = moments(adapted(sites(NARROW), PRIOR, modes))
     variance, log_evidence = exact(NARROW)

@@ -46,6 +46,11 @@ class GaussianMixture(NamedTuple):
         log_prob = NormalTwist(self.centers, self.covariances).log_prob(pose[:, None])
         return (self.log_weights + log_prob).argmax(dim=1)
 
+    def squared_deviations(self, pose: Tensor) -> Tensor:
+        """The squared standard deviations (N, M) of poses (N, 7) from each of the components."""
+        away = poses.log(self.centers, pose[:, None])
+        return torch.einsum("nmi,mij,nmj->nm", away, torch.linalg.inv(self.covariances), away)
+
     def times(self, factor: NormalPose) -> GaussianMixture:
         """The mixture that approximates its product with a Gaussian (...,)."""
         center, spread = factor.center[..., None, :], factor.covariance[..., None, :, :]

@@ -60,8 +60,10 @@ def adapted(
             effective = float(1.0 / weights.square().sum())
             if not math.isfinite(effective):
                 return modes  # no draw has any weight
-            if number == 0 and effective > GOOD * FIRST and float(weights @ _away(curved, pose)) < FAR:
-                return modes
+            if number == 0 and effective > GOOD * FIRST:
+                away = curved.squared_deviations(pose).amin(dim=1)
+                if float(weights @ away) < FAR:
+                    return modes
             log_evidence = float(log_weights.logsumexp(dim=0)) - math.log(len(pose))
             mixture = _moments(mixture, pose, weights, log_evidence)
             if effective > ENOUGH:
@@ -86,12 +88,6 @@ def _moments(mixture: GaussianMixture, pose: Tensor, weights: Tensor, log_eviden
     spread = torch.einsum("sm,smi,smj->mij", within, away, away)
     covariances = (effective * spread + _OLD * mixture.covariances) / (effective + _OLD)
     return GaussianMixture(centers, covariances, mass.log() + log_evidence)
-
-
-def _away(mixture: GaussianMixture, pose: Tensor) -> Tensor:
-    """The squared standard deviations (S,) of poses (S, 7) from the nearest component."""
-    away = poses.log(mixture.centers, pose[:, None])
-    return torch.einsum("smi,mij,smj->sm", away, torch.linalg.inv(mixture.covariances), away).amin(dim=1)
 
 
 def _both(one: GaussianMixture, other: GaussianMixture) -> GaussianMixture:

@@ -18,7 +18,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bcppl import poses
 from bcppl.devices import HOST, current_device, moved, on_host
 from bcppl.distributions.pose_normals import (
     GaussianMixture,
@@ -283,8 +282,7 @@ class GaussianApproximation:
         if self.quadratic is None:
             return False
         here, mixture = self.here, self.here.modes
-        away = poses.log(mixture.centers, trace[self.pose][:, None])
-        squared = torch.einsum("nmi,mij,nmj->nm", away, torch.linalg.inv(mixture.covariances), away)
+        squared = mixture.squared_deviations(trace[self.pose])
         alone = (squared > _APART).all(dim=0) & (mixture.log_weights.softmax(dim=0) > _SHARE)
         if not bool(alone.any()):
             return False
