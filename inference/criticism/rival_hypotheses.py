@@ -168,6 +168,7 @@ def _with_contacts(
         contacts=tuple(contacts),
         relevant=relevant,
         quadratic=None,
+        adapted=None,
         stale=True,
         thorough=thorough,
     ).searched()
