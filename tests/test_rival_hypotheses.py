@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from bcppl.contact.touch import Touch
@@ -17,7 +18,7 @@ from bcppl.geometry.extrusion import block, box_peg, cylinder_peg
 from bcppl.geometry.parts import Part
 from bcppl.inference.criticism import explanations
 from bcppl.inference.criticism.hypotheses import VERY_STRONG
-from bcppl.inference.criticism.rival_hypotheses import approximated, log_evidence
+from bcppl.inference.criticism.rival_hypotheses import _with_contacts, approximated, log_evidence
 from bcppl.models import look_and_touch
 from bcppl.recordings import Guess, Measurement, Probe, ProbeWindow, Recording
 from bcppl.sensors.altered import (
@@ -127,6 +128,18 @@ def test_evidence_is_for_what_was_wrong_and_for_nothing_else(name: str) -> None:
     )
     assert with_fault > VERY_STRONG
     assert without < 0.0
+
+
+def test_a_search_for_modes_does_not_depend_on_what_was_known_before() -> None:
+    """A pose that is known to hundredths of a millimetre, and all else as it was."""
+    stated = approximated(model, touched())
+    assert stated.quadratic is not None
+    sure = stated.quadratic._replace(information=1e10 * torch.eye(6).double() + stated.quadratic.information)
+    sure = type(sure)(*(values[:1] for values in sure))
+    known = _with_contacts(replace(stated, adapted=sure, quadratic=sure), stated.contacts, True)
+    assert known.quadratic is not None
+    for again, first in zip(known.quadratic, stated.quadratic, strict=True):
+        assert torch.equal(again, first)
 
 
 @pytest.mark.long
