@@ -31,8 +31,7 @@ import bcppl
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.live import Filter
-from bcppl.inference.live.filter import Update
+from bcppl.inference.live import Filter, Update
 from bcppl.robot.plan import Plan
 from bcppl.sensors import Recording
 from bcppl.traces import Model

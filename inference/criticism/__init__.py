@@ -4,7 +4,7 @@
     import pyro.distributions as dist
     import torch
     from bcppl.inference import importance_sampling
-    from bcppl.inference.criticism.predictive import surprise
+    from bcppl.inference.criticism import surprise
 
     def weighed():
         mass = pyro.sample("mass", dist.Normal(torch.tensor(2.0).double(), 0.5))
@@ -19,6 +19,15 @@ direction in which touches leave a position open, `shared_errors` how grasp, arm
 """
 
 from bcppl.inference.criticism.nuisances import SharedError, SuddenChange, shared_errors, sudden_changes
+from bcppl.inference.criticism.predictive import surprise
 from bcppl.inference.criticism.rival_hypotheses import Explanation, explanations
 
-__all__ = ["Explanation", "SharedError", "SuddenChange", "explanations", "shared_errors", "sudden_changes"]
+__all__ = [
+    "Explanation",
+    "SharedError",
+    "SuddenChange",
+    "explanations",
+    "shared_errors",
+    "sudden_changes",
+    "surprise",
+]

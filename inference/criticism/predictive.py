@@ -4,7 +4,7 @@
     import pyro.distributions as dist
     import torch
     from bcppl.inference import importance_sampling
-    from bcppl.inference.criticism.predictive import surprise
+    from bcppl.inference.criticism import surprise
 
     def weighed():
         mass = pyro.sample("mass", dist.Normal(torch.tensor(2.0).double(), 0.5))
